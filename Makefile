@@ -1,0 +1,53 @@
+# Everything a user or CI needs: `make demo`, `make test`. Both set up what is missing.
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STORE ?= .extrags/demo
+# OpenMP threads that spin while they wait starve each other on small machines.
+export OMP_WAIT_POLICY := passive
+
+.PHONY: help setup system demo test test-slow lint bench clean
+
+help: ## Show this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | sort
+
+setup: .stamps/installed ## System libraries, virtual environment, native kernels
+
+system:
+	@bash .ci/system-libraries
+
+.stamps/venv: requirements.lock
+	@$(MAKE) --no-print-directory system
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
+	@mkdir -p .stamps && touch $@
+
+NATIVE := $(wildcard CMakeLists.txt extrags/raster/native/*)
+.stamps/installed: .stamps/venv pyproject.toml $(NATIVE)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps \
+		--no-build-isolation --editable .
+	@touch $@
+
+demo: setup ## Reconstruct, explore, restore and evaluate the phantom, both settings
+	$(BIN)/extrags run phantom/0@sparse phantom/0@distanced --profile quick --store $(STORE)
+
+test: setup ## The default test suite
+	$(BIN)/python -m pytest
+
+test-slow: setup ## The default suite and everything marked slow
+	$(BIN)/python -m pytest --runslow
+
+lint: setup ## Format, lint, types, import layers, spelling
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/codespell
+
+bench: setup ## Benchmarks of the kernels (JSON on standard output)
+	$(BIN)/extrags bench raster --json -
+	$(BIN)/extrags bench train --json -
+
+clean: ## Remove build products, not the artefact store
+	rm -rf build dist .stamps .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,223 @@
+"""Pinhole cameras and rigid motions.
+
+Axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5. Poses are kept as
+`world_from_camera` in float64; the rasteriser gets `viewmats` (camera from world) in float32.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as AbstractSequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from extrags.errors import PoseError, ShapeError
+
+__all__ = [
+    "Cameras",
+    "as_rotation",
+    "compose",
+    "interpolate_poses",
+    "invert_poses",
+    "look_at",
+    "pixel_rays",
+    "rotation_about",
+    "rotation_angle_deg",
+]
+
+# Quaternions printed with six digits give rotations that are off by about 1e-6; a frame that is
+# off by more than this is not a rotation that lost digits, but something else.
+ROTATION_TOLERANCE = 1e-2
+
+
+@dataclass(frozen=True, slots=True)
+class Cameras:
+    """A batch of pinhole cameras that share one image size.
+
+    Args:
+        K: intrinsics in pixels, [C, 3, 3], float64.
+        world_from_camera: rigid camera-to-world motions, [C, 4, 4], float64.
+        width: image width in pixels.
+        height: image height in pixels.
+
+    Raises:
+        ShapeError: when the arrays do not fit each other.
+    """
+
+    K: Float[np.ndarray, "c 3 3"]
+    world_from_camera: Float[np.ndarray, "c 4 4"]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        n = self.world_from_camera.shape[0]
+        if self.world_from_camera.shape != (n, 4, 4) or self.K.shape != (n, 3, 3):
+            raise ShapeError(
+                f"Cameras need K [C, 3, 3] and world_from_camera [C, 4, 4], "
+                f"found {self.K.shape} and {self.world_from_camera.shape}"
+            )
+
+    def __len__(self) -> int:
+        return int(self.world_from_camera.shape[0])
+
+    def __getitem__(self, index: int | slice | AbstractSequence[int] | np.ndarray) -> Cameras:
+        """Select cameras; an integer keeps the batch axis."""
+        chosen = np.arange(len(self))[index]
+        chosen = np.atleast_1d(chosen)
+        return Cameras(self.K[chosen], self.world_from_camera[chosen], self.width, self.height)
+
+    @property
+    def viewmats(self) -> Float[np.ndarray, "c 4 4"]:
+        """Camera from world, [C, 4, 4], float64."""
+        return invert_poses(self.world_from_camera)
+
+    @property
+    def centers(self) -> Float[np.ndarray, "c 3"]:
+        """Camera centres in world coordinates."""
+        return self.world_from_camera[:, :3, 3]
+
+    @property
+    def forward(self) -> Float[np.ndarray, "c 3"]:
+        """Unit optical axes in world coordinates."""
+        return self.world_from_camera[:, :3, 2]
+
+    def resized(self, width: int, height: int) -> Cameras:
+        """The same views at another resolution (pixel edges stay where they are)."""
+        K = self.K.copy()
+        K[:, 0] *= width / self.width
+        K[:, 1] *= height / self.height
+        return Cameras(K, self.world_from_camera, width, height)
+
+    @staticmethod
+    def concatenated(parts: AbstractSequence[Cameras]) -> Cameras:
+        """Join batches of equal image size."""
+        sizes = {(part.width, part.height) for part in parts}
+        if len(sizes) != 1:
+            raise ShapeError(f"cameras of different image sizes cannot be joined: {sorted(sizes)}")
+        return Cameras(
+            np.concatenate([part.K for part in parts]),
+            np.concatenate([part.world_from_camera for part in parts]),
+            parts[0].width,
+            parts[0].height,
+        )
+
+
+def as_rotation(
+    matrix: Float[np.ndarray, "3 3"], *, frame: object = None, file: object = None
+) -> Float[np.ndarray, "3 3"]:
+    """The rotation nearest to a matrix that is one up to rounding.
+
+    Args:
+        matrix: what a file calls a rotation.
+        frame: named in the error.
+        file: named in the error.
+
+    Raises:
+        PoseError: for non-finite entries, a mirrored matrix (det < 0), or one further than
+            `ROTATION_TOLERANCE` from SO(3).
+    """
+    if not np.isfinite(matrix).all():
+        raise PoseError(
+            "the rotation holds NaN or infinity", file=file, frame=frame, field="world_from_camera"
+        )
+    u, singular, vt = np.linalg.svd(matrix)
+    determinant = float(np.linalg.det(u @ vt))
+    if determinant < 0:
+        raise PoseError(
+            f"the rotation is mirrored (det = {np.linalg.det(matrix):.3f}); expected det = +1. "
+            "Axes are probably swapped or one of them is negated",
+            file=file,
+            frame=frame,
+            field="world_from_camera",
+        )
+    if float(np.abs(singular - 1).max()) > ROTATION_TOLERANCE:
+        raise PoseError(
+            f"not a rotation: singular values {np.round(singular, 4).tolist()}, expected 1, 1, 1. "
+            "Is the matrix scaled, sheared or transposed?",
+            file=file,
+            frame=frame,
+            field="world_from_camera",
+        )
+    return np.asarray(u @ vt, dtype=np.float64)
+
+
+def invert_poses(poses: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
+    """Inverse of rigid motions, exact for orthonormal rotations."""
+    inverse = np.zeros_like(poses)
+    rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = -np.einsum("...ij,...j->...i", rotation, poses[..., :3, 3])
+    inverse[..., 3, 3] = 1
+    return inverse
+
+
+def compose(rotation: Float[np.ndarray, "3 3"], center: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """`world_from_camera` from a rotation and the camera centre."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:3, 3] = center
+    return pose
+
+
+def rotation_about(axis: Float[np.ndarray, "3"], angle_rad: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation by an angle about an axis (Rodrigues)."""
+    x, y, z = np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.eye(3) + np.sin(angle_rad) * cross + (1 - np.cos(angle_rad)) * (cross @ cross))
+
+
+def rotation_angle_deg(
+    first: Float[np.ndarray, "*b 3 3"], second: Float[np.ndarray, "*b 3 3"]
+) -> Float[np.ndarray, "*b"]:
+    """Angle of the rotation between two orientations, in degrees."""
+    trace = np.einsum("...ij,...ij->...", first, second)
+    return np.asarray(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))))
+
+
+def look_at(
+    center: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
+) -> Float[np.ndarray, "4 4"]:
+    """A camera at `center` that looks at `target`, its image-up nearest to `up`.
+
+    Raises:
+        PoseError: when target and centre coincide.
+    """
+    forward = np.asarray(target, dtype=np.float64) - center
+    length = np.linalg.norm(forward)
+    if length < 1e-12:
+        raise PoseError("look_at needs a target different from the centre", field="target")
+    forward = forward / length
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6:
+        # Looking straight along `up`: any direction across will do, but always the same one.
+        right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
+    right = right / np.linalg.norm(right)
+    down = np.cross(forward, right)
+    return compose(np.stack([right, down, forward], axis=1), np.asarray(center, dtype=np.float64))
+
+
+def interpolate_poses(
+    first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"], t: float
+) -> Float[np.ndarray, "4 4"]:
+    """Straight line between centres, shortest rotation between orientations."""
+    from scipy.spatial.transform import Rotation
+
+    between = Rotation.from_matrix(first[:3, :3].T @ second[:3, :3]).as_rotvec() * t
+    rotation = first[:3, :3] @ Rotation.from_rotvec(between).as_matrix()
+    return compose(rotation, (1 - t) * first[:3, 3] + t * second[:3, 3])
+
+
+def pixel_rays(cameras: Cameras) -> Float[np.ndarray, "c h w 3"]:
+    """World-space rays through pixel centres with unit z in the camera frame.
+
+    `center + z * ray` is the point at z-depth `z`.
+    """
+    u = np.arange(cameras.width) + 0.5
+    v = np.arange(cameras.height) + 0.5
+    K = cameras.K
+    x = (u[None, None, :] - K[:, 0, 2, None, None]) / K[:, 0, 0, None, None]
+    y = (v[None, :, None] - K[:, 1, 2, None, None]) / K[:, 1, 1, None, None]
+    x, y = np.broadcast_arrays(x, y)
+    local = np.stack([x, y, np.ones_like(x)], axis=-1)
+    return np.asarray(np.einsum("cij,chwj->chwi", cameras.world_from_camera[:, :3, :3], local))

@@ -1,0 +1,398 @@
+"""Settings: one frozen model per stage, and the profiles that combine them.
+
+Lengths that depend on the scene are given relative to it (to a depth quantile, say), so that the same
+settings serve a colon in millimetres and a COLMAP model in arbitrary units. Budgets are counted in
+iterations, never in seconds: a result must not depend on how busy the machine was.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from extrags.errors import ConfigError
+
+__all__ = [
+    "PROFILES",
+    "AssessConfig",
+    "CoarseConfig",
+    "EnhanceConfig",
+    "EvaluateConfig",
+    "ExploreConfig",
+    "FinetuneConfig",
+    "FreespaceConfig",
+    "IngestConfig",
+    "PipelineConfig",
+    "PosesConfig",
+    "ReportConfig",
+    "StageConfig",
+    "SurfaceConfig",
+    "profile_config",
+]
+
+ProfileName = Literal["quick", "balanced", "paper"]
+
+
+class StageConfig(BaseModel):
+    """Base of all settings: immutable, unknown names refused."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class IngestConfig(StageConfig):
+    """How a source becomes a `Sequence`."""
+
+    width: int | None = Field(
+        None, ge=16, le=4096, description="image width in pixels; None keeps the source's own"
+    )
+    height: int | None = Field(None, ge=16, le=4096, description="image height in pixels")
+    downscale: int | None = Field(
+        None,
+        ge=1,
+        le=16,
+        description="divide the source's size by this; None: the source's usual divisor (sinus 4, "
+        "simcol3d 2, others 1); ignored when width is set",
+    )
+    holdout_every: int = Field(
+        8, ge=2, description="hold out every n-th frame where the source defines no split"
+    )
+    max_frames: int | None = Field(None, ge=2, description="read at most so many frames")
+
+
+class PosesConfig(StageConfig):
+    """Camera poses by COLMAP, for sources without them."""
+
+    n_features: int = Field(6000, ge=100, description="SIFT features per image")
+    peak_threshold: float = Field(
+        0.001, gt=0, description="SIFT peak threshold; COLMAP's default is too high for mucosa"
+    )
+    edge_threshold: float = Field(20.0, gt=0, description="SIFT edge threshold")
+    sequential_overlap: int = Field(12, ge=1, description="frames matched to each side")
+    exhaustive_below: int = Field(
+        60, ge=2, description="match all pairs when there are at most so many frames"
+    )
+    min_tri_angle_deg: float = Field(4.0, gt=0, description="smallest initial triangulation angle")
+    min_registered_share: float = Field(
+        0.5, gt=0, le=1, description="fewer registered training frames are an error"
+    )
+    seed: int = Field(0, ge=0, description="seed of COLMAP's RANSAC")
+
+
+class LightConfig(StageConfig):
+    """Near-field light that rides on the camera (design section 6)."""
+
+    enabled: bool = Field(True, description="False: colours do not depend on the distance")
+    exponent: float = Field(1.0, gt=0, description="starting exponent e of gain / (c + r^2)^e")
+    learning_rate: float = Field(0.01, gt=0, description="of the global light parameters")
+    exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
+    exposure_prior: float = Field(
+        0.02, ge=0, description="weight that holds log-exposures near their mean of zero"
+    )
+
+
+class OptimiserConfig(StageConfig):
+    """Learning rates of the Gaussians; positions are relative to the scene's extent."""
+
+    means: float = Field(1.6e-4, gt=0, description="positions at the start, times the extent")
+    means_final: float = Field(1.6e-6, gt=0, description="positions at the end, times the extent")
+    sh0: float = Field(2.5e-3, gt=0)
+    shN: float = Field(1.25e-4, gt=0)
+    opacities: float = Field(0.05, gt=0)
+    scales: float = Field(5e-3, gt=0)
+    quats: float = Field(1e-3, gt=0)
+
+
+class DensifyConfig(StageConfig):
+    """When Gaussians are cloned, split and pruned."""
+
+    enabled: bool = True
+    start_share: float = Field(0.1, ge=0, le=1, description="from this share of the iterations")
+    stop_share: float = Field(0.6, ge=0, le=1, description="until this share of the iterations")
+    every: int = Field(100, ge=1, description="iterations between two rounds")
+    gradient_threshold: float = Field(
+        2e-4, gt=0, description="mean 2D-position gradient (in half image widths) that densifies"
+    )
+    prune_opacity: float = Field(0.005, ge=0, lt=1, description="fainter Gaussians are removed")
+    max_gaussians: int = Field(60_000, ge=100, description="no growth beyond this")
+    split_scale_share: float = Field(
+        0.01, gt=0, description="larger than this share of the extent: split, else clone"
+    )
+
+
+class CoarseConfig(StageConfig):
+    """Gaussians from the training views."""
+
+    iterations: int = Field(3000, ge=1, description="optimisation steps, one view each")
+    sh_degree: int = Field(1, ge=0, le=3, description="degree of the spherical harmonics")
+    sh_every: int = Field(500, ge=1, description="iterations between two raises of the degree")
+    dssim_weight: float = Field(0.2, ge=0, le=1, description="lambda of the photometric loss")
+    depth_weight: float = Field(
+        0.1, ge=0, description="weight of the inverse-depth term, relative to the median depth"
+    )
+    depth_weight_final_share: float = Field(
+        0.1, ge=0, le=1, description="the term decays to this share, log-linearly"
+    )
+    max_points: int = Field(12_000, ge=10, description="starting points at most")
+    optimiser: OptimiserConfig = OptimiserConfig()
+    densify: DensifyConfig = DensifyConfig()
+    light: LightConfig = LightConfig()
+    seed: int = Field(0, ge=0)
+
+
+class AssessConfig(StageConfig):
+    """What the scene still lacks, and the plan that follows."""
+
+    probe_views: int = Field(24, ge=1, description="views in the fan round the training views")
+    probe_offset: float = Field(0.35, gt=0, description="sideways offset of a probe, in median depths")
+    probe_turn_deg: float = Field(35.0, ge=0, description="turn of a probe")
+    hole_alpha: float = Field(0.5, gt=0, lt=1, description="a pixel below this alpha is a hole")
+    min_hole_share: float = Field(
+        0.002,
+        ge=0,
+        le=1,
+        description="explore only when holes and poorly seen pixels exceed this share",
+    )
+    min_directions: int = Field(
+        3, ge=1, description="a Gaussian seen from fewer direction bins counts as poorly seen"
+    )
+    full_budget_share: float = Field(
+        0.25, gt=0, le=1, description="at this share of lacking pixels the whole budget is spent"
+    )
+    force: bool = Field(False, description="run every stage whatever the measurements say")
+    seed: int = Field(0, ge=0)
+
+
+class SurfaceConfig(StageConfig):
+    """TSDF fusion of rendered depth."""
+
+    voxel_share: float = Field(
+        1 / 96, gt=0, lt=1, description="voxel edge as a share of the 95 % depth quantile"
+    )
+    truncation_voxels: float = Field(5.0, gt=1, description="truncation in voxels")
+    min_alpha: float = Field(0.5, gt=0, lt=1, description="depth counts only above this alpha")
+    depth_quantile: float = Field(0.98, gt=0.5, le=1, description="farther depth is not fused")
+    min_cluster_triangles: int = Field(50, ge=1, description="smaller pieces are removed")
+    max_width: int = Field(320, ge=16, description="wider images are rendered at this width")
+
+
+class FreespaceConfig(StageConfig):
+    """Occupancy and clearance."""
+
+    grid_size: int = Field(64, ge=8, le=256, description="S: voxels per axis")
+    top_views: int = Field(3, ge=1, description="visibility = mean of so many best views")
+    occupied_below: float = Field(0.5, gt=0, lt=1, description="tau of the paper")
+    margin_share: float = Field(
+        0.05, ge=0, description="padding of the bounding volume, as a share of its largest side"
+    )
+    min_alpha: float = Field(
+        0.5, gt=0, lt=1, description="a ray that ends below this alpha hit nothing and proves nothing"
+    )
+    wall_voxels: float = Field(
+        2.0, gt=0, description="unseen voxels this near to the mesh are occupied, farther ones unknown"
+    )
+    render_width: int = Field(160, ge=16, description="width of the renders in pixels")
+
+
+class ExploreConfig(StageConfig):
+    """The search for virtual trajectories."""
+
+    trajectories: int = Field(20, ge=1, description="N_Tr: starts at most")
+    length: int = Field(16, ge=2, description="L: views per trajectory, the start included")
+    directions: int = Field(32, ge=4, le=32, description="D: equal-area direction bins")
+    step_share: float = Field(0.2, gt=0, description="length of a translation, in median rendered depths")
+    rotation_deg: float = Field(10.0, gt=0, le=90)
+    orbit_deg: float = Field(10.0, gt=0, le=90)
+    safety_share: float = Field(0.15, ge=0, description="smallest clearance, in median rendered depths")
+    visible_weight: float = Field(
+        0.02, gt=0, lt=1, description="a Gaussian is seen when its largest T * alpha exceeds this"
+    )
+    max_hole_share: float = Field(
+        0.5, gt=0, le=1, description="a candidate with a larger share of empty pixels is rejected"
+    )
+    darkness_weight: float = Field(0.5, ge=0, description="lambda_l of the illumination weight")
+    fold_angle_deg: float = Field(25.0, gt=0, description="tau_R, on the rotation over the last three steps")
+    fold_penalty: float = Field(0.6, gt=0, lt=1, description="eta")
+    max_expansions: int = Field(60, ge=1, description="budget of expansions per trajectory")
+    wave: int = Field(5, ge=1, description="branches that grow from one coverage snapshot")
+    min_gain_share: float = Field(
+        0.002,
+        ge=0,
+        description="stop when a trajectory adds less than this share of all pairs",
+    )
+    render_width: int = Field(80, ge=16, description="width of the scoring renders in pixels")
+    seed: int = Field(0, ge=0)
+
+
+class EnhanceConfig(StageConfig):
+    """Restoration of the virtual views."""
+
+    backend: Literal["embedded", "classical"] = Field(
+        "embedded", description="embedded: the conditional diffusion; classical: blend and fill"
+    )
+    folds: int = Field(2, ge=1, description="leave-out reconstructions that make training pairs")
+    fold_iterations: int = Field(300, ge=1, description="optimisation steps of each of them")
+    cheap_views: int = Field(24, ge=0, description="further pairs from perturbed, unoptimised Gaussians")
+    train_iterations: int = Field(300, ge=1, description="steps of the diffusion's training")
+    batch: int = Field(4, ge=1, description="crops per step")
+    crop: int = Field(96, ge=32, description="crop size in pixels, a multiple of 8")
+    channels: tuple[int, int, int] = Field((32, 64, 96), description="widths of the U-Net's levels")
+    learning_rate: float = Field(8e-4, gt=0)
+    steps: int | Literal["auto"] = Field(
+        "auto", description="sampling steps; auto: 1 or 4, chosen on held-out pairs"
+    )
+    samples: int = Field(1, ge=1, le=16, description="samples per view; more give an uncertainty")
+    references: int = Field(8, ge=1, description="real views blended into the reference")
+    max_views: int = Field(160, ge=1, description="virtual views restored at most")
+    clips_per_batch: int = Field(4, ge=1, description="clips restored by one task")
+    seed: int = Field(0, ge=0)
+
+
+class FinetuneConfig(StageConfig):
+    """Real and restored views together."""
+
+    iterations: int = Field(2000, ge=1)
+    densify_share: float = Field(0.6, ge=0, le=1, description="densification ends at this share")
+    pseudo_share: float = Field(
+        0.5, ge=0, lt=1, description="share of virtual views among the steps, at the start"
+    )
+    pseudo_share_final: float = Field(0.25, ge=0, lt=1, description="the same at the end; linear in between")
+    seed_holes: bool = Field(
+        True, description="place new Gaussians where the restored view has surface and none is"
+    )
+    keep_known: bool = Field(
+        True, description="u * restored + (1 - u) * rendered instead of the restored image alone"
+    )
+    confidence_floor: float = Field(
+        0.1, ge=0, le=1, description="smallest pixel-level weight, so that no pixel drifts freely"
+    )
+    seed: int = Field(0, ge=0)
+
+
+class EvaluateConfig(StageConfig):
+    """Held-out views and their metrics."""
+
+    lpips_net: Literal["alex", "squeeze"] = Field("alex", description="backbone of LPIPS")
+    lpips_weights: str | None = Field(
+        None, description="npz file with LPIPS weights; None looks in the usual places"
+    )
+
+
+class ReportConfig(StageConfig):
+    """The HTML page."""
+
+    held_out_views: int = Field(6, ge=1, description="held-out views shown")
+    virtual_views: int = Field(8, ge=1, description="virtual views shown")
+
+
+class PipelineConfig(StageConfig):
+    """All stages of one run."""
+
+    ingest: IngestConfig = IngestConfig()
+    poses: PosesConfig = PosesConfig()
+    coarse: CoarseConfig = CoarseConfig()
+    assess: AssessConfig = AssessConfig()
+    surface: SurfaceConfig = SurfaceConfig()
+    freespace: FreespaceConfig = FreespaceConfig()
+    explore: ExploreConfig = ExploreConfig()
+    enhance: EnhanceConfig = EnhanceConfig()
+    finetune: FinetuneConfig = FinetuneConfig()
+    evaluate: EvaluateConfig = EvaluateConfig()
+    report: ReportConfig = ReportConfig()
+
+    def with_seed(self, seed: int) -> PipelineConfig:
+        """The same settings with every stage's seed set."""
+        seeded = {
+            name: value.model_copy(update={"seed": seed})
+            for name, value in self
+            if "seed" in type(value).model_fields
+        }
+        return self.model_copy(update=seeded)
+
+    def with_overrides(self, overrides: dict[str, Any]) -> PipelineConfig:
+        """Apply `{"coarse.iterations": 500}`-like settings.
+
+        Raises:
+            ConfigError: for an unknown name (with the nearest known one) or a value out of range.
+        """
+        tree = self.model_dump()
+        for path, value in overrides.items():
+            _set_by_path(tree, path, value)
+        try:
+            return PipelineConfig.model_validate(tree)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise ConfigError(f"setting {where}: {first['msg']} (found {first['input']!r})") from error
+
+
+def _set_by_path(tree: dict[str, Any], path: str, value: Any) -> None:
+    from difflib import get_close_matches
+
+    *parents, leaf = path.split(".")
+    node: Any = tree
+    for done, name in enumerate([*parents, leaf]):
+        if not isinstance(node, dict) or name not in node:
+            known = sorted(node) if isinstance(node, dict) else []
+            near = get_close_matches(name, known, n=1)
+            hint = f"; did you mean {'.'.join([*parents[:done], near[0]])}?" if near else ""
+            raise ConfigError(f"no setting {path}{hint} Known here: {', '.join(known) or 'none'}")
+        if done < len(parents):
+            node = node[name]
+    if isinstance(node[leaf], dict):
+        raise ConfigError(f"{path} is a group of settings; name one of {', '.join(node[leaf])}")
+    node[leaf] = value
+
+
+PROFILES: dict[str, PipelineConfig] = {
+    # A look at the scene in about three minutes on two cores.
+    "quick": PipelineConfig(
+        coarse=CoarseConfig(iterations=1500, max_points=8000, sh_every=400),
+        explore=ExploreConfig(trajectories=12, length=10),
+        enhance=EnhanceConfig(train_iterations=220, max_views=96, batch=4),
+        finetune=FinetuneConfig(iterations=1000),
+    ),
+    # The default: minutes to a quarter of an hour on two cores.
+    "balanced": PipelineConfig(
+        coarse=CoarseConfig(iterations=5000, max_points=16_000, sh_every=1000),
+        enhance=EnhanceConfig(
+            folds=3,
+            fold_iterations=600,
+            train_iterations=1200,
+            channels=(48, 96, 160),
+            max_views=240,
+        ),
+        finetune=FinetuneConfig(iterations=4000),
+    ),
+    # The paper's counts.
+    "paper": PipelineConfig(
+        coarse=CoarseConfig(
+            iterations=30_000,
+            max_points=60_000,
+            sh_degree=3,
+            sh_every=1000,
+            densify=DensifyConfig(max_gaussians=400_000, start_share=1 / 60, stop_share=0.5),
+        ),
+        enhance=EnhanceConfig(
+            folds=4,
+            fold_iterations=2000,
+            train_iterations=6000,
+            channels=(48, 96, 160),
+            max_views=320,
+            samples=4,
+        ),
+        finetune=FinetuneConfig(iterations=15_000),
+        explore=ExploreConfig(render_width=160, max_expansions=200),
+    ),
+}
+
+
+def profile_config(name: str) -> PipelineConfig:
+    """Settings of a profile.
+
+    Raises:
+        ConfigError: for an unknown profile.
+    """
+    if name not in PROFILES:
+        raise ConfigError(f"no profile {name!r}; known: {', '.join(PROFILES)}")
+    return PROFILES[name]

@@ -1,0 +1,120 @@
+"""Every error the library raises on purpose.
+
+One root class; each error is also the builtin kind a caller would expect, so that `except ValueError`
+keeps working. A message names the file, the frame and the field, what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "CaptureError",
+    "ConfigError",
+    "DivergedError",
+    "ExtragsError",
+    "MissingDependencyError",
+    "NonFiniteError",
+    "PoseError",
+    "ShapeError",
+    "SourceError",
+    "SourceNotFoundError",
+    "StoreError",
+    "UnknownSequenceError",
+    "WeightsError",
+]
+
+
+class ExtragsError(Exception):
+    """Root of all errors raised by extrags."""
+
+
+class ShapeError(ExtragsError, ValueError):
+    """An array has the wrong number of dimensions, size or dtype."""
+
+
+class NonFiniteError(ExtragsError, ValueError):
+    """A NaN or an infinity where only finite numbers make sense; names the array."""
+
+
+class ConfigError(ExtragsError, ValueError):
+    """A setting that cannot be used, alone or together with others."""
+
+
+class SourceError(ExtragsError, ValueError):
+    """A file of the input is there but wrong.
+
+    Args:
+        problem: what is wrong and what was expected, as a sentence.
+        file: the file it was found in.
+        frame: the frame it belongs to, by name or index.
+        field: the field of the file, e.g. `K` or `world_from_camera`.
+    """
+
+    def __init__(
+        self,
+        problem: str,
+        *,
+        file: object | None = None,
+        frame: object | None = None,
+        field: str | None = None,
+    ) -> None:
+        self.problem = problem
+        self.file = None if file is None else str(file)
+        self.frame = None if frame is None else str(frame)
+        self.field = field
+        where = [
+            f"{label} {value}"
+            for label, value in (("file", self.file), ("frame", self.frame), ("field", field))
+            if value is not None
+        ]
+        super().__init__(f"{', '.join(where)}: {problem}" if where else problem)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Survive pickling between worker processes with all fields."""
+        return (
+            _rebuild_source_error,
+            (type(self), self.problem, self.file, self.frame, self.field),
+        )
+
+
+def _rebuild_source_error(
+    kind: type[SourceError], problem: str, file: str | None, frame: str | None, field: str | None
+) -> SourceError:
+    return kind(problem, file=file, frame=frame, field=field)
+
+
+class SourceNotFoundError(SourceError, FileNotFoundError):
+    """A file or folder of the input is missing."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+class PoseError(SourceError):
+    """A camera pose that is not a rigid motion, or not where it should be."""
+
+
+class CaptureError(ExtragsError, RuntimeError):
+    """The recording itself does not allow the step: too few frames, no parallax, nothing visible."""
+
+
+class UnknownSequenceError(ExtragsError, KeyError):
+    """No sequence of this name in the catalogue, and no such path on disk."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+class StoreError(ExtragsError, OSError):
+    """The artefact store cannot be read or written."""
+
+
+class WeightsError(ExtragsError, FileNotFoundError):
+    """Weights of a network are missing or do not fit; says how to get them."""
+
+
+class MissingDependencyError(ExtragsError, ImportError):
+    """An optional package is not installed; names the extra that brings it."""
+
+
+class DivergedError(ExtragsError, ArithmeticError):
+    """An optimisation produced NaN or infinity; names the iteration and the parameter group."""

@@ -1,0 +1,59 @@
+"""Typed events that long loops emit.
+
+The library never prints. Loops call an `Emit`; progress bars, logs and Prefect artifacts subscribe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+
+__all__ = ["Emit", "Event", "MetricRecorded", "Progress", "emit", "subscribed"]
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """A step of a loop whose length is known."""
+
+    stage: str
+    """Name of the stage the loop belongs to."""
+    done: int
+    """Steps finished so far."""
+    total: int
+    """Steps in all."""
+    values: dict[str, float] = field(default_factory=dict)
+    """What is worth watching: loss, number of Gaussians, ..."""
+
+
+@dataclass(frozen=True, slots=True)
+class MetricRecorded:
+    """A number measured once."""
+
+    stage: str
+    name: str
+    value: float
+
+
+Event = Progress | MetricRecorded
+Emit = Callable[[Event], None]
+
+_subscriber: ContextVar[Emit | None] = ContextVar("extrags_event_subscriber", default=None)
+
+
+def emit(event: Event) -> None:
+    """Hand an event to the current subscriber; without one it is dropped."""
+    subscriber = _subscriber.get()
+    if subscriber is not None:
+        subscriber(event)
+
+
+@contextmanager
+def subscribed(subscriber: Emit) -> Iterator[None]:
+    """Receive all events emitted inside the block, in this thread and in contexts copied from it."""
+    token = _subscriber.set(subscriber)
+    try:
+        yield
+    finally:
+        _subscriber.reset(token)

@@ -1,0 +1,217 @@
+"""3D Gaussians: the packed parameters, PLY in and out, and their form in zarr."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+import zarr
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from extrags.errors import ShapeError, SourceError, SourceNotFoundError
+from extrags.zarr_io import open_group, read_array, write_array
+
+__all__ = ["SH_C0", "Gaussians"]
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic."""
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """Parameters of N Gaussians before activation, as 3DGS stores them.
+
+    Args:
+        means: centres in world units, [N, 3].
+        quats: rotations (w, x, y, z), any length above zero, [N, 4].
+        scales: logarithm of the standard deviations, [N, 3].
+        opacities: logits, [N].
+        sh0: constant SH coefficient per colour, [N, 1, 3].
+        shN: higher SH coefficients, [N, K - 1, 3]; K - 1 may be 0.
+
+    Raises:
+        ShapeError: when the arrays do not describe the same number of Gaussians.
+    """
+
+    means: Float[Tensor, "n 3"]
+    quats: Float[Tensor, "n 4"]
+    scales: Float[Tensor, "n 3"]
+    opacities: Float[Tensor, "n"]
+    sh0: Float[Tensor, "n 1 3"]
+    shN: Float[Tensor, "n k 3"]
+
+    def __post_init__(self) -> None:
+        n = self.means.shape[0]
+        expected = {
+            "means": (n, 3),
+            "quats": (n, 4),
+            "scales": (n, 3),
+            "opacities": (n,),
+            "sh0": (n, 1, 3),
+        }
+        for name, shape in expected.items():
+            if tuple(getattr(self, name).shape) != shape:
+                raise ShapeError(f"{name} has shape {tuple(getattr(self, name).shape)}, expected {shape}")
+        if self.shN.ndim != 3 or self.shN.shape[0] != n or self.shN.shape[2] != 3:
+            raise ShapeError(f"shN has shape {tuple(self.shN.shape)}, expected ({n}, K - 1, 3)")
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    @property
+    def n_gaussians(self) -> int:
+        """How many Gaussians there are."""
+        return len(self)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the stored spherical harmonics."""
+        return math.isqrt(self.shN.shape[1] + 1) - 1
+
+    @property
+    def sh(self) -> Float[Tensor, "n k 3"]:
+        """All SH coefficients, [N, K, 3]."""
+        return torch.cat([self.sh0, self.shN], dim=1)
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The arrays by name."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    def detached(self) -> Gaussians:
+        """A copy without gradient history."""
+        return Gaussians(**{k: v.detach().clone() for k, v in self.parameters().items()})
+
+    def subset(self, index: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> Gaussians:
+        """Chosen Gaussians."""
+        return Gaussians(**{k: v[index] for k, v in self.parameters().items()})
+
+    @staticmethod
+    def concatenated(first: Gaussians, second: Gaussians) -> Gaussians:
+        """Both sets, `first` in front."""
+        other = second.parameters()
+        return Gaussians(**{k: torch.cat([v, other[k]]) for k, v in first.parameters().items()})
+
+    @classmethod
+    def from_points(
+        cls,
+        points: Float[np.ndarray, "n 3"],
+        rgb: Float[np.ndarray, "n 3"],
+        radius: Float[np.ndarray, "n"],
+        *,
+        opacity: float = 0.5,
+        sh_degree: int = 0,
+    ) -> Gaussians:
+        """Isotropic Gaussians at points.
+
+        Args:
+            points: centres in world units.
+            rgb: colours in [0, 1].
+            radius: standard deviation of each, in world units.
+            opacity: the same for all, in (0, 1).
+            sh_degree: higher coefficients are zero.
+        """
+        n = len(points)
+        quats = torch.zeros(n, 4)
+        quats[:, 0] = 1
+        return cls(
+            means=torch.tensor(points, dtype=torch.float32),
+            quats=quats,
+            scales=torch.tensor(radius, dtype=torch.float32).log()[:, None].repeat(1, 3),
+            opacities=torch.full((n,), float(np.log(opacity / (1 - opacity)))),
+            sh0=((torch.tensor(rgb, dtype=torch.float32) - 0.5) / SH_C0)[:, None, :],
+            shN=torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
+        )
+
+    def save(self, path: Path) -> None:
+        """Write a zarr v3 group, one array per attribute."""
+        group = open_group(path, mode="w")
+        for name, value in self.parameters().items():
+            write_array(group, name, value.detach().numpy())
+
+    @classmethod
+    def load(cls, path: Path) -> Gaussians:
+        """Read what `save` wrote."""
+        group = zarr.open_group(str(path), mode="r")
+        return cls(**{f.name: torch.from_numpy(read_array(group, f.name)) for f in fields(cls)})
+
+    def write_ply(self, path: Path) -> None:
+        """Write the standard 3DGS PLY (opens in SuperSplat and brush).
+
+        Colours go out as they are stored: with a near-field light they are albedo, so bake the
+        light first when a plain viewer shall show what the endoscope saw.
+        """
+        from plyfile import PlyData, PlyElement
+
+        n = len(self)
+        columns: dict[str, np.ndarray] = {}
+        means = self.means.detach().numpy()
+        for axis, name in enumerate("xyz"):
+            columns[name] = means[:, axis]
+        for name in ("nx", "ny", "nz"):
+            columns[name] = np.zeros(n, np.float32)
+        for axis in range(3):
+            columns[f"f_dc_{axis}"] = self.sh0.detach().numpy()[:, 0, axis]
+        # 3DGS stores the higher coefficients colour by colour.
+        rest = self.shN.detach().numpy().transpose(0, 2, 1).reshape(n, -1)
+        for k in range(rest.shape[1]):
+            columns[f"f_rest_{k}"] = rest[:, k]
+        columns["opacity"] = self.opacities.detach().numpy()
+        for axis in range(3):
+            columns[f"scale_{axis}"] = self.scales.detach().numpy()[:, axis]
+        for axis in range(4):
+            columns[f"rot_{axis}"] = self.quats.detach().numpy()[:, axis]
+        table = np.empty(n, dtype=[(name, "f4") for name in columns])
+        for name, values in columns.items():
+            table[name] = values
+        PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
+
+    @classmethod
+    def read_ply(cls, path: Path) -> Gaussians:
+        """Read a standard 3DGS PLY.
+
+        Raises:
+            SourceNotFoundError: when there is no such file.
+            SourceError: when a field is missing.
+        """
+        from plyfile import PlyData
+
+        if not Path(path).exists():
+            raise SourceNotFoundError("no such file", file=path)
+        vertex = PlyData.read(str(path))["vertex"].data
+        names = set(vertex.dtype.names or ())
+        required = [
+            "x",
+            "y",
+            "z",
+            "opacity",
+            *(f"f_dc_{i}" for i in range(3)),
+            *(f"scale_{i}" for i in range(3)),
+            *(f"rot_{i}" for i in range(4)),
+        ]
+        for name in required:
+            if name not in names:
+                raise SourceError("not a 3DGS PLY: the property is missing", file=path, field=name)
+
+        def stacked(*columns: str) -> Tensor:
+            return torch.from_numpy(
+                np.stack([np.asarray(vertex[c], dtype=np.float32) for c in columns], axis=1)
+            )
+
+        n_rest = sum(name.startswith("f_rest_") for name in names)
+        rest = (
+            stacked(*(f"f_rest_{k}" for k in range(n_rest))).reshape(len(vertex), 3, -1)
+            if n_rest
+            else torch.zeros(len(vertex), 3, 0)
+        )
+        return cls(
+            means=stacked("x", "y", "z"),
+            quats=stacked("rot_0", "rot_1", "rot_2", "rot_3"),
+            scales=stacked("scale_0", "scale_1", "scale_2"),
+            opacities=stacked("opacity")[:, 0],
+            sh0=stacked("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
+            shN=rest.transpose(1, 2).contiguous(),
+        )

@@ -1,0 +1,196 @@
+"""A posed endoscopic sequence and its form in zarr."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from jaxtyping import Bool, Float, Int, UInt8
+
+from extrags.cameras import Cameras
+from extrags.errors import ShapeError
+from extrags.zarr_io import open_group, read_array, write_array, write_frames
+
+__all__ = ["Sequence", "Split"]
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Which frames train and which are held out; always from a manifest, never from file names.
+
+    Args:
+        name: e.g. `sparse`, `distanced`, `every8`.
+        train: indices of frames the reconstruction may see.
+        test: indices of held-out frames.
+        version: raised by hand when the rule behind the name changes.
+    """
+
+    name: str
+    train: Int[np.ndarray, "n_train"]
+    test: Int[np.ndarray, "n_test"]
+    version: int = 1
+
+
+@dataclass(frozen=True)
+class Sequence:
+    """Frames of one scene: colour, and depth, poses and ground truth where they exist.
+
+    Frames of all recordings of the scene stand one after the other in one world frame.
+
+    Args:
+        name: `DATASET/SEQUENCE[@SETTING]`.
+        rgb: colour images, uint8, [F, H, W, 3].
+        K: pinhole intrinsics in pixels, [F, 3, 3].
+        mask: true where a pixel shows tissue (field of view, no overlay), [F, H, W].
+        split: training and held-out frames.
+        world_from_camera: poses, or None until the poses stage has found them.
+        depth_mm: z-depth, 0 where unknown, [F, H, W]; millimetres when `metric`.
+        recording: index of the recording each frame belongs to, [F].
+        frame_names: one name per frame, for messages.
+        metric: true when lengths are millimetres; false for an arbitrary scale.
+        observed: for frames of the test split, true where the surface seen by a pixel was seen by
+            at least one training frame; false elsewhere. None where the source cannot tell.
+        points: sparse points known from the source, [P, 3], or None.
+        points_rgb: their colours, uint8, [P, 3], or None.
+        truth: further ground truth of simulated sources, as JSON (light, exposure, ...).
+
+    Raises:
+        ShapeError: when sizes do not fit each other.
+    """
+
+    name: str
+    rgb: UInt8[np.ndarray, "f h w 3"]
+    K: Float[np.ndarray, "f 3 3"]
+    mask: Bool[np.ndarray, "f h w"]
+    split: Split
+    world_from_camera: Float[np.ndarray, "f 4 4"] | None = None
+    depth_mm: Float[np.ndarray, "f h w"] | None = None
+    recording: Int[np.ndarray, "f"] | None = None
+    frame_names: tuple[str, ...] = ()
+    metric: bool = True
+    observed: Bool[np.ndarray, "f h w"] | None = None
+    points: Float[np.ndarray, "p 3"] | None = None
+    points_rgb: UInt8[np.ndarray, "p 3"] | None = None
+    truth: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        frames, height, width = self.rgb.shape[:3]
+        for name, array, shape in (
+            ("mask", self.mask, (frames, height, width)),
+            ("K", self.K, (frames, 3, 3)),
+            ("world_from_camera", self.world_from_camera, (frames, 4, 4)),
+            ("depth_mm", self.depth_mm, (frames, height, width)),
+            ("observed", self.observed, (frames, height, width)),
+            ("recording", self.recording, (frames,)),
+        ):
+            if array is not None and array.shape != shape:
+                raise ShapeError(f"{self.name}: {name} has shape {array.shape}, expected {shape}")
+        if self.frame_names and len(self.frame_names) != frames:
+            raise ShapeError(f"{self.name}: {len(self.frame_names)} frame names for {frames} frames")
+
+    def __len__(self) -> int:
+        return int(self.rgb.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Image width in pixels."""
+        return int(self.rgb.shape[2])
+
+    @property
+    def height(self) -> int:
+        """Image height in pixels."""
+        return int(self.rgb.shape[1])
+
+    @property
+    def cameras(self) -> Cameras:
+        """All frames as cameras.
+
+        Raises:
+            ShapeError: while the poses are unknown.
+        """
+        if self.world_from_camera is None:
+            raise ShapeError(f"{self.name} has no poses yet; the poses stage finds them")
+        return Cameras(self.K, self.world_from_camera, self.width, self.height)
+
+    @property
+    def train(self) -> Int[np.ndarray, "n_train"]:
+        """Indices of training frames."""
+        return self.split.train
+
+    @property
+    def test(self) -> Int[np.ndarray, "n_test"]:
+        """Indices of held-out frames."""
+        return self.split.test
+
+    def frame_name(self, index: int) -> str:
+        """Name of a frame for messages."""
+        return self.frame_names[index] if self.frame_names else f"{index:04d}"
+
+    def with_poses(self, world_from_camera: Float[np.ndarray, "f 4 4"]) -> Sequence:
+        """The same sequence with poses."""
+        return replace(self, world_from_camera=world_from_camera)
+
+    def save(self, path: Path) -> None:
+        """Write a zarr v3 group; one frame per chunk for image stacks."""
+        group = open_group(path, mode="w")
+        write_frames(group, "rgb", self.rgb)
+        write_frames(group, "mask", self.mask)
+        write_array(group, "K", self.K)
+        write_array(group, "split/train", self.split.train.astype(np.int64))
+        write_array(group, "split/test", self.split.test.astype(np.int64))
+        for name in ("depth_mm", "observed"):
+            stack = getattr(self, name)
+            if stack is not None:
+                write_frames(group, name, stack)
+        for name in ("world_from_camera", "recording", "points", "points_rgb"):
+            array = getattr(self, name)
+            if array is not None:
+                write_array(group, name, array)
+        group.attrs.update(
+            {
+                "name": self.name,
+                "metric": self.metric,
+                "frame_names": list(self.frame_names),
+                "split": {"name": self.split.name, "version": self.split.version},
+                "truth": self.truth,
+            }
+        )
+
+    @classmethod
+    def load(cls, path: Path) -> Sequence:
+        """Read what `save` wrote."""
+        group = zarr.open_group(str(path), mode="r")
+        attributes = dict(group.attrs)
+        split: Any = attributes["split"]
+        optional = {
+            name: read_array(group, name) if name in group else None
+            for name in (
+                "depth_mm",
+                "observed",
+                "world_from_camera",
+                "recording",
+                "points",
+                "points_rgb",
+            )
+        }
+        truth: Any = attributes["truth"]
+        names: Any = attributes["frame_names"]
+        return cls(
+            name=str(attributes["name"]),
+            rgb=read_array(group, "rgb"),
+            K=read_array(group, "K"),
+            mask=read_array(group, "mask"),
+            split=Split(
+                split["name"],
+                read_array(group, "split/train"),
+                read_array(group, "split/test"),
+                split["version"],
+            ),
+            frame_names=tuple(names),
+            metric=bool(attributes["metric"]),
+            truth=truth,
+            **optional,
+        )

@@ -1,0 +1,9 @@
+"""Optimisation of scenes: coarse reconstruction from real views, fine-tuning with virtual ones."""
+
+from __future__ import annotations
+
+from extrags.training.finetuning import finetune as finetune
+from extrags.training.optimise import TrainingResult as TrainingResult
+from extrags.training.reconstruction import reconstruct as reconstruct
+from extrags.training.starting import median_depth as median_depth
+from extrags.training.starting import starting_gaussians as starting_gaussians

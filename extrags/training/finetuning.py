@@ -1,0 +1,212 @@
+"""Joint fine-tuning on real views and confidence-weighted pseudo-observations."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import cKDTree
+
+from extrags.cameras import pixel_rays
+from extrags.config import CoarseConfig, FinetuneConfig
+from extrags.enhance.pseudo import PseudoObservations
+from extrags.gaussians import Gaussians
+from extrags.scene import Scene
+from extrags.sequence import Sequence
+from extrags.training.optimise import TrainingResult, optimise
+from extrags.training.reconstruction import coarse_schedule, scene_extent
+from extrags.training.starting import median_depth, thin_out
+from extrags.training.views import View, epochs, real_views
+
+__all__ = ["finetune", "hole_gaussians", "virtual_views"]
+
+HOLE_ALPHA = 0.5
+"""A virtual pixel below this alpha shows a hole that new Gaussians may fill."""
+
+CARVED_MARGIN = 0.05
+"""A new Gaussian nearer than a real view's surface by this share of its depth would hide it."""
+
+LEAK_STRIDE = 2
+"""Hole pixels are taken on a grid of this step; thinning would drop most of them anyway."""
+
+
+def finetune(
+    scene: Scene,
+    sequence: Sequence,
+    pseudo: PseudoObservations | None,
+    config: FinetuneConfig,
+    coarse: CoarseConfig,
+) -> TrainingResult:
+    r"""Fine-tune a scene on real and virtual views together.
+
+    Virtual views weigh :math:`U_{img} (|I^P - \hat I| \odot U_{pixel} + L_{D-SSIM})`; which kind a step
+    draws follows a fixed pattern whose share of virtual views falls linearly. The position learning
+    rate starts anew. Without pseudo-observations only real views are used: the control of a comparison.
+
+    Args:
+        scene: the coarse scene.
+        sequence: posed frames; only training frames are used.
+        pseudo: restored virtual views with confidences, or None.
+        config: budgets and shares.
+        coarse: rates and weights, shared with the coarse stage.
+
+    Raises:
+        DivergedError: when the optimisation does not stay finite.
+
+    Source: paper equations 10 (training views) and 11 (virtual views).
+    """
+    frames = sequence.train
+    depth = median_depth(sequence, frames)
+    start = scene
+    if pseudo is not None and config.seed_holes:
+        room = coarse.densify.max_gaussians - len(scene.gaussians)
+        born = hole_gaussians(scene, sequence, pseudo, room)
+        if born is not None:
+            start = Scene(Gaussians.concatenated(scene.gaussians, born), scene.light)
+    real = real_views(sequence, frames)
+    virtual = [] if pseudo is None else virtual_views(pseudo, config)
+    generator = np.random.default_rng(config.seed)
+    next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
+    pattern = _virtual_steps(config, bool(virtual))
+
+    def draw(iteration: int) -> View:
+        return virtual[next(next_virtual)] if pattern[iteration] else real[next(next_real)]
+
+    schedule = coarse_schedule(
+        coarse,
+        scene_extent(sequence, frames),
+        depth,
+        "finetune",
+        iterations=config.iterations,
+        densify=coarse.densify.model_copy(update={"stop_share": config.densify_share, "start_share": 0.0}),
+    )
+    # All harmonics are there from the first step: the scene is not new.
+    return optimise(start, draw, schedule.resumed(seed=config.seed))
+
+
+def _virtual_steps(config: FinetuneConfig, any_virtual: bool) -> Bool[np.ndarray, "i"]:
+    """Which iterations draw a virtual view: evenly spread, with a share that falls linearly."""
+    if not any_virtual:
+        return np.zeros(config.iterations, dtype=bool)
+    share = np.linspace(config.pseudo_share, config.pseudo_share_final, config.iterations)
+    return np.asarray(np.diff(np.floor(np.cumsum(share)), prepend=0) > 0)
+
+
+def virtual_views(pseudo: PseudoObservations, config: FinetuneConfig) -> list[View]:
+    """Pseudo-observations as views, with both levels of confidence as weights."""
+    views = []
+    confidence = np.maximum(pseudo.pixel_confidence, config.confidence_floor)
+    for index in range(len(pseudo.cameras)):
+        weight = float(pseudo.image_confidence[index])
+        if weight <= 0:
+            continue
+        target = pseudo.target[index] if config.keep_known else pseudo.restored[index]
+        views.append(
+            View(
+                camera=pseudo.cameras[index],
+                rgb=torch.from_numpy(np.asarray(target, dtype=np.float32)),
+                weight=torch.from_numpy(confidence[index].astype(np.float32)),
+                depth_mm=None,
+                frame=None,
+                loss_weight=weight,
+            )
+        )
+    return views
+
+
+def hole_gaussians(
+    scene: Scene, sequence: Sequence, pseudo: PseudoObservations, room: int
+) -> Gaussians | None:
+    """New Gaussians where a restored virtual view shows surface and the scene has none.
+
+    Points come from the completed depth of hole pixels, their albedo from the restored colour with the
+    light divided out. Points that would stand in front of what a real view saw are dropped.
+
+    Args:
+        scene: the coarse scene.
+        sequence: posed frames; training frames carve.
+        pseudo: restored virtual views.
+        room: at most so many new Gaussians.
+
+    Returns:
+        The new Gaussians, or None where there is nothing to fill.
+    """
+    holes = (pseudo.alpha < HOLE_ALPHA) & (pseudo.depth_mm > 0)
+    lattice = np.zeros_like(holes)
+    lattice[:, ::LEAK_STRIDE, ::LEAK_STRIDE] = True
+    chosen = np.flatnonzero(holes & lattice)
+    if len(chosen) == 0 or room <= 0:
+        return None
+    cameras = pseudo.cameras
+    view = chosen // (cameras.width * cameras.height)
+    rays = pixel_rays(cameras).reshape(-1, 3)[chosen]
+    points = cameras.centers[view] + pseudo.depth_mm.reshape(-1)[chosen, None] * rays
+    rgb = np.asarray(pseudo.target, dtype=np.float64).reshape(-1, 3)[chosen]
+    if scene.light is not None:
+        distance = np.linalg.norm(points - cameras.centers[view], axis=1).astype(np.float32)
+        falloff = scene.light.falloff(torch.from_numpy(distance)).detach().numpy()
+        rgb = rgb / np.maximum(falloff, 1e-2)[:, None]
+    unseen = ~_in_front_of_real_surface(points, scene, sequence)
+    points, rgb = points[unseen], rgb[unseen]
+    if len(points) < 4:
+        return None
+    spacing = _typical_spacing(scene.gaussians)
+    points, rgb = _one_per_cell(points, rgb, spacing)
+    points, rgb = thin_out(points, rgb, room)
+    radius = np.full(len(points), 0.7 * spacing)
+    return Gaussians.from_points(
+        points, rgb.clip(0, None), radius, opacity=0.3, sh_degree=scene.gaussians.sh_degree
+    )
+
+
+def _typical_spacing(gaussians: Gaussians) -> float:
+    means = gaussians.means.numpy()
+    sample = means[:: max(1, len(means) // 5000)]
+    distance, _ = cKDTree(means).query(sample, k=2)
+    return float(np.median(distance[:, 1])) * 1.5
+
+
+def _one_per_cell(
+    points: Float[np.ndarray, "n 3"], rgb: Float[np.ndarray, "n 3"], edge: float
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]]:
+    cells = np.floor((points - points.min(axis=0)) / edge).astype(np.int64)
+    _, owner, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    owner = owner.reshape(-1)
+
+    def averaged(array: np.ndarray) -> np.ndarray:
+        sums = np.stack(
+            [np.bincount(owner, weights=array[:, k], minlength=len(count)) for k in range(3)], axis=1
+        )
+        return np.asarray(sums / count[:, None])
+
+    return averaged(points), averaged(rgb)
+
+
+def _in_front_of_real_surface(
+    points: Float[np.ndarray, "n 3"], scene: Scene, sequence: Sequence
+) -> Bool[np.ndarray, "n"]:
+    """Points that stand between a training camera and the surface it saw."""
+    hides = np.zeros(len(points), dtype=bool)
+    cameras = sequence.cameras[sequence.train]
+    for index, frame in enumerate(sequence.train):
+        depth = _real_depth(scene, sequence, int(frame))
+        viewmat = cameras.viewmats[index]
+        local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        z = np.where(local[:, 2] > 1e-6, local[:, 2], np.inf)
+        column = np.floor(local[:, 0] / z * cameras.K[index, 0, 0] + cameras.K[index, 0, 2])
+        row = np.floor(local[:, 1] / z * cameras.K[index, 1, 1] + cameras.K[index, 1, 2])
+        inside = (
+            np.isfinite(z) & (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
+        )
+        seen = depth[row[inside].astype(np.int64), column[inside].astype(np.int64)]
+        hides[inside] |= (seen > 0) & (z[inside] < (1 - CARVED_MARGIN) * seen)
+    return hides
+
+
+def _real_depth(scene: Scene, sequence: Sequence, frame: int) -> Float[np.ndarray, "h w"]:
+    if sequence.depth_mm is not None:
+        return np.asarray(np.where(sequence.mask[frame], sequence.depth_mm[frame], 0))
+    with torch.no_grad():
+        rendering = scene.render(sequence.cameras[frame])
+    depth = rendering.depth[0].numpy()
+    return np.asarray(np.where((rendering.alpha[0].numpy() > HOLE_ALPHA), depth, 0))

@@ -1,0 +1,95 @@
+"""The coarse scene: Gaussians and light from real views."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Int
+
+from extrags.config import CoarseConfig, DensifyConfig
+from extrags.errors import CaptureError
+from extrags.illumination import NearFieldLight
+from extrags.scene import Scene
+from extrags.sequence import Sequence
+from extrags.training.optimise import Schedule, TrainingResult, optimise
+from extrags.training.starting import median_depth, starting_gaussians
+from extrags.training.views import epochs, real_views
+
+__all__ = ["coarse_schedule", "reconstruct", "scene_extent"]
+
+
+def reconstruct(
+    sequence: Sequence,
+    config: CoarseConfig,
+    *,
+    frames: Int[np.ndarray, "m"] | None = None,
+    stage: str = "coarse",
+) -> TrainingResult:
+    """Optimise Gaussians (and the near-field light) on training frames.
+
+    Args:
+        sequence: posed frames.
+        config: budgets, rates and weights.
+        frames: which frames to use; default: the split's training frames.
+        stage: named in progress events.
+
+    Raises:
+        CaptureError: with fewer than one frame, or nothing to start from.
+        DivergedError: when the optimisation does not stay finite.
+
+    Source: 3DGS loss (paper equation 2) inside the mask, with inverse depth where it is known.
+    """
+    chosen = sequence.train if frames is None else np.asarray(frames)
+    if len(chosen) == 0:
+        raise CaptureError(f"{sequence.name}: no training frames")
+    depth = median_depth(sequence, chosen)
+    light = None
+    if config.light.enabled:
+        light = NearFieldLight.initial(len(chosen), depth, exponent=config.light.exponent)
+    gaussians = starting_gaussians(
+        sequence,
+        chosen,
+        config.max_points,
+        light=light,
+        sh_degree=config.sh_degree,
+        seed=config.seed,
+    )
+    views = real_views(sequence, chosen)
+    order = epochs(len(views), np.random.default_rng(config.seed))
+    schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
+    return optimise(Scene(gaussians, light), lambda _: views[next(order)], schedule)
+
+
+def coarse_schedule(
+    config: CoarseConfig,
+    extent: float,
+    depth: float,
+    stage: str,
+    *,
+    iterations: int | None = None,
+    densify: DensifyConfig | None = None,
+) -> Schedule:
+    """The schedule of coarse reconstruction; fine-tuning changes two of its numbers."""
+    return Schedule(
+        stage=stage,
+        iterations=config.iterations if iterations is None else iterations,
+        extent=extent,
+        optimiser=config.optimiser,
+        light=config.light,
+        densify=config.densify if densify is None else densify,
+        dssim_weight=config.dssim_weight,
+        depth_weight=config.depth_weight,
+        depth_weight_final_share=config.depth_weight_final_share,
+        depth_scale=depth,
+        sh_every=config.sh_every,
+        seed=config.seed,
+    )
+
+
+def scene_extent(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> float:
+    """Length scale of positions: spread of the cameras, at least the median depth.
+
+    3DGS takes the spread alone, which is nearly zero for a scope that hardly moves.
+    """
+    centers = sequence.cameras[frames].centers
+    spread = 1.1 * float(np.linalg.norm(centers - centers.mean(axis=0), axis=1).max())
+    return max(spread, median_depth(sequence, frames))

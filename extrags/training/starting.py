@@ -1,0 +1,199 @@
+"""Where the optimisation starts: Gaussians on the surface that depth or sparse points show."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
+
+from extrags.cameras import pixel_rays
+from extrags.errors import CaptureError
+from extrags.gaussians import Gaussians
+from extrags.illumination import NearFieldLight
+from extrags.sequence import Sequence
+
+__all__ = ["depth_from_points", "median_depth", "starting_gaussians", "thin_out"]
+
+MIN_POINTS_PER_VIEW = 20
+"""A view with fewer visible sparse points gives no interpolated depth."""
+
+
+def median_depth(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> float:
+    """Median distance from lens to surface over frames, in world units: the scene's length scale.
+
+    Raises:
+        CaptureError: when neither depth nor points are known.
+    """
+    if sequence.depth_mm is not None:
+        depth = sequence.depth_mm[frames]
+        valid = (depth > 0) & sequence.mask[frames]
+        if valid.any():
+            return float(np.median(depth[valid]))
+    if sequence.points is not None and len(sequence.points):
+        viewmats = sequence.cameras[frames].viewmats
+        z = np.einsum("cj,nj->cn", viewmats[:, 2, :3], sequence.points) + viewmats[:, 2, 3:4]
+        if (z > 0).any():
+            return float(np.median(z[z > 0]))
+    raise CaptureError(
+        f"{sequence.name}: neither depth nor sparse points are known, so there is nothing to start "
+        "the reconstruction from; provide depth, or let the poses stage triangulate points"
+    )
+
+
+def starting_gaussians(
+    sequence: Sequence,
+    frames: Int[np.ndarray, "m"],
+    max_points: int,
+    *,
+    light: NearFieldLight | None = None,
+    sh_degree: int = 0,
+    seed: int = 0,
+) -> Gaussians:
+    """Gaussians from back-projected depth, or from sparse points where there is no depth.
+
+    Each point carries the mean albedo of its pixels: the colour with the light's fall-off divided out.
+    Radii follow the distance to the three nearest neighbours.
+
+    Args:
+        sequence: posed frames.
+        frames: the frames that may be used.
+        max_points: upper bound of the number of Gaussians.
+        light: the light the optimisation starts with; None keeps colours as they are.
+        sh_degree: degree of the (zero) higher harmonics.
+        seed: chooses among equivalent pixels.
+
+    Raises:
+        CaptureError: when neither depth nor points are known.
+    """
+    depth = sequence.depth_mm
+    if depth is None:
+        depth = depth_from_points(sequence, frames)
+    cameras = sequence.cameras[frames]
+    valid = (depth[frames] > 0) & sequence.mask[frames]
+    count = int(valid.sum())
+    if count == 0:
+        raise CaptureError(f"{sequence.name}: no valid depth in any training frame")
+    # A point per pixel of all frames would be millions; a tenfold surplus is enough for thinning.
+    generator = np.random.default_rng(seed)
+    chosen = np.flatnonzero(valid)
+    if count > 10 * max_points:
+        chosen = np.sort(generator.choice(chosen, 10 * max_points, replace=False))
+    rays = pixel_rays(cameras).reshape(-1, 3)[chosen]
+    z = depth[frames].reshape(-1)[chosen].astype(np.float64)
+    view = chosen // (sequence.width * sequence.height)
+    points = cameras.centers[view] + z[:, None] * rays
+    rgb = sequence.rgb[frames].reshape(-1, 3)[chosen].astype(np.float64) / 255
+    if light is not None:
+        distance = np.linalg.norm(points - cameras.centers[view], axis=1)
+        falloff = light.falloff(torch.from_numpy(distance.astype(np.float32))).detach().numpy()
+        rgb = rgb / np.maximum(falloff, 1e-3)[:, None]
+    points, rgb = thin_out(points, rgb, max_points)
+    neighbours = min(4, len(points))
+    distance, _ = cKDTree(points).query(points, k=neighbours)
+    distance = np.atleast_2d(distance.reshape(len(points), -1))
+    radius = np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1)) if neighbours > 1 else distance[:, 0]
+    floor = 1e-3 * float(np.median(z))
+    return Gaussians.from_points(
+        points, np.clip(rgb, 0, None), np.maximum(radius, floor), opacity=0.5, sh_degree=sh_degree
+    )
+
+
+def thin_out(
+    points: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "n c"], max_points: int
+) -> tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m c"]]:
+    """Average points and values in cubic voxels, as small as `max_points` allows.
+
+    The voxel size is found by bisection: on a surface the number of voxels falls with its square.
+    """
+    if len(points) <= max_points:
+        return points, values
+    low, high = 0.0, float(np.ptp(points, axis=0).max())
+    origin = points.min(axis=0)
+    for _ in range(24):
+        middle = (low + high) / 2
+        cells = np.floor((points - origin) / middle).astype(np.int64)
+        if len(np.unique(_cell_keys(cells))) > max_points:
+            low = middle
+        else:
+            high = middle
+        if high - low < 0.01 * high:
+            break
+    _, owner = np.unique(_cell_keys(np.floor((points - origin) / high).astype(np.int64)), return_inverse=True)
+    weight = np.bincount(owner).astype(np.float64)
+
+    def averaged(array: np.ndarray) -> np.ndarray:
+        columns = [np.bincount(owner, weights=array[:, k]) for k in range(array.shape[1])]
+        return np.asarray(np.stack(columns, axis=1) / weight[:, None])
+
+    return averaged(points), averaged(values)
+
+
+def _cell_keys(cells: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
+    span = cells.max(axis=0) + 1
+    return np.asarray((cells[:, 0] * span[1] + cells[:, 1]) * span[2] + cells[:, 2])
+
+
+def depth_from_points(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> Float[np.ndarray, "f h w"]:
+    """Rough depth maps interpolated between the projections of sparse points.
+
+    Only a start: linear inside the convex hull of the points in view, nearest outside it, nothing outside
+    the mask. Frames other than `frames` stay empty.
+
+    Raises:
+        CaptureError: when no frame sees enough points.
+    """
+    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
+
+    points = sequence.points
+    if points is None or len(points) < MIN_POINTS_PER_VIEW:
+        raise CaptureError(
+            f"{sequence.name}: no depth and {0 if points is None else len(points)} sparse points; "
+            f"at least {MIN_POINTS_PER_VIEW} are needed to start the reconstruction"
+        )
+    depth = np.zeros(sequence.rgb.shape[:3], np.float32)
+    cameras = sequence.cameras
+    u, v = np.meshgrid(np.arange(sequence.width) + 0.5, np.arange(sequence.height) + 0.5)
+    used = 0
+    for frame in frames:
+        pixels, z = _visible_points(points, cameras.viewmats[frame], sequence.K[frame])
+        inside = (
+            (z > 0)
+            & (pixels[:, 0] >= 0)
+            & (pixels[:, 0] < sequence.width)
+            & (pixels[:, 1] >= 0)
+            & (pixels[:, 1] < sequence.height)
+        )
+        inside[inside] = _mask_at(sequence.mask[frame], pixels[inside])
+        if inside.sum() < MIN_POINTS_PER_VIEW:
+            continue
+        used += 1
+        # Inverse depth is linear across a plane in the image; depth is not.
+        linear = LinearNDInterpolator(pixels[inside], 1 / z[inside])(u, v)
+        nearest = NearestNDInterpolator(pixels[inside], 1 / z[inside])(u, v)
+        inverse = np.where(np.isfinite(linear), linear, nearest)
+        depth[frame] = np.where(sequence.mask[frame], 1 / inverse, 0)
+    if used == 0:
+        raise CaptureError(
+            f"{sequence.name}: no training frame sees {MIN_POINTS_PER_VIEW} of the "
+            f"{len(points)} sparse points; are poses and points in the same frame and scale?"
+        )
+    return depth
+
+
+def _visible_points(
+    points: Float[np.ndarray, "p 3"], viewmat: Float[np.ndarray, "4 4"], K: Float[np.ndarray, "3 3"]
+) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "p"]]:
+    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    z = local[:, 2]
+    safe = np.where(np.abs(z) > 1e-9, z, 1e-9)
+    pixels = np.stack(
+        [K[0, 0] * local[:, 0] / safe + K[0, 2], K[1, 1] * local[:, 1] / safe + K[1, 2]], axis=1
+    )
+    return pixels, z
+
+
+def _mask_at(mask: Bool[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
+    column = pixels[:, 0].astype(np.int64)
+    row = pixels[:, 1].astype(np.int64)
+    return np.asarray(mask[row, column])

@@ -1,0 +1,69 @@
+"""What one optimisation step is supervised with, and the order in which views are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from extrags.cameras import Cameras
+from extrags.sequence import Sequence
+
+__all__ = ["SATURATED", "View", "epochs", "real_views"]
+
+SATURATED = 250
+"""A channel at or above this (of 255) says nothing about albedo; such pixels do not supervise."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One image to be matched.
+
+    Args:
+        camera: a single camera.
+        rgb: the target in [0, 1], [H, W, 3].
+        weight: per-pixel weight of the colour terms; zero outside the mask, [H, W].
+        depth_mm: z-depth, 0 where it does not supervise, [H, W]; None without depth.
+        frame: position among the training frames, for its exposure; None for a virtual view.
+        loss_weight: weight of the whole view.
+    """
+
+    camera: Cameras
+    rgb: Float[Tensor, "h w 3"]
+    weight: Float[Tensor, "h w"]
+    depth_mm: Float[Tensor, "h w"] | None
+    frame: int | None
+    loss_weight: float = 1.0
+
+
+def real_views(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> list[View]:
+    """The training frames as views; saturated pixels carry no weight."""
+    cameras = sequence.cameras
+    views = []
+    for position, frame in enumerate(frames):
+        index = int(frame)
+        mask = sequence.mask[index]
+        weight = mask & (sequence.rgb[index].max(axis=-1) < SATURATED)
+        depth = None
+        if sequence.depth_mm is not None:
+            depth = torch.from_numpy(np.where(mask, sequence.depth_mm[index], 0).astype(np.float32))
+        views.append(
+            View(
+                camera=cameras[index],
+                rgb=torch.from_numpy(sequence.rgb[index].astype(np.float32) / 255),
+                weight=torch.from_numpy(weight.astype(np.float32)),
+                depth_mm=depth,
+                frame=position,
+            )
+        )
+    return views
+
+
+def epochs(count: int, generator: np.random.Generator) -> Iterator[int]:
+    """Indices in random order without replacement, for ever."""
+    while True:
+        yield from generator.permutation(count).tolist()

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from extrags.cameras import (
+    Cameras,
+    as_rotation,
+    compose,
+    interpolate_poses,
+    invert_poses,
+    look_at,
+    pixel_rays,
+    rotation_about,
+    rotation_angle_deg,
+)
+from extrags.errors import PoseError, ShapeError
+
+
+def random_poses(count: int, seed: int = 0) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.random(count, random_state=generator).as_matrix()
+    poses[:, :3, 3] = generator.normal(size=(count, 3)) * 20
+    return poses
+
+
+def cameras(count: int = 3) -> Cameras:
+    K = np.array([[50.0, 0, 32], [0, 50.0, 24], [0, 0, 1]])
+    return Cameras(np.tile(K, (count, 1, 1)), random_poses(count), 64, 48)
+
+
+class TestCameras:
+    def test_viewmats_are_the_inverse(self) -> None:
+        batch = cameras()
+        product = batch.viewmats @ batch.world_from_camera
+        np.testing.assert_allclose(product, np.tile(np.eye(4), (3, 1, 1)), atol=1e-12)
+
+    def test_indexing_keeps_the_batch_axis(self) -> None:
+        batch = cameras()
+        assert len(batch[1]) == 1
+        assert len(batch[np.array([0, 2])]) == 2
+        assert len(batch[1:]) == 2
+        np.testing.assert_array_equal(batch[1].centers[0], batch.centers[1])
+
+    def test_resized_keeps_the_rays_of_image_corners(self) -> None:
+        batch = cameras(1)
+        half = batch.resized(32, 24)
+        for camera in (batch, half):
+            corner = np.linalg.inv(camera.K[0]) @ [camera.width, camera.height, 1]
+            np.testing.assert_allclose(corner, [0.64, 0.48, 1], atol=1e-12)
+
+    def test_rays_project_back_to_their_pixel_centres(self) -> None:
+        batch = cameras(2)
+        points = batch.centers[:, None, None] + 7.5 * pixel_rays(batch)
+        local = np.einsum("cij,chwj->chwi", batch.viewmats[:, :3, :3], points)
+        local += batch.viewmats[:, None, None, :3, 3]
+        np.testing.assert_allclose(local[..., 2], 7.5, atol=1e-9)
+        u = 50 * local[..., 0] / local[..., 2] + 32
+        np.testing.assert_allclose(u[0, 5], np.arange(64) + 0.5, atol=1e-9)
+
+    @pytest.mark.usefixtures("unchecked")
+    def test_wrong_shapes_are_refused(self) -> None:
+        with pytest.raises(ShapeError, match="world_from_camera"):
+            Cameras(np.eye(3)[None], np.tile(np.eye(4), (2, 1, 1)), 4, 4)
+
+    @pytest.mark.usefixtures("unchecked")
+    def test_concatenated_needs_equal_sizes(self) -> None:
+        with pytest.raises(ShapeError, match="sizes"):
+            Cameras.concatenated([cameras(1), cameras(1).resized(32, 24)])
+
+
+class TestRotations:
+    def test_rounded_rotation_is_projected_to_so3(self) -> None:
+        rotation = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix()
+        fixed = as_rotation(np.round(rotation, 5))
+        np.testing.assert_allclose(fixed @ fixed.T, np.eye(3), atol=1e-14)
+        np.testing.assert_allclose(fixed, rotation, atol=1e-5)
+
+    def test_mirrored_rotation_is_refused_by_frame(self) -> None:
+        with pytest.raises(PoseError, match=r"frame 0007.*mirrored"):
+            as_rotation(np.diag([1.0, -1.0, 1.0]), frame="0007")
+
+    @pytest.mark.parametrize("bad", [2 * np.eye(3), np.full((3, 3), np.nan)])
+    def test_no_rotation_is_refused(self, bad: np.ndarray) -> None:
+        with pytest.raises(PoseError):
+            as_rotation(bad)
+
+    def test_rodrigues_agrees_with_scipy(self) -> None:
+        axis = np.array([1.0, -2.0, 0.5])
+        expected = Rotation.from_rotvec(0.7 * axis / np.linalg.norm(axis)).as_matrix()
+        np.testing.assert_allclose(rotation_about(axis, 0.7), expected, atol=1e-14)
+
+    def test_angle(self) -> None:
+        turned = rotation_about(np.array([0.0, 0, 1]), np.radians(25))
+        assert rotation_angle_deg(np.eye(3), turned) == pytest.approx(25)
+
+    @pytest.mark.parametrize("up", [np.array([0.0, -1, 0]), np.array([0.0, 0, 1])])
+    def test_look_at_is_a_rotation_that_looks_there(self, up: np.ndarray) -> None:
+        pose = look_at(np.array([1.0, 2, 3]), np.array([1.0, 2, 9]), up)
+        np.testing.assert_allclose(pose[:3, 2], [0, 0, 1], atol=1e-12)
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+
+    def test_look_at_itself_is_refused(self) -> None:
+        with pytest.raises(PoseError):
+            look_at(np.zeros(3), np.zeros(3), np.array([0.0, -1, 0]))
+
+    def test_interpolation_ends_where_it_should(self) -> None:
+        first, second = random_poses(2)
+        np.testing.assert_allclose(interpolate_poses(first, second, 0.0), first, atol=1e-12)
+        np.testing.assert_allclose(interpolate_poses(first, second, 1.0), second, atol=1e-12)
+
+    def test_inverting_twice_gives_the_pose(self) -> None:
+        poses = random_poses(5)
+        np.testing.assert_allclose(invert_poses(invert_poses(poses)), poses, atol=1e-12)
+
+    def test_compose(self) -> None:
+        pose = compose(np.eye(3), np.array([1.0, 2, 3]))
+        np.testing.assert_array_equal(pose[:3, 3], [1, 2, 3])

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from extrags.errors import ShapeError
+from extrags.sequence import Sequence, Split
+
+
+def small_sequence(frames: int = 4) -> Sequence:
+    generator = np.random.default_rng(0)
+    return Sequence(
+        name="test/0@half",
+        rgb=generator.integers(0, 255, (frames, 6, 8, 3), dtype=np.uint8),
+        K=np.tile(np.array([[8.0, 0, 4], [0, 8.0, 3], [0, 0, 1]]), (frames, 1, 1)),
+        mask=generator.random((frames, 6, 8)) > 0.2,
+        split=Split("half", np.array([0, 2]), np.array([1, 3]), version=2),
+        world_from_camera=np.tile(np.eye(4), (frames, 1, 1)),
+        depth_mm=generator.random((frames, 6, 8)).astype(np.float32),
+        recording=np.array([0, 1] * (frames // 2)),
+        frame_names=tuple(f"frame{i}" for i in range(frames)),
+        observed=generator.random((frames, 6, 8)) > 0.5,
+        points=generator.random((5, 3)),
+        points_rgb=generator.integers(0, 255, (5, 3), dtype=np.uint8),
+        truth={"exposure": [1.0, 1.25]},
+    )
+
+
+class TestSequence:
+    def test_round_trip_through_zarr(self, tmp_path: Path) -> None:
+        sequence = small_sequence()
+        sequence.save(tmp_path / "sequence")
+        loaded = Sequence.load(tmp_path / "sequence")
+        for name in ("rgb", "K", "mask", "world_from_camera", "depth_mm", "recording", "observed",
+                     "points", "points_rgb"):  # fmt: skip
+            np.testing.assert_array_equal(getattr(loaded, name), getattr(sequence, name))
+            assert getattr(loaded, name).dtype == getattr(sequence, name).dtype
+        np.testing.assert_array_equal(loaded.train, [0, 2])
+        assert (loaded.split.name, loaded.split.version) == ("half", 2)
+        assert loaded.truth == sequence.truth
+        assert loaded.frame_names == sequence.frame_names
+
+    def test_absent_parts_stay_absent(self, tmp_path: Path) -> None:
+        bare = replace(small_sequence(), depth_mm=None, points=None, world_from_camera=None)
+        bare.save(tmp_path / "sequence")
+        loaded = Sequence.load(tmp_path / "sequence")
+        assert loaded.depth_mm is None
+        assert loaded.points is None
+        with pytest.raises(ShapeError, match="no poses"):
+            _ = loaded.cameras
+
+    def test_one_frame_per_chunk(self, tmp_path: Path) -> None:
+        small_sequence().save(tmp_path / "sequence")
+        group = zarr.open_group(str(tmp_path / "sequence"), mode="r")
+        assert group["rgb"].chunks == (1, 6, 8, 3)
+
+    def test_same_content_gives_same_bytes(self, tmp_path: Path) -> None:
+        for name in "ab":
+            small_sequence().save(tmp_path / name)
+        files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*") if p.is_file())
+        assert files
+        for file in files:
+            assert (tmp_path / "a" / file).read_bytes() == (tmp_path / "b" / file).read_bytes()
+
+    @pytest.mark.usefixtures("unchecked")
+    @pytest.mark.parametrize("field", ["mask", "K", "depth_mm", "observed", "recording"])
+    def test_wrong_length_is_refused_by_name(self, field: str) -> None:
+        sequence = small_sequence()
+        with pytest.raises(ShapeError, match=field):
+            replace(sequence, **{field: getattr(sequence, field)[:-1]})
+
+    @pytest.mark.usefixtures("unchecked")
+    def test_wrong_number_of_names(self) -> None:
+        with pytest.raises(ShapeError, match="frame names"):
+            replace(small_sequence(), frame_names=("a",))

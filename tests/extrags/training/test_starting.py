@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from extrags.errors import CaptureError
+from extrags.sequence import Sequence
+from extrags.training.starting import depth_from_points, median_depth, starting_gaussians, thin_out
+
+
+class TestStartingGaussians:
+    def test_points_lie_on_the_tube(self, tube_sequence: Sequence) -> None:
+        gaussians = starting_gaussians(tube_sequence, tube_sequence.train, 500)
+        assert 250 < len(gaussians) <= 500
+        radius = gaussians.means[:, :2].norm(dim=1).numpy()
+        assert np.median(np.abs(radius - 10)) < 0.5
+
+    def test_same_input_same_bits(self, tube_sequence: Sequence) -> None:
+        first, second = (starting_gaussians(tube_sequence, tube_sequence.train, 300) for _ in range(2))
+        for name, value in first.parameters().items():
+            np.testing.assert_array_equal(value.numpy(), second.parameters()[name].numpy())
+
+    def test_uses_the_given_frames_only(self, tube_sequence: Sequence) -> None:
+        depth = tube_sequence.depth_mm
+        assert depth is not None
+        poisoned = depth.copy()
+        poisoned[tube_sequence.test] = 1e4
+        changed = replace(tube_sequence, depth_mm=poisoned)
+        first = starting_gaussians(tube_sequence, tube_sequence.train, 300)
+        second = starting_gaussians(changed, tube_sequence.train, 300)
+        np.testing.assert_array_equal(first.means.numpy(), second.means.numpy())
+
+    def test_nothing_to_start_from(self, tube_sequence: Sequence) -> None:
+        bare = replace(tube_sequence, depth_mm=None)
+        with pytest.raises(CaptureError, match="neither depth nor sparse points"):
+            median_depth(bare, bare.train)
+        with pytest.raises(CaptureError, match="no depth and 0 sparse points"):
+            starting_gaussians(bare, bare.train, 100)
+
+    def test_sparse_points_give_rough_depth(self, tube_sequence: Sequence) -> None:
+        generator = np.random.default_rng(0)
+        angle, along = generator.uniform(0, 2 * np.pi, 400), generator.uniform(8, 45, 400)
+        points = np.stack([10 * np.cos(angle), 10 * np.sin(angle), along], axis=1)
+        sparse = replace(tube_sequence, depth_mm=None, points=points)
+        depth = depth_from_points(sparse, sparse.train)
+        truth = tube_sequence.depth_mm
+        assert truth is not None
+        both = (truth[sparse.train] > 0) & (truth[sparse.train] < 30)
+        error = np.abs(depth[sparse.train] - truth[sparse.train])[both] / truth[sparse.train][both]
+        assert np.median(error) < 0.15
+        assert not depth[sparse.test].any()
+
+    def test_points_elsewhere_are_refused(self, tube_sequence: Sequence) -> None:
+        behind = np.random.default_rng(0).normal(size=(100, 3)) + [0, 0, -500]
+        sparse = replace(tube_sequence, depth_mm=None, points=behind)
+        with pytest.raises(CaptureError, match="same frame and scale"):
+            depth_from_points(sparse, sparse.train)
+
+
+class TestThinOut:
+    def test_fewer_than_asked_are_untouched(self) -> None:
+        points = np.random.default_rng(0).random((10, 3))
+        thinned, _ = thin_out(points, points, 10)
+        np.testing.assert_array_equal(thinned, points)
+
+    def test_keeps_the_bound_and_the_mean(self) -> None:
+        points = np.random.default_rng(0).random((5000, 3))
+        thinned, values = thin_out(points, 2 * points, 400)
+        assert 200 < len(thinned) <= 400
+        np.testing.assert_allclose(values, 2 * thinned, atol=1e-12)

@@ -1,0 +1,43 @@
+"""The layers of the house, and the speed of its front door, as tests."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+
+
+def test_imports_run_one_way() -> None:
+    result = subprocess.run(
+        [str(Path(sys.executable).with_name("lint-imports")), "--no-cache"],
+        cwd=REPOSITORY,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_importing_the_library_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, extrags, extrags.config, extrags.errors, extrags.store\n"
+        "heavy = {'torch', 'open3d', 'pycolmap', 'prefect', 'kornia', 'matplotlib', 'cv2'}\n"
+        "print(sorted(heavy & set(sys.modules)))"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    assert result.stdout.strip() == "[]"
+
+
+def test_root_holds_only_what_belongs_there() -> None:
+    tracked = subprocess.run(
+        ["git", "ls-files"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    ).stdout.split("\n")
+    roots = {name.split("/")[0] for name in tracked if name and not name.startswith(".")}
+    assert roots <= {
+        "extrags", "tasks", "flows", "data_catalog", "tests", "docs", "pyproject.toml", "README.md",
+        "LICENSE", "Makefile", "CMakeLists.txt", "prefect.yaml", "requirements.lock",
+    }  # fmt: skip
