@@ -1,0 +1,271 @@
+"""Checks that every sequence passes before anything else sees it.
+
+What is refused: non-finite or mirrored poses, intrinsics that are no pinhole, depth with NaN, infinity or
+negative values (0 is the one mark for "unknown"; a reader whose format has others turns them into 0), a
+frame without any valid depth or mask, a split that leaks or points outside, and camera axes that depth
+itself contradicts.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float
+
+from extrags.cameras import as_rotation, invert_poses
+from extrags.errors import PoseError, SourceError
+from extrags.sequence import Sequence
+
+__all__ = ["check_axes", "check_depth", "check_intrinsics", "check_pose", "check_sequence"]
+
+# Below this depth re-projection error (relative, median) poses are right. Another reading of the axes is
+# named as the likely mistake when its error is small, and a small share of the error as given.
+_SUSPICIOUS_ERROR = 0.03
+_CONVINCING_ERROR = 0.10
+_CLEARLY_BETTER = 0.35
+# A pair of views whose points mostly leave the image tells nothing.
+_MIN_INSIDE_SHARE = 0.15
+_CHECKED_PAIRS = 6
+_CHECKED_POINTS = 400
+
+
+def check_sequence(sequence: Sequence, *, file: object = None) -> None:
+    """Refuse a sequence that no stage could use.
+
+    Args:
+        sequence: what a reader made.
+        file: named in errors.
+
+    Raises:
+        PoseError: a pose that is not a rigid motion, or axes that the depth contradicts.
+        SourceError: anything else; names frame and field.
+    """
+    _check_split(sequence, file)
+    for index in range(len(sequence)):
+        name = sequence.frame_name(index)
+        check_intrinsics(sequence.K[index], sequence.width, sequence.height, frame=name, file=file)
+        if not sequence.mask[index].any():
+            raise SourceError("the mask leaves no pixel", file=file, frame=name, field="mask")
+        if sequence.world_from_camera is not None:
+            check_pose(sequence.world_from_camera[index], frame=name, file=file)
+        if sequence.depth_mm is not None:
+            check_depth(sequence.depth_mm[index], frame=name, file=file)
+    check_axes(sequence, file=file)
+
+
+def check_pose(
+    pose: Float[np.ndarray, "4 4"], *, frame: object = None, file: object = None
+) -> Float[np.ndarray, "4 4"]:
+    """The rigid motion a matrix stands for, its rotation projected to SO(3) where it lost digits.
+
+    Raises:
+        PoseError: not finite, not a rotation, mirrored, or a last row other than 0, 0, 0, 1.
+    """
+    if not np.isfinite(pose).all():
+        raise PoseError(
+            f"{int((~np.isfinite(pose)).sum())} of 16 entries are NaN or infinite",
+            file=file,
+            frame=frame,
+            field="world_from_camera",
+        )
+    if not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-6):
+        hint = " The matrix looks transposed" if np.allclose(pose[:, 3], (0, 0, 0, 1), atol=1e-6) else ""
+        raise PoseError(
+            f"the last row is {np.round(pose[3], 4).tolist()}, expected [0, 0, 0, 1].{hint}",
+            file=file,
+            frame=frame,
+            field="world_from_camera",
+        )
+    rigid = np.eye(4)
+    rigid[:3, :3] = as_rotation(np.asarray(pose[:3, :3], dtype=np.float64), frame=frame, file=file)
+    rigid[:3, 3] = pose[:3, 3]
+    return rigid
+
+
+def check_intrinsics(
+    K: Float[np.ndarray, "3 3"], width: int, height: int, *, frame: object = None, file: object = None
+) -> None:
+    """Refuse a K that is no pinhole for an image of this size.
+
+    Raises:
+        SourceError: names the entry that is wrong.
+    """
+
+    def refuse(problem: str) -> SourceError:
+        return SourceError(problem, file=file, frame=frame, field="K")
+
+    if not np.isfinite(K).all():
+        raise refuse("K holds NaN or infinity")
+    for name, focal, size in (("fx", K[0, 0], width), ("fy", K[1, 1], height)):
+        if focal <= 0:
+            raise refuse(f"focal length {name} = {focal:g} px; expected a positive number")
+        if not 0.05 * size < focal < 100 * size:
+            raise refuse(f"focal length {name} = {focal:g} px does not fit an image of {width} x {height} px")
+    if not np.allclose([K[1, 0], K[2, 0], K[2, 1], K[2, 2]], (0, 0, 0, 1), atol=1e-9) or abs(K[0, 1]) > 1e-9:
+        raise refuse(f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], found {np.round(K, 4).tolist()}")
+    for name, center, size in (("cx", K[0, 2], width), ("cy", K[1, 2], height)):
+        if not -size < center < 2 * size:
+            raise refuse(f"principal point {name} = {center:g} px lies far outside {width} x {height} px")
+
+
+def check_depth(depth_mm: Float[np.ndarray, "h w"], *, frame: object = None, file: object = None) -> None:
+    """Refuse a depth map with values that are no depth; 0 means unknown.
+
+    Raises:
+        SourceError: names the kind of value and how many there are.
+    """
+    for found, kind in (
+        (np.isnan(depth_mm), "NaN"),
+        (np.isinf(depth_mm), "infinite"),
+        (depth_mm < 0, "negative"),
+    ):
+        count = int(found.sum())
+        if count:
+            v, u = np.argwhere(found)[0]
+            raise SourceError(
+                f"{count} of {depth_mm.size} depth values are {kind}, the first at row {v}, column {u}; "
+                "expected millimetres, 0 where unknown",
+                file=file,
+                frame=frame,
+                field="depth_mm",
+            )
+    if not (depth_mm > 0).any():
+        raise SourceError("no pixel has a depth", file=file, frame=frame, field="depth_mm")
+
+
+def check_axes(sequence: Sequence, *, file: object = None) -> None:
+    """Refuse poses in other axes than OpenCV's camera-to-world, where depth can tell.
+
+    Depth of one frame, carried to the next one by their poses, must meet that frame's depth. Where it does
+    not, every other reading of the axes (24 proper ones, and the inverse) is tried; one that fits much
+    better is named in the message. Without depth, or with hardly any motion, nothing can be told.
+
+    Raises:
+        PoseError: another reading of the axes fits the depth much better.
+    """
+    if sequence.world_from_camera is None or sequence.depth_mm is None:
+        return
+    pairs = _pairs(sequence)
+    if not pairs:
+        return
+    poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
+    as_given = _reprojection_error(sequence, poses, pairs)
+    if as_given < _SUSPICIOUS_ERROR:
+        return
+    best_error, best_name = as_given, ""
+    for axes in _axis_readings():
+        turn = np.eye(4)
+        turn[:3, :3] = axes
+        for inverted, base in ((False, poses), (True, invert_poses(poses))):
+            if not inverted and np.array_equal(axes, np.eye(3)):
+                continue
+            error = _reprojection_error(sequence, base @ turn, pairs)
+            if error < best_error:
+                best_error, best_name = error, _reading_name(axes, inverted)
+    if best_error < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
+        raise PoseError(
+            f"the poses contradict the depth: carried from frame to frame it is off by {as_given:.0%} "
+            f"(median), but only by {best_error:.1%} when the poses are read as {best_name}. "
+            "Expected OpenCV axes (x right, y down, z forward), camera to world",
+            file=file,
+            field="world_from_camera",
+        )
+
+
+def _check_split(sequence: Sequence, file: object) -> None:
+    frames = len(sequence)
+    for name, indices in (("train", sequence.train), ("test", sequence.test)):
+        if indices.size and (indices.min() < 0 or indices.max() >= frames):
+            raise SourceError(
+                f"the {name} split names frame {int(indices.max())}, there are {frames} frames",
+                file=file,
+                field="split",
+            )
+        if np.unique(indices).size != indices.size:
+            raise SourceError(f"the {name} split names a frame twice", file=file, field="split")
+    if not sequence.train.size:
+        raise SourceError("no training frame is left; expected at least one", file=file, field="split")
+    shared = np.intersect1d(sequence.train, sequence.test)
+    if shared.size:
+        raise SourceError(
+            f"{shared.size} frames both train and evaluate, this one is the first",
+            file=file,
+            frame=sequence.frame_name(int(shared[0])),
+            field="split",
+        )
+
+
+def _pairs(sequence: Sequence) -> list[tuple[int, int]]:
+    """Neighbouring frames of one recording, spread over the sequence."""
+    recording = np.zeros(len(sequence), dtype=int) if sequence.recording is None else sequence.recording
+    neighbours = [(k, k + 1) for k in range(len(sequence) - 1) if recording[k] == recording[k + 1]]
+    if len(neighbours) <= _CHECKED_PAIRS:
+        return neighbours
+    chosen = np.round(np.linspace(0, len(neighbours) - 1, _CHECKED_PAIRS)).astype(int)
+    return [neighbours[int(k)] for k in chosen]
+
+
+def _reprojection_error(
+    sequence: Sequence, poses: Float[np.ndarray, "f 4 4"], pairs: list[tuple[int, int]]
+) -> float:
+    """Relative difference of carried and found depth: median over a pair's points, mean over pairs.
+
+    A pair of which too few points stay inside the image counts as 1.
+    """
+    if sequence.depth_mm is None:
+        return 0.0
+    errors = []
+    height, width = sequence.height, sequence.width
+    stride = max(1, int(np.sqrt(height * width / _CHECKED_POINTS)))
+    v, u = (part.ravel() for part in np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride])
+    for first, second in pairs:
+        K = sequence.K[first]
+        z = sequence.depth_mm[first][v, u].astype(np.float64)
+        known = (z > 0) & sequence.mask[first][v, u]
+        x = (u[known] + 0.5 - K[0, 2]) / K[0, 0]
+        y = (v[known] + 0.5 - K[1, 2]) / K[1, 1]
+        local = np.stack([x, y, np.ones_like(x)], axis=1) * z[known, None]
+        relative = invert_poses(poses[second][None])[0] @ poses[first]
+        carried = local @ relative[:3, :3].T + relative[:3, 3]
+        K = sequence.K[second]
+        depth = np.maximum(carried[:, 2], 1e-9)
+        column = np.floor(K[0, 0] * carried[:, 0] / depth + K[0, 2])
+        row = np.floor(K[1, 1] * carried[:, 1] / depth + K[1, 2])
+        inside = (carried[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        found = sequence.depth_mm[second][row[inside].astype(int), column[inside].astype(int)]
+        comparable = found > 0
+        if comparable.sum() < _MIN_INSIDE_SHARE * max(1, known.sum()):
+            errors.append(1.0)
+            continue
+        expected = found[comparable].astype(np.float64)
+        relative_error = np.abs(carried[inside, 2][comparable] - expected) / expected
+        errors.append(min(1.0, float(np.median(relative_error))))
+    return float(np.mean(errors))
+
+
+def _axis_readings() -> list[Float[np.ndarray, "3 3"]]:
+    """The 24 rotations that map axes to axes; OpenGL's flip of y and z is one of them."""
+    readings = []
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            matrix = np.zeros((3, 3))
+            matrix[list(order), range(3)] = signs
+            if np.linalg.det(matrix) > 0:
+                readings.append(matrix)
+    return readings
+
+
+def _reading_name(axes: Float[np.ndarray, "3 3"], inverted: bool) -> str:
+    letters = "xyz"
+    parts = []
+    for k in range(3):
+        source = int(np.argmax(np.abs(axes[:, k])))
+        parts.append(("" if axes[source, k] > 0 else "-") + letters[source])
+    if np.array_equal(axes, np.diag([1.0, -1.0, -1.0])):
+        name = "OpenGL axes (y up, z backward: columns y and z negated)"
+    elif np.array_equal(axes, np.eye(3)):
+        name = "OpenCV axes"
+    else:
+        name = f"axes ({', '.join(parts)})"
+    return f"world-to-camera (inverted), {name}" if inverted else name

@@ -1,0 +1,40 @@
+"""What a kind of source on disk must tell the catalogue, and the kinds there are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from extrags.config import IngestConfig
+from extrags.sequence import Sequence
+
+__all__ = ["FolderFormat", "folder_formats"]
+
+
+@dataclass(frozen=True)
+class FolderFormat:
+    """One way in which a sequence lies in a folder.
+
+    Args:
+        name: identifier, part of cache keys.
+        version: raised by hand when the same files are read into other arrays; part of cache keys.
+        summary: one line for messages.
+        recognises: whether a folder holds this format, from file names only.
+        files: every file that `read` may look at, as a sorted list.
+        read: the folder, the settings and the sequence's name to a checked `Sequence`.
+    """
+
+    name: str
+    version: int
+    summary: str
+    recognises: Callable[[Path], bool]
+    files: Callable[[Path], list[Path]]
+    read: Callable[[Path, IngestConfig, str], Sequence]
+
+
+def folder_formats() -> tuple[FolderFormat, ...]:
+    """All formats, the most specific first: a folder is read by the first that recognises it."""
+    from data_catalog import frames_folder, posed_folder, simcol, sinus
+
+    return (posed_folder.FORMAT, sinus.FORMAT, simcol.FORMAT, frames_folder.FORMAT)

@@ -1,0 +1,169 @@
+"""Reader of the Johns Hopkins sinus sequence: undistorted frames with structure from motion.
+
+On disk: `images/NNNN.jpg`, one for each line of `visible_view_indexes`; `camera_intrinsics_per_view` (fx,
+fy, cx, cy, one to a line); `motion.yaml` (position x, y, z and quaternion x, y, z, w of each view, camera to
+world);
+`structure.ply` (points, then a camera element that is skipped); `undistorted_mask.bmp` (white is tissue).
+Axes are OpenCV's throughout and nothing is turned; lengths have an arbitrary unit (`metric=False`). Images
+are cropped to the mask's bounding box and shrunk 4x by area unless the settings say otherwise.
+
+Source: Liu et al., "Dense depth estimation in monocular endoscopy with self-supervised learning methods",
+IEEE TMI 2020 (data layout of the accompanying example set).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from data_catalog.formats import FolderFormat
+from data_catalog.images import Resampling, read_colour, read_mask, spread
+from data_catalog.rotations import quaternion_rotation
+from data_catalog.splits import every_nth
+from extrags.cameras import compose
+from extrags.config import IngestConfig
+from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.sequence import Sequence
+
+__all__ = ["FORMAT", "read_points", "read_poses", "read_view_names"]
+
+_USUAL_DOWNSCALE = 4
+
+
+def _recognises(folder: Path) -> bool:
+    return (folder / "motion.yaml").is_file() and (folder / "structure.ply").is_file()
+
+
+def _files(folder: Path) -> list[Path]:
+    fixed = ("camera_intrinsics_per_view", "motion.yaml", "structure.ply", "undistorted_mask.bmp")
+    listed = [folder / name for name in (*fixed, "visible_view_indexes")]
+    return sorted([*(file for file in listed if file.is_file()), *(folder / "images").glob("*.jpg")])
+
+
+def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+    views = read_view_names(folder)
+    poses = read_poses(folder)
+    if len(poses) != len(views):
+        raise PoseError(
+            f"{len(poses)} poses for {len(views)} frames in visible_view_indexes",
+            file=folder / "motion.yaml",
+            field="poses",
+        )
+    mask = read_mask(folder / "undistorted_mask.bmp")
+    resampling = Resampling.planned(
+        mask.shape[1], mask.shape[0], config, _USUAL_DOWNSCALE, box=_bounding_box(mask, folder)
+    )
+    K = resampling.intrinsics(_intrinsics(folder))
+    kept = spread(len(views), config.max_frames)
+    colours = []
+    for index in kept:
+        file = folder / "images" / f"{views[index]}.jpg"
+        colours.append(
+            resampling.colour(read_colour(file, frame=views[index]), file=file, frame=views[index])
+        )
+    small_mask = resampling.mask(mask)
+    return Sequence(
+        name=name,
+        rgb=np.stack(colours),
+        K=np.repeat(K[None], len(kept), axis=0),
+        mask=np.repeat(small_mask[None], len(kept), axis=0),
+        split=every_nth(len(kept), config.holdout_every, file=folder),
+        world_from_camera=poses[kept],
+        recording=np.zeros(len(kept), dtype=np.int64),
+        frame_names=tuple(views[index] for index in kept),
+        metric=False,
+        points=read_points(folder),
+    )
+
+
+FORMAT = FolderFormat(
+    name="sinus",
+    version=1,
+    summary="motion.yaml, structure.ply and images/ of the Hopkins sinus set",
+    recognises=_recognises,
+    files=_files,
+    read=_read,
+)
+
+
+def read_view_names(folder: Path) -> list[str]:
+    """Names of the frames, in the order of the poses."""
+    text = _text(folder / "visible_view_indexes")
+    return [f"{int(line):08d}" for line in text.split()]
+
+
+def read_poses(folder: Path) -> Float[np.ndarray, "f 4 4"]:
+    """`world_from_camera` of each view.
+
+    Raises:
+        PoseError: an entry is incomplete or no rotation; names the pose.
+        SourceError: the file is no YAML of the expected shape.
+    """
+    import yaml
+
+    file = folder / "motion.yaml"
+    try:
+        content: Any = yaml.load(_text(file), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    except yaml.YAMLError as error:
+        raise SourceError(f"not readable as YAML: {error}", file=file) from error
+    entries = content.get("poses[]") if isinstance(content, dict) else None
+    if not isinstance(entries, dict):
+        raise SourceError("no block `poses[]`", file=file, field="poses[]")
+    poses = []
+    for index in range(len(entries)):
+        key = f"poses[{index}]"
+        try:
+            position = [float(entries[key]["position"][axis]) for axis in "xyz"]
+            quaternion = [float(entries[key]["orientation"][axis]) for axis in "xyzw"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise PoseError(f"incomplete pose: {error!r}", file=file, frame=index, field=key) from error
+        poses.append(compose(quaternion_rotation(quaternion, file=file, frame=index), np.array(position)))
+    return np.stack(poses)
+
+
+def read_points(folder: Path) -> Float[np.ndarray, "p 3"]:
+    """The points of the structure from motion.
+
+    Raises:
+        SourceError: the header does not count the points, or lines are missing.
+    """
+    file = folder / "structure.ply"
+    lines = _text(file).splitlines()
+    count = next((int(line.split()[2]) for line in lines if line.startswith("element vertex ")), None)
+    if count is None or "end_header" not in lines:
+        raise SourceError("no PLY header with `element vertex`", file=file)
+    start = lines.index("end_header") + 1
+    rows = [line.split()[:3] for line in lines[start : start + count]]
+    if len(rows) != count or any(len(row) != 3 for row in rows):
+        raise SourceError(f"{count} points announced, {len(rows)} found", file=file, field="vertex")
+    return np.asarray(rows, dtype=np.float64)
+
+
+def _intrinsics(folder: Path) -> Float[np.ndarray, "3 3"]:
+    file = folder / "camera_intrinsics_per_view"
+    values = [float(value) for value in _text(file).split()]
+    if len(values) < 4:
+        raise SourceError(f"{len(values)} numbers; expected fx, fy, cx, cy", file=file, field="K")
+    fx, fy, cx, cy = values[:4]
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def _bounding_box(mask: Bool[np.ndarray, "h w"], folder: Path) -> tuple[int, int, int, int]:
+    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+    if not rows.size:
+        raise SourceError("the mask leaves no pixel", file=folder / "undistorted_mask.bmp", field="mask")
+    return (
+        int(columns[0]),
+        int(rows[0]),
+        int(columns[-1] - columns[0] + 1),
+        int(rows[-1] - rows[0] + 1),
+    )
+
+
+def _text(file: Path) -> str:
+    if not file.is_file():
+        raise SourceNotFoundError("no such file", file=file)
+    return file.read_text()

@@ -1,0 +1,73 @@
+"""Which pixels of held-out frames show surface that training frames saw, from depth alone."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from extrags.cameras import Cameras, pixel_rays
+
+__all__ = ["observed_from_depth"]
+
+
+def observed_from_depth(
+    cameras: Cameras,
+    depth_mm: Float[np.ndarray, "f h w"],
+    train: Int[np.ndarray, "n_train"],
+    test: Int[np.ndarray, "n_test"],
+    *,
+    tolerance_share: float = 0.03,
+    tolerance_mm: float = 0.0,
+) -> Bool[np.ndarray, "f h w"]:
+    """A depth test against every training frame.
+
+    A point of a held-out frame is observed when it falls into a training image and lies no farther than
+    that image's depth (the farthest of the four pixels round it, so that rounding at slanted walls does
+    not hide it).
+
+    Args:
+        cameras: all frames.
+        depth_mm: z-depth, 0 where unknown, [F, H, W].
+        train: indices of training frames.
+        test: indices of held-out frames.
+        tolerance_share: how much farther still counts, as a share of the depth.
+        tolerance_mm: the same as a length: the step of the depth's encoding.
+
+    Returns:
+        True where observed, [F, H, W]; false in training frames and where depth is unknown.
+    """
+    observed = np.zeros(depth_mm.shape, dtype=bool)
+    for index in test:
+        known = depth_mm[index] > 0
+        rays = pixel_rays(cameras[int(index)])[0][known]
+        points = cameras.centers[index] + rays * depth_mm[index][known][:, None].astype(np.float64)
+        seen = np.zeros(len(points), dtype=bool)
+        for other in train:
+            seen |= _in_front(points, cameras[int(other)], depth_mm[other], tolerance_share, tolerance_mm)
+        observed[index][known] = seen
+    return observed
+
+
+def _in_front(
+    points: Float[np.ndarray, "p 3"],
+    camera: Cameras,
+    depth_mm: Float[np.ndarray, "h w"],
+    tolerance_share: float,
+    tolerance_mm: float,
+) -> Bool[np.ndarray, "p"]:
+    pose, K = camera.world_from_camera[0], camera.K[0]
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    z = local[:, 2]
+    safe = np.maximum(z, 1e-9)
+    u = K[0, 0] * local[:, 0] / safe + K[0, 2]
+    v = K[1, 1] * local[:, 1] / safe + K[1, 2]
+    inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    farthest = np.zeros(int(inside.sum()))
+    for dy in (-0.5, 0.5):
+        for dx in (-0.5, 0.5):
+            row = np.clip(np.floor(v[inside] + dy).astype(int), 0, camera.height - 1)
+            column = np.clip(np.floor(u[inside] + dx).astype(int), 0, camera.width - 1)
+            farthest = np.maximum(farthest, depth_mm[row, column])
+    result = np.zeros(len(points), dtype=bool)
+    result[inside] = z[inside] <= farthest * (1 + tolerance_share) + tolerance_mm * (farthest > 0)
+    return result

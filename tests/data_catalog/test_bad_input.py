@@ -1,0 +1,222 @@
+"""Every kind of bad input is refused by an error that names file, frame and field."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_catalog.catalog import read
+from data_catalog.checks import check_axes, check_sequence
+from extrags.cameras import invert_poses
+from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.sequence import Split
+
+
+def set_pose(change):
+    """An edit of `poses.json` that changes the pose of frame 3."""
+
+    def edit(content) -> None:
+        pose = np.array(content["frames"][3]["world_from_camera"])
+        content["frames"][3]["world_from_camera"] = change(pose).tolist()
+
+    return edit
+
+
+class TestFolder:
+    def test_the_good_folder_is_good(self, posed_folder) -> None:
+        assert len(read(posed_folder)) == 10
+
+    def test_missing_frame(self, posed_folder) -> None:
+        (posed_folder / "rgb" / "0004.png").unlink()
+        with pytest.raises(SourceNotFoundError, match=r"0004\.png.*no such file") as caught:
+            read(posed_folder)
+        assert caught.value.frame == "rgb/0004.png"
+        assert caught.value.field == "file"
+        assert isinstance(caught.value, FileNotFoundError)
+
+    def test_missing_depth(self, posed_folder) -> None:
+        (posed_folder / "depth" / "0004.npy").unlink()
+        with pytest.raises(SourceNotFoundError, match=r"frame rgb/0004\.png, field depth"):
+            read(posed_folder)
+
+    def test_wrong_pose_count(self, posed_folder, edit_poses) -> None:
+        edit_poses(lambda content: content["frames"].pop(6))
+        with pytest.raises(PoseError, match="9 poses for 10 images") as caught:
+            read(posed_folder)
+        assert caught.value.frame == "rgb/0006.png"
+        assert str(caught.value.file).endswith("poses.json")
+
+    def test_mirrored_rotation(self, posed_folder, edit_poses) -> None:
+        edit_poses(set_pose(lambda pose: pose @ np.diag([-1.0, 1, 1, 1])))
+        with pytest.raises(PoseError, match=r"mirrored \(det = -1") as caught:
+            read(posed_folder)
+        assert caught.value.frame == "rgb/0003.png"
+        assert caught.value.field == "world_from_camera"
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            (lambda pose: pose * np.array([[1.2], [1.2], [1.2], [1]]), "not a rotation: singular values"),
+            (lambda pose: pose.T, "looks transposed"),
+            (
+                lambda pose: pose + np.array([[0, 0, 0, np.inf]] + 3 * [[0] * 4]),
+                "1 of 16 entries are NaN or inf",
+            ),
+            (lambda pose: pose[:3], r"found shape \(3, 4\)"),
+        ],
+    )
+    def test_other_broken_poses(self, posed_folder, edit_poses, change, message) -> None:
+        edit_poses(set_pose(change))
+        with pytest.raises(PoseError, match=message) as caught:
+            read(posed_folder)
+        assert caught.value.frame == "rgb/0003.png"
+
+    def test_pose_without_matrix(self, posed_folder, edit_poses) -> None:
+        edit_poses(lambda content: content["frames"][2].pop("world_from_camera"))
+        with pytest.raises(PoseError, match=r"frame rgb/0002\.png.*no world_from_camera"):
+            read(posed_folder)
+
+    @pytest.mark.parametrize(("value", "kind"), [(np.nan, "NaN"), (np.inf, "infinite"), (-2.0, "negative")])
+    def test_bad_depth_values(self, posed_folder, value, kind) -> None:
+        file = posed_folder / "depth" / "0005.npy"
+        depth = np.load(file)
+        depth[7, 3:6] = value
+        np.save(file, depth)
+        with pytest.raises(
+            SourceError, match=f"3 of 1920 depth values are {kind}, the first at row 7, column 3"
+        ) as caught:
+            read(posed_folder)
+        assert caught.value.frame == "rgb/0005.png"
+        assert str(caught.value.file).endswith("0005.npy")
+
+    def test_depth_that_is_nowhere_known(self, posed_folder) -> None:
+        file = posed_folder / "depth" / "0005.npy"
+        np.save(file, np.zeros_like(np.load(file)))
+        with pytest.raises(SourceError, match="no pixel has a depth"):
+            read(posed_folder)
+
+    def test_opengl_axes(self, posed_folder, edit_poses) -> None:
+        def to_opengl(content) -> None:
+            for entry in content["frames"]:
+                pose = np.array(entry["world_from_camera"]) @ np.diag([1.0, -1, -1, 1])
+                entry["world_from_camera"] = pose.tolist()
+
+        edit_poses(to_opengl)
+        with pytest.raises(PoseError, match=r"read as OpenGL axes \(y up, z backward") as caught:
+            read(posed_folder)
+        assert caught.value.field == "world_from_camera"
+
+    def test_inverted_poses(self, posed_folder, edit_poses) -> None:
+        def invert(content) -> None:
+            for entry in content["frames"]:
+                pose = np.array(entry["world_from_camera"])
+                entry["world_from_camera"] = invert_poses(pose).tolist()
+
+        edit_poses(invert)
+        with pytest.raises(PoseError, match="world-to-camera"):
+            read(posed_folder)
+
+    def test_zero_focal_length(self, posed_folder, edit_poses) -> None:
+        edit_poses(lambda content: content["K"][0].__setitem__(0, 0.0))
+        with pytest.raises(SourceError, match="focal length fx = 0 px; expected a positive number") as caught:
+            read(posed_folder)
+        assert caught.value.field == "K"
+
+    @pytest.mark.parametrize("share", [0.5, 0.02])
+    def test_truncated_png(self, posed_folder, share) -> None:
+        file = posed_folder / "rgb" / "0002.png"
+        content = file.read_bytes()
+        file.write_bytes(content[: int(share * len(content))])
+        with pytest.raises(
+            SourceError, match=r"0002\.png, frame rgb/0002\.png, field rgb: .*(truncated|not an image)"
+        ):
+            read(posed_folder)
+
+    def test_truncated_depth(self, posed_folder) -> None:
+        file = posed_folder / "depth" / "0002.npy"
+        file.write_bytes(file.read_bytes()[:500])
+        with pytest.raises(SourceError, match=r"0002\.npy, frame rgb/0002\.png, field depth: cannot be read"):
+            read(posed_folder)
+
+    def test_depth_of_another_size(self, posed_folder) -> None:
+        np.save(posed_folder / "depth" / "0002.npy", np.ones((20, 24), np.float32))
+        with pytest.raises(SourceError, match="24 x 20 pixels; expected 48 x 40"):
+            read(posed_folder)
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("{", "not readable as JSON"),
+            ("[]", "list `frames`"),
+            ('{"frames": []}', "the list of frames is empty"),
+            ('{"frames": [{"name": "x"}]}', "an object with `file`"),
+            ('{"frames": [{"file": "x"}], "length_unit": "inch"}', "'inch' is no length unit"),
+        ],
+    )
+    def test_broken_list_of_frames(self, posed_folder, text, message) -> None:
+        (posed_folder / "poses.json").write_text(text)
+        with pytest.raises(SourceError, match=message):
+            read(posed_folder)
+
+    def test_frame_listed_twice(self, posed_folder, edit_poses) -> None:
+        edit_poses(lambda content: content["frames"].append(content["frames"][1]))
+        with pytest.raises(SourceError, match=r"frame rgb/0001\.png.*listed twice"):
+            read(posed_folder)
+
+    def test_half_named_split(self, posed_folder, edit_poses) -> None:
+        edit_poses(lambda content: content["frames"][1].update(split="train"))
+        with pytest.raises(SourceError, match="expected 'train' or 'test', in all frames or in none"):
+            read(posed_folder)
+
+    def test_nothing_left_to_train(self, posed_folder) -> None:
+        content = json.loads((posed_folder / "poses.json").read_text())
+        for entry in content["frames"]:
+            entry["split"] = "test"
+        (posed_folder / "poses.json").write_text(json.dumps(content))
+        with pytest.raises(SourceError, match="no training frame"):
+            read(posed_folder)
+
+
+class TestChecks:
+    def test_leaking_split(self, sparse) -> None:
+        leaking = replace(sparse, split=Split("bad", np.arange(21), np.arange(20, 48)))
+        with pytest.raises(SourceError, match="1 frames both train and evaluate"):
+            check_sequence(leaking)
+
+    def test_split_beyond_the_frames(self, sparse) -> None:
+        with pytest.raises(SourceError, match="names frame 48, there are 48 frames"):
+            check_sequence(replace(sparse, split=Split("bad", np.arange(20), np.arange(20, 49))))
+
+    def test_empty_mask(self, sparse) -> None:
+        mask = sparse.mask.copy()
+        mask[2] = False
+        with pytest.raises(SourceError, match="frame b_0020, field mask"):
+            check_sequence(replace(sparse, mask=mask))
+
+    def test_distant_frames_are_not_accused(self, distanced) -> None:
+        """Views far apart say little; that must never look like wrong axes."""
+        for kept in ([0, 10, 25, 47], [20, 30, 40], [5]):
+            few = replace(
+                distanced,
+                rgb=distanced.rgb[kept],
+                K=distanced.K[kept],
+                mask=distanced.mask[kept],
+                depth_mm=distanced.depth_mm[kept],
+                world_from_camera=distanced.world_from_camera[kept],
+                observed=None,
+                recording=None,
+                frame_names=(),
+                split=Split("few", np.arange(len(kept)), np.arange(0)),
+            )
+            check_axes(few)
+
+    @pytest.mark.parametrize("axes", [[0, 2, 1], [1, 0, 2], [2, 0, 1]])
+    def test_swapped_axes_are_found(self, sparse, axes) -> None:
+        swap = np.eye(4)
+        swap[:3, :3] = np.eye(3)[axes]
+        swap[:3, 0] *= np.linalg.det(swap)
+        with pytest.raises(PoseError, match="contradict the depth"):
+            check_axes(replace(sparse, world_from_camera=sparse.world_from_camera @ swap))

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import json
+import pickle
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from data_catalog.catalog import (
+    Source,
+    describe,
+    list_sequences,
+    phantom_config,
+    read,
+    resolve,
+    source_fingerprint,
+)
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError, SourceError, SourceNotFoundError, UnknownSequenceError
+
+
+class TestNames:
+    def test_every_listed_name_is_described_and_phantoms_resolve(self) -> None:
+        listed = list_sequences()
+        assert len({descriptor.name for descriptor in listed}) == len(listed)
+        for descriptor in listed:
+            assert describe(descriptor.name) == descriptor
+            if descriptor.format == "phantom":
+                assert resolve(descriptor.name).name == descriptor.name
+
+    def test_phantom_beyond_the_list(self) -> None:
+        source = resolve("phantom/1234@distanced")
+        assert (source.scene, source.setting, source.name) == (1234, "distanced", "phantom/1234@distanced")
+        assert describe("phantom/1234@distanced").frames == 48
+
+    def test_setting_defaults_to_sparse(self) -> None:
+        assert resolve("phantom/3") == resolve("phantom/3@sparse")
+
+    @pytest.mark.parametrize(
+        ("wrong", "near"), [("phantm/1@sparse", "phantom/1@sparse"), ("sinus_hopkin", "sinus_hopkins")]
+    )
+    def test_unknown_names_suggest_the_nearest(self, wrong, near) -> None:
+        with pytest.raises(UnknownSequenceError, match=f"Did you mean {near}"):
+            resolve(wrong)
+        with pytest.raises(UnknownSequenceError, match=f"Did you mean {near}"):
+            describe(wrong)
+
+    def test_unknown_setting_names_the_known_ones(self) -> None:
+        with pytest.raises(UnknownSequenceError, match="'spars'; known: sparse, distanced"):
+            resolve("phantom/3@spars")
+
+    def test_known_set_without_its_files(self, tmp_path, monkeypatch) -> None:
+        monkeypatch.setattr("data_catalog.catalog._data_roots", lambda: [tmp_path])
+        assert not describe("sinus/hopkins").available
+        with pytest.raises(SourceNotFoundError, match="EXTRAGS_DATA"):
+            resolve("sinus/hopkins")
+
+    def test_data_root_from_the_environment(self, shared_data, tmp_path, monkeypatch) -> None:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("EXTRAGS_DATA", str(shared_data))
+        assert resolve("simcol3d/s1").path == str(shared_data / "simcol3d_s1")
+
+    def test_file_instead_of_folder(self, tmp_path) -> None:
+        file = tmp_path / "video.mp4"
+        file.write_bytes(b"0")
+        with pytest.raises(SourceError, match="expected a folder"):
+            resolve(file)
+
+
+class TestFolders:
+    def test_formats_are_recognised_by_content(self, shared_data, posed_folder) -> None:
+        assert resolve(shared_data / "sinus_hopkins").name == "sinus/hopkins"
+        assert resolve(shared_data / "simcol3d_s1").format == "simcol3d"
+        assert resolve(shared_data / "sinus_hopkins" / "images").format == "frames"
+        assert resolve(posed_folder).format == "extrags"
+
+    def test_empty_folder(self, tmp_path) -> None:
+        with pytest.raises(SourceNotFoundError, match=r"the folder is empty; expected one of: .*poses\.json"):
+            resolve(tmp_path)
+
+    def test_folder_without_a_sequence(self, tmp_path) -> None:
+        (tmp_path / "notes.txt").write_text("nothing here")
+        with pytest.raises(SourceNotFoundError, match="no sequence recognised"):
+            read(tmp_path)
+
+
+class TestPhantomSettings:
+    def test_size_follows_the_settings(self) -> None:
+        source = resolve("phantom/0")
+        assert (
+            phantom_config(source, IngestConfig()).width,
+            phantom_config(source, IngestConfig()).height,
+        ) == (
+            160,
+            128,
+        )
+        half = phantom_config(source, IngestConfig(downscale=2))
+        assert (half.width, half.height) == (80, 64)
+        assert phantom_config(source, IngestConfig(width=100)).height == 80
+        assert phantom_config(source, IngestConfig(width=100, height=50)).height == 50
+
+    def test_unusable_settings(self, posed_folder) -> None:
+        with pytest.raises(ConfigError, match=r"ingest\.height needs ingest\.width"):
+            phantom_config(resolve("phantom/0"), IngestConfig(height=64))
+        with pytest.raises(ConfigError, match="too small"):
+            phantom_config(resolve("phantom/0"), IngestConfig(downscale=16))
+        with pytest.raises(ConfigError, match="is not a phantom"):
+            phantom_config(resolve(posed_folder), IngestConfig())
+
+    def test_read_applies_them(self) -> None:
+        sequence = read("phantom/7@distanced", IngestConfig(width=40, max_frames=4))
+        assert sequence.rgb.shape == (4, 32, 40, 3)
+        assert sequence.name == "phantom/7@distanced"
+        assert sequence.split.name == "distanced"
+        assert sequence.train.size >= 1
+        assert sequence.test.size >= 1
+
+
+class TestFingerprint:
+    def test_is_plain_json(self, posed_folder) -> None:
+        for source in ("phantom/3@sparse", posed_folder):
+            fingerprint = source_fingerprint(source)
+            assert json.loads(json.dumps(fingerprint)) == fingerprint
+
+    def test_phantom_depends_on_what_it_renders_only(self) -> None:
+        plain = source_fingerprint("phantom/3@sparse")
+        assert source_fingerprint("phantom/3") == plain
+        assert source_fingerprint("phantom/3@sparse", IngestConfig(holdout_every=5)) == plain
+        for other in ("phantom/4@sparse", "phantom/3@distanced"):
+            assert source_fingerprint(other) != plain
+        assert source_fingerprint("phantom/3@sparse", IngestConfig(width=80)) != plain
+
+    def test_moved_folder_is_the_same_input(self, posed_folder: Path, tmp_path: Path) -> None:
+        before = source_fingerprint(posed_folder)
+        moved = tmp_path / "elsewhere" / "other_name"
+        shutil.copytree(posed_folder, moved)
+        assert source_fingerprint(moved) == before
+
+    def test_one_changed_byte_is_another_input(self, posed_folder: Path) -> None:
+        before = source_fingerprint(posed_folder)
+        file = posed_folder / "depth" / "0003.npy"
+        content = bytearray(file.read_bytes())
+        content[-1] ^= 1
+        file.write_bytes(bytes(content))
+        assert source_fingerprint(posed_folder) != before
+
+    def test_unrelated_files_do_not_count(self, posed_folder: Path) -> None:
+        before = source_fingerprint(posed_folder)
+        (posed_folder / "notes.txt").write_text("seen on Monday")
+        assert source_fingerprint(posed_folder) == before
+
+
+def test_source_survives_pickling() -> None:
+    source = resolve("phantom/2@distanced")
+    assert pickle.loads(pickle.dumps(source)) == source
+    assert Source.model_validate_json(source.model_dump_json()) == source
+
+
+def test_reading_a_folder_twice_gives_the_same_bits(posed_folder) -> None:
+    first, second = read(posed_folder), read(posed_folder)
+    np.testing.assert_array_equal(first.rgb, second.rgb)
+    np.testing.assert_array_equal(first.depth_mm, second.depth_mm)

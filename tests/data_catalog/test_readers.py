@@ -1,0 +1,262 @@
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_catalog.catalog import read
+from data_catalog.frames_folder import view_mask
+from data_catalog.images import Resampling, natural_key, spread
+from data_catalog.sinus import read_points, read_view_names
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError, PoseError, SourceError, SourceNotFoundError
+
+
+class TestSinus:
+    def test_every_observation_lies_inside_the_mask(self, shared_data) -> None:
+        """570 points, 6,585 observations: the re-projection check of poses, K and crop together."""
+        folder = shared_data / "sinus_hopkins"
+        sequence = read(folder)
+        names = read_view_names(folder)
+        viewmats = sequence.cameras.viewmats
+        tracks = (folder / "view_indexes_per_point").read_text().split("-1")[1:]
+        points = read_points(folder)
+        assert len(tracks) == len(points) == 570
+        inside = total = 0
+        for point, track in zip(points, tracks, strict=True):
+            for view in track.split():
+                index = names.index(f"{int(view):08d}")
+                local = viewmats[index][:3, :3] @ point + viewmats[index][:3, 3]
+                u, v, _ = sequence.K[index] @ local / local[2]
+                total += 1
+                row, column = int(np.floor(v)), int(np.floor(u))
+                within = 0 <= row < sequence.height and 0 <= column < sequence.width
+                inside += bool(local[2] > 0 and within and sequence.mask[index, row, column])
+        assert total == 6585
+        # The small mask leaves out pixels that the full-size border cuts.
+        assert inside >= 6580
+
+    def test_shape_and_split(self, shared_data) -> None:
+        sequence = read(shared_data / "sinus_hopkins")
+        assert sequence.rgb.shape == (35, 243, 262, 3)
+        assert sequence.test.tolist() == [0, 8, 16, 24, 32]
+        assert sequence.metric is False
+        assert sequence.depth_mm is None
+        assert sequence.points is not None
+        assert sequence.frame_name(0) == "00004584"
+        # Tissue is lit, the surround is black.
+        assert sequence.rgb[sequence.mask].mean() > 60
+        assert sequence.rgb[~sequence.mask].mean() < 40
+
+    def test_wrong_pose_count(self, shared_data, tmp_path) -> None:
+        folder = tmp_path / "sinus"
+        folder.mkdir()
+        for name in ("motion.yaml", "structure.ply", "undistorted_mask.bmp", "camera_intrinsics_per_view"):
+            shutil.copyfile(shared_data / "sinus_hopkins" / name, folder / name)
+        views = (shared_data / "sinus_hopkins" / "visible_view_indexes").read_text().split()
+        (folder / "visible_view_indexes").write_text("\n".join(views[:-2]))
+        with pytest.raises(PoseError, match=r"motion\.yaml, field poses: 35 poses for 33 frames"):
+            read(folder)
+
+
+class TestSimcol:
+    def test_reprojection_of_matched_features(self, shared_data) -> None:
+        """Features matched between images, carried by depth and poses: 0.65 px at the median."""
+        sequence = read(shared_data / "simcol3d_s1", IngestConfig(downscale=1))
+        assert sequence.depth_mm is not None
+        detector = cv2.SIFT_create(1200, contrastThreshold=0.01)
+        errors = []
+        for first, second in ((1, 2), (4, 5), (6, 9)):
+            found = [
+                detector.detectAndCompute(cv2.cvtColor(sequence.rgb[k], cv2.COLOR_RGB2GRAY), None)
+                for k in (first, second)
+            ]
+            matches = cv2.BFMatcher().knnMatch(found[0][1], found[1][1], k=2)
+            good = [best for best, other in matches if best.distance < 0.7 * other.distance]
+            here = np.array([found[0][0][match.queryIdx].pt for match in good]) + 0.5
+            there = np.array([found[1][0][match.trainIdx].pt for match in good]) + 0.5
+            z = sequence.depth_mm[first][here[:, 1].astype(int), here[:, 0].astype(int)]
+            K = sequence.K[first]
+            local = np.column_stack([(here - K[:2, 2]) / K[0, 0], np.ones(len(here))]) * z[:, None]
+            relative = sequence.cameras.viewmats[second] @ sequence.cameras.world_from_camera[first]
+            carried = local @ relative[:3, :3].T + relative[:3, 3]
+            uv = carried[:, :2] / carried[:, 2:] * K[0, 0] + K[:2, 2]
+            errors.append(np.linalg.norm(uv - there, axis=1))
+        assert len(np.concatenate(errors)) > 300
+        assert np.median(np.concatenate(errors)) < 0.8
+
+    def test_shape_split_and_visibility(self, shared_data) -> None:
+        sequence = read(shared_data / "simcol3d_s1", IngestConfig(holdout_every=3))
+        assert sequence.name == "simcol3d/s1"
+        assert sequence.rgb.shape == (10, 237, 237, 3)
+        assert sequence.test.tolist() == [0, 3, 6, 9]
+        assert sequence.depth_mm is not None
+        assert sequence.observed is not None
+        assert 10 < np.median(sequence.depth_mm) < 30
+        # Frames between training frames see nothing new; the last one moves on to new surface.
+        assert sequence.observed[3].mean() > 0.97
+        assert 0.6 < sequence.observed[[0, 9]].mean(axis=(1, 2)).min() < 0.99
+
+    def test_missing_frame_in_the_middle(self, shared_data, tmp_path) -> None:
+        folder = tmp_path / "simcol"
+        shutil.copytree(shared_data / "simcol3d_s1", folder, copy_function=shutil.copyfile)
+        folder.chmod(0o755)
+        (folder / "FrameBuffer_0004.png").unlink()
+        with pytest.raises(SourceNotFoundError, match=r"FrameBuffer_0004\.png, frame 0004, field rgb"):
+            read(folder)
+
+    def test_too_few_poses(self, shared_data, tmp_path) -> None:
+        folder = tmp_path / "simcol"
+        shutil.copytree(shared_data / "simcol3d_s1", folder, copy_function=shutil.copyfile)
+        folder.chmod(0o755)
+        for file in folder.glob("Saved*.txt"):
+            file.write_text("\n".join(file.read_text().splitlines()[:8]))
+        with pytest.raises(PoseError, match="8 poses, but there is a frame 0008"):
+            read(folder)
+
+
+class TestFrames:
+    @pytest.fixture
+    def frames(self, tmp_path):
+        rng = np.random.default_rng(0)
+        for k in (2, 10, 1):
+            picture = np.zeros((60, 80, 3), np.uint8)
+            picture[10:50, 15:65] = rng.integers(60, 200, (40, 50, 3))
+            picture[25:35, 35:45] = 3  # a dark lumen
+            picture[10, 15] = 10 * k
+            Image.fromarray(picture).save(tmp_path / f"frame_{k}.png")
+        return tmp_path
+
+    def test_natural_order_no_poses_and_a_mask(self, frames, caplog) -> None:
+        with caplog.at_level(logging.WARNING):
+            sequence = read(frames)
+        assert sequence.frame_names == ("frame_1", "frame_2", "frame_10")
+        assert sequence.world_from_camera is None
+        assert sequence.metric is False
+        assert "90 degrees" in caplog.text
+        assert not sequence.mask[0, :10].any()
+        assert sequence.mask[0, 28:32, 38:42].all()  # dark, but not joined to the border
+
+    def test_intrinsics_file(self, frames) -> None:
+        (frames / "intrinsics.json").write_text(json.dumps({"fx": 70, "fy": 71, "cx": 41, "cy": 29}))
+        sequence = read(frames, IngestConfig(downscale=2))
+        np.testing.assert_allclose(sequence.K[0], [[35, 0, 20.5], [0, 35.5, 14.5], [0, 0, 1]])
+
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [
+            ({"fx": 0, "fy": 71, "cx": 41, "cy": 29}, "focal length fx = 0 px"),
+            ({"fx": 70}, "expected K, or fx"),
+            ({"field_of_view_deg": 200}, "200 degrees"),
+            ({"K": [[1, 2], [3, 4]]}, "3 x 3"),
+        ],
+    )
+    def test_bad_intrinsics(self, frames, content, message) -> None:
+        (frames / "intrinsics.json").write_text(json.dumps(content))
+        with pytest.raises(SourceError, match=message):
+            read(frames)
+
+    def test_frame_of_another_size(self, frames) -> None:
+        Image.fromarray(np.full((50, 80, 3), 99, np.uint8)).save(frames / "frame_3.png")
+        with pytest.raises(SourceError, match=r"frame_3\.png.*80 x 50 pixels; expected 80 x 60"):
+            read(frames)
+
+    def test_mask_of_a_full_picture(self) -> None:
+        assert view_mask(np.full((2, 20, 30, 3), 90, np.uint8)).all()
+
+
+class TestPosedFolder:
+    def test_round_trip(self, posed_folder) -> None:
+        content = json.loads((posed_folder / "poses.json").read_text())
+        sequence = read(posed_folder, IngestConfig(holdout_every=4))
+        assert len(sequence) == 10
+        assert sequence.test.tolist() == [0, 4, 8]
+        np.testing.assert_allclose(sequence.K[0], content["K"])
+        for k, entry in enumerate(content["frames"]):
+            np.testing.assert_allclose(
+                sequence.cameras.world_from_camera[k], entry["world_from_camera"], atol=1e-12
+            )
+            np.testing.assert_array_equal(sequence.depth_mm[k], np.load(posed_folder / f"depth/{k:04d}.npy"))
+        assert sequence.observed is not None
+        assert sequence.observed[sequence.test].mean() > 0.8
+
+    def test_split_from_the_file(self, posed_folder, edit_poses) -> None:
+        def name_splits(content) -> None:
+            for k, entry in enumerate(content["frames"]):
+                entry["split"] = "test" if k > 6 else "train"
+
+        edit_poses(name_splits)
+        sequence = read(posed_folder)
+        assert sequence.split.name == "manifest"
+        assert sequence.test.tolist() == [7, 8, 9]
+
+    def test_depth_as_tiff(self, posed_folder) -> None:
+        before = read(posed_folder).depth_mm
+        for file in (posed_folder / "depth").glob("*.npy"):
+            Image.fromarray(np.load(file)).save(file.with_suffix(".tiff"))
+            file.unlink()
+        np.testing.assert_array_equal(read(posed_folder).depth_mm, before)
+
+    def test_without_depth(self, posed_folder) -> None:
+        shutil.rmtree(posed_folder / "depth")
+        sequence = read(posed_folder)
+        assert sequence.depth_mm is None
+        assert sequence.observed is None
+
+
+class TestResampling:
+    def test_depth_of_a_slanted_plane_is_exact(self) -> None:
+        """z-depth of a plane is linear in inverse depth: shrinking must not bend it."""
+        focal, size = 60.0, 96
+        u = (np.arange(size) + 0.5 - size / 2) / focal
+        plane = (20 / (1 + 0.4 * u[None, :] + 0.2 * u[:, None])).astype(np.float32)
+        plan = Resampling.planned(size, size, IngestConfig(width=40))
+        v = (np.arange(40) + 0.5 - 20) / (focal * 40 / size)
+        expected = 20 / (1 + 0.4 * v[None, :] + 0.2 * v[:, None])
+        np.testing.assert_allclose(plan.depth(plane), expected, rtol=1e-5)
+
+    def test_depth_is_not_mixed_across_a_fold(self) -> None:
+        depth = np.full((32, 32), 10, np.float32)
+        depth[:, 15:] = 30
+        depth[5, 5] = 0
+        small = Resampling.planned(32, 32, IngestConfig(downscale=2)).depth(depth)
+        assert set(np.unique(small)) <= {0.0, 10.0, 30.0}
+
+    def test_crop_moves_the_principal_point(self) -> None:
+        plan = Resampling.planned(100, 90, IngestConfig(downscale=2), box=(10, 6, 61, 70))
+        assert (plan.width, plan.height, plan.crop_width) == (30, 35, 60)
+        K = np.array([[80.0, 0, 50], [0, 80, 45], [0, 0, 1]])
+        np.testing.assert_allclose(plan.intrinsics(K), [[40, 0, 20], [0, 40, 19.5], [0, 0, 1]])
+
+    def test_mask_needs_every_pixel_below(self) -> None:
+        mask = np.ones((32, 32), bool)
+        mask[3, 3] = False
+        small = Resampling.planned(32, 32, IngestConfig(downscale=2)).mask(mask)
+        assert not small[1, 1]
+        assert small.sum() == 255
+
+    @pytest.mark.parametrize(
+        ("settings", "message"),
+        [
+            ({"width": 64, "height": 20}, "would squeeze"),
+            ({"width": 200}, "larger than the source"),
+            ({"downscale": 8}, "too small"),
+            ({"height": 32}, "needs ingest.width"),
+        ],
+    )
+    def test_impossible_sizes(self, settings, message) -> None:
+        with pytest.raises(ConfigError, match=message):
+            Resampling.planned(100, 100, IngestConfig(**settings))
+
+    def test_natural_order(self) -> None:
+        names = ["f10.png", "f9.png", "f09b.png", "f1.png", "a.png"]
+        assert sorted(names, key=natural_key) == ["a.png", "f1.png", "f9.png", "f09b.png", "f10.png"]
+
+    def test_spread_keeps_both_ends(self) -> None:
+        assert spread(5, None) == [0, 1, 2, 3, 4]
+        assert spread(100, 3) == [0, 50, 99]
