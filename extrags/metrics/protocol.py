@@ -1,0 +1,324 @@
+"""The evaluation protocol: which pixels count, how, and what the numbers are called.
+
+Version 1. For each held-out view:
+
+* Pixels. Primary figures are taken inside the sequence's validity mask; pixels outside it are set to 0
+  in render and target, so that windows and receptive fields reaching over the edge see the same there.
+  `whole` holds the figures of the whole image as it stands. `observed` and `unobserved` part the mask by
+  whether any training frame saw the surface behind the pixel; a part smaller than 0.3 % of the image has
+  no figure.
+* Photometric figures: PSNR over the pixels; SSIM, LPIPS and FLIP as means of their maps over the pixels
+  (LPIPS: of each layer's map). See `extrags.metrics.image`, `.lpips`, `.flip`.
+* Exposure. `aligned` holds the same figures after one least-squares gain per image, fitted inside the
+  mask (`extrags.metrics.exposure`); the parts reuse that gain.
+* Depth: rendered expected z-depth where alpha >= 0.5, against true depth inside the mask.
+
+Figures of a sequence are means over the views that have one. What cannot be had is None, and `reasons`
+says why.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import zarr
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from extrags.errors import NonFiniteError, ShapeError, SourceNotFoundError
+from extrags.events import Progress, emit
+from extrags.metrics.depth import depth_errors
+from extrags.metrics.exposure import align_exposure, exposure_gain
+from extrags.metrics.flip import flip_map
+from extrags.metrics.image import mean_of_known, means_per_image, psnr_per_image, ssim_map
+from extrags.metrics.lpips import Lpips
+from extrags.sequence import Sequence
+from extrags.zarr_io import open_group, read_array, write_frames
+
+__all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
+
+PROTOCOL_VERSION = 1
+"""Raised by hand whenever a figure could change for the same renders."""
+SMALLEST_PART = 0.003
+"""Share of the image below which a part of the pixels has no figure: a handful of pixels is noise."""
+SURFACE_ALPHA = 0.5
+"""A pixel has a rendered depth from this alpha on."""
+_PIXELS_AT_ONCE = 400_000
+
+_DEPTH_KEYS = ("depth_absrel", "depth_rmse", "depth_delta125", "depth_coverage")
+
+
+@dataclass(frozen=True)
+class RenderedViews:
+    """Held-out views as rendered once; every metric starts from these.
+
+    Args:
+        rgb: colours, [V, H, W, 3], float32.
+        alpha: opacities, [V, H, W], float32.
+        depth_mm: expected z-depth in the unit of the sequence, [V, H, W], float32.
+        n_gaussians: size of the scene that was rendered.
+
+    Raises:
+        ShapeError: when sizes do not fit each other.
+    """
+
+    rgb: Float[np.ndarray, "v h w 3"]
+    alpha: Float[np.ndarray, "v h w"]
+    depth_mm: Float[np.ndarray, "v h w"]
+    n_gaussians: int
+
+    def __post_init__(self) -> None:
+        if self.alpha.shape != self.rgb.shape[:-1] or self.depth_mm.shape != self.rgb.shape[:-1]:
+            raise ShapeError(
+                f"renders differ in shape: rgb {self.rgb.shape}, alpha {self.alpha.shape}, "
+                f"depth {self.depth_mm.shape}"
+            )
+
+    def __len__(self) -> int:
+        return int(self.rgb.shape[0])
+
+    def save(self, path: Path) -> None:
+        """Write a zarr v3 group, one view per chunk."""
+        group = open_group(path, mode="w")
+        for name in ("rgb", "alpha", "depth_mm"):
+            write_frames(group, name, getattr(self, name).astype(np.float32))
+        group.attrs["n_gaussians"] = self.n_gaussians
+
+    @classmethod
+    def load(cls, path: Path) -> RenderedViews:
+        """Read what `save` wrote.
+
+        Raises:
+            SourceNotFoundError: when there is nothing at the path.
+        """
+        if not Path(path).exists():
+            raise SourceNotFoundError("no renders here", file=path)
+        group = zarr.open_group(str(path), mode="r")
+        count: Any = group.attrs["n_gaussians"]
+        return cls(
+            read_array(group, "rgb"), read_array(group, "alpha"), read_array(group, "depth_mm"), int(count)
+        )
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Metrics of a sequence and of each view, ready for JSON.
+
+    Args:
+        sequence: name of the sequence.
+        metrics: `{psnr, ssim, lpips_alex, flip, depth_absrel, ..., n_gaussians, aligned: {...},
+            observed: {...}, unobserved: {...}, whole: {...}}`; None for what cannot be had.
+        per_view: the same per view, with `frame` and `name`.
+        reasons: why a figure is None, by its key.
+        protocol: version of the protocol.
+    """
+
+    sequence: str
+    metrics: dict[str, Any]
+    per_view: list[dict[str, Any]]
+    reasons: dict[str, str] = field(default_factory=dict)
+    protocol: int = PROTOCOL_VERSION
+
+    def to_json(self) -> dict[str, Any]:
+        """A tree of JSON values; holds neither NaN nor infinity."""
+        return {
+            "protocol": self.protocol,
+            "sequence": self.sequence,
+            "n_views": len(self.per_view),
+            "metrics": self.metrics,
+            "reasons": self.reasons,
+            "per_view": self.per_view,
+        }
+
+
+def evaluate_views(
+    renders: RenderedViews,
+    sequence: Sequence,
+    frames: Int[np.ndarray, "v"],
+    lpips: Lpips | None,
+    *,
+    lpips_reason: str = "no LPIPS weights were given",
+) -> EvaluationResult:
+    """Compare rendered views with the frames they stand for, by the protocol of this module.
+
+    Args:
+        renders: one render per frame of `frames`, at the sequence's size; colours outside [0, 1] are
+            clipped.
+        sequence: holds the frames, masks and what is known of depth and of observed surface.
+        frames: indices into the sequence.
+        lpips: the metric with its weights, or None.
+        lpips_reason: said in `reasons` when `lpips` is None.
+
+    Returns:
+        Metrics per view and their means.
+
+    Raises:
+        ShapeError: when renders and frames do not fit each other, or there are none.
+        NonFiniteError: for NaN or infinity in the renders; names the frame.
+    """
+    _check(renders, sequence, frames)
+    per_view: list[dict[str, Any]] = []
+    at_once = max(1, _PIXELS_AT_ONCE // (sequence.height * sequence.width))
+    for start in range(0, len(frames), at_once):
+        part = slice(start, start + at_once)
+        per_view += _evaluate_chunk(renders, sequence, frames, part, lpips)
+        emit(Progress("evaluate", len(per_view), len(frames)))
+    metrics = _mean_tree([{k: v for k, v in view.items() if k not in ("frame", "name")} for view in per_view])
+    metrics["n_gaussians"] = renders.n_gaussians
+    return EvaluationResult(
+        sequence.name, metrics, per_view, _reasons(metrics, sequence, frames, lpips, lpips_reason)
+    )
+
+
+def _check(renders: RenderedViews, sequence: Sequence, frames: np.ndarray) -> None:
+    if len(frames) == 0:
+        raise ShapeError(f"{sequence.name}: there is no frame to evaluate on")
+    expected = (len(frames), sequence.height, sequence.width, 3)
+    if renders.rgb.shape != expected:
+        raise ShapeError(f"{sequence.name}: renders have shape {renders.rgb.shape}, expected {expected}")
+    for name, stack in (("rgb", renders.rgb), ("alpha", renders.alpha), ("depth", renders.depth_mm)):
+        finite = np.isfinite(stack).reshape(len(frames), -1).all(1)
+        if not finite.all():
+            worst = sequence.frame_name(int(frames[int(np.argmin(finite))]))
+            raise NonFiniteError(
+                f"{sequence.name}: the rendered {name} of frame {worst} holds NaN or infinity"
+            )
+
+
+def _evaluate_chunk(
+    renders: RenderedViews, sequence: Sequence, frames: np.ndarray, part: slice, lpips: Lpips | None
+) -> list[dict[str, Any]]:
+    chosen = frames[part]
+    render = torch.from_numpy(renders.rgb[part].astype(np.float32)).clamp(0, 1)
+    target = torch.from_numpy(sequence.rgb[chosen].astype(np.float32) / 255)
+    valid = torch.from_numpy(np.ascontiguousarray(sequence.mask[chosen]))
+    parts, shares = _parts_of(sequence, chosen)
+
+    inside = valid[..., None].to(render.dtype)
+    regions = {"valid": valid, **parts}
+    plain = _photometric(render * inside, target * inside, regions, lpips)
+    aligned = _photometric(align_exposure(render, target, valid) * inside, target * inside, regions, lpips)
+    gains = exposure_gain(render, target, valid)[:, 0].tolist()
+    full = bool(valid.all())
+    everything = {"whole": torch.ones_like(valid)}
+    whole = plain["valid"] if full else _photometric(render, target, everything, lpips)["whole"]
+
+    depth = np.where(renders.alpha[part] >= SURFACE_ALPHA, renders.depth_mm[part], 0)
+    views = []
+    for index, frame in enumerate(chosen):
+        view: dict[str, Any] = {"frame": int(frame), "name": sequence.frame_name(int(frame))}
+        view |= plain["valid"][index] | _depth_metrics(depth[index], sequence, int(frame), valid[index])
+        view["aligned"] = aligned["valid"][index] | {
+            "gain": gains[index] if bool(valid[index].any()) else None
+        }
+        for name, region in parts.items():
+            view[name] = (
+                plain[name][index]
+                | _depth_metrics(depth[index], sequence, int(frame), region[index])
+                | {"aligned": aligned[name][index], "pixel_share": shares[name][index]}
+            )
+        view["whole"] = whole[index]
+        views.append(view)
+    return views
+
+
+def _parts_of(
+    sequence: Sequence, chosen: np.ndarray
+) -> tuple[dict[str, Tensor], dict[str, list[float | None]]]:
+    """Observed and unobserved pixels, and their shares of the mask.
+
+    The pixels are empty where it is unknown or there are too few to tell; the share is the true one.
+    """
+    mask = sequence.mask[chosen]
+    # The array says nothing about frames that are not held out.
+    known = np.isin(chosen, sequence.test) & mask.any((1, 2)) & (sequence.observed is not None)
+    seen = np.zeros_like(mask) if sequence.observed is None else sequence.observed[chosen]
+    smallest = SMALLEST_PART * sequence.height * sequence.width
+    parts, shares = {}, {}
+    for name, pixels in (("observed", mask & seen), ("unobserved", mask & ~seen)):
+        counts = pixels.sum((1, 2))
+        parts[name] = torch.from_numpy(pixels & (known & (counts >= smallest))[:, None, None])
+        shares[name] = [
+            float(count / area) if there else None
+            for count, area, there in zip(counts, mask.sum((1, 2)), known, strict=True)
+        ]
+    return parts, shares
+
+
+def _photometric(
+    render: Float[Tensor, "n h w 3"],
+    target: Float[Tensor, "n h w 3"],
+    regions: dict[str, Tensor],
+    lpips: Lpips | None,
+) -> dict[str, list[dict[str, Any]]]:
+    """Photometric figures of each image inside each region."""
+    structure, error = ssim_map(render, target), flip_map(render, target)
+    distances = None if lpips is None else lpips.regional_distances(render, target, regions)
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name, region in regions.items():
+        columns: dict[str, list[float | None]] = {
+            "psnr": psnr_per_image(render, target, region),
+            "ssim": means_per_image(structure, region),
+            "lpips_alex": [None] * len(region),
+            "flip": means_per_image(error, region),
+        }
+        if lpips is not None and distances is not None:
+            columns[lpips.name] = distances[name]
+        found[name] = [
+            {key: values[index] for key, values in columns.items()} for index in range(len(region))
+        ]
+    return found
+
+
+def _depth_metrics(
+    depth: np.ndarray, sequence: Sequence, frame: int, region: Tensor
+) -> dict[str, float | None]:
+    errors = None
+    if sequence.depth_mm is not None:
+        errors = depth_errors(depth, sequence.depth_mm[frame], region.numpy())
+    if errors is None:
+        return dict.fromkeys(_DEPTH_KEYS)
+    values = (errors.absrel, errors.rmse, errors.delta125, errors.coverage)
+    return dict(zip(_DEPTH_KEYS, values, strict=True))
+
+
+def _mean_tree(views: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means over the views, key by key, through nested groups."""
+    means: dict[str, Any] = {}
+    for key, first in views[0].items():
+        values = [view[key] for view in views]
+        means[key] = _mean_tree(values) if isinstance(first, dict) else mean_of_known(values)
+    return means
+
+
+def _reasons(
+    metrics: dict[str, Any],
+    sequence: Sequence,
+    frames: np.ndarray,
+    lpips: Lpips | None,
+    lpips_reason: str,
+) -> dict[str, str]:
+    reasons = {}
+    if metrics["psnr"] is None:
+        reasons["psnr"] = "the validity masks of all views are empty"
+    if metrics["lpips_alex"] is None and metrics["psnr"] is not None:
+        reasons["lpips_alex"] = lpips_reason if lpips is None else f"LPIPS was taken with {lpips.net}"
+    if metrics["depth_absrel"] is None:
+        reasons["depth_absrel"] = (
+            "the sequence has no true depth"
+            if sequence.depth_mm is None
+            else "no pixel has both a true and a rendered depth"
+        )
+    for name in ("observed", "unobserved"):
+        if metrics[name]["psnr"] is None:
+            if sequence.observed is None:
+                reasons[name] = "the source does not tell which surface the training frames saw"
+            elif not np.isin(frames, sequence.test).any():
+                reasons[name] = "told apart for held-out frames only"
+            else:
+                reasons[name] = f"no view has {SMALLEST_PART:.1%} of its pixels {name}"
+    return reasons

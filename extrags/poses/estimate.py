@@ -1,0 +1,243 @@
+"""Poses of a sequence, and the sequence with them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import subprocess
+import sys
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from extrags.cameras import as_rotation
+from extrags.config import PosesConfig
+from extrags.errors import CaptureError, ShapeError
+from extrags.events import Progress, emit
+from extrags.poses.job import PoseJob, PoseJobResult
+from extrags.poses.scale import depth_scale
+from extrags.sequence import Sequence, Split
+
+__all__ = ["PoseEstimate", "estimate_poses", "with_estimated_poses"]
+
+FEWEST_TRAINING_FRAMES = 3
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class PoseEstimate:
+    """What COLMAP found.
+
+    Args:
+        world_from_camera: [F, 4, 4], float64, NaN for frames that did not register.
+        registered: true for frames with a pose, [F].
+        points: triangulated points, [P, 3], float32, in the unit of the poses.
+        points_rgb: their colours, [P, 3].
+        mean_reprojection_px: over the observations in training frames.
+        metric: true when the unit is the millimetre, from known depth.
+        account: counts of features, matches and registrations, ready for JSON.
+    """
+
+    world_from_camera: Float[np.ndarray, "f 4 4"]
+    registered: Bool[np.ndarray, "f"]
+    points: Float[np.ndarray, "p 3"]
+    points_rgb: UInt8[np.ndarray, "p 3"]
+    mean_reprojection_px: float
+    metric: bool
+    account: dict[str, Any]
+
+
+def estimate_poses(sequence: Sequence, config: PosesConfig) -> PoseEstimate:
+    """Reconstruct the cameras of a sequence with COLMAP.
+
+    SIFT inside the validity mask, known intrinsics held fixed, incremental mapping on the training
+    frames alone; the largest model counts. Held-out frames are registered afterwards against the
+    finished map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the
+    millimetre (`extrags.poses.depth_scale`). COLMAP runs in a process of its own. Same input and seed
+    give the same poses, bit by bit, on one machine.
+
+    Args:
+        sequence: frames with intrinsics; poses it may have are not looked at.
+        config: settings.
+
+    Returns:
+        Poses of the frames that registered; the others are named in the log and in the account.
+
+    Raises:
+        CaptureError: when too few training frames register, with an account of why; or when COLMAP's
+            process ends on its own.
+
+    Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
+    """
+    if len(sequence.train) < FEWEST_TRAINING_FRAMES:
+        raise CaptureError(
+            f"{sequence.name}: poses need at least {FEWEST_TRAINING_FRAMES} training frames, "
+            f"found {len(sequence.train)}"
+        )
+    frames = len(sequence)
+    recording = np.zeros(frames, dtype=np.int64) if sequence.recording is None else sequence.recording
+    result = _run(
+        PoseJob(
+            rgb=sequence.rgb,
+            mask=sequence.mask,
+            K=sequence.K,
+            recording=recording,
+            train=np.asarray(sequence.train, dtype=np.int64),
+            test=np.asarray(sequence.test, dtype=np.int64),
+            settings=config.model_dump(),
+        ),
+        sequence.name,
+    )
+    registered = np.isfinite(result.world_from_camera).all((1, 2))
+    account = _account(sequence, result, registered)
+    _check_share(sequence, registered, account, config)
+    for kind in ("train", "test"):
+        if account[f"unregistered_{kind}"]:
+            _LOG.warning(
+                "%s: no pose for %s frames %s",
+                sequence.name,
+                "training" if kind == "train" else "held-out",
+                ", ".join(account[f"unregistered_{kind}"]),
+            )
+    poses, points = _cleaned(result, registered), result.points
+    scale = None
+    if sequence.depth_mm is not None and sequence.metric:
+        scale = depth_scale(
+            poses,
+            points,
+            result.observed_frame,
+            result.observed_point,
+            result.observed_px,
+            sequence.depth_mm,
+            sequence.mask,
+        )
+    if scale is not None:
+        poses[:, :3, 3] *= scale.mm_per_unit
+        points = points * scale.mm_per_unit
+        account["scale"] = asdict(scale)
+    return PoseEstimate(
+        world_from_camera=poses,
+        registered=registered,
+        points=points.astype(np.float32),
+        points_rgb=result.points_rgb,
+        mean_reprojection_px=float(account["mean_reprojection_px"]),
+        metric=scale is not None,
+        account=account,
+    )
+
+
+def with_estimated_poses(sequence: Sequence, estimate: PoseEstimate) -> Sequence:
+    """The sequence with poses and points, without the frames that did not register.
+
+    Frames keep their names; the split is renumbered. `truth` is kept as it is.
+
+    Raises:
+        ShapeError: when the estimate is of another sequence.
+    """
+    if len(estimate.registered) != len(sequence):
+        raise ShapeError(
+            f"{sequence.name} has {len(sequence)} frames, the estimate has {len(estimate.registered)}"
+        )
+    kept = np.flatnonzero(estimate.registered)
+    number = np.cumsum(estimate.registered) - 1
+
+    def renumbered(frames: np.ndarray) -> np.ndarray:
+        return np.asarray(number[frames[estimate.registered[frames]]], dtype=np.int64)
+
+    def of_kept(stack: np.ndarray | None) -> Any:
+        return None if stack is None else stack[kept]
+
+    split = sequence.split
+    return replace(
+        sequence,
+        rgb=sequence.rgb[kept],
+        K=sequence.K[kept],
+        mask=sequence.mask[kept],
+        depth_mm=of_kept(sequence.depth_mm),
+        recording=of_kept(sequence.recording),
+        observed=of_kept(sequence.observed),
+        world_from_camera=estimate.world_from_camera[kept],
+        split=Split(split.name, renumbered(split.train), renumbered(split.test), split.version),
+        frame_names=tuple(sequence.frame_name(int(frame)) for frame in kept),
+        metric=estimate.metric,
+        points=estimate.points,
+        points_rgb=estimate.points_rgb,
+    )
+
+
+def _run(job: PoseJob, name: str) -> PoseJobResult:
+    """Run the job in a process of its own and pass its progress on."""
+    with TemporaryDirectory(prefix="extrags-poses-") as scratch:
+        folder = Path(scratch)
+        job.save(folder)
+        log = folder / "colmap.log"
+        # The child must find this very package, installed or not.
+        root = str(Path(__file__).resolve().parents[2])
+        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+        with (
+            log.open("wb") as log_file,
+            subprocess.Popen(
+                [sys.executable, "-m", "extrags.poses.colmap", scratch],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log_file,
+                text=True,
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+            ) as process,
+        ):
+            try:
+                for line in process.stdout or ():
+                    told = json.loads(line)
+                    emit(Progress("poses", told["done"], told["total"], told["values"]))
+                code = process.wait()
+            except BaseException:
+                process.kill()
+                raise
+        if code != 0 or not (folder / "result.json").exists():
+            last = log.read_text(errors="replace").strip().splitlines()[-8:]
+            raise CaptureError(f"{name}: COLMAP's process ended with code {code}:\n" + "\n".join(last))
+        return PoseJobResult.load(folder)
+
+
+def _cleaned(result: PoseJobResult, registered: np.ndarray) -> np.ndarray:
+    """Poses with rotations orthonormal to rounding."""
+    poses = result.world_from_camera.copy()
+    for frame in np.flatnonzero(registered):
+        poses[frame, :3, :3] = as_rotation(poses[frame, :3, :3], frame=int(frame))
+    return poses
+
+
+def _account(sequence: Sequence, result: PoseJobResult, registered: np.ndarray) -> dict[str, Any]:
+    account = dict(result.account)
+    account.setdefault("mean_reprojection_px", 0.0)
+    for kind, frames in (("train", sequence.train), ("test", sequence.test)):
+        account[f"registered_{kind}"] = int(registered[frames].sum())
+        account[f"unregistered_{kind}"] = [
+            sequence.frame_name(int(frame)) for frame in frames if not registered[frame]
+        ]
+    account["registrations"] = {
+        sequence.frame_name(int(frame)): counts for frame, counts in account["registrations"].items()
+    }
+    return account
+
+
+def _check_share(
+    sequence: Sequence, registered: np.ndarray, account: dict[str, Any], config: PosesConfig
+) -> None:
+    share = float(registered[sequence.train].mean())
+    if share >= config.min_registered_share and account["registered_train"] > 0:
+        return
+    raise CaptureError(
+        f"{sequence.name}: COLMAP found poses for {account['registered_train']} of {account['n_train']} "
+        f"training frames ({share:.0%}), expected at least {config.min_registered_share:.0%}. "
+        f"Features per frame (median): {account['features_median']:.0f}; pairs matched: {account['pairs']}, "
+        f"verified: {account['pairs_verified']}, inliers per verified pair (median): "
+        f"{account['inliers_median']:.0f}; frames per model: {account['model_sizes'] or 'none'}. "
+        "Few features ask for a lower poses.peak_threshold or larger images, few inliers for frames nearer "
+        "together, good pairs without a model for more sideways motion or a lower poses.min_tri_angle_deg"
+    )

@@ -1,0 +1,97 @@
+"""What passes between the caller and the process COLMAP runs in: files in a scratch folder."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["PoseJob", "PoseJobResult"]
+
+
+@dataclass(frozen=True)
+class PoseJob:
+    """Input of the process; arrays as in `extrags.sequence.Sequence`.
+
+    Args:
+        rgb: uint8, [F, H, W, 3].
+        mask: pixels features may come from, [F, H, W].
+        K: [F, 3, 3].
+        recording: [F].
+        train: indices of frames the map is made of.
+        test: indices of frames registered afterwards.
+        settings: fields of `PosesConfig`.
+    """
+
+    rgb: np.ndarray
+    mask: np.ndarray
+    K: np.ndarray
+    recording: np.ndarray
+    train: np.ndarray
+    test: np.ndarray
+    settings: dict[str, Any]
+
+    def save(self, folder: Path) -> None:
+        """Write the job."""
+        np.savez(
+            folder / "job.npz",
+            rgb=self.rgb,
+            mask=self.mask,
+            K=self.K,
+            recording=self.recording,
+            train=self.train,
+            test=self.test,
+        )
+        (folder / "job.json").write_text(json.dumps(self.settings))
+
+    @classmethod
+    def load(cls, folder: Path) -> PoseJob:
+        """Read the job."""
+        with np.load(folder / "job.npz") as arrays:
+            return cls(**dict(arrays.items()), settings=json.loads((folder / "job.json").read_text()))
+
+
+@dataclass(frozen=True)
+class PoseJobResult:
+    """Output of the process, in COLMAP's unit.
+
+    Args:
+        world_from_camera: [F, 4, 4], NaN for frames without a pose.
+        points: [P, 3] float64.
+        points_rgb: [P, 3] uint8.
+        observed_frame: [O], training frames only.
+        observed_point: [O], index into `points`.
+        observed_px: [O, 2].
+        account: counts, ready for JSON.
+    """
+
+    world_from_camera: np.ndarray
+    points: np.ndarray
+    points_rgb: np.ndarray
+    observed_frame: np.ndarray
+    observed_point: np.ndarray
+    observed_px: np.ndarray
+    account: dict[str, Any]
+
+    def save(self, folder: Path) -> None:
+        """Write the result."""
+        np.savez(
+            folder / "result.npz",
+            world_from_camera=self.world_from_camera,
+            points=self.points,
+            points_rgb=self.points_rgb,
+            observed_frame=self.observed_frame,
+            observed_point=self.observed_point,
+            observed_px=self.observed_px,
+        )
+        # Written last: its presence says that the result is whole.
+        (folder / "result.json").write_text(json.dumps(self.account))
+
+    @classmethod
+    def load(cls, folder: Path) -> PoseJobResult:
+        """Read the result."""
+        with np.load(folder / "result.npz") as arrays:
+            return cls(**dict(arrays.items()), account=json.loads((folder / "result.json").read_text()))

@@ -1,0 +1,72 @@
+"""Metric scale of a reconstruction from known depth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+__all__ = ["DepthScale", "depth_scale"]
+
+FEWEST_OBSERVATIONS = 20
+"""A median over fewer is no measurement of scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class DepthScale:
+    """How long one unit of a reconstruction is.
+
+    Args:
+        mm_per_unit: median over observations of true depth / reconstructed depth.
+        relative_spread: median absolute deviation of the ratios, divided by their median; small when
+            the reconstruction has the true shape.
+        n_observations: observations the median is taken over.
+    """
+
+    mm_per_unit: float
+    relative_spread: float
+    n_observations: int
+
+
+def depth_scale(
+    world_from_camera: Float[np.ndarray, "f 4 4"],
+    points: Float[np.ndarray, "p 3"],
+    observed_frame: Int[np.ndarray, "o"],
+    observed_point: Int[np.ndarray, "o"],
+    observed_px: Float[np.ndarray, "o 2"],
+    depth_mm: Float[np.ndarray, "f h w"],
+    mask: Bool[np.ndarray, "f h w"],
+) -> DepthScale | None:
+    """Robust ratio of known depth to reconstructed depth where triangulated points were observed.
+
+    The median of ratios ignores the points that sit on a fold's edge in one of the two, and those that
+    COLMAP placed badly.
+
+    Args:
+        world_from_camera: poses in the reconstruction's unit.
+        points: triangulated points in the same unit.
+        observed_frame: frame of each observation.
+        observed_point: index of the point it observes.
+        observed_px: where in the image, in pixels, centres at +0.5.
+        depth_mm: true z-depth, 0 where unknown.
+        mask: pixels whose depth counts.
+
+    Returns:
+        The scale, or None when fewer than 20 observations have a known depth.
+    """
+    height, width = depth_mm.shape[1:]
+    column = np.floor(observed_px[:, 0]).astype(np.int64)
+    row = np.floor(observed_px[:, 1]).astype(np.int64)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    frame, point = observed_frame[inside], observed_point[inside]
+    column, row = column[inside], row[inside]
+    true = depth_mm[frame, row, column].astype(np.float64)
+    pose = world_from_camera[frame]
+    found = np.einsum("oi,oi->o", pose[:, :3, 2], points[point] - pose[:, :3, 3])
+    counts = mask[frame, row, column] & np.isfinite(true) & (true > 0) & (found > 0)
+    if int(counts.sum()) < FEWEST_OBSERVATIONS:
+        return None
+    ratios = true[counts] / found[counts]
+    median = float(np.median(ratios))
+    return DepthScale(median, float(np.median(np.abs(ratios - median)) / median), int(counts.sum()))

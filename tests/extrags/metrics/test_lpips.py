@@ -1,0 +1,158 @@
+"""LPIPS against published figures, and where its weights are looked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+
+from extrags.errors import ConfigError, ShapeError, WeightsError
+from extrags.metrics.lpips import WEIGHTS_VARIABLE, Lpips, LpipsNet, find_weights
+
+
+@pytest.fixture(scope="module")
+def weights_folder(shared_data: Path) -> Path:
+    return shared_data / "lpips_weights"
+
+
+@pytest.fixture(scope="module")
+def alex(weights_folder: Path) -> Lpips:
+    return Lpips.load(weights_folder, "alex")
+
+
+def example(folder: Path, name: str) -> torch.Tensor:
+    from PIL import Image
+
+    with Image.open(folder / name) as image:
+        return torch.from_numpy(np.asarray(image.convert("RGB"), dtype=np.float32) / 255)
+
+
+def random_pair(n: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    first = torch.rand(n, height, width, 3, generator=generator)
+    return first, (first + 0.2 * torch.randn(n, height, width, 3, generator=generator)).clamp(0, 1)
+
+
+@pytest.mark.parametrize(
+    ("net", "far", "near", "doctest"),
+    [
+        ("alex", 0.7218807, 0.1375656, (0.1311690, 0.1419626)),
+        ("squeeze", 0.7110476, 0.1479016, (0.1023802, 0.0937736)),
+    ],
+)
+def test_published_figures(
+    weights_folder: Path, net: LpipsNet, far: float, near: float, doctest: tuple[float, float]
+) -> None:
+    metric = Lpips.load(weights_folder / f"lpips_{net}_v0.1.npz", net)
+    reference = example(weights_folder, "ex_ref.png")
+    assert float(metric.distance(reference, example(weights_folder, "ex_p0.png"))) == pytest.approx(
+        far, abs=2e-5
+    )
+    assert float(metric.distance(reference, example(weights_folder, "ex_p1.png"))) == pytest.approx(
+        near, abs=2e-5
+    )
+    generator = torch.Generator().manual_seed(42)
+    first = torch.rand(2, 3, 100, 100, generator=generator).movedim(1, -1)
+    second = torch.rand(2, 3, 100, 100, generator=generator).movedim(1, -1)
+    assert metric.distance(first, second).tolist() == pytest.approx(doctest, abs=2e-5)
+
+
+def test_map_has_image_size_and_points_at_the_change(alex: Lpips) -> None:
+    first, _ = random_pair(1, 96, 128)
+    second = first.clone()
+    second[0, 60:90, 80:120] = 0
+    error = alex.distance_map(first, second)
+    assert error.shape == (1, 96, 128)
+    assert float(error.min()) >= 0
+    assert float(error[0, 62:88, 82:118].mean()) > 10 * float(error[0, :30, :30].mean())
+    assert float(alex.distance_map(first, first).max()) == 0
+
+
+def test_regions(alex: Lpips) -> None:
+    first, second = random_pair(2, 64, 80)
+    everything = torch.ones(2, 64, 80, dtype=torch.bool)
+    left = everything.clone()
+    left[:, :, 40:] = False
+    left[1] = False
+    found = alex.regional_distances(first, second, {"all": everything, "left": left})
+    assert found["all"] == pytest.approx(alex.distance(first, second).tolist(), abs=1e-6)
+    assert found["left"][1] is None
+    changed = first.clone()
+    changed[0, :, :30] = 0.5
+    halves = alex.regional_distances(first, changed, {"left": left, "right": everything & ~left})
+    assert halves["left"][0] is not None
+    assert halves["right"][0] is not None
+    assert halves["left"][0] > 3 * halves["right"][0]
+
+
+def test_batches_longer_than_a_chunk_change_nothing(alex: Lpips) -> None:
+    first, second = random_pair(18, 32, 40)
+    together = alex.distance(first.reshape(2, 9, 32, 40, 3), second.reshape(2, 9, 32, 40, 3))
+    alone = torch.stack([alex.distance(a, b) for a, b in zip(first, second, strict=True)])
+    torch.testing.assert_close(together.reshape(-1), alone, atol=1e-6, rtol=1e-5)
+
+
+def test_has_a_gradient(alex: Lpips) -> None:
+    first, second = random_pair(1, 32, 32)
+    first.requires_grad_(True)
+    alex.distance(first, second).sum().backward()
+    assert first.grad is not None
+    assert float(first.grad.abs().max()) > 0
+
+
+def test_small_images_are_refused(alex: Lpips) -> None:
+    first, second = random_pair(1, 31, 64)
+    with pytest.raises(ShapeError, match="at least 32 px, found 64x31"):
+        alex.distance(first, second)
+
+
+def empty_search_places(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    import extrags.metrics.lpips as module
+
+    monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "checkout/extrags/metrics/lpips.py"))
+
+
+def test_search_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    empty_search_places(monkeypatch, tmp_path)
+    with pytest.raises(
+        WeightsError, match=r"no LPIPS weights for alex: lpips_alex_v0\.1\.npz is in none of .*npz"
+    ):
+        find_weights(None, "alex")
+
+    cached = tmp_path / "cache" / "extrags" / "lpips" / "lpips_alex_v0.1.npz"
+    beside_checkout = tmp_path / "shared" / "data" / "lpips_weights" / "lpips_alex_v0.1.npz"
+    by_variable = tmp_path / "elsewhere" / "lpips_alex_v0.1.npz"
+    explicit = tmp_path / "mine.npz"
+    for file in (cached, beside_checkout, by_variable, explicit):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.touch()
+        if file == by_variable:
+            monkeypatch.setenv(WEIGHTS_VARIABLE, str(by_variable.parent))
+        assert find_weights(str(explicit) if file == explicit else None, "alex") == file
+    with pytest.raises(WeightsError, match=r"lpips_squeeze_v0\.1\.npz, which does not exist"):
+        find_weights(None, "squeeze")
+
+
+def test_a_named_file_that_is_missing_is_an_error(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, weights_folder: Path
+) -> None:
+    monkeypatch.chdir(weights_folder)
+    with pytest.raises(WeightsError, match=r"the setting names .*nowhere\.npz, which does not exist"):
+        find_weights(str(tmp_path / "nowhere.npz"), "alex")
+
+
+def test_wrong_files_are_refused(tmp_path: Path, weights_folder: Path) -> None:
+    with pytest.raises(WeightsError, match="not the weights of LPIPS with squeeze"):
+        Lpips.load(weights_folder / "lpips_alex_v0.1.npz", "squeeze")
+    (tmp_path / "text.npz").write_text("no archive")
+    with pytest.raises(WeightsError, match="not a readable npz"):
+        Lpips.load(tmp_path / "text.npz")
+    with pytest.raises((ConfigError, TypeCheckError), match=r"known: alex, squeeze|Type-check"):
+        find_weights(None, "vgg")  # type: ignore[arg-type]

@@ -1,0 +1,113 @@
+"""Alignment and trajectory errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from extrags.cameras import compose, rotation_about
+from extrags.errors import ConfigError, NonFiniteError, ShapeError
+from extrags.metrics.pose import Similarity, absolute_trajectory_error, relative_pose_error, umeyama
+
+
+def trajectory(n: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.stack(
+        [compose(Rotation.random(rng=rng).as_matrix(), rng.normal(size=3) * (3, 1, 0.3)) for _ in range(n)]
+    )
+
+
+def random_similarity(seed: int, scale: float) -> Similarity:
+    rng = np.random.default_rng(seed)
+    return Similarity(scale, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3) * 10)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), scale=st.floats(0.01, 100), n=st.integers(3, 20), flat=st.booleans())
+def test_umeyama_recovers_a_similarity(seed: int, scale: float, n: int, flat: bool) -> None:
+    source = np.random.default_rng(seed).normal(size=(n, 3))
+    if flat:
+        source[:, 2] = 0
+    wanted = random_similarity(seed + 1, scale)
+    found = umeyama(source, wanted.apply(source))
+    assert np.linalg.det(found.rotation) == pytest.approx(1)
+    np.testing.assert_allclose(found.apply(source), wanted.apply(source), atol=1e-8 * max(scale, 1))
+    assert found.scale == pytest.approx(scale, rel=1e-6)
+
+
+def test_umeyama_never_mirrors() -> None:
+    source = np.random.default_rng(0).normal(size=(10, 3))
+    found = umeyama(source, source * (1, 1, -1))
+    assert np.linalg.det(found.rotation) == pytest.approx(1)
+
+
+def test_points_on_a_line_still_fit() -> None:
+    source = np.linspace(0, 1, 8)[:, None] * np.array([1.0, 2.0, 3.0])
+    wanted = random_similarity(3, 2.0)
+    np.testing.assert_allclose(
+        umeyama(source, wanted.apply(source)).apply(source), wanted.apply(source), atol=1e-12
+    )
+
+
+def test_ate_is_blind_to_the_world_frame_and_counts_what_is_left() -> None:
+    truth = trajectory(12)
+    moved = random_similarity(5, 3.0).apply_to_poses(truth)
+    errors = absolute_trajectory_error(moved, truth, "sim3")
+    assert errors.rmse == pytest.approx(0, abs=1e-10)
+    assert errors.rotation_mean_deg == pytest.approx(0, abs=1e-5)
+    # The wrong scale can be mended by a similarity only.
+    assert absolute_trajectory_error(moved, truth, "se3").rmse > 1
+    assert absolute_trajectory_error(moved, truth, "none").rmse > 1
+
+
+def test_ate_without_alignment_by_hand() -> None:
+    truth = trajectory(4)
+    off = truth.copy()
+    off[:, :3, 3] += np.array([[3, 4, 0], [0, 0, 0], [0, 0, 1], [0, 2, 0]])
+    off[:, :3, :3] = off[:, :3, :3] @ rotation_about(np.array([0.0, 1, 0]), np.radians(7))
+    errors = absolute_trajectory_error(off, truth, "none")
+    assert errors.rmse == pytest.approx(np.sqrt((25 + 1 + 4) / 4))
+    assert errors.mean == pytest.approx(2)
+    assert errors.median == pytest.approx(1.5)
+    assert errors.max == pytest.approx(5)
+    assert errors.rotation_mean_deg == pytest.approx(7)
+
+
+def test_rpe_counts_drift_per_step() -> None:
+    steps = 10
+    truth = np.stack([compose(np.eye(3), np.array([float(i), 0, 0])) for i in range(steps)])
+    drifting = np.stack(
+        [
+            compose(rotation_about(np.array([0.0, 0, 1]), np.radians(2 * i)), np.array([float(i), 0, 0]))
+            for i in range(steps)
+        ]
+    )
+    errors = relative_pose_error(drifting, truth, alignment="none")
+    assert errors.rotation_rmse_deg == pytest.approx(2)
+    assert errors.n_pairs == steps - 1
+    assert relative_pose_error(drifting, truth, frames_apart=3, alignment="none").rotation_rmse_deg == (
+        pytest.approx(6)
+    )
+    scaled = truth.copy()
+    scaled[:, :3, 3] *= 1.1
+    assert relative_pose_error(scaled, truth, alignment="none").translation_rmse == pytest.approx(0.1)
+    assert relative_pose_error(scaled, truth, alignment="sim3").translation_rmse == pytest.approx(
+        0, abs=1e-12
+    )
+
+
+def test_bad_input_is_named() -> None:
+    truth = trajectory(4)
+    broken = truth.copy()
+    broken[2, 0, 3] = np.nan
+    with pytest.raises(NonFiniteError, match="estimated poses"):
+        absolute_trajectory_error(broken, truth)
+    with pytest.raises(ShapeError, match="three or more"):
+        absolute_trajectory_error(truth[:2], truth[:2])
+    with pytest.raises(ShapeError, match="no two of 4 poses"):
+        relative_pose_error(truth, truth, frames_apart=4)
+    with pytest.raises(ConfigError, match="at least 1"):
+        relative_pose_error(truth, truth, frames_apart=0)

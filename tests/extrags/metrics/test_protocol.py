@@ -1,0 +1,246 @@
+"""The protocol: which pixels count where, stable keys, and nothing that JSON cannot hold."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from jaxtyping import TypeCheckError
+
+from extrags.errors import NonFiniteError, ShapeError, SourceNotFoundError
+from extrags.events import Event, subscribed
+from extrags.metrics.image import psnr
+from extrags.metrics.lpips import Lpips
+from extrags.metrics.protocol import PROTOCOL_VERSION, EvaluationResult, RenderedViews, evaluate_views
+from extrags.sequence import Sequence, Split
+
+FRAMES, HEIGHT, WIDTH = 5, 48, 64
+TEST = np.array([1, 3])
+
+
+@pytest.fixture
+def sequence() -> Sequence:
+    rng = np.random.default_rng(0)
+    mask = np.ones((FRAMES, HEIGHT, WIDTH), dtype=bool)
+    mask[:, :, :8] = False
+    observed = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=bool)
+    observed[1, :, :40] = True
+    observed[3] = True
+    return Sequence(
+        name="made/up@here",
+        rgb=rng.integers(40, 200, (FRAMES, HEIGHT, WIDTH, 3), dtype=np.uint8),
+        K=np.tile(np.eye(3), (FRAMES, 1, 1)),
+        mask=mask,
+        split=Split("here", np.array([0, 2, 4]), TEST),
+        depth_mm=np.full((FRAMES, HEIGHT, WIDTH), 20.0, dtype=np.float32),
+        observed=observed,
+    )
+
+
+def renders_of(sequence: Sequence, frames: np.ndarray) -> RenderedViews:
+    rgb = sequence.rgb[frames].astype(np.float32) / 255
+    return RenderedViews(
+        rgb=rgb,
+        alpha=np.ones(rgb.shape[:-1], dtype=np.float32),
+        depth_mm=np.full(rgb.shape[:-1], 22.0, dtype=np.float32),
+        n_gaussians=7,
+    )
+
+
+def test_perfect_renders(sequence: Sequence) -> None:
+    result = evaluate_views(renders_of(sequence, TEST), sequence, TEST, None)
+    metrics = result.metrics
+    assert metrics["psnr"] == pytest.approx(100, abs=0.1)
+    assert metrics["ssim"] == pytest.approx(1, abs=1e-4)
+    assert metrics["flip"] == pytest.approx(0, abs=1e-4)
+    assert metrics["depth_absrel"] == pytest.approx(0.1)
+    assert metrics["depth_rmse"] == pytest.approx(2)
+    assert metrics["n_gaussians"] == 7
+    assert metrics["aligned"]["gain"] == pytest.approx(1, abs=1e-4)
+    assert result.protocol == PROTOCOL_VERSION
+
+
+def test_stable_keys_and_json(sequence: Sequence) -> None:
+    result = evaluate_views(renders_of(sequence, TEST), sequence, TEST, None)
+    tree = json.loads(json.dumps(result.to_json(), allow_nan=False))
+    photometric = {"psnr", "ssim", "lpips_alex", "flip"}
+    keys = photometric | {"depth_absrel", "n_gaussians", "aligned", "observed", "unobserved", "whole"}
+    assert keys <= set(tree["metrics"])
+    for group in ("aligned", "observed", "unobserved", "whole"):
+        assert photometric <= set(tree["metrics"][group])
+    assert tree["metrics"]["lpips_alex"] is None
+    assert tree["reasons"] == {"lpips_alex": "no LPIPS weights were given"}
+    assert [view["name"] for view in tree["per_view"]] == ["0001", "0003"]
+    assert tree["n_views"] == 2
+
+
+def test_masked_out_pixels_do_not_count(sequence: Sequence) -> None:
+    clean = renders_of(sequence, TEST)
+    spoiled = clean.rgb.copy()
+    spoiled[~sequence.mask[TEST]] = 1
+    result = evaluate_views(replace(clean, rgb=spoiled), sequence, TEST, None)
+    reference = evaluate_views(clean, sequence, TEST, None)
+    for group in ("observed", "unobserved", "aligned"):
+        assert result.metrics[group] == reference.metrics[group]
+    assert result.metrics["psnr"] == reference.metrics["psnr"]
+    assert result.metrics["ssim"] == reference.metrics["ssim"]
+    assert result.metrics["whole"]["psnr"] < 25
+
+
+def test_observed_and_unobserved_stand_apart(sequence: Sequence) -> None:
+    renders = renders_of(sequence, TEST)
+    renders.rgb[0, :, 40:] *= 0.5
+    result = evaluate_views(renders, sequence, TEST, None)
+    first, second = result.per_view
+    assert first["observed"]["psnr"] == pytest.approx(100, abs=0.1)
+    target = torch.from_numpy(sequence.rgb[1].astype(np.float32) / 255)
+    mask = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[:, 40:] = True
+    assert first["unobserved"]["psnr"] == pytest.approx(psnr(0.5 * target, target, mask), abs=1e-4)
+    assert first["unobserved"]["pixel_share"] == pytest.approx(24 / 56)
+    # The second view has no unobserved pixel: no figure, and the mean is the first view's.
+    assert second["unobserved"]["psnr"] is None
+    assert second["unobserved"]["pixel_share"] == 0
+    assert result.metrics["unobserved"]["psnr"] == first["unobserved"]["psnr"]
+    assert result.metrics["unobserved"]["pixel_share"] == pytest.approx(12 / 56)
+
+
+def test_a_few_pixels_are_no_part(sequence: Sequence) -> None:
+    assert sequence.observed is not None
+    observed = sequence.observed.copy()
+    observed[1] = True
+    observed[1, 0, 20:28] = False
+    result = evaluate_views(renders_of(sequence, TEST), replace(sequence, observed=observed), TEST, None)
+    assert result.metrics["unobserved"]["psnr"] is None
+    assert result.reasons["unobserved"] == "no view has 0.3% of its pixels unobserved"
+    assert result.per_view[0]["unobserved"]["pixel_share"] == pytest.approx(8 / (48 * 56))
+
+
+def test_exposure_is_mended_in_its_own_place_only(sequence: Sequence) -> None:
+    clean = renders_of(sequence, TEST)
+    dim = replace(clean, rgb=clean.rgb * np.array([0.6, 0.9], dtype=np.float32)[:, None, None, None])
+    result = evaluate_views(dim, sequence, TEST, None)
+    assert result.metrics["psnr"] < 30
+    assert result.metrics["aligned"]["psnr"] > 90
+    assert [view["aligned"]["gain"] for view in result.per_view] == pytest.approx(
+        [1 / 0.6, 1 / 0.9], rel=1e-4
+    )
+    assert result.metrics["observed"]["psnr"] < 30
+    assert result.metrics["observed"]["aligned"]["psnr"] > 90
+
+
+def test_empty_render_has_depth_coverage_only(sequence: Sequence) -> None:
+    clean = renders_of(sequence, TEST)
+    alpha = clean.alpha.copy()
+    alpha[:, :, :36] = 0.2
+    result = evaluate_views(replace(clean, alpha=alpha), sequence, TEST, None)
+    assert result.metrics["depth_coverage"] == pytest.approx(0.5)
+    assert result.metrics["depth_absrel"] == pytest.approx(0.1)
+
+
+def test_what_cannot_be_had_is_null_with_a_reason(sequence: Sequence) -> None:
+    bare = replace(sequence, depth_mm=None, observed=None)
+    result = evaluate_views(renders_of(bare, TEST), bare, TEST, None, lpips_reason="no file")
+    assert result.metrics["depth_absrel"] is None
+    assert result.metrics["observed"]["psnr"] is None
+    assert result.metrics["observed"]["pixel_share"] is None
+    assert result.reasons == {
+        "lpips_alex": "no file",
+        "depth_absrel": "the sequence has no true depth",
+        "observed": "the source does not tell which surface the training frames saw",
+        "unobserved": "the source does not tell which surface the training frames saw",
+    }
+
+
+def test_training_frames_have_no_parts(sequence: Sequence) -> None:
+    train = sequence.train
+    result = evaluate_views(renders_of(sequence, train), sequence, train, None)
+    assert result.metrics["unobserved"]["psnr"] is None
+    assert result.reasons["unobserved"] == "told apart for held-out frames only"
+
+
+def test_an_empty_mask_gives_nulls_not_nans(sequence: Sequence) -> None:
+    mask = sequence.mask.copy()
+    mask[3] = False
+    blind = replace(sequence, mask=mask)
+    result = evaluate_views(renders_of(blind, TEST), blind, TEST, None)
+    assert result.per_view[1]["psnr"] is None
+    assert result.per_view[1]["aligned"]["gain"] is None
+    assert result.metrics["psnr"] == result.per_view[0]["psnr"]
+    json.dumps(result.to_json(), allow_nan=False)
+    nothing = replace(sequence, mask=np.zeros_like(mask))
+    result = evaluate_views(renders_of(nothing, TEST), nothing, TEST, None)
+    assert result.metrics["psnr"] is None
+    assert "empty" in result.reasons["psnr"]
+
+
+def test_lpips_inside_the_mask(sequence: Sequence, shared_data: Path) -> None:
+    metric = Lpips.load(shared_data / "lpips_weights")
+    clean = renders_of(sequence, TEST)
+    rng = np.random.default_rng(1)
+    noisy = replace(
+        clean, rgb=np.clip(clean.rgb + rng.normal(0, 0.1, clean.rgb.shape), 0, 1).astype(np.float32)
+    )
+    result = evaluate_views(noisy, sequence, TEST, metric)
+    whole = metric.distance(
+        torch.from_numpy(noisy.rgb), torch.from_numpy(sequence.rgb[TEST].astype(np.float32) / 255)
+    )
+    assert result.metrics["whole"]["lpips_alex"] == pytest.approx(float(whole.mean()), abs=1e-5)
+    assert 0 < result.metrics["lpips_alex"] < 1
+    assert result.metrics["unobserved"]["lpips_alex"] > 0
+    squeeze = evaluate_views(noisy, sequence, TEST, Lpips.load(shared_data / "lpips_weights", "squeeze"))
+    assert squeeze.metrics["lpips_alex"] is None
+    assert squeeze.metrics["lpips_squeeze"] > 0
+    assert squeeze.reasons["lpips_alex"] == "LPIPS was taken with squeeze"
+
+
+def test_same_bits_twice_and_whatever_the_batch(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+    import extrags.metrics.protocol as protocol
+
+    renders = renders_of(sequence, TEST)
+    renders.rgb[:, 10:20] = 0.3
+    once = evaluate_views(renders, sequence, TEST, None).to_json()
+    assert evaluate_views(renders, sequence, TEST, None).to_json() == once
+    monkeypatch.setattr(protocol, "_PIXELS_AT_ONCE", 1)
+    single = evaluate_views(renders, sequence, TEST, None)
+    assert single.metrics["psnr"] == pytest.approx(once["metrics"]["psnr"], abs=1e-9)
+    assert single.metrics["ssim"] == pytest.approx(once["metrics"]["ssim"], abs=1e-6)
+
+
+def test_progress_is_told(sequence: Sequence) -> None:
+    events: list[Event] = []
+    with subscribed(events.append):
+        evaluate_views(renders_of(sequence, TEST), sequence, TEST, None)
+    assert events[-1].stage == "evaluate"
+    assert (events[-1].done, events[-1].total) == (2, 2)  # type: ignore[union-attr]
+
+
+def test_bad_renders_are_named(sequence: Sequence) -> None:
+    renders = renders_of(sequence, TEST)
+    with pytest.raises(ShapeError, match="no frame to evaluate"):
+        evaluate_views(renders, sequence, np.zeros(0, dtype=np.int64), None)
+    with pytest.raises(ShapeError, match="expected \\(3, 48, 64, 3\\)"):
+        evaluate_views(renders, sequence, np.arange(3), None)
+    renders.rgb[1, 4, 4, 0] = np.nan
+    with pytest.raises(NonFiniteError, match="rendered rgb of frame 0003"):
+        evaluate_views(renders, sequence, TEST, None)
+    with pytest.raises((ShapeError, TypeCheckError), match=r"differ in shape|Type-check"):
+        RenderedViews(renders.rgb, renders.alpha[:1], renders.depth_mm, 1)
+
+
+def test_renders_survive_the_disk(sequence: Sequence, tmp_path: Path) -> None:
+    renders = renders_of(sequence, TEST)
+    renders.save(tmp_path / "renders")
+    again = RenderedViews.load(tmp_path / "renders")
+    for name in ("rgb", "alpha", "depth_mm"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(renders, name))
+    assert again.n_gaussians == 7
+    first = evaluate_views(renders, sequence, TEST, None)
+    assert isinstance(first, EvaluationResult)
+    assert evaluate_views(again, sequence, TEST, None).to_json() == first.to_json()
+    with pytest.raises(SourceNotFoundError, match="no renders here"):
+        RenderedViews.load(tmp_path / "nothing")

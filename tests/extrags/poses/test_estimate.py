@@ -1,0 +1,221 @@
+"""Poses of a textured room by COLMAP, against the exact ones."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import extrags.poses.estimate as estimate_module
+from extrags.config import PosesConfig
+from extrags.errors import CaptureError, ShapeError
+from extrags.events import Event, Progress, subscribed
+from extrags.metrics.pose import absolute_trajectory_error
+from extrags.poses import PoseEstimate, estimate_poses, with_estimated_poses
+from extrags.poses.job import PoseJobResult
+from extrags.sequence import Sequence
+from tests.extrags.poses.textured_room import HALF_SIZE_MM, room_sequence
+
+CONFIG = PosesConfig(n_features=600)
+FRAMES, NOISE_FRAME, BLIND_COLUMNS = 9, 8, 40
+
+
+@dataclass(frozen=True)
+class Run:
+    sequence: Sequence
+    estimate: PoseEstimate
+    raw: PoseJobResult
+    events: list[Event]
+    log: str
+
+
+@pytest.fixture(scope="module")
+def sequence() -> Sequence:
+    """Seven training frames, and held-out ones, the last of which shows nothing but noise."""
+    room = room_sequence(FRAMES, width=200, height=150)
+    rng = np.random.default_rng(0)
+    rgb = room.rgb.copy()
+    rgb[NOISE_FRAME] = rng.integers(0, 255, rgb.shape[1:])
+    # An overlay that is the same in every frame, as devices draw; the mask leaves it out.
+    overlay = rng.integers(0, 255, (rgb.shape[1] // 6, BLIND_COLUMNS // 6 + 1, 3))
+    rgb[:, :, :BLIND_COLUMNS] = np.kron(overlay, np.ones((6, 6, 1)))[: rgb.shape[1], :BLIND_COLUMNS]
+    mask = room.mask.copy()
+    mask[:, :, :BLIND_COLUMNS] = False
+    split = replace(room.split, train=np.array([0, 1, 2, 4, 5, 6, 7]), test=np.array([3, 8]))
+    return replace(room, rgb=rgb, mask=mask, split=split)
+
+
+@pytest.fixture(scope="module")
+def run(sequence: Sequence) -> Run:
+    events: list[Event] = []
+    kept: list[PoseJobResult] = []
+    messages: list[str] = []
+    run_job = estimate_module._run
+
+    def keeping(*arguments: object) -> PoseJobResult:
+        kept.append(run_job(*arguments))  # type: ignore[arg-type]
+        return kept[-1]
+
+    handler = logging.Handler()
+    handler.emit = lambda record: messages.append(record.getMessage())  # type: ignore[method-assign]
+    logger = logging.getLogger("extrags.poses.estimate")
+    logger.addHandler(handler)
+    with pytest.MonkeyPatch.context() as patch, subscribed(events.append):
+        patch.setattr(estimate_module, "_run", keeping)
+        found = estimate_poses(sequence, CONFIG)
+    logger.removeHandler(handler)
+    return Run(sequence, found, kept[0], events, "\n".join(messages))
+
+
+def test_poses_are_metric_and_right(run: Run) -> None:
+    registered = np.flatnonzero(run.estimate.registered)
+    assert registered.tolist() == [0, 1, 2, 3, 4, 5, 6, 7]
+    assert run.estimate.metric
+    assert run.sequence.world_from_camera is not None
+    # A rigid alignment only: the unit must be the millimetre already. The path is 12 mm wide.
+    errors = absolute_trajectory_error(
+        run.estimate.world_from_camera[registered], run.sequence.world_from_camera[registered], "se3"
+    )
+    assert errors.rmse < 0.05
+    assert errors.rotation_mean_deg < 0.5
+    assert run.estimate.mean_reprojection_px < 0.5
+    assert run.estimate.account["scale"]["relative_spread"] < 0.01
+
+
+def test_points_lie_on_the_walls(run: Run) -> None:
+    from extrags.metrics.pose import umeyama
+
+    assert run.sequence.world_from_camera is not None
+    chosen = run.estimate.registered
+    world = umeyama(
+        run.estimate.world_from_camera[chosen, :3, 3],
+        run.sequence.world_from_camera[chosen, :3, 3],
+        with_scale=False,
+    )
+    points = world.apply(run.estimate.points.astype(np.float64))
+    off_wall = np.abs(np.abs(points) - HALF_SIZE_MM).min(1)
+    assert len(points) > 200
+    assert float(np.median(off_wall)) < 0.1
+    assert run.estimate.points_rgb.dtype == np.uint8
+    assert run.estimate.points_rgb.std() > 5
+
+
+def test_no_point_comes_from_masked_pixels(run: Run) -> None:
+    assert len(run.raw.observed_px) > 1000
+    assert run.raw.observed_px[:, 0].min() >= BLIND_COLUMNS
+    assert set(np.unique(run.raw.observed_frame)) == set(run.sequence.train.tolist())
+
+
+def test_a_frame_without_pose_is_named(run: Run) -> None:
+    assert run.estimate.account["unregistered_test"] == ["arc-8"]
+    assert run.estimate.account["unregistered_train"] == []
+    assert "no pose for held-out frames arc-8" in run.log
+    assert run.estimate.account["registrations"]["arc-3"]["inliers"] > 50
+    json.dumps(run.estimate.account, allow_nan=False)
+
+
+def test_progress_runs_to_its_end(run: Run) -> None:
+    steps = [event for event in run.events if isinstance(event, Progress)]
+    assert {step.stage for step in steps} == {"poses"}
+    assert [step.done for step in steps] == sorted(step.done for step in steps)
+    assert steps[-1].done == steps[-1].total
+    assert steps[-1].values["registered"] == 8
+
+
+def test_same_bits_and_nothing_of_held_out_frames_in_the_map(run: Run) -> None:
+    """Once more with other held-out frames: training poses and points must be the very same."""
+    rgb = run.sequence.rgb.copy()
+    rgb[3] = rgb[0]
+    other = replace(
+        run.sequence, rgb=rgb, split=replace(run.sequence.split, test=np.array([3], dtype=np.int64))
+    )
+    again = estimate_poses(other, CONFIG)
+    train = run.sequence.train
+    np.testing.assert_array_equal(
+        again.world_from_camera[train], run.estimate.world_from_camera[train], strict=True
+    )
+    np.testing.assert_array_equal(again.points, run.estimate.points, strict=True)
+    # The copy of frame 0 lands where frame 0 is.
+    np.testing.assert_allclose(again.world_from_camera[3], again.world_from_camera[0], atol=0.05)
+
+
+def test_sequence_without_the_frames_that_failed(run: Run) -> None:
+    posed = with_estimated_poses(run.sequence, run.estimate)
+    assert len(posed) == FRAMES - 1
+    assert posed.frame_names == tuple(f"arc-{k}" for k in range(8))
+    assert posed.train.tolist() == [0, 1, 2, 4, 5, 6, 7]
+    assert posed.test.tolist() == [3]
+    assert posed.world_from_camera is not None
+    assert np.isfinite(posed.world_from_camera).all()
+    assert posed.metric
+    np.testing.assert_array_equal(posed.rgb, run.sequence.rgb[:8])
+    assert posed.points is run.estimate.points
+
+
+def test_frames_in_the_middle_may_fail(run: Run) -> None:
+    registered = run.estimate.registered.copy()
+    registered[[1, 3]] = False
+    posed = with_estimated_poses(run.sequence, replace(run.estimate, registered=registered, metric=False))
+    assert posed.frame_names == ("arc-0", "arc-2", "arc-4", "arc-5", "arc-6", "arc-7")
+    assert posed.train.tolist() == [0, 1, 2, 3, 4, 5]
+    assert posed.test.tolist() == []
+    assert not posed.metric
+    assert posed.depth_mm is not None
+    np.testing.assert_array_equal(posed.depth_mm[1], run.sequence.depth_mm[2])  # type: ignore[index]
+    with pytest.raises(ShapeError, match="has 9 frames, the estimate has 3"):
+        with_estimated_poses(
+            run.sequence,
+            replace(
+                run.estimate, registered=registered[:3], world_from_camera=run.estimate.world_from_camera[:3]
+            ),
+        )
+
+
+def test_without_texture_the_account_says_so(sequence: Sequence) -> None:
+    flat = replace(sequence, rgb=np.full_like(sequence.rgb, 128))
+    with pytest.raises(
+        CaptureError, match=r"poses for 0 of 7 training frames \(0%\), expected at least 50%"
+    ) as told:
+        estimate_poses(flat, CONFIG)
+    assert "Features per frame (median): 0" in str(told.value)
+    assert "frames per model: none" in str(told.value)
+
+
+def test_too_few_frames(sequence: Sequence) -> None:
+    two = replace(sequence, split=replace(sequence.split, train=np.array([0, 1])))
+    with pytest.raises(CaptureError, match="at least 3 training frames, found 2"):
+        estimate_poses(two, CONFIG)
+
+
+def test_a_process_that_dies_is_told_with_its_last_words(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    program = tmp_path / "python"
+    program.write_text("#!/bin/sh\necho 'zlib: out of luck' >&2\nexit 7\n")
+    program.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(program))
+    with pytest.raises(CaptureError, match="ended with code 7:\nzlib: out of luck"):
+        estimate_poses(sequence, CONFIG)
+
+
+@pytest.mark.slow
+def test_human_sinus_at_a_quarter_of_its_size(shared_data: Path) -> None:
+    from data_catalog import sinus
+    from extrags.config import IngestConfig
+
+    source = sinus.FORMAT.read(shared_data / "sinus_hopkins", IngestConfig(downscale=4), "sinus/hopkins")
+    found = estimate_poses(source, PosesConfig())
+    assert source.world_from_camera is not None
+    chosen = found.registered
+    assert int(chosen.sum()) >= 33
+    assert not found.metric
+    errors = absolute_trajectory_error(found.world_from_camera[chosen], source.world_from_camera[chosen])
+    # The path is 0.14 x 0.27 x 0.19 units long; the shipped poses are themselves estimates.
+    assert errors.rmse < 0.012
+    assert found.mean_reprojection_px < 1.0
+    assert len(found.points) > 500
