@@ -1,0 +1,295 @@
+"""What a reconstruction still lacks, and which stages that calls for."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from extrags.cameras import Cameras, rotation_about
+from extrags.config import AssessConfig, PipelineConfig, StageConfig
+from extrags.errors import CaptureError, ConfigError
+from extrags.events import Progress, emit
+from extrags.explore.coverage import direction_counts, training_coverage
+from extrags.explore.waves import start_views
+from extrags.raster import rasterize
+from extrags.scene import Scene
+from extrags.sequence import Sequence
+
+__all__ = ["Decision", "ScenePlan", "assess", "decide", "probe_views"]
+
+_log = logging.getLogger(__name__)
+
+GOLDEN_TURN = math.pi * (3 - math.sqrt(5))
+"""Successive multiples of the golden angle never line up: the probes' sides spread evenly."""
+PROBE_CLEARANCE_SHARE = 0.2
+"""A probe keeps this distance from solid Gaussians, in median depths."""
+SOLID_OPACITY = 0.5
+PROBES_PER_BATCH = 8
+
+
+class Decision(StageConfig):
+    """One line of the plan."""
+
+    stage: str = Field(description="name of the stage")
+    run: bool = Field(description="whether it runs")
+    budget: dict[str, int] = Field(default_factory=dict, description="settings of the stage to use instead")
+    reason: str = Field(description="why, in words")
+    value: float = Field(description="the number the decision rests on")
+    threshold: float = Field(description="what it was compared with")
+
+
+class ScenePlan(StageConfig):
+    """Which later stages run, with what budget, and why."""
+
+    measurements: dict[str, float] = Field(description="what was measured, by name")
+    decisions: tuple[Decision, ...] = Field(description="one per stage, in the order they run")
+
+    def decision(self, stage: str) -> Decision:
+        """The line of a stage.
+
+        Raises:
+            ConfigError: when the plan says nothing about it.
+        """
+        for line in self.decisions:
+            if line.stage == stage:
+                return line
+        raise ConfigError(
+            f"the plan has no line for {stage!r}; it has {', '.join(line.stage for line in self.decisions)}"
+        )
+
+    def applied_to(self, config: PipelineConfig) -> PipelineConfig:
+        """The settings with the plan's budgets in place."""
+        overrides: dict[str, Any] = {
+            f"{line.stage}.{name}": value for line in self.decisions for name, value in line.budget.items()
+        }
+        return config.with_overrides(overrides)
+
+
+def assess(scene: Scene, sequence: Sequence, config: PipelineConfig) -> ScenePlan:
+    """Measure what the scene lacks in a fan of nearby views and decide what to do about it.
+
+    A pixel of the fan lacks something when it is a hole (alpha too low) or is mostly made of Gaussians
+    that the training views saw from too few directions. The share of such pixels decides whether
+    anything is explored, and scales the number of trajectories: the whole budget from
+    `assess.full_budget_share` on.
+
+    Args:
+        scene: the coarse reconstruction.
+        sequence: its frames.
+        config: settings of all stages; `assess`, and what the budgets are made from.
+
+    Returns:
+        The plan, with every number it rests on.
+
+    Raises:
+        CaptureError: when there are no Gaussians, or no training view sees any.
+    """
+    settings = config.assess
+    cameras = sequence.cameras[sequence.train]
+    if len(scene.gaussians) == 0 or len(cameras) == 0:
+        raise CaptureError(
+            f"{sequence.name}: nothing to assess with {len(scene.gaussians)} Gaussians "
+            f"and {len(cameras)} training views"
+        )
+    small = _small(cameras, config.explore.render_width)
+    depth_unit_mm, training_holes = _training_view_measurements(scene, small, settings)
+    covered = training_coverage(
+        scene,
+        small,
+        visible_weight=config.explore.visible_weight,
+        n_directions=config.explore.directions,
+    )
+    directions = direction_counts(covered)
+    probes = probe_views(scene, small, depth_unit_mm, settings)
+    holes, poor = _lacking_pixels(scene, probes, directions < settings.min_directions, settings)
+    lacking = float((holes | poor).mean())
+    seen = directions > 0
+    measurements = {
+        "lacking_share": lacking,
+        "hole_share": float(holes.mean()),
+        "poor_share": float(poor.mean()),
+        "worst_probe_lacking_share": float((holes | poor).mean(axis=(1, 2)).max()),
+        "training_hole_share": training_holes,
+        "gaussians": float(len(directions)),
+        "gaussians_unseen_share": float(1 - seen.mean()),
+        "gaussians_poorly_seen_share": float((directions < settings.min_directions).mean()),
+        "directions_mean": float(directions[seen].mean()) if seen.any() else 0.0,
+        "directions_median": float(np.median(directions[seen])) if seen.any() else 0.0,
+        "coverage_share": float(directions.mean()) / config.explore.directions,
+        "depth_unit_mm": depth_unit_mm,
+        "training_views": float(len(cameras)),
+        "probe_views": float(len(probes)),
+    }
+    plan = ScenePlan(measurements=measurements, decisions=decide(lacking, config))
+    _log.info(
+        "assess: %.1f %% of probe pixels lack something (%.1f %% holes, %.1f %% poorly seen)",
+        100 * lacking,
+        100 * measurements["hole_share"],
+        100 * measurements["poor_share"],
+    )
+    return plan
+
+
+def probe_views(scene: Scene, cameras: Cameras, depth_unit_mm: float, config: AssessConfig) -> Cameras:
+    """A fan of views beside the training views: shifted sideways and turned.
+
+    Anchors are spread over the recording; round each optical axis the side of the shift advances by the
+    golden angle, and the turn is alternately towards and away from that side. A shift that would
+    bring the probe to the tissue is halved until it does not.
+
+    Args:
+        scene: its solid Gaussians are what a probe must not touch.
+        cameras: the training views.
+        depth_unit_mm: median rendered depth.
+        config: number, shift and turn of the probes.
+
+    Returns:
+        `probe_views` cameras.
+    """
+    from scipy.spatial import cKDTree
+
+    anchors = start_views(cameras, config.probe_views, depth_unit_mm)
+    solid = scene.gaussians.opacities.detach().sigmoid().numpy() > SOLID_OPACITY
+    means = scene.gaussians.means.detach().numpy().astype(np.float64)
+    tissue = cKDTree(means[solid] if solid.any() else means)
+    phase = float(np.random.default_rng(config.seed).uniform(0, 2 * np.pi))
+    poses = []
+    for index in range(config.probe_views):
+        pose = cameras.world_from_camera[anchors[index % len(anchors)]].copy()
+        angle = phase + index * GOLDEN_TURN
+        side = np.array([np.cos(angle), np.sin(angle), 0.0])
+        # The tissue may already be nearer to the training view itself; then the probe turns in place.
+        allowed = min(PROBE_CLEARANCE_SHARE * depth_unit_mm, float(tissue.query(pose[:3, 3])[0]))
+        shift = config.probe_offset * depth_unit_mm
+        while shift > 0.02 * depth_unit_mm:
+            path = pose[:3, 3] + np.linspace(0.25, 1, 4)[:, None] * shift * (pose[:3, :3] @ side)
+            if (tissue.query(path)[0] >= allowed).all():
+                break
+            shift /= 2
+        else:
+            shift = 0.0
+        pose[:3, 3] += shift * (pose[:3, :3] @ side)
+        axis = np.cross([0.0, 0.0, 1.0], side)
+        turn = np.radians(config.probe_turn_deg) * (1 if index % 2 == 0 else -1)
+        pose[:3, :3] = pose[:3, :3] @ rotation_about(axis, turn)
+        poses.append(pose)
+    K = cameras.K[anchors[np.arange(config.probe_views) % len(anchors)]]
+    return Cameras(K, np.stack(poses), cameras.width, cameras.height)
+
+
+def _training_view_measurements(scene: Scene, cameras: Cameras, config: AssessConfig) -> tuple[float, float]:
+    """Median rendered depth, and share of holes in the training views themselves."""
+    depths, holes = [], []
+    with torch.no_grad():
+        for start in range(0, len(cameras), PROBES_PER_BATCH):
+            rendering = scene.render(cameras[start : start + PROBES_PER_BATCH], sh_degree=0)
+            surface = rendering.alpha >= config.hole_alpha
+            depths.append(rendering.depth[surface].numpy())
+            holes.append((~surface).numpy())
+            emit(Progress("assess", min(start + PROBES_PER_BATCH, len(cameras)), len(cameras)))
+    depth = np.concatenate(depths)
+    if depth.size == 0:
+        raise CaptureError(f"none of the {len(cameras)} training views sees a surface of the scene")
+    return float(np.median(depth)), float(np.concatenate(holes).mean())
+
+
+def _lacking_pixels(
+    scene: Scene, probes: Cameras, poorly_seen: np.ndarray, config: AssessConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels of the probes are holes, and which others show mostly poorly seen Gaussians."""
+    gaussians = scene.gaussians
+    flag = torch.from_numpy(poorly_seen.astype(np.float32))[:, None].expand(-1, 3).contiguous()
+    holes, poor = [], []
+    with torch.no_grad():
+        for start in range(0, len(probes), PROBES_PER_BATCH):
+            batch = probes[start : start + PROBES_PER_BATCH]
+            rendering = rasterize(
+                gaussians.means,
+                gaussians.quats,
+                gaussians.scales.exp(),
+                gaussians.opacities.sigmoid(),
+                None,
+                torch.from_numpy(batch.viewmats.astype(np.float32)),
+                torch.from_numpy(batch.K.astype(np.float32)),
+                batch.width,
+                batch.height,
+                colors=flag,
+            )
+            hole = rendering.alpha < config.hole_alpha
+            holes.append(hole.numpy())
+            poor.append(((rendering.rgb[..., 0] > 0.5 * rendering.alpha) & ~hole).numpy())
+    return np.concatenate(holes), np.concatenate(poor)
+
+
+def decide(lacking_share: float, config: PipelineConfig) -> tuple[Decision, ...]:
+    """What the measured share of lacking pixels means for each later stage.
+
+    Args:
+        lacking_share: `measurements["lacking_share"]` of a plan.
+        config: thresholds in `assess`, and the full budgets of the stages.
+
+    Returns:
+        One line per stage: surface, freespace, explore, enhance, finetune.
+    """
+    settings = config.assess
+    lacking = lacking_share
+    needed = lacking > settings.min_hole_share
+    run = needed or settings.force
+    share = f"{100 * lacking:.2f} % of the pixels of nearby views are holes or poorly seen"
+    limit = f"{100 * settings.min_hole_share:.2f} %"
+    if needed:
+        why = f"{share}, more than {limit}"
+    elif settings.force:
+        why = f"{share}, no more than {limit}, but assess.force is set"
+    else:
+        why = f"{share}, no more than {limit}: the training views show the scene well enough"
+
+    need = 1.0 if settings.force else min(1.0, lacking / settings.full_budget_share)
+    trajectories = max(1, math.ceil(need * config.explore.trajectories)) if run else 0
+    views = min(config.enhance.max_views, trajectories * (config.explore.length - 1))
+    spent = (
+        f"{trajectories} of {config.explore.trajectories} trajectories "
+        f"(all of them from {100 * settings.full_budget_share:.0f} % on)"
+    )
+
+    def line(stage: str, reason: str, **budget: int) -> Decision:
+        return Decision(
+            stage=stage,
+            run=run,
+            budget=budget if run else {},
+            reason=reason,
+            value=lacking,
+            threshold=settings.min_hole_share,
+        )
+
+    if not run:
+        return (
+            line("surface", f"only exploration needs it, and {why}"),
+            line("freespace", f"only exploration needs it, and {why}"),
+            line("explore", why),
+            line("enhance", f"there will be no virtual views: {why}"),
+            line("finetune", f"there will be no virtual views: {why}"),
+        )
+    return (
+        line("surface", f"exploration needs it: {why}"),
+        line("freespace", f"exploration needs it: {why}"),
+        line("explore", f"{why}; {spent}", trajectories=trajectories),
+        line(
+            "enhance", f"at most {views} virtual views come from {trajectories} trajectories", max_views=views
+        ),
+        line("finetune", f"on at most {views} virtual views", iterations=config.finetune.iterations),
+    )
+
+
+def _small(cameras: Cameras, width: int) -> Cameras:
+    width = min(width, cameras.width)
+    return cameras.resized(width, max(1, round(cameras.height * width / cameras.width)))
+
+
+# The name `tasks.assess` was written against; goes when that uses `decide`.
+_decide = decide

@@ -1,0 +1,230 @@
+"""Triangle mesh of the scene by TSDF fusion of rendered depth."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+import zarr
+from jaxtyping import Float, Int
+
+from extrags.cameras import Cameras
+from extrags.config import SurfaceConfig
+from extrags.errors import CaptureError, ShapeError
+from extrags.events import Progress, emit
+from extrags.scene import Scene
+from extrags.zarr_io import open_group, read_array, write_array
+
+__all__ = ["Mesh", "fuse_depth", "fuse_surface", "rendered_depth"]
+
+_log = logging.getLogger(__name__)
+
+VIEWS_PER_BATCH = 8
+"""Views rendered in one call; bounds the memory, has no influence on the result."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mesh:
+    """A triangle mesh.
+
+    Args:
+        vertices: positions in world units, [V, 3], float32.
+        triangles: vertex indices, counter-clockwise seen from free space, [T, 3], int32.
+
+    Raises:
+        ShapeError: when a triangle names a vertex that is not there.
+    """
+
+    vertices: Float[np.ndarray, "v 3"]
+    triangles: Int[np.ndarray, "t 3"]
+
+    def __post_init__(self) -> None:
+        if self.triangles.size and not 0 <= self.triangles.min() <= self.triangles.max() < len(self.vertices):
+            raise ShapeError(
+                f"triangles use vertices {self.triangles.min()} to {self.triangles.max()}, "
+                f"but there are {len(self.vertices)}"
+            )
+
+    def save(self, path: Path) -> None:
+        """Write a zarr v3 group with `vertices` and `triangles`."""
+        group = open_group(path, mode="w")
+        write_array(group, "vertices", self.vertices.astype(np.float32))
+        write_array(group, "triangles", self.triangles.astype(np.int32))
+
+    @classmethod
+    def load(cls, path: Path) -> Mesh:
+        """Read what `save` wrote."""
+        group = zarr.open_group(str(path), mode="r")
+        return cls(read_array(group, "vertices"), read_array(group, "triangles"))
+
+    def write_ply(self, path: Path) -> None:
+        """Write a binary PLY, which every mesh viewer opens."""
+        from plyfile import PlyData, PlyElement
+
+        vertex = np.empty(len(self.vertices), dtype=[("x", "f4"), ("y", "f4"), ("z", "f4")])
+        for axis, name in enumerate("xyz"):
+            vertex[name] = self.vertices[:, axis]
+        face = np.empty(len(self.triangles), dtype=[("vertex_indices", "i4", (3,))])
+        face["vertex_indices"] = self.triangles
+        elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
+        PlyData(elements, byte_order="<").write(str(path))
+
+
+def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig) -> Mesh:
+    """Mesh of what the views see, from the scene's own median depth.
+
+    Voxel size and truncation follow the depth quantiles of all views: an endoscope looks along a
+    tube, so there is no object in the middle whose distance could set the scale.
+
+    Args:
+        scene: the reconstructed scene.
+        cameras: the training views.
+        config: settings.
+
+    Returns:
+        The mesh in canonical order: the same inputs give the same bits.
+
+    Raises:
+        CaptureError: when the views see no surface.
+    """
+    views, depth = rendered_depth(scene, cameras, config)
+    return fuse_depth(views, depth, config)
+
+
+def rendered_depth(
+    scene: Scene, cameras: Cameras, config: SurfaceConfig
+) -> tuple[Cameras, Float[np.ndarray, "c h w"]]:
+    """Median z-depth of all views, 0 where alpha is too low.
+
+    The median, not the expected depth, is fused: at a fold's edge the expected depth lies in mid-air
+    between the fold and what is behind it.
+
+    Args:
+        scene: the reconstructed scene.
+        cameras: the views.
+        config: settings; images wider than `max_width` are rendered smaller.
+
+    Returns:
+        The cameras at the size rendered, and their depth.
+    """
+    if cameras.width > config.max_width:
+        cameras = cameras.resized(
+            config.max_width, max(1, round(cameras.height * config.max_width / cameras.width))
+        )
+    batches = []
+    with torch.no_grad():
+        for start in range(0, len(cameras), VIEWS_PER_BATCH):
+            batch = scene.render(cameras[start : start + VIEWS_PER_BATCH], median_depth=True)
+            depth = cast("torch.Tensor", batch.median_depth)
+            batches.append(torch.where(batch.alpha >= config.min_alpha, depth, 0.0).numpy())
+            emit(Progress("surface", min(start + VIEWS_PER_BATCH, len(cameras)), len(cameras)))
+    return cameras, np.concatenate(batches).astype(np.float32)
+
+
+def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: SurfaceConfig) -> Mesh:
+    """TSDF fusion of depth maps (Curless and Levoy 1996) with Open3D's sparse voxel blocks.
+
+    Args:
+        cameras: the views, at the size of the depth maps.
+        depth_mm: z-depth in world units, 0 where unknown.
+        config: settings.
+
+    Returns:
+        The mesh, small clusters removed, in canonical order.
+
+    Raises:
+        ShapeError: when depth maps and cameras do not fit each other.
+        CaptureError: when there is no valid depth or no surface comes out of it.
+    """
+    if depth_mm.shape != (len(cameras), cameras.height, cameras.width):
+        raise ShapeError(
+            f"depth has shape {depth_mm.shape}, expected {(len(cameras), cameras.height, cameras.width)}"
+        )
+    valid = depth_mm[depth_mm > 0]
+    if valid.size == 0:
+        raise CaptureError(
+            f"none of the {len(cameras)} views sees a surface; the reconstruction is empty there"
+        )
+    voxel_mm = float(np.quantile(valid, 0.95)) * config.voxel_share
+    far_mm = float(np.quantile(valid, config.depth_quantile))
+
+    import open3d as o3d
+    import open3d.core as o3c
+
+    grid = o3d.t.geometry.VoxelBlockGrid(
+        attr_names=("tsdf", "weight"),
+        attr_dtypes=(o3c.float32, o3c.float32),
+        attr_channels=(o3c.SizeVector([1]), o3c.SizeVector([1])),
+        voxel_size=voxel_mm,
+        block_resolution=8,
+        block_count=20_000,
+        device=o3c.Device("CPU:0"),
+    )
+    # Open3D has its pixel centres at integers. It refuses arrays whose byte order is spelled out, as
+    # those read by zarr have it; astype always leaves the machine's own.
+    K = cameras.K.astype(np.float64)
+    K[:, :2, 2] -= 0.5
+    viewmats = cameras.viewmats.astype(np.float64)
+    for index in range(len(cameras)):
+        if not (depth_mm[index] > 0).any():
+            continue
+        image = o3d.t.geometry.Image(o3c.Tensor(depth_mm[index].astype(np.float32, order="C")))
+        intrinsic, extrinsic = o3c.Tensor(K[index]), o3c.Tensor(viewmats[index])
+        view = (image, intrinsic, extrinsic, 1.0, far_mm, config.truncation_voxels)
+        grid.integrate(grid.compute_unique_block_coordinates(*view), *view)
+    extracted = grid.extract_triangle_mesh(weight_threshold=0.5)
+    if len(extracted.vertex.positions) == 0 or len(extracted.triangle.indices) == 0:
+        raise CaptureError(f"the fused depth of {len(cameras)} views holds no surface")
+    vertices, triangles = _canonical(
+        extracted.vertex.positions.numpy(), extracted.triangle.indices.numpy().astype(np.int64)
+    )
+    mesh = _without_small_clusters(vertices, triangles, config.min_cluster_triangles)
+    _log.info("surface: %d vertices, %d triangles", len(mesh.vertices), len(mesh.triangles))
+    return mesh
+
+
+def _canonical(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
+    """Sorted vertices and triangles: Open3D's order varies from run to run, the positions do not."""
+    # Adding zero turns -0.0 into 0.0, which would sort apart from it.
+    unique, index = np.unique(vertices + np.float32(0), axis=0, return_inverse=True)
+    triangles = index.reshape(-1)[triangles]
+    distinct = (
+        (triangles[:, 0] != triangles[:, 1])
+        & (triangles[:, 1] != triangles[:, 2])
+        & (triangles[:, 2] != triangles[:, 0])
+    )
+    triangles = triangles[distinct]
+    first = np.argmin(triangles, axis=1)
+    turned = np.take_along_axis(triangles, (first[:, None] + np.arange(3)) % 3, axis=1)
+    return unique, turned[np.lexsort(turned.T[::-1])]
+
+
+def _without_small_clusters(
+    vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], min_triangles: int
+) -> Mesh:
+    """Drop connected pieces of fewer triangles, and vertices that nothing uses."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]]])
+    ones = np.ones(len(edges), dtype=np.int8)
+    graph = coo_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(len(vertices), len(vertices)))
+    _, label = connected_components(graph, directed=False)
+    cluster = label[triangles[:, 0]]
+    size = np.bincount(cluster, minlength=int(label.max()) + 1)
+    triangles = triangles[size[cluster] >= min_triangles]
+    if len(triangles) == 0:
+        raise CaptureError(
+            f"the largest piece of the surface has {int(size.max())} triangles, fewer than "
+            f"surface.min_cluster_triangles = {min_triangles}"
+        )
+    used = np.zeros(len(vertices), dtype=bool)
+    used[triangles] = True
+    renumbered = np.cumsum(used) - 1
+    return Mesh(vertices[used].astype(np.float32), renumbered[triangles].astype(np.int32))

@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.assess import ScenePlan, assess, probe_views
+from extrags.cameras import rotation_angle_deg
+from extrags.config import AssessConfig, ExploreConfig, PipelineConfig
+from extrags.errors import CaptureError, ConfigError
+from extrags.scene import Scene
+
+from .explore.tube import Tube, make_ball, make_tube, small_tube
+
+STAGES = ("surface", "freespace", "explore", "enhance", "finetune")
+
+
+def config(**assess_settings: object) -> PipelineConfig:
+    return PipelineConfig(
+        assess=AssessConfig.model_validate({"probe_views": 8} | assess_settings),
+        explore=ExploreConfig(render_width=32),
+    )
+
+
+@cache
+def ball_plan(force: bool = False) -> ScenePlan:
+    ball = make_ball()
+    return assess(ball.scene, ball.sequence, config(force=force))
+
+
+@cache
+def tube_plan() -> ScenePlan:
+    return assess(small_tube().scene, small_tube().sequence, config())
+
+
+def with_gap(tube: Tube) -> Scene:
+    """The same tube with a third of its wall cut out."""
+    means = tube.scene.gaussians.means
+    keep = torch.atan2(means[:, 2], torch.hypot(means[:, 0], means[:, 1]) - 60) < 1.0
+    return Scene(tube.scene.gaussians.subset(keep), tube.scene.light)
+
+
+class TestAssess:
+    def test_a_scene_seen_from_all_sides_needs_nothing(self):
+        plan = ball_plan()
+        assert plan.measurements["lacking_share"] <= 0.002
+        assert [line.stage for line in plan.decisions] == list(STAGES)
+        for line in plan.decisions:
+            assert not line.run
+            assert line.budget == {}
+            assert line.value == plan.measurements["lacking_share"]
+            assert line.threshold == 0.002
+            assert "no more than 0.20 %" in line.reason
+
+    def test_force_runs_all_the_same(self):
+        plan = ball_plan(force=True)
+        assert plan.measurements == ball_plan().measurements
+        assert all(line.run for line in plan.decisions)
+        assert "assess.force is set" in plan.decision("explore").reason
+        assert plan.decision("explore").budget == {"trajectories": 20}
+
+    def test_a_tube_seen_along_its_axis_is_explored(self):
+        plan = tube_plan()
+        assert plan.measurements["poor_share"] > 0.1
+        assert plan.measurements["hole_share"] < 0.05
+        assert all(line.run for line in plan.decisions)
+        assert (
+            "% of the pixels of nearby views are holes or poorly seen, more than"
+            in plan.decision("explore").reason
+        )
+
+    def test_a_gap_in_the_wall_shows_as_holes(self):
+        tube = small_tube()
+        holes = assess(with_gap(tube), tube.sequence, config()).measurements
+        whole = tube_plan().measurements
+        assert holes["hole_share"] > whole["hole_share"] + 0.1
+        assert holes["training_hole_share"] > whole["training_hole_share"] + 0.1
+
+    def test_the_budget_follows_the_need(self):
+        tube = small_tube()
+        lacking = tube_plan().measurements["lacking_share"]
+        for full, expected in ((min(1.0, 2 * lacking), 0.5), (lacking / 2, 1.0)):
+            plan = assess(tube.scene, tube.sequence, config(full_budget_share=full))
+            share = lacking / full if expected < 1 else 1.0
+            assert plan.decision("explore").budget["trajectories"] == int(np.ceil(share * 20))
+
+    def test_every_number_is_finite_and_every_share_a_share(self):
+        for plan in (tube_plan(), ball_plan()):
+            for name, value in plan.measurements.items():
+                assert np.isfinite(value), name
+                if name.endswith("_share"):
+                    assert 0 <= value <= 1, name
+
+    def test_more_training_views_leave_less_to_explore(self):
+        tube = make_tube(n_gaussians=800, n_views=12, width=32, height=24, view_arc=(0.1, 1.6))
+        few = replace(tube.sequence, split=replace(tube.sequence.split, train=np.array([5])))
+        settings = config(min_directions=2)
+        assert (
+            assess(tube.scene, few, settings).measurements["gaussians_poorly_seen_share"]
+            > assess(tube.scene, tube.sequence, settings).measurements["gaussians_poorly_seen_share"]
+        )
+
+    def test_is_deterministic(self):
+        assert assess(small_tube().scene, small_tube().sequence, config()) == tube_plan()
+
+    def test_one_training_view_works(self):
+        tube = small_tube()
+        one = replace(tube.sequence, split=replace(tube.sequence.split, train=np.array([3])))
+        assert assess(tube.scene, one, config()).measurements["training_views"] == 1
+
+    def test_nothing_to_assess_is_refused(self):
+        tube = small_tube()
+        empty = Scene(tube.scene.gaussians.subset(torch.zeros(len(tube.scene.gaussians), dtype=torch.bool)))
+        with pytest.raises(CaptureError, match="nothing to assess with 0 Gaussians"):
+            assess(empty, tube.sequence, config())
+
+    def test_views_of_nothing_are_refused(self):
+        tube = small_tube()
+        away = replace(tube.scene.gaussians, means=tube.scene.gaussians.means + 1e5)
+        with pytest.raises(CaptureError, match="none of the 8 training views sees a surface"):
+            assess(Scene(away), tube.sequence, config())
+
+
+class TestScenePlan:
+    def test_json_round_trip(self):
+        plan = tube_plan()
+        assert ScenePlan.model_validate_json(plan.model_dump_json()) == plan
+
+    def test_budgets_go_into_the_settings(self):
+        settings = config()
+        planned = tube_plan().applied_to(settings)
+        budget = tube_plan().decision("explore").budget
+        assert planned.explore.trajectories == budget["trajectories"]
+        assert planned.explore.length == settings.explore.length
+        assert planned.coarse == settings.coarse
+
+    def test_an_unknown_stage_is_refused(self):
+        with pytest.raises(ConfigError, match="no line for 'coarse'"):
+            tube_plan().decision("coarse")
+
+
+class TestProbeViews:
+    def test_stand_beside_the_training_views(self):
+        tube = small_tube()
+        settings = AssessConfig(probe_views=16)
+        probes = probe_views(tube.scene, tube.cameras, 26.0, settings)
+        assert len(probes) == 16
+        apart = np.linalg.norm(probes.centers[:, None] - tube.cameras.centers[None], axis=-1).min(axis=1)
+        assert apart.max() <= 0.35 * 26.0 + 1e-9
+        assert (tube.distance_from_wall(probes.centers) > 2).all()
+        rotation = probes.world_from_camera[:, :3, :3]
+        np.testing.assert_allclose(np.linalg.det(rotation), 1)
+
+    def test_turn_to_both_sides(self):
+        tube = small_tube()
+        settings = AssessConfig(probe_views=8)
+        probes = probe_views(tube.scene, tube.cameras, 26.0, settings)
+        turned = [
+            rotation_angle_deg(
+                tube.cameras.world_from_camera[:, :3, :3], np.broadcast_to(pose[:3, :3], (8, 3, 3))
+            )
+            for pose in probes.world_from_camera
+        ]
+        # Each is turned by 35 degrees from its own training view.
+        assert np.allclose(np.abs(np.stack(turned) - 35.0).min(axis=1), 0, atol=1e-6)
+
+    def test_do_not_enter_the_tissue(self):
+        # A camera 3 mm from the wall: shifts towards it are cut short.
+        tube = make_tube(n_gaussians=1500, n_views=1, width=32, height=24)
+        pose = tube.cameras.world_from_camera.copy()
+        outward = pose[0, :3, 3] / np.linalg.norm(pose[0, :3, 3])
+        pose[0, :3, 3] += 17 * outward
+        near = replace(tube.cameras, world_from_camera=pose)
+        probes = probe_views(tube.scene, near, 26.0, AssessConfig(probe_views=12))
+        assert (tube.distance_from_wall(probes.centers) > 1.5).all()

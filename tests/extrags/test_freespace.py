@@ -1,0 +1,237 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from extrags.cameras import Cameras, rotation_about
+from extrags.config import FreespaceConfig
+from extrags.errors import CaptureError, ShapeError
+from extrags.freespace import FREE, OCCUPIED, UNKNOWN, FreeSpace, carve, voxel_visibility
+from extrags.gaussians import Gaussians
+from extrags.scene import Scene
+from extrags.surface import Mesh
+
+from .explore.tube import scene_of_points, small_freespace, small_mesh, small_tube, square_camera
+
+AXES = rotation_about(np.array([1.0, 2.0, -1.0]), 0.7)
+
+
+def made_space(occupancy: np.ndarray, voxel_mm: float = 2.0) -> FreeSpace:
+    clearance = np.arange(occupancy.size, dtype=np.float32).reshape(occupancy.shape)
+    return FreeSpace(occupancy, np.array([3.0, -5.0, 7.0]), AXES, voxel_mm, clearance)
+
+
+def sheet(z: float, half: float = 12.0, n: int = 40) -> np.ndarray:
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-half, half, n), np.linspace(-half, half, n)))
+    return np.stack([x, y, np.full_like(x, z)], axis=1)
+
+
+def sheet_mesh(z: float, half: float = 12.0) -> Mesh:
+    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], np.float32)
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+
+
+class TestLookup:
+    def test_finds_the_voxel_of_each_centre(self):
+        occupancy = np.random.default_rng(0).integers(0, 3, (6, 6, 6)).astype(np.uint8)
+        space = made_space(occupancy)
+        np.testing.assert_array_equal(space.lookup(space.voxel_centers()), occupancy.ravel())
+        np.testing.assert_allclose(space.clearance_at(space.voxel_centers()), np.arange(216), atol=1e-3)
+
+    def test_outside_is_unknown(self):
+        space = made_space(np.zeros((6, 6, 6), np.uint8))
+        outside = space.origin_mm + np.array([[-0.01, 1, 1], [1, 12.01, 1], [1, 1, 500]]) @ AXES
+        np.testing.assert_array_equal(space.lookup(outside), UNKNOWN)
+        np.testing.assert_array_equal(space.clearance_at(outside), 0)
+
+    def test_shapes_that_do_not_fit_are_refused(self):
+        with pytest.raises(ShapeError, match="S x S x S"):
+            FreeSpace(
+                np.zeros((4, 4, 4), np.uint8), np.zeros(3), np.eye(3), 1.0, np.zeros((4, 4, 5), np.float32)
+            )
+
+    def test_round_trip_on_disk(self, tmp_path):
+        space = small_freespace()
+        space.save(tmp_path / "freespace")
+        loaded = FreeSpace.load(tmp_path / "freespace")
+        for name in ("occupancy", "clearance", "origin_mm", "axes"):
+            np.testing.assert_array_equal(getattr(loaded, name), getattr(space, name))
+        assert loaded.voxel_mm == space.voxel_mm
+
+
+class TestSegments:
+    @settings(max_examples=60, deadline=None)
+    @given(seed=st.integers(0, 10_000))
+    def test_agree_with_dense_sampling(self, seed):
+        rng = np.random.default_rng(seed)
+        occupancy = (rng.random((7, 7, 7)) < 0.12).astype(np.uint8)
+        space = made_space(occupancy)
+        ends = space.origin_mm + rng.uniform(0, 14, (2, 5, 3)) @ AXES
+        free = space.segment_is_free(ends[0], ends[1])
+        t = np.linspace(0, 1, 4001)[:, None, None]
+        sampled = (space.lookup((1 - t) * ends[0] + t * ends[1]) == FREE).all(axis=0)
+        # Sampling may miss a voxel that the segment only grazes, never the other way round.
+        assert (sampled | ~free).all()
+        grazed = sampled & ~free
+        for k in np.flatnonzero(grazed):
+            fine = np.linspace(0, 1, 400_001)[:, None]
+            assert (space.lookup((1 - fine) * ends[0, k] + fine * ends[1, k]) != FREE).any()
+
+    def test_thin_walls_stop_them(self):
+        occupancy = np.zeros((8, 8, 8), np.uint8)
+        occupancy[4] = OCCUPIED
+        space = made_space(occupancy)
+        centers = space.voxel_centers().reshape(8, 8, 8, 3)
+        assert space.segment_is_free(centers[0, 0, 0], centers[3, 7, 7])
+        assert not space.segment_is_free(centers[0, 0, 0], centers[7, 0, 0])
+
+    def test_a_point_is_a_segment(self):
+        occupancy = np.zeros((4, 4, 4), np.uint8)
+        occupancy[1, 1, 1] = UNKNOWN
+        space = made_space(occupancy)
+        centers = space.voxel_centers().reshape(4, 4, 4, 3)
+        assert space.segment_is_free(centers[0, 0, 0], centers[0, 0, 0])
+        assert not space.segment_is_free(centers[1, 1, 1], centers[1, 1, 1])
+
+    def test_leaving_the_volume_is_not_free(self):
+        space = made_space(np.zeros((4, 4, 4), np.uint8))
+        inside = space.voxel_centers()[0]
+        assert not space.segment_is_free(inside, inside - 50 * AXES[0])
+
+    def test_none_is_none(self):
+        space = made_space(np.zeros((4, 4, 4), np.uint8))
+        assert space.segment_is_free(np.zeros((0, 3)), np.zeros((0, 3))).shape == (0,)
+
+
+class TestVisibility:
+    CONFIG = FreespaceConfig()
+
+    def test_is_one_in_front_and_nothing_behind(self):
+        scene = scene_of_points(sheet(8.0))
+        points = np.array([[0, 0, 4.0], [0, 0, 7.0], [0, 0, 10.0], [2.0, 1.0, 12.0]])
+        visibility = voxel_visibility(scene, square_camera(), points, self.CONFIG)
+        np.testing.assert_allclose(visibility, [1, 1, 0, 0], atol=0.05)
+
+    def test_outside_the_image_nobody_can_tell(self):
+        scene = scene_of_points(sheet(8.0))
+        points = np.array([[0, 0, -4.0], [30.0, 0, 4.0]])
+        assert np.isnan(voxel_visibility(scene, square_camera(), points, self.CONFIG)).all()
+
+    def test_a_ray_that_ends_nowhere_proves_nothing(self):
+        scene = scene_of_points(sheet(8.0, half=3.0, n=12))
+        points = np.array([[0, 0, 4.0], [3.5, 3.5, 4.0]])
+        visibility = voxel_visibility(scene, square_camera(), points, self.CONFIG)
+        assert visibility[0] == pytest.approx(1, abs=0.05)
+        assert np.isnan(visibility[1])
+
+    def test_is_the_mean_of_the_best_three(self):
+        # Four views on a line; a screen hides the point from some of them.
+        wall = sheet(20.0, half=30.0, n=100)
+        poses = np.stack([np.eye(4)] * 4)
+        poses[:, 0, 3] = [-6, -2, 2, 6]
+        K = np.broadcast_to(square_camera().K, (4, 3, 3)).copy()
+        point = np.array([[0.0, 0, 10.0]])
+        for hidden, expected in ((1, 1.0), (2, 2 / 3), (3, 1 / 3)):
+            between = poses[:hidden, :3, 3] * 0.5 + point * 0.5
+            screen = (between[:, None] + sheet(0.0, half=0.5, n=9)).reshape(-1, 3)
+            scene = Scene(
+                Gaussians.concatenated(
+                    scene_of_points(wall).gaussians, scene_of_points(screen, radius=0.15).gaussians
+                )
+            )
+            visibility = voxel_visibility(scene, Cameras(K, poses, 32, 32), point, self.CONFIG)
+            assert visibility[0] == pytest.approx(expected, abs=0.05)
+
+    def test_two_views_are_averaged_over_two(self):
+        scene = scene_of_points(sheet(8.0))
+        poses = np.stack([np.eye(4)] * 2)
+        cameras = Cameras(np.concatenate([square_camera().K] * 2), poses, 32, 32)
+        visibility = voxel_visibility(scene, cameras, np.array([[0, 0, 4.0]]), self.CONFIG)
+        assert visibility[0] == pytest.approx(1, abs=0.05)
+
+
+class TestCarve:
+    def test_no_free_voxel_lies_outside_the_tube(self):
+        space, tube = small_freespace(), small_tube()
+        centers = space.voxel_centers()[space.occupancy.ravel() == FREE]
+        assert len(centers) > 500
+        assert (tube.distance_from_wall(centers) > 0).all()
+
+    def test_the_lumen_between_the_cameras_is_free(self):
+        space, tube = small_freespace(), small_tube()
+        assert (space.lookup(tube.cameras.centers) == FREE).all()
+        assert space.segment_is_free(tube.cameras.centers[:-1], tube.cameras.centers[1:]).all()
+
+    def test_the_wall_is_occupied_and_beyond_it_nothing_known(self):
+        space, tube = small_freespace(), small_tube()
+        assert (space.lookup(small_mesh().vertices.astype(np.float64)) != FREE).all()
+        centers = space.voxel_centers()
+        beyond = tube.distance_from_wall(centers) < -4 * space.voxel_mm
+        assert (space.occupancy.ravel()[beyond] == UNKNOWN).all()
+
+    def test_clearance_is_the_distance_to_the_nearest_occupied_voxel(self):
+        space = small_freespace()
+        centers = space.voxel_centers()
+        occupied = centers[space.occupancy.ravel() == OCCUPIED]
+        some = np.random.default_rng(0).integers(len(centers), size=40)
+        brute = np.linalg.norm(centers[some][:, None] - occupied[None], axis=-1).min(axis=1)
+        expected = np.maximum(brute - space.voxel_mm / 2, 0)
+        np.testing.assert_allclose(space.clearance.ravel()[some], expected, atol=1e-3)
+
+    def test_clearance_is_about_the_distance_to_the_mesh(self):
+        space, mesh = small_freespace(), small_mesh()
+        middle = small_tube().cameras.centers[3:]
+        exact = np.linalg.norm(middle[:, None] - mesh.vertices[None], axis=-1).min(axis=1)
+        found = space.clearance_at(middle)
+        assert (found <= exact).all()
+        assert (found > exact - 1.5 * space.voxel_mm).all()
+
+    def test_voxels_are_cubes_along_the_principal_axes(self):
+        space = small_freespace()
+        np.testing.assert_allclose(space.axes @ space.axes.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(space.axes) == pytest.approx(1)
+        # The bend lies in the x-y plane, so the thinnest axis is z.
+        assert abs(space.axes[2, 2]) > 0.95
+
+    def test_is_deterministic(self):
+        tube = small_tube()
+        config = FreespaceConfig(grid_size=16, render_width=32)
+        first = carve(tube.scene, small_mesh(), tube.cameras, config)
+        second = carve(tube.scene, small_mesh(), tube.cameras, config)
+        assert first.occupancy.tobytes() == second.occupancy.tobytes()
+        assert first.clearance.tobytes() == second.clearance.tobytes()
+
+    def test_behind_a_screen_is_unknown_not_occupied(self):
+        scene = scene_of_points(np.concatenate([sheet(6.0, half=2.0, n=10), sheet(16.0, half=20.0, n=80)]))
+        screen, wall = sheet_mesh(6.0, 2.0), sheet_mesh(16.0, 20.0)
+        both = Mesh(
+            np.concatenate([screen.vertices, wall.vertices]),
+            np.concatenate([screen.triangles, wall.triangles + 4]),
+        )
+        config = FreespaceConfig(grid_size=32, wall_voxels=1.5)
+        space = carve(scene, both, square_camera(), config)
+        assert space.lookup(np.array([0.0, 0, 3.0])) == FREE
+        assert space.lookup(np.array([0.0, 0, 6.0])) == OCCUPIED
+        assert space.lookup(np.array([0.0, 0, 11.0])) == UNKNOWN
+        assert space.lookup(np.array([8.0, 0, 11.0])) == FREE
+
+    def test_one_training_view_is_enough(self):
+        tube = small_tube()
+        space = carve(
+            tube.scene, small_mesh(), tube.cameras[[4]], FreespaceConfig(grid_size=24, render_width=32)
+        )
+        assert space.lookup(tube.cameras.centers[[4]])[0] == FREE
+        ahead = tube.cameras.centers[4] + 5 * tube.cameras.forward[4]
+        assert space.lookup(ahead) == FREE
+
+    def test_a_volume_without_extent_is_refused(self):
+        tube = small_tube()
+        point = Mesh(tube.cameras.centers[[0, 0, 0]].astype(np.float32), np.array([[0, 1, 2]], np.int32))
+        cameras = replace(tube.cameras[[0]], world_from_camera=np.round(tube.cameras.world_from_camera[[0]]))
+        at_camera = replace(point, vertices=cameras.centers[[0, 0, 0]].astype(np.float32))
+        with pytest.raises(CaptureError, match="in one point"):
+            carve(tube.scene, at_camera, cameras, FreespaceConfig(grid_size=8))
