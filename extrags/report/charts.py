@@ -1,0 +1,262 @@
+"""Charts of a report: training curves, views compared, coverage gains, run time against error.
+
+Drawn by matplotlib without its global figure state, as SVG whose bytes depend on the input only.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import threading
+from collections.abc import Iterator, Mapping
+from collections.abc import Sequence as AbstractSequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from extrags.report.encode import DataImage, data_uri
+
+__all__ = [
+    "COARSE_COLOR",
+    "FINAL_COLOR",
+    "drawing_style",
+    "gain_chart",
+    "history_chart",
+    "sequences_chart",
+    "svg_image",
+    "views_chart",
+]
+
+COARSE_COLOR = "#8794a3"
+FINAL_COLOR = "#0b6e75"
+WORSE_COLOR = "#b4481e"
+INK = "#1d2733"
+QUIET = "#5b6774"
+RULE = "#d9dee4"
+
+# matplotlib keeps its style in one global dictionary; figures of parallel tasks take turns.
+_STYLE_LOCK = threading.Lock()
+_STYLE: Any = {
+    "font.family": "DejaVu Sans",  # ships with matplotlib: the same everywhere
+    "font.size": 9.0,
+    "axes.edgecolor": RULE,
+    "axes.labelcolor": QUIET,
+    "axes.titlecolor": INK,
+    "axes.titlesize": 9.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.grid.axis": "y",
+    "axes.axisbelow": True,
+    "grid.color": "#e9edf1",
+    "grid.linewidth": 0.8,
+    "xtick.color": QUIET,
+    "ytick.color": QUIET,
+    "xtick.major.size": 0.0,
+    "xtick.minor.size": 0.0,
+    "ytick.major.size": 0.0,
+    "ytick.minor.size": 0.0,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "text.color": INK,
+    "svg.fonttype": "path",
+    "svg.hashsalt": "extrags",
+    "path.simplify": True,
+}
+# Outlines carry six digits behind the point; two are finer than any screen and halve the page's share.
+_LONG_PATHS = re.compile(r' d="[^"]*"')
+_LONG_FRACTION = re.compile(r"(\.\d\d)\d+")
+SMOOTHING_SHARE = 0.08
+"""Training figures are of one view each and jump; the line is a running mean over this share of them."""
+
+_HISTORY_PANELS = (
+    ("loss", "Loss", "log"),
+    ("psnr", "PSNR of the training view (dB)", "linear"),
+    ("n_gaussians", "Gaussians", "linear"),
+)
+
+
+@contextmanager
+def drawing_style() -> Iterator[None]:
+    """Draw in the report's style, one figure at a time, and leave matplotlib as it was."""
+    import matplotlib
+
+    with _STYLE_LOCK, matplotlib.rc_context(_STYLE):
+        yield
+
+
+def svg_image(figure: Any) -> DataImage:
+    """A figure as an SVG data URI without date or random names; call inside `drawing_style`."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
+    text = _LONG_PATHS.sub(lambda path: _LONG_FRACTION.sub(r"\1", path.group()), buffer.getvalue())
+    width, height = (round(float(inches) * 72) for inches in figure.get_size_inches())
+    return DataImage(data_uri(text.encode("utf-8"), "image/svg+xml"), width, height)
+
+
+def history_chart(history: Mapping[str, AbstractSequence[Mapping[str, Any]]]) -> DataImage:
+    """Training curves of the stages, one after the other on one axis of iterations.
+
+    Args:
+        history: by stage, a list of `{iteration, loss, psnr, n_gaussians}`.
+    """
+    from matplotlib.ticker import FormatStrFormatter, LogLocator, NullLocator
+
+    stages = [(stage, entries) for stage, entries in history.items() if entries]
+    panels = [panel for panel in _HISTORY_PANELS if any(panel[0] in entries[0] for _, entries in stages)]
+    with drawing_style():
+        figure = _figure(9.6, 2.5)
+        for place, (key, title, scale) in enumerate(panels):
+            axes = figure.add_subplot(1, len(panels), place + 1)
+            offset = 0.0
+            for index, (stage, entries) in enumerate(stages):
+                if key not in entries[0]:
+                    continue
+                iteration = offset + np.array([entry["iteration"] for entry in entries], dtype=np.float64)
+                values = np.array([entry[key] for entry in entries], dtype=np.float64)
+                color = COARSE_COLOR if index == 0 else FINAL_COLOR
+                smooth = _running_mean(values) if key != "n_gaussians" else values
+                axes.plot(iteration, values, color=color, linewidth=0.7, alpha=0.35)
+                axes.plot(iteration, smooth, color=color, linewidth=1.8, label=stage)
+                if index > 0:
+                    axes.axvline(offset, color=RULE, linewidth=1, zorder=0)
+                offset = float(iteration[-1]) + 1
+            if scale == "log":
+                axes.set_yscale("log")
+                axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+                axes.yaxis.set_minor_locator(NullLocator())
+                axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+            axes.set_title(title)
+            axes.set_xlabel("iteration")
+            axes.margins(x=0.01)
+            if key == "n_gaussians":
+                axes.set_ylim(bottom=0)
+            if place == 0 and len(stages) > 1:
+                axes.legend(handlelength=1.4)
+        return svg_image(figure)
+
+
+def views_chart(
+    coarse: Float[np.ndarray, "t"],
+    final: Float[np.ndarray, "t"] | None,
+    unobserved_share: Float[np.ndarray, "t"] | None,
+) -> DataImage:
+    """PSNR of every held-out view, coarse to final, and the gain against how much was never seen.
+
+    Args:
+        coarse: PSNR per view in dB; NaN where there is none.
+        final: the same after fine-tuning, or None.
+        unobserved_share: share of each view's pixels that training did not see, or None.
+    """
+    with drawing_style():
+        scatter = final is not None and unobserved_share is not None
+        figure = _figure(9.6, 2.7)
+        grid = figure.add_gridspec(1, 2 if scatter else 1, width_ratios=[2.4, 1] if scatter else [1])
+        axes = figure.add_subplot(grid[0])
+        order = np.arange(len(coarse)) + 1
+        if final is not None:
+            better = final >= coarse
+            for side, color in ((better, FINAL_COLOR), (~better, WORSE_COLOR)):
+                axes.vlines(order[side], coarse[side], final[side], color=color, linewidth=2.2, alpha=0.35)
+            axes.scatter(order, final, s=20, color=FINAL_COLOR, label="final", zorder=3)
+        axes.scatter(
+            order, coarse, s=16, facecolor="white", edgecolor=COARSE_COLOR, linewidth=1.4, label="coarse"
+        )
+        axes.set_title("PSNR of each held-out view (dB)")
+        axes.set_xlabel("held-out view, in the order of the recording")
+        axes.set_xlim(0.3, len(coarse) + 0.7)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.legend(ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.1, handletextpad=0.1)
+        if final is not None and unobserved_share is not None:
+            axes = figure.add_subplot(grid[1])
+            gain = final - coarse
+            axes.axhline(0, color=QUIET, linewidth=0.8)
+            axes.scatter(
+                100 * unobserved_share,
+                gain,
+                s=18,
+                alpha=0.85,
+                color=[FINAL_COLOR if value >= 0 else WORSE_COLOR for value in gain],
+            )
+            axes.set_title("Gain (dB) by unseen surface")
+            axes.set_xlabel("pixels training never saw (%)")
+        return svg_image(figure)
+
+
+def gain_chart(gains: AbstractSequence[float | int], colors: AbstractSequence[str]) -> DataImage:
+    """What each trajectory added, in the order of acceptance.
+
+    Args:
+        gains: newly covered share of all (Gaussian, direction) pairs.
+        colors: of the trajectories, as in the figures of the scene.
+    """
+    with drawing_style():
+        figure = _figure(9.6, 1.9)
+        axes = figure.add_subplot()
+        order = np.arange(len(gains)) + 1
+        axes.bar(order, 100 * np.asarray(gains, dtype=np.float64), color=list(colors), width=0.7)
+        axes.set_title("Newly covered (Gaussian, direction) pairs per trajectory (% of all)")
+        axes.set_xlabel("trajectory, in the order of acceptance")
+        axes.set_xlim(0.4, max(len(gains), 8) + 0.6)
+        axes.xaxis.get_major_locator().set_params(integer=True)
+        return svg_image(figure)
+
+
+def sequences_chart(
+    names: AbstractSequence[str],
+    coarse: Float[np.ndarray, "s"],
+    final: Float[np.ndarray, "s"],
+    seconds: Float[np.ndarray, "s"],
+) -> DataImage:
+    """PSNR of each sequence, coarse to final, and PSNR against run time.
+
+    Args:
+        names: of the sequences.
+        coarse: PSNR in dB; NaN where there is none.
+        final: the same after fine-tuning.
+        seconds: run time of each.
+    """
+    with drawing_style():
+        figure = _figure(9.6, max(2.4, 0.9 + 0.24 * len(names)))
+        left, right = figure.subplots(1, 2, width_ratios=[1.6, 1])
+        row = np.arange(len(names))[::-1]
+        known = np.isfinite(coarse) & np.isfinite(final)
+        better = final >= coarse
+        for side, color in ((known & better, FINAL_COLOR), (known & ~better, WORSE_COLOR)):
+            left.hlines(row[side], coarse[side], final[side], color=color, linewidth=2.2, alpha=0.35)
+        left.scatter(final, row, s=22, color=FINAL_COLOR, label="final", zorder=3)
+        left.scatter(
+            coarse, row, s=18, facecolor="white", edgecolor=COARSE_COLOR, linewidth=1.4, label="coarse"
+        )
+        left.set_yticks(row, names)
+        left.set_ylim(-0.6, len(names) - 0.4)
+        left.grid(axis="x")
+        left.set_title("PSNR on held-out views (dB)")
+        left.legend(ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.1, handletextpad=0.1)
+        right.scatter(seconds, final, s=22, color=FINAL_COLOR)
+        right.set_title("Final PSNR (dB) by run time")
+        right.set_xlabel("seconds")
+        right.set_xlim(left=0)
+        return svg_image(figure)
+
+
+def _figure(width_in: float, height_in: float) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _running_mean(values: np.ndarray) -> np.ndarray:
+    half = max(1, round(SMOOTHING_SHARE * len(values) / 2))
+    total = np.cumsum(np.insert(values, 0, 0.0))
+    index = np.arange(len(values))
+    # Windows shrink alike on both sides towards the ends, so that a line does not bend there.
+    reach = np.minimum(np.minimum(index, len(values) - 1 - index), half)
+    return np.asarray((total[index + reach + 1] - total[index - reach]) / (2 * reach + 1))

@@ -1,0 +1,183 @@
+"""The page of a dataset: all sequences of a run, side by side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from collections.abc import Sequence as AbstractSequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from extrags.report.charts import sequences_chart
+from extrags.report.page import rendered_page
+from extrags.report.wording import (
+    METRICS,
+    Metric,
+    compare,
+    count,
+    duration,
+    lpips_networks,
+    metric_of,
+    number,
+    shown_metrics,
+)
+
+__all__ = ["DatasetRow", "build_dataset_report"]
+
+
+@dataclass(frozen=True)
+class DatasetRow:
+    """One sequence of a run.
+
+    Args:
+        name: of the sequence.
+        status: `completed` or `failed`.
+        seconds: run time.
+        coarse: metrics of the coarse scene, as the `metrics` of an `EvaluationResult`.
+        final: the same of the fine-tuned scene; None when the plan left fine-tuning out.
+        stages: `{stage, state, seconds, reason}`.
+        error: what went wrong, for a failed sequence.
+        seed: of the run, when there are several of the same sequence.
+        link: relative address of the sequence's own page; no link when empty.
+    """
+
+    name: str
+    status: Literal["completed", "failed"]
+    seconds: float | int
+    coarse: Mapping[str, Any] | None = None
+    final: Mapping[str, Any] | None = None
+    stages: AbstractSequence[Mapping[str, Any]] = ()
+    error: str = ""
+    seed: int | None = None
+    link: str = ""
+
+    @property
+    def label(self) -> str:
+        """Name and seed."""
+        return self.name if self.seed is None else f"{self.name}, seed {self.seed}"
+
+
+def build_dataset_report(
+    rows: AbstractSequence[DatasetRow], *, name: str = "Dataset", made: str = "", profile: str = ""
+) -> str:
+    """One self-contained HTML page that compares the sequences of a run.
+
+    Means are over the sequences that have both a coarse and a final figure, with the standard deviation
+    between them; sequences run with several seeds get a table of their spread. Failures stand at the top.
+
+    Args:
+        rows: the sequences, in the order they are to be shown.
+        name: title of the page.
+        made: when, in words; nothing is said when empty.
+        profile: of the settings.
+    """
+    metrics = shown_metrics(*(tree for row in rows for tree in (row.coarse, row.final)))
+    measured = [row for row in rows if metric_of(row.final or row.coarse, "psnr") is not None]
+    chart = None
+    if measured:
+        chart = sequences_chart(
+            [row.label for row in measured],
+            _column([metric_of(row.coarse, "psnr") for row in measured]),
+            _column([metric_of(row.final, "psnr") for row in measured]),
+            np.array([row.seconds for row in measured]),
+        )
+    return rendered_page(
+        "dataset.html.j2",
+        name=name,
+        made=made,
+        profile=profile,
+        summary=_summary(rows),
+        facts=[
+            ("Sequences", count(len(rows))),
+            ("Completed", count(sum(row.status == "completed" for row in rows))),
+            ("Failed", count(sum(row.status == "failed" for row in rows))),
+            ("Run time of all", duration(sum(row.seconds for row in rows))),
+        ],
+        failures=[
+            (row.label, row.error or "no reason was recorded") for row in rows if row.status == "failed"
+        ],
+        metrics=metrics,
+        rows=[_table_row(row, metrics) for row in rows],
+        means=[_mean_cell(metric, rows, ()) for metric in metrics],
+        unobserved=[_mean_cell(metric, rows, ("unobserved",)) for metric in metrics],
+        compared=sum(_both(row, METRICS[0], ()) is not None for row in rows),
+        seeds=_seed_rows(rows, metrics),
+        chart=chart,
+        protocol={
+            "version": None,
+            "lpips": lpips_networks(*(tree for row in rows for tree in (row.coarse, row.final))),
+        },
+    )
+
+
+def _summary(rows: AbstractSequence[DatasetRow]) -> str:
+    pairs = [pair for row in rows if (pair := _both(row, METRICS[0], ())) is not None]
+    completed = sum(row.status == "completed" for row in rows)
+    text = f"{completed} of {len(rows)} sequences completed."
+    if not pairs:
+        return f"{text} None of them has both a coarse and a final figure to compare."
+    change = np.array([final - coarse for coarse, final in pairs])
+    better = int((change > 0).sum())
+    return (
+        f"{text} Over the {len(pairs)} with a coarse and a final scene, PSNR on held-out views changes by "
+        f"{number(float(change.mean()), 2, signed=True)} dB on average; {better} of {len(pairs)} gain."
+    )
+
+
+def _table_row(row: DatasetRow, metrics: AbstractSequence[Metric]) -> dict[str, Any]:
+    states = [stage["state"] for stage in row.stages]
+    said = [
+        f"{states.count(state)} {state}"
+        for state in ("ran", "cached", "skipped", "failed")
+        if state in states
+    ]
+    size = metric_of(row.final or row.coarse, "n_gaussians")
+    gaussians = "" if size is None else f"{count(size)} Gaussians"
+    return {
+        "label": row.label,
+        "link": row.link,
+        "status": row.status,
+        "seconds": duration(row.seconds),
+        "note": " · ".join(part for part in (", ".join(said), gaussians) if part),
+        "cells": [
+            compare(metric, metric_of(row.coarse, metric.key), metric_of(row.final, metric.key))
+            for metric in metrics
+        ],
+    }
+
+
+def _both(row: DatasetRow, metric: Metric, path: tuple[str, ...]) -> tuple[float, float] | None:
+    coarse, final = metric_of(row.coarse, *path, metric.key), metric_of(row.final, *path, metric.key)
+    return None if coarse is None or final is None else (coarse, final)
+
+
+def _mean_cell(metric: Metric, rows: AbstractSequence[DatasetRow], path: tuple[str, ...]) -> dict[str, Any]:
+    pairs = [pair for row in rows if (pair := _both(row, metric, path)) is not None]
+    if not pairs:
+        return {"comparison": compare(metric, None, None), "deviation": ""}
+    coarse, final = np.array(pairs).T
+    comparison = compare(metric, float(coarse.mean()), float(final.mean()))
+    return {"comparison": comparison, "deviation": _deviation(final - coarse, metric.digits)}
+
+
+def _seed_rows(rows: AbstractSequence[DatasetRow], metrics: AbstractSequence[Metric]) -> list[dict[str, Any]]:
+    groups: dict[str, list[DatasetRow]] = {}
+    for row in rows:
+        if row.seed is not None:
+            groups.setdefault(row.name, []).append(row)
+    return [
+        {"label": name, "seeds": len(group), "cells": [_mean_cell(metric, group, ()) for metric in metrics]}
+        for name, group in groups.items()
+        if len(group) > 1
+    ]
+
+
+def _deviation(change: np.ndarray, digits: int) -> str:
+    """Standard deviation of the change between rows, when there are at least two."""
+    return f"± {number(float(change.std(ddof=1)), digits)}" if len(change) > 1 else ""
+
+
+def _column(values: list[float | None]) -> np.ndarray:
+    return np.array([math.nan if value is None else value for value in values])

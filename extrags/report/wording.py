@@ -1,0 +1,144 @@
+"""Numbers and comparisons in words: how a figure is written, and whether a change is for the better."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+__all__ = [
+    "METRICS",
+    "Comparison",
+    "Metric",
+    "compare",
+    "count",
+    "duration",
+    "lpips_networks",
+    "metric_of",
+    "number",
+    "shown_metrics",
+]
+
+MINUS = "\N{MINUS SIGN}"
+MISSING = "\N{EN DASH}"
+Verdict = Literal["better", "worse", "equal", ""]
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A figure of the evaluation and how it is written."""
+
+    key: str
+    label: str
+    unit: str
+    higher_is_better: bool
+    digits: int
+
+
+METRICS = (
+    Metric("psnr", "PSNR", "dB", True, 2),
+    Metric("ssim", "SSIM", "", True, 3),
+    Metric("lpips_alex", "LPIPS (AlexNet)", "", False, 3),
+    Metric("lpips_squeeze", "LPIPS (SqueezeNet)", "", False, 3),
+    Metric("flip", "FLIP", "", False, 3),
+    Metric("depth_absrel", "Depth AbsRel", "", False, 3),
+)
+
+
+_LPIPS_NETWORKS = {"lpips_alex": "AlexNet", "lpips_squeeze": "SqueezeNet"}
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """A figure of the coarse and of the final scene, ready to be shown."""
+
+    coarse: str
+    final: str
+    change: str
+    verdict: Verdict
+    why: str = ""
+    """Why there is no figure."""
+
+
+def number(value: float | int | None, digits: int, *, signed: bool = False) -> str:
+    """A number with a real minus sign; an en dash for none."""
+    if value is None or not math.isfinite(value):
+        return MISSING
+    text = f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
+    if float(text) == 0:
+        text = f"{'±' if signed else ''}{0:.{digits}f}"
+    return text.replace("-", MINUS)
+
+
+def count(value: float | int | None) -> str:
+    """A whole number with thin spaces between thousands."""
+    return MISSING if value is None else f"{round(value):,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def duration(seconds: float | int | None) -> str:
+    """Seconds as people say them: `0.3 s`, `42 s`, `3 min 05 s`, `2 h 04 min`."""
+    if seconds is None:
+        return MISSING
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def metric_of(tree: Mapping[str, Any] | None, *path: str) -> float | None:
+    """A figure of a tree of metrics, or None when any part of the way is missing."""
+    node: Any = tree
+    for name in path:
+        if not isinstance(node, Mapping):
+            return None
+        node = node.get(name)
+    return None if node is None or isinstance(node, Mapping) else float(node)
+
+
+def compare(
+    metric: Metric, coarse: float | int | None, final: float | int | None, why: str = ""
+) -> Comparison:
+    """A figure before and after, with the change in words that do not need colour."""
+    change = None if coarse is None or final is None else final - coarse
+    verdict: Verdict = ""
+    if change is not None:
+        if round(change, metric.digits) == 0:
+            verdict = "equal"
+        else:
+            verdict = "better" if (change > 0) == metric.higher_is_better else "worse"
+    missing = coarse is None and final is None
+    return Comparison(
+        number(coarse, metric.digits),
+        number(final, metric.digits),
+        number(change, metric.digits, signed=True),
+        verdict,
+        why if missing else "",
+    )
+
+
+def lpips_networks(*trees: Mapping[str, Any] | None) -> list[str]:
+    """Names of the networks for which there is an LPIPS figure."""
+    return [
+        network
+        for key, network in _LPIPS_NETWORKS.items()
+        if any(metric_of(tree, key) is not None for tree in trees)
+    ]
+
+
+def shown_metrics(*trees: Mapping[str, Any] | None) -> list[Metric]:
+    """The metrics a page has columns for: all but an LPIPS whose network was not used."""
+    used = [
+        metric
+        for metric in METRICS
+        if not metric.key.startswith("lpips")
+        or any(metric_of(tree, metric.key) is not None for tree in trees)
+    ]
+    if not any(metric.key.startswith("lpips") for metric in used):
+        # Its absence is worth a column of its own, with the reason.
+        used.insert(2, METRICS[2])
+    return used

@@ -1,0 +1,230 @@
+"""The page of a sequence: complete, self-contained, honest about what is missing."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from extrags.config import ReportConfig
+from extrags.errors import NonFiniteError, ShapeError
+from extrags.report import ReportInputs, build_report
+from extrags.sequence import Split
+
+from .conftest import Renders, result_of
+from .pages import Page, decoded
+
+CONFIG = ReportConfig(held_out_views=3, virtual_views=4)
+
+
+@pytest.fixture(scope="module")
+def html(inputs: ReportInputs) -> str:
+    return build_report(inputs, CONFIG)
+
+
+@pytest.fixture(scope="module")
+def page(html: str) -> Page:
+    return Page(html)
+
+
+def test_page_loads_nothing_from_outside(page: Page, html: str) -> None:
+    assert page.loads, "a page without images is not a report"
+    assert all(load.startswith("data:image/") for load in page.loads)
+    assert all(link.startswith("#") and link[1:] in page.ids for link in page.links)
+    assert "url(" not in html
+    assert "@import" not in html
+    for image in page.images:
+        if str(image["src"]).startswith("data:image/svg"):
+            svg = str(decoded(str(image["src"])))
+            assert 'href="http' not in svg
+
+
+def test_same_inputs_give_the_same_bytes(inputs: ReportInputs, html: str) -> None:
+    assert build_report(inputs, CONFIG) == html
+
+
+def test_page_is_small(html: str) -> None:
+    assert len(html.encode()) < 6_000_000
+
+
+def test_every_image_shows_something_and_says_what(page: Page) -> None:
+    for image in page.images:
+        assert image["alt"], "an image without words"
+        content = decoded(str(image["src"]))
+        if isinstance(content, str):
+            assert content.count("<path") > 10
+        else:
+            assert len(np.unique(np.asarray(content.convert("RGB")).reshape(-1, 3), axis=0)) > 1
+    alts = [str(image["alt"]) for image in page.images]
+    assert sum(alt.startswith("Frame b_") and "render, mean" in alt for alt in alts) == 2 * 3
+    assert sum(alt.startswith("Uncertainty of virtual view") for alt in alts) == 4
+    assert sum(alt.startswith("The scene ") for alt in alts) == 3
+    assert sum(alt.startswith("Slice of the occupancy grid") for alt in alts) == 3
+
+
+def test_ids_are_unique(page: Page) -> None:
+    assert len(page.ids) == len(set(page.ids))
+
+
+def test_numbers_and_changes_are_on_the_page(page: Page) -> None:
+    assert (
+        "On 5 held-out views the final scene reaches 22.50 dB PSNR, 2.50 dB above the coarse reconstruction. "
+        "On surface that no training frame saw it reaches 18.50 dB, 2.50 dB above the coarse one."
+    ) in page.text
+    assert "+2.50 better from 20.00" in page.text
+    assert "\N{MINUS SIGN}0.062 better" in page.text  # LPIPS falls, which is good
+    assert "20.0 % of the pixels" in page.text
+    assert "1 min 05 s in all: 1 ran, 1 came from the cache, 1 skipped." in page.text
+    assert "The cache spared 5.0 s" in page.text
+    assert "the source has poses" in page.text
+    assert "iterations 777 default 3000" in page.text
+    assert "on the network AlexNet" in page.text
+
+
+def test_a_loss_is_called_a_loss(inputs: ReportInputs) -> None:
+    worse = replace(inputs, coarse_metrics=inputs.final_metrics, final_metrics=inputs.coarse_metrics)
+    text = Page(build_report(worse, CONFIG)).text
+    assert "20.00 dB PSNR, 2.50 dB below the coarse reconstruction" in text
+    assert "\N{MINUS SIGN}2.50 worse from 22.50" in text
+
+
+def test_what_the_plan_left_out_is_named_with_its_reason(inputs: ReportInputs) -> None:
+    plan = {
+        "measurements": {"hole_share": 0.0004},
+        "decisions": [
+            {**line, "run": False, "reason": f"no need for {line['stage']}"}
+            for line in inputs.plan["decisions"]
+        ],
+    }
+    lean = replace(
+        inputs, plan=plan, final=None, final_metrics=None, pseudo=None, trajectories=(), exploration=None,
+        mesh=None, grid=None,
+    )  # fmt: skip
+    page = Page(build_report(lean, CONFIG))
+    for stage in ("surface", "freespace", "explore", "enhance", "finetune"):
+        assert f"The scene plan leaves out {stage}: no need for {stage}." in page.text
+    assert "There is no fine-tuned scene to compare with." in page.text
+    assert not any("final render" in str(image["alt"]) for image in page.images)
+
+
+def test_bare_inputs_name_every_absent_part(inputs: ReportInputs) -> None:
+    page = Page(build_report(ReportInputs(name="bare", sequence=inputs.sequence), CONFIG))
+    for stage in ("evaluate", "enhance", "explore", "freespace", "surface", "coarse", "assess"):
+        assert f"Nothing from the stage {stage} was handed to this report." in page.text
+    assert "No settings were handed to this report." in page.text
+
+
+def test_reasons_come_from_stages_and_caller_too(inputs: ReportInputs) -> None:
+    bare = ReportInputs(
+        name="bare",
+        sequence=replace(inputs.sequence, world_from_camera=None, depth_mm=None),
+        stages=[{"stage": "enhance", "state": "failed", "seconds": 1.0, "reason": "loss is NaN"}],
+        absent={"poses": "COLMAP registered 2 of 30 frames"},
+    )
+    text = Page(build_report(bare, CONFIG)).text
+    assert "The stage enhance failed: loss is NaN." in text
+    assert "COLMAP registered 2 of 30 frames." in text
+
+
+def test_lpips_without_weights_says_why(inputs: ReportInputs) -> None:
+    result = result_of(20.0, 10)
+    result["reasons"] = {"lpips_alex": "no LPIPS weights were given"}
+    for tree in (result["metrics"], *result["per_view"]):
+        for part in (tree, tree["aligned"], tree["observed"], tree["unobserved"]):
+            part["lpips_alex"] = None
+    text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
+    assert "LPIPS (AlexNet): not available, no LPIPS weights were given." in text
+    assert "Not measured in this run" in text
+
+
+def test_one_camera_and_nothing_held_out(inputs: ReportInputs) -> None:
+    none = np.zeros(0, dtype=np.int64)
+    alone = replace(inputs.sequence, split=Split("all", np.array([2]), none))
+    page = Page(build_report(ReportInputs(name="alone", sequence=alone), CONFIG))
+    assert sum(str(image["alt"]).startswith("The scene ") for image in page.images) == 3
+    assert "1 training and 0 held-out cameras" in str(page.images[0]["alt"])
+
+
+def test_names_are_escaped(inputs: ReportInputs) -> None:
+    html = build_report(replace(inputs, name='<script>alert("x")</script>'), CONFIG)
+    assert "<script" not in html
+
+
+def test_masked_sequences_grey_out_what_does_not_count(inputs: ReportInputs) -> None:
+    mask = inputs.sequence.mask.copy()
+    mask[:, :, :10] = False
+    masked = replace(inputs, sequence=replace(inputs.sequence, mask=mask))
+    page = Page(build_report(masked, CONFIG))
+    assert "Light grey lies outside the validity mask." in page.text
+    truth = next(image for image in page.images if str(image["alt"]).endswith("as recorded"))
+    pixels = np.asarray(decoded(str(truth["src"])).convert("RGB"))
+    assert (pixels[:, :10] == (228, 231, 235)).all()
+
+
+def test_many_large_views_stay_below_the_bound(inputs: ReportInputs) -> None:
+    random = np.random.default_rng(1)
+    sequence = inputs.sequence
+    big = replace(
+        sequence,
+        rgb=random.integers(0, 256, (11, 400, 480, 3), dtype=np.uint8),
+        mask=np.ones((11, 400, 480), dtype=bool),
+        depth_mm=None,
+        observed=None,
+    )
+    noise = random.integers(0, 256, (5, 400, 480, 3), dtype=np.uint8)
+    renders = Renders(noise, np.ones((5, 400, 480)), np.ones((5, 400, 480)))
+    html = build_report(replace(inputs, sequence=big, coarse=renders, final=renders), ReportConfig())
+    assert len(html.encode()) < 6_000_000
+
+
+def test_renders_that_do_not_fit_are_refused(inputs: ReportInputs) -> None:
+    short = Renders(inputs.final.rgb[:2], inputs.final.alpha[:2], inputs.final.depth_mm[:2])
+    with pytest.raises(ShapeError, match="final renders have shape"):
+        replace(inputs, final=short)
+    with pytest.raises(ShapeError, match="coarse metrics hold 1 views, expected 5"):
+        replace(inputs, coarse_metrics={"metrics": {}, "per_view": [{}]})
+
+
+def test_nan_in_a_shown_image_is_refused(inputs: ReportInputs) -> None:
+    rgb = inputs.final.rgb.copy()
+    rgb[2, 5, 5] = np.nan
+    broken = Renders(rgb, inputs.final.alpha, inputs.final.depth_mm)
+    with pytest.raises(NonFiniteError):
+        build_report(replace(inputs, final=broken), CONFIG)
+
+
+def test_protocol_words_agree_with_the_metrics(page: Page) -> None:
+    from extrags.metrics.flip import PIXELS_PER_DEGREE
+    from extrags.metrics.image import SSIM_SIGMA_PX, SSIM_WINDOW_PX
+    from extrags.metrics.protocol import PROTOCOL_VERSION, SMALLEST_PART, SURFACE_ALPHA
+
+    assert f"{PIXELS_PER_DEGREE:.0f} pixels per degree" in page.text
+    window = rf"{SSIM_WINDOW_PX} . {SSIM_WINDOW_PX} Gaussian window, . = {SSIM_SIGMA_PX} px"
+    assert re.search(window, page.text)
+    assert f"smaller than {100 * SMALLEST_PART:.1f} % of the image" in page.text.replace(
+        "\N{NO-BREAK SPACE}", " "
+    )
+    assert SURFACE_ALPHA == 0.5
+    assert f"Evaluation protocol {PROTOCOL_VERSION}" in page.text
+
+
+def test_real_types_fit_the_protocols() -> None:
+    from extrags.enhance.pseudo import PseudoObservations
+    from extrags.explore import Exploration
+    from extrags.freespace import FreeSpace
+    from extrags.metrics.protocol import RenderedViews
+    from extrags.surface import Mesh
+
+    fields = {
+        RenderedViews: ("rgb", "alpha", "depth_mm"),
+        FreeSpace: ("occupancy", "origin_mm", "axes", "voxel_mm"),
+        Mesh: ("vertices", "triangles"),
+        PseudoObservations: (
+            "rendered", "restored", "target", "uncertainty", "image_confidence", "reference", "clip",
+        ),
+    }  # fmt: skip
+    for kind, names in fields.items():
+        assert set(names) <= set(kind.__dataclass_fields__), kind
+    assert callable(Exploration.summary)
