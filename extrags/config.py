@@ -87,7 +87,7 @@ class LightConfig(StageConfig):
     learning_rate: float = Field(0.01, gt=0, description="of the global light parameters")
     exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
     exposure_prior: float = Field(
-        0.02, ge=0, description="weight that holds log-exposures near their mean of zero"
+        0.3, ge=0, description="weight that holds log-exposures near their mean of zero"
     )
 
 
@@ -154,7 +154,7 @@ class AssessConfig(StageConfig):
         description="explore only when holes and poorly seen pixels exceed this share",
     )
     min_directions: int = Field(
-        3, ge=1, description="a Gaussian seen from fewer direction bins counts as poorly seen"
+        2, ge=1, description="a Gaussian seen from fewer direction bins counts as poorly seen"
     )
     full_budget_share: float = Field(
         0.25, gt=0, le=1, description="at this share of lacking pixels the whole budget is spent"
@@ -210,6 +210,12 @@ class ExploreConfig(StageConfig):
     max_hole_share: float = Field(
         0.5, gt=0, le=1, description="a candidate with a larger share of empty pixels is rejected"
     )
+    max_saturated_share: float = Field(
+        0.2,
+        gt=0,
+        le=1,
+        description="a candidate is rejected when the light that rides on the camera overexposes more",
+    )
     darkness_weight: float = Field(0.5, ge=0, description="lambda_l of the illumination weight")
     fold_angle_deg: float = Field(25.0, gt=0, description="tau_R, on the rotation over the last three steps")
     fold_penalty: float = Field(0.6, gt=0, lt=1, description="eta")
@@ -242,6 +248,9 @@ class EnhanceConfig(StageConfig):
         "auto", description="sampling steps; auto: 1 or 4, chosen on held-out pairs"
     )
     samples: int = Field(1, ge=1, le=16, description="samples per view; more give an uncertainty")
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto", description="of the convolutions; auto: bfloat16 where the processor computes it faster"
+    )
     references: int = Field(8, ge=1, description="real views blended into the reference")
     max_views: int = Field(160, ge=1, description="virtual views restored at most")
     clips_per_batch: int = Field(4, ge=1, description="clips restored by one task")
@@ -347,14 +356,18 @@ def _set_by_path(tree: dict[str, Any], path: str, value: Any) -> None:
 PROFILES: dict[str, PipelineConfig] = {
     # A look at the scene in about three minutes on two cores.
     "quick": PipelineConfig(
-        coarse=CoarseConfig(iterations=1500, max_points=8000, sh_every=400),
+        coarse=CoarseConfig(
+            iterations=1500, max_points=8000, sh_every=400, densify=DensifyConfig(max_gaussians=14_000)
+        ),
         explore=ExploreConfig(trajectories=12, length=10),
         enhance=EnhanceConfig(train_iterations=220, max_views=96, batch=4),
         finetune=FinetuneConfig(iterations=1000),
     ),
     # The default: minutes to a quarter of an hour on two cores.
     "balanced": PipelineConfig(
-        coarse=CoarseConfig(iterations=5000, max_points=16_000, sh_every=1000),
+        coarse=CoarseConfig(
+            iterations=5000, max_points=16_000, sh_every=1000, densify=DensifyConfig(max_gaussians=40_000)
+        ),
         enhance=EnhanceConfig(
             folds=3,
             fold_iterations=600,

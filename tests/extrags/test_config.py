@@ -39,7 +39,7 @@ class TestConfig:
         ("path", "message"),
         [
             ("coarse.iteration", "did you mean coarse.iterations"),
-            ("corse.iterations", "did you mean coarse"),
+            ("coars.iterations", "did you mean coarse"),
             ("coarse", "group of settings"),
             ("coarse.iterations.more", "no setting"),
         ],

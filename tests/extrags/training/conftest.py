@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -22,7 +24,15 @@ def tube_gaussians(n: int = 900, radius_mm: float = 10.0) -> Gaussians:
     points = np.stack([radius_mm * np.cos(angle), radius_mm * np.sin(angle), along], axis=1)
     stripes = 0.5 + 0.3 * np.sin(3 * angle) * np.cos(along / 4)
     rgb = np.stack([0.3 + 0.5 * stripes, 0.2 + 0.3 * stripes, 0.25 + 0.2 * stripes], axis=1)
-    return Gaussians.from_points(points, rgb, np.full(n, 1.2), opacity=0.9)
+    round_ones = Gaussians.from_points(points, rgb, np.full(n, 1.2), opacity=0.9)
+    # Flat on the wall, so that the rendered depth is the tube's: thin along the radius.
+    half = torch.from_numpy(angle / 2).float()
+    zero = torch.zeros(n)
+    return replace(
+        round_ones,
+        quats=torch.stack([half.cos(), zero, zero, half.sin()], dim=1),
+        scales=torch.tensor([0.05, 1.2, 1.2]).log().repeat(n, 1),
+    )
 
 
 def tube_cameras(n: int = 6) -> Cameras:

@@ -53,9 +53,7 @@ class TestDensityControl:
     def test_the_cap_takes_the_strongest(self) -> None:
         parameters = tube_gaussians(10).parameters()
         parameters["scales"] = torch.full((10, 3), 0.05).log()
-        density = DensityControl(
-            DensifyConfig(max_gaussians=100), extent=20.0, n_gaussians=10, seed=0
-        )
+        density = DensityControl(DensifyConfig(max_gaussians=100), extent=20.0, n_gaussians=10, seed=0)
         density._config = DensifyConfig(max_gaussians=100).model_copy(update={"max_gaussians": 11})
         gradient = torch.arange(10.0)[:, None].expand(10, 2)
         density.observe(gradient, torch.ones(10, dtype=torch.bool), 48, 36)

@@ -1,0 +1,18 @@
+"""Refs, keys and content-addressed artefacts."""
+
+from __future__ import annotations
+
+from extrags.store.artefacts import Slot, Store
+from extrags.store.canonical import Ref, canonical, digest_of
+from extrags.store.manifest import MANIFEST, Manifest, content_digest
+
+__all__ = [
+    "MANIFEST",
+    "Manifest",
+    "Ref",
+    "Slot",
+    "Store",
+    "canonical",
+    "content_digest",
+    "digest_of",
+]

@@ -1,0 +1,89 @@
+"""Keys by content: one JSON form per value, and its digest."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from extrags.errors import ConfigError
+
+__all__ = ["Ref", "canonical", "digest_of"]
+
+DIGEST_BYTES = 16
+
+
+class Ref(BaseModel):
+    """Where an immutable artefact is, and what is in it.
+
+    Only the digest enters cache keys: a moved or copied artefact is still the same input.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    uri: str
+    """Directory, or URL prefix, of the artefact."""
+    digest: str
+    """Digest over the artefact's files (names and bytes); the manifest is not part of it."""
+
+
+def canonical(value: Any) -> Any:
+    """The one JSON form of a value, independent of process, platform and order of insertion.
+
+    Floats go by their exact bits (`float.hex`), pydantic models by their fields, refs by their digest
+    alone. Tuples and lists are the same; `1`, `1.0` and `True` are not.
+
+    Args:
+        value: None, bool, int, float, str, `Ref`, a pydantic model, or lists, tuples and string-keyed
+            dicts of these.
+
+    Returns:
+        The same as plain JSON types.
+
+    Raises:
+        ConfigError: for anything else. Sets have no order, paths and arrays no content that could be
+            read off cheaply, functions no identity: each would make keys that lie.
+    """
+    return _canonical(value, "value")
+
+
+def _canonical(value: Any, where: str) -> Any:
+    if value is None or isinstance(value, bool | str):
+        return value
+    if type(value) is int:
+        return value
+    if type(value) is float:
+        if not math.isfinite(value):
+            raise ConfigError(f"{where}: {value} cannot be part of a cache key; expected a finite number")
+        # + 0.0 folds -0.0 into 0.0: they compare equal, so they must have one key.
+        return {"$float": (value + 0.0).hex()}
+    if isinstance(value, Ref):
+        return {"$ref": value.digest}
+    if isinstance(value, BaseModel):
+        return {
+            name: _canonical(getattr(value, name), f"{where}.{name}") for name in type(value).model_fields
+        }
+    if isinstance(value, list | tuple):
+        return [_canonical(item, f"{where}[{index}]") for index, item in enumerate(value)]
+    if isinstance(value, dict):
+        for name in value:
+            if not isinstance(name, str) or name.startswith("$"):
+                raise ConfigError(f"{where}: key {name!r} cannot be part of a cache key; expected a string")
+        return {name: _canonical(item, f"{where}.{name}") for name, item in value.items()}
+    raise ConfigError(
+        f"{where}: a {type(value).__name__} cannot be part of a cache key; expected numbers, strings, "
+        "lists, dicts, settings or refs"
+    )
+
+
+def digest_of(value: Any) -> str:
+    """Digest of the canonical form, 32 hexadecimal digits.
+
+    Raises:
+        ConfigError: as `canonical`.
+    """
+    text = json.dumps(canonical(value), sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.blake2b(text.encode(), digest_size=DIGEST_BYTES).hexdigest()

@@ -1,0 +1,185 @@
+"""Artefacts in a local directory: scratch, then one rename."""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from extrags.errors import StoreError
+from extrags.store.canonical import Ref
+from extrags.store.manifest import MANIFEST, Manifest
+
+__all__ = ["DirectoryBackend", "private_directory", "sweep_directories"]
+
+log = logging.getLogger(__name__)
+
+
+class DirectoryBackend:
+    """`artefacts/<key>/` below a root; what is being written stands in `scratch/`.
+
+    A scratch directory is moved into place with one `rename`, so a reader sees all of it or nothing.
+    Its writer holds a `flock` on it: the kernel drops the lock when the process dies, however it dies,
+    and `sweep` removes exactly the scratch directories that nobody holds.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self.artefacts = root / "artefacts"
+        self.scratch = root / "scratch"
+        self.state = root
+
+    def check_writable(self) -> None:
+        """Make the directories and try one write and one rename.
+
+        Raises:
+            StoreError: when that fails, with the reason.
+        """
+        try:
+            self.artefacts.mkdir(parents=True, exist_ok=True)
+            with private_directory(self.scratch, "probe") as probe:
+                (probe / "written").write_bytes(b"x")
+                (probe / "written").rename(probe / "renamed")
+        except StoreError:
+            raise
+        except OSError as error:
+            reason = error.strerror or error
+            raise StoreError(f"the store {self.root} cannot be written: {reason}") from error
+
+    def read_manifest(self, key: str) -> Manifest | None:
+        """Manifest of a key; None where there is no such artefact."""
+        path = self.artefacts / key / MANIFEST
+        try:
+            return Manifest.model_validate_json(path.read_bytes())
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        except ValidationError as error:
+            # Not ours, or damaged: the stage runs again and replaces it.
+            log.warning("%s is not a manifest (%d faults); ignored", path, error.error_count())
+            return None
+        except OSError as error:
+            raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
+
+    def uri(self, key: str) -> str:
+        """Where the artefact of a key stands."""
+        return str(self.artefacts / key)
+
+    def names(self) -> list[str]:
+        """All keys, sorted."""
+        try:
+            return sorted(entry.name for entry in os.scandir(self.artefacts) if entry.is_dir())
+        except FileNotFoundError:
+            return []
+
+    def path(self, ref: Ref, manifest: Manifest) -> Path:
+        """The artefact's files on the local disk."""
+        return self.artefacts / manifest.key
+
+    def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
+        """Move a finished scratch directory into place.
+
+        Where another process was first with the same content, its artefact stays.
+        """
+        (scratch / MANIFEST).write_text(manifest.model_dump_json(indent=1))
+        target = self.artefacts / manifest.key
+        target.parent.mkdir(parents=True, exist_ok=True)
+        for _ in range(8):
+            try:
+                scratch.rename(target)
+                return manifest
+            except OSError:
+                present = self.read_manifest(manifest.key)
+                if present is not None and present.digest == manifest.digest:
+                    return present
+                if not target.exists():
+                    raise
+                # Other content, or a damaged artefact: `refresh` replaces it. Between the two renames
+                # the key is merely absent, which is a cache miss and never a half-written artefact.
+                self.discard(manifest.key)
+        raise StoreError(f"artefact {manifest.key} is being replaced by others again and again")
+
+    def discard(self, key: str) -> bool:
+        """Remove one artefact: out of sight at once, then from the disk."""
+        aside = self.scratch / f"{key}.{secrets.token_hex(4)}.removed"
+        self.scratch.mkdir(parents=True, exist_ok=True)
+        try:
+            (self.artefacts / key).rename(aside)
+        except FileNotFoundError:
+            return False
+        shutil.rmtree(aside, ignore_errors=True)
+        return True
+
+    def sweep(self, older_than_hours: float) -> list[str]:
+        """Remove what killed processes left behind, and artefact folders without a manifest."""
+        removed = sweep_directories(self.scratch)
+        for key in self.names():
+            if not (self.artefacts / key / MANIFEST).exists() and self.discard(key):
+                removed.append(f"artefacts/{key}")
+        return removed
+
+
+@contextmanager
+def private_directory(parent: Path, name: str) -> Iterator[Path]:
+    """A fresh directory that belongs to this process as long as it lives; removed at the end.
+
+    Raises:
+        StoreError: when it cannot be made.
+    """
+    try:
+        path, lock = _claim(parent, name)
+    except OSError as error:
+        raise StoreError(f"the store {parent.parent} cannot be written: {error.strerror or error}") from error
+    try:
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+        os.close(lock)
+
+
+def _claim(parent: Path, name: str) -> tuple[Path, int]:
+    parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        path = parent / f"{name}.{secrets.token_hex(4)}"
+        path.mkdir()
+        try:
+            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        except FileNotFoundError:
+            continue  # A sweeper saw it before we could lock it.
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(lock), os.stat(path)):
+                return path, lock
+        except (BlockingIOError, FileNotFoundError):
+            pass  # The same, a moment later.
+        os.close(lock)
+
+
+def sweep_directories(parent: Path) -> list[str]:
+    """Remove the directories below `parent` whose owner is gone; returns their names."""
+    removed = []
+    try:
+        entries = sorted(entry.name for entry in os.scandir(parent) if entry.is_dir(follow_symlinks=False))
+    except FileNotFoundError:
+        return []
+    for name in entries:
+        try:
+            lock = os.open(parent / name, os.O_RDONLY | os.O_DIRECTORY)
+        except FileNotFoundError:
+            continue
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            pass
+        else:
+            shutil.rmtree(parent / name, ignore_errors=True)
+            removed.append(f"{parent.name}/{name}")
+        finally:
+            os.close(lock)
+    return removed

@@ -1,0 +1,357 @@
+"""Keys depend on content only; artefacts are whole or absent."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import BaseModel
+
+from extrags.config import CoarseConfig
+from extrags.errors import ConfigError, MissingDependencyError, StoreError
+from extrags.store import MANIFEST, Ref, Store, canonical, content_digest, digest_of
+
+plain = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats(allow_nan=False, allow_infinity=False)
+    | st.text(max_size=8),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(
+            st.text(max_size=4).filter(lambda name: not name.startswith("$")), inner, max_size=4
+        )
+    ),
+    max_leaves=12,
+)
+
+
+class TestCanonical:
+    @given(plain)
+    def test_order_of_insertion_does_not_count(self, value: object) -> None:
+        def turned(node: object) -> object:
+            if isinstance(node, dict):
+                return {name: turned(item) for name, item in reversed(node.items())}
+            return [turned(item) for item in node] if isinstance(node, list) else node
+
+        assert digest_of(turned(value)) == digest_of(value)
+
+    @pytest.mark.parametrize(
+        ("first", "second"),
+        [
+            (1, 1.0),
+            (1, True),
+            (0, False),
+            ("1", 1),
+            (None, "null"),
+            ({"a": 1}, {"b": 1}),
+            ([1, 2], [2, 1]),
+            (0.1, 0.1 + 2 ** (-56)),
+            ({"x": Ref(uri="p", digest="d")}, {"x": "d"}),
+            ("0x1p+0", 1.0),
+        ],
+    )
+    def test_different_values_have_different_keys(self, first: object, second: object) -> None:
+        assert digest_of(first) != digest_of(second)
+
+    def test_equal_values_have_equal_keys(self) -> None:
+        assert digest_of((1, 2)) == digest_of([1, 2])
+        assert digest_of(0.0) == digest_of(-0.0)
+
+    def test_ref_counts_by_its_digest_alone(self) -> None:
+        assert digest_of(Ref(uri="here", digest="d")) == digest_of(Ref(uri="there", digest="d"))
+        assert digest_of(Ref(uri="here", digest="d")) != digest_of(Ref(uri="here", digest="e"))
+
+    @pytest.mark.parametrize("field", ["iterations", "sh_degree", "depth_weight", "seed"])
+    def test_every_field_of_a_model_counts(self, field: str) -> None:
+        config = CoarseConfig()
+        other = config.model_copy(update={field: getattr(config, field) + 1})
+        assert digest_of(config) != digest_of(other)
+
+    def test_nested_model_fields_count(self) -> None:
+        config = CoarseConfig()
+        other = config.model_copy(update={"light": config.light.model_copy(update={"enabled": False})})
+        assert digest_of(config) != digest_of(other)
+
+    def test_moving_or_renaming_the_class_does_not_count(self) -> None:
+        class First(BaseModel):
+            steps: int = 3
+
+        class Second(BaseModel):
+            steps: int = 3
+
+        assert digest_of(First()) == digest_of(Second())
+
+    @pytest.mark.parametrize(
+        "value",
+        [
+            {1, 2},
+            frozenset(),
+            Path("x"),
+            np.zeros(2),
+            np.float32(1),
+            print,
+            b"x",
+            object(),
+            {1: 2},
+            {"$ref": 1},
+            float("nan"),
+            float("inf"),
+        ],
+        ids=lambda value: type(value).__name__,
+    )
+    def test_refuses_what_has_no_stable_content(self, value: object) -> None:
+        with pytest.raises(ConfigError, match=r"value\.deep\[0\]"):
+            canonical({"deep": [value]})
+
+    def test_digest_is_the_same_in_another_process(self) -> None:
+        value = {"b": [1, 2.5, None], "a": "é"}
+        code = f"from extrags.store import digest_of; print(digest_of({value!r}))"
+        other = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "PYTHONHASHSEED": "7"},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert other.stdout.strip() == digest_of(value)
+        # Golden: a change here silently invalidates every artefact users have.
+        assert digest_of(value) == "b319363c676d28c24377cfb85da55656"
+
+
+@pytest.fixture(params=["directory", "memory"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
+    if request.param == "directory":
+        yield Store(tmp_path / "store")
+    else:
+        made = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path / "cache")
+        yield made
+        for name in made.backend.names():
+            made.backend.discard(name)
+
+
+def put(store: Store, key: str = "toy-v1-aa", text: str = "hello", **about: object) -> Ref:
+    with store.slot(stage="toy", version=1, key=key, **about) as slot:  # type: ignore[arg-type]
+        (slot.path / "deep").mkdir()
+        (slot.path / "deep" / "file.txt").write_text(text)
+        slot.counts["letters"] = len(text)
+    return slot.ref
+
+
+class TestStore:
+    def test_what_was_put_is_found_and_opened(self, store: Store) -> None:
+        source = put(store, "toy-v1-source")
+        ref = put(store, config={"a": 1}, inputs={"source": source}, label="phantom/0@sparse")
+        assert store.find("toy-v1-aa") == ref
+        assert (store.open(ref) / "deep" / "file.txt").read_text() == "hello"
+        manifest = store.manifest(ref)
+        assert (manifest.stage, manifest.version, manifest.label) == ("toy", 1, "phantom/0@sparse")
+        assert manifest.config == {"a": 1}
+        assert manifest.inputs == {"source": source.digest}
+        assert manifest.input_keys == {"source": "toy-v1-source"}
+        assert manifest.counts == {"letters": 5}
+        assert (manifest.files, manifest.bytes) == (1, 5)
+        assert "python" in manifest.software
+        assert store.verify(ref)
+
+    def test_an_absent_key_is_none(self, store: Store) -> None:
+        assert store.find("toy-v1-none") is None
+        assert store.ls() == []
+        assert store.sweep() == []
+
+    def test_equal_content_has_equal_digest_under_any_key(self, store: Store) -> None:
+        assert put(store, "toy-v1-a").digest == put(store, "toy-v1-b").digest
+        assert put(store, "toy-v1-c", "other").digest != put(store, "toy-v1-d").digest
+
+    def test_names_count_in_the_digest(self, tmp_path: Path) -> None:
+        (tmp_path / "a").mkdir()
+        (tmp_path / "a" / "x").write_text("1")
+        (tmp_path / "b").mkdir()
+        (tmp_path / "b" / "y").write_text("1")
+        assert content_digest(tmp_path / "a")[0] != content_digest(tmp_path / "b")[0]
+
+    def test_a_failing_block_leaves_nothing(self, store: Store) -> None:
+        def fail() -> None:
+            with store.slot(stage="toy", version=1, key="toy-v1-bad") as slot:
+                (slot.path / "half").write_text("x")
+                raise ArithmeticError("no")
+
+        with pytest.raises(ArithmeticError):
+            fail()
+        assert store.find("toy-v1-bad") is None
+        assert store.backend.names() == []
+        assert list(store.backend.scratch.iterdir()) == []
+
+    def test_a_failure_may_keep_debugging_files(self, store: Store) -> None:
+        def fail() -> None:
+            with store.slot(stage="toy", version=1, key="toy-v1-bad", label="me") as slot:
+                (slot.debug / "last_good.txt").write_text("step 7")
+                raise ArithmeticError("diverged")
+
+        with pytest.raises(ArithmeticError):
+            fail()
+        kept = store.state / "failed" / "toy-v1-bad"
+        assert (kept / "last_good.txt").read_text() == "step 7"
+        assert "diverged" in (kept / "error.json").read_text()
+        assert store.find("toy-v1-bad") is None
+        assert "failed/toy-v1-bad" in store.gc()
+        assert not kept.exists()
+
+    def test_a_success_keeps_no_debugging_files(self, store: Store) -> None:
+        with store.slot(stage="toy", version=1, key="toy-v1-ok") as slot:
+            (slot.debug / "trace.txt").write_text("x")
+        assert not (store.state / "failed").exists()
+        assert store.manifest(slot.ref).files == 0
+
+    def test_an_unfinished_slot_has_no_ref(self, store: Store) -> None:
+        with (
+            store.slot(stage="toy", version=1, key="toy-v1-a") as slot,
+            pytest.raises(StoreError, match="unfinished"),
+        ):
+            _ = slot.ref
+
+    def test_writing_the_same_again_keeps_the_first(self, store: Store) -> None:
+        first = put(store)
+        assert put(store) == first
+        assert store.backend.sweep(0.0) == []
+
+    def test_other_content_replaces(self, store: Store) -> None:
+        first = put(store)
+        second = put(store, text="changed")
+        assert store.find("toy-v1-aa") == second
+        assert (store.open(second) / "deep" / "file.txt").read_text() == "changed"
+        with pytest.raises(StoreError, match="replaced"):
+            store.open(first)
+
+    def test_opening_a_removed_artefact_is_an_error(self, store: Store) -> None:
+        ref = put(store)
+        assert store.rm("toy-v1-*") == ["toy-v1-aa"]
+        assert store.find("toy-v1-aa") is None
+        with pytest.raises(StoreError, match="removed"):
+            store.open(ref)
+
+    def test_rm_goes_by_key_stage_or_label(self, store: Store) -> None:
+        put(store, "toy-v1-a", label="phantom/0@sparse")
+        put(store, "toy-v1-b", label="phantom/1@sparse")
+        assert store.rm("phantom/0*") == ["toy-v1-a"]
+        assert [manifest.key for manifest in store.ls()] == ["toy-v1-b"]
+        assert store.rm("toy") == ["toy-v1-b"]
+
+    def test_gc_removes_superseded_versions_only(self, store: Store) -> None:
+        put(store)
+        assert store.gc({"toy": 1, "other": 5}) == []
+        assert store.gc({"toy": 2}) == ["artefacts/toy-v1-aa"]
+
+    def test_nested_refs_survive_a_moved_store(self, tmp_path: Path) -> None:
+        ref = put(Store(tmp_path / "first"))
+        (tmp_path / "first").rename(tmp_path / "second")
+        moved = Store(tmp_path / "second")
+        found = moved.find("toy-v1-aa")
+        assert found is not None
+        assert digest_of(found) == digest_of(ref)
+        assert moved.open(ref) == tmp_path / "second" / "artefacts" / "toy-v1-aa"
+
+
+class TestDirectory:
+    def test_a_damaged_manifest_is_a_miss_and_is_replaced(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        store = Store(tmp_path)
+        ref = put(store)
+        (tmp_path / "artefacts" / "toy-v1-aa" / MANIFEST).write_text("{")
+        assert store.find("toy-v1-aa") is None
+        assert "not a manifest" in caplog.text
+        assert put(store) == ref
+
+    def test_verify_sees_a_changed_byte(self, tmp_path: Path) -> None:
+        store = Store(tmp_path)
+        ref = put(store)
+        (store.open(ref) / "deep" / "file.txt").write_text("jello")
+        assert not store.verify(ref)
+
+    def test_a_store_that_cannot_be_written_says_so(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("x")
+        with pytest.raises(StoreError, match="cannot be written"):
+            Store(tmp_path / "file" / "store").check_writable()
+        with pytest.raises(StoreError, match="cannot be written"):
+            put(Store(tmp_path / "file"))
+        Store(tmp_path / "good").check_writable()
+        assert list((tmp_path / "good" / "scratch").iterdir()) == []
+
+    def test_sigkill_leaves_only_scratch_and_sweep_removes_it(self, tmp_path: Path) -> None:
+        code = (
+            "import os, signal, sys; from extrags.store import Store\n"
+            "with Store(sys.argv[1]).slot(stage='toy', version=1, key='toy-v1-aa') as slot:\n"
+            "    (slot.path / 'half').write_text('x')\n"
+            "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        )
+        ended = subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=False)
+        assert ended.returncode == -signal.SIGKILL
+        store = Store(tmp_path)
+        assert store.find("toy-v1-aa") is None
+        assert len(list((tmp_path / "scratch").iterdir())) == 1
+        with store.slot(stage="toy", version=1, key="toy-v1-bb") as alive:
+            (alive.path / "being-written").write_text("x")
+            removed = store.sweep()
+            assert len(removed) == 1
+            assert removed[0].startswith("scratch/toy-v1-aa.")
+        assert [manifest.key for manifest in store.ls()] == ["toy-v1-bb"]
+        assert list((tmp_path / "scratch").iterdir()) == []
+
+    def test_several_processes_write_one_key(self, tmp_path: Path) -> None:
+        context = multiprocessing.get_context("spawn")
+        with context.Pool(3) as pool:
+            refs = pool.map(_put_many, [str(tmp_path)] * 3)
+        assert refs[0] == refs[1] == refs[2]
+        assert len(Store(tmp_path).ls()) == 20
+        assert list((tmp_path / "scratch").iterdir()) == []
+
+
+def _put_many(root: str) -> list[Ref]:
+    store = Store(root)
+    return [put(store, f"toy-v1-{index:02d}") for index in range(20)]
+
+
+class TestUrl:
+    def test_an_upload_without_manifest_is_invisible_and_swept(self, tmp_path: Path) -> None:
+        store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)
+        ref = put(store)
+        backend = store.backend
+        backend.fs.pipe_file(f"{backend.prefix}/toy-v1-bb/attempt/half", b"x")  # type: ignore[union-attr]
+        backend.fs.pipe_file(f"{backend.prefix}/toy-v1-aa/loser/half", b"x")  # type: ignore[union-attr]
+        assert store.find("toy-v1-bb") is None
+        assert store.sweep(older_than_hours=1.0) == []
+        assert sorted(store.sweep(older_than_hours=0.0)) == ["toy-v1-aa/loser", "toy-v1-bb/attempt"]
+        assert store.verify(ref)
+
+    def test_damage_is_seen_on_reading(self, tmp_path: Path) -> None:
+        store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)
+        ref = put(store)
+        backend = store.backend
+        (name,) = [name for name in backend.fs.find(backend.prefix) if name.endswith("file.txt")]  # type: ignore[union-attr]
+        backend.fs.pipe_file(name, b"jello")  # type: ignore[union-attr]
+        with pytest.raises(StoreError, match="damaged"):
+            store.open(ref)
+
+    def test_an_unknown_protocol_is_an_error(self) -> None:
+        with pytest.raises(StoreError, match="nosuch"):
+            Store("nosuch://bucket")
+
+    def test_a_missing_driver_is_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        import fsspec.registry
+
+        driver = {"class": "no_such_driver.FileSystem", "err": "Install no_such_driver"}
+        monkeypatch.setitem(fsspec.registry.known_implementations, "undriven", driver)
+        with pytest.raises(MissingDependencyError, match="Install no_such_driver"):
+            Store("undriven://bucket/prefix")
