@@ -216,6 +216,12 @@ class ExploreConfig(StageConfig):
         le=1,
         description="a candidate is rejected when the light that rides on the camera overexposes more",
     )
+    hole_weight: float = Field(
+        16.0,
+        ge=0,
+        description="gain grows by this times the share of holes in view: missing surface has no Gaussians "
+        "that could be counted as covered; 0 is the paper's rule",
+    )
     darkness_weight: float = Field(0.5, ge=0, description="lambda_l of the illumination weight")
     fold_angle_deg: float = Field(25.0, gt=0, description="tau_R, on the rotation over the last three steps")
     fold_penalty: float = Field(0.6, gt=0, lt=1, description="eta")
@@ -266,6 +272,15 @@ class FinetuneConfig(StageConfig):
         0.5, ge=0, lt=1, description="share of virtual views among the steps, at the start"
     )
     pseudo_share_final: float = Field(0.25, ge=0, lt=1, description="the same at the end; linear in between")
+    pseudo_weight: float = Field(
+        3.0,
+        gt=0,
+        description="weight of all virtual views: U_img alone is about 0.2 in a tube, which "
+        "would let the real views overrule what the virtual ones add",
+    )
+    growth: float = Field(
+        1.4, ge=1, description="room for new Gaussians: times the coarse stage's largest number"
+    )
     seed_holes: bool = Field(
         True, description="place new Gaussians where the restored view has surface and none is"
     )

@@ -156,6 +156,7 @@ class _State:
     length: int = 1
     path_gain: int = 0
     saturated_share: float = 0.0
+    hole_share: float = 0.0
     rejected: bool = False
 
     def path(self) -> list[_State]:
@@ -341,7 +342,8 @@ def _expand(
         if candidate.rejected:
             continue
         fold = fold_weight(np.array([*recent, candidate.turn_deg]), config)
-        scored.append((float(candidate.gain * weight * fold), candidate))
+        missing = 1 + config.hole_weight * candidate.hole_share
+        scored.append((float(candidate.gain * weight * fold * missing), candidate))
         visited.poses.append(candidate.pose)
     # Stable: equal scores keep the order of the primitives.
     return sorted(scored, key=lambda item: -item[0]), len(kept)
@@ -375,7 +377,7 @@ def _observe(
         # it. A recording may itself be overexposed; from there the share must not grow.
         saturated = float((luminance(rgb[index]) >= 1.0).mean())
         glare = saturated > max(config.max_saturated_share, 0.0 if parent is None else parent.saturated_share)
-        too_empty = 1 - surface.mean() > config.max_hole_share
+        hole_share = float(1 - surface.mean())
         new = pairs[index] & ~known
         touched = np.flatnonzero(new).astype(np.int32)
         turn = 0.0 if parent is None else float(rotation_angle_deg(parent.pose[:3, :3], poses[index, :3, :3]))
@@ -396,7 +398,8 @@ def _observe(
                 length=1 if parent is None else parent.length + 1,
                 path_gain=int(gains[index]) + (0 if parent is None else parent.path_gain),
                 saturated_share=saturated,
-                rejected=bool(too_empty or glare or near.mean() > NEAR_SHARE),
+                hole_share=hole_share,
+                rejected=bool(hole_share > config.max_hole_share or glare or near.mean() > NEAR_SHARE),
             )
         )
     return states

@@ -39,9 +39,10 @@ def finetune(
 ) -> TrainingResult:
     r"""Fine-tune a scene on real and virtual views together.
 
-    Virtual views weigh :math:`U_{img} (|I^P - \hat I| \odot U_{pixel} + L_{D-SSIM})`; which kind a step
-    draws follows a fixed pattern whose share of virtual views falls linearly. The position learning
-    rate starts anew. Without pseudo-observations only real views are used: the control of a comparison.
+    Virtual views weigh :math:`w U_{img} (|I^P - \hat I| \odot U_{pixel} + L_{D-SSIM})` with w the
+    `pseudo_weight`; which kind a step draws follows a fixed pattern whose share of virtual views falls
+    linearly. The position learning rate starts anew. Without pseudo-observations only real views are
+    used: the control of a comparison.
 
     Args:
         scene: the coarse scene.
@@ -58,8 +59,9 @@ def finetune(
     frames = sequence.train
     depth = median_depth(sequence, frames)
     start = scene
+    max_gaussians = round(config.growth * coarse.densify.max_gaussians)
     if pseudo is not None and config.seed_holes:
-        room = coarse.densify.max_gaussians - len(scene.gaussians)
+        room = max_gaussians - len(scene.gaussians)
         born = hole_gaussians(scene, sequence, pseudo, room)
         if born is not None:
             start = Scene(Gaussians.concatenated(scene.gaussians, born), scene.light)
@@ -97,7 +99,7 @@ def virtual_views(pseudo: PseudoObservations, config: FinetuneConfig) -> list[Vi
     views = []
     confidence = np.maximum(pseudo.pixel_confidence, config.confidence_floor)
     for index in range(len(pseudo.cameras)):
-        weight = float(pseudo.image_confidence[index])
+        weight = config.pseudo_weight * float(pseudo.image_confidence[index])
         if weight <= 0:
             continue
         target = pseudo.target[index] if config.keep_known else pseudo.restored[index]
