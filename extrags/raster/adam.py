@@ -1,0 +1,179 @@
+"""Adam that steps only the rows a view has touched, and follows densification."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from extrags.errors import ConfigError, ShapeError
+from extrags.raster import native
+
+__all__ = ["SelectiveAdam"]
+
+
+class SelectiveAdam:
+    """Adam over named parameters that share their rows (one row per Gaussian).
+
+    A step updates the rows flagged visible and leaves the others, their moments and their count of steps
+    alone: untouched Gaussians cost nothing. The bias correction of a row counts that row's own steps, so
+    a row first seen late, or born in densification, starts as at step one. With all rows visible this is
+    `torch.optim.Adam`. The result depends on nothing but the inputs, whatever the number of threads.
+
+    Args:
+        parameters: leaf tensors [N, ...] by name, contiguous; stepped in place.
+        learning_rates: one per parameter, by name; a rate of 0 leaves the parameter as it is.
+        betas: decay of the first and second moment.
+        eps: added to the root of the second moment.
+
+    Raises:
+        ShapeError: when the parameters differ in their number of rows.
+        ConfigError: when a learning rate is missing.
+
+    Source: Kingma & Ba, Adam, ICLR 2015; Mallick et al., Taming 3DGS, 2024 (selective steps).
+    """
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Tensor],
+        learning_rates: Mapping[str, float],
+        *,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+    ) -> None:
+        self.parameters: dict[str, Tensor] = dict(parameters)
+        self.learning_rates: dict[str, float] = dict(learning_rates)
+        self.betas = betas
+        self.eps = eps
+        rows = {name: len(value) for name, value in self.parameters.items()}
+        if len(set(rows.values())) > 1:
+            raise ShapeError(f"parameters differ in their number of rows: {rows}")
+        missing = set(self.parameters) - set(self.learning_rates)
+        if missing:
+            raise ConfigError(f"no learning rate for {', '.join(sorted(missing))}")
+        self.first_moments = {k: torch.zeros_like(v) for k, v in self._detached().items()}
+        self.second_moments = {k: torch.zeros_like(v) for k, v in self._detached().items()}
+        self.steps = torch.zeros(next(iter(rows.values()), 0), dtype=torch.int32)
+        self._bias = self._bias_corrections(1024)
+        self._taken = 0
+
+    def _bias_corrections(self, n_steps: int) -> tuple[Tensor, Tensor]:
+        """1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) for t up to `n_steps`; 1 for t = 0."""
+        t = torch.arange(n_steps + 1, dtype=torch.float64)
+        first, second = (1 - beta**t for beta in self.betas)
+        first[0] = second[0] = 1
+        return (1 / first).float(), (1 / second.sqrt()).float()
+
+    def _detached(self) -> dict[str, Tensor]:
+        return {name: value.detach() for name, value in self.parameters.items()}
+
+    @torch.no_grad()
+    def step(self, visible: Bool[Tensor, "n"] | None = None) -> None:
+        """Update the parameters from their `.grad`; a parameter without one is left alone.
+
+        Args:
+            visible: rows to update; None updates all.
+
+        Raises:
+            ShapeError: when `visible` does not have one flag per row.
+        """
+        if visible is not None and visible.shape != self.steps.shape:
+            raise ShapeError(f"visible has shape {tuple(visible.shape)}, expected {tuple(self.steps.shape)}")
+        self.steps += 1 if visible is None else visible.to(torch.int32)
+        self._taken += 1
+        if self._taken >= len(self._bias[0]):
+            self._bias = self._bias_corrections(2 * self._taken)
+        for name, value in self.parameters.items():
+            rate = self.learning_rates[name]
+            if value.grad is None or rate == 0 or value.numel() == 0:
+                continue
+            moments = self.first_moments[name], self.second_moments[name]
+            if value.dtype == torch.float32 and native.native_isa() is not None:
+                native.adam_step(
+                    value,
+                    value.grad,
+                    *moments,
+                    self.steps,
+                    visible,
+                    self._bias,
+                    rate,
+                    self.betas,
+                    self.eps,
+                )
+            else:
+                self._step_torch(value, value.grad, *moments, visible, rate)
+
+    def _step_torch(
+        self,
+        value: Tensor,
+        gradient: Tensor,
+        first: Tensor,
+        second: Tensor,
+        visible: Tensor | None,
+        rate: float,
+    ) -> None:
+        beta1, beta2 = self.betas
+        rows = slice(None) if visible is None else visible
+        shape = (-1, *([1] * (value.ndim - 1)))
+        count = self.steps[rows].to(value.dtype).reshape(shape)
+        g = gradient[rows]
+        m = beta1 * first[rows] + (1 - beta1) * g
+        v = beta2 * second[rows] + (1 - beta2) * g * g
+        first[rows], second[rows] = m, v
+        denominator = (v / (1 - beta2**count)).sqrt() + self.eps
+        value[rows] -= rate * (m / (1 - beta1**count)) / denominator
+
+    def zero_grad(self) -> None:
+        """Forget the gradients."""
+        for value in self.parameters.values():
+            value.grad = None
+
+    @torch.no_grad()
+    def keep(self, mask: Bool[Tensor, "n"]) -> None:
+        """Keep the flagged rows of parameters, moments and counts; `parameters` holds new leaves.
+
+        Args:
+            mask: which rows stay.
+
+        Raises:
+            ShapeError: when there is not one flag per row.
+        """
+        if mask.shape != self.steps.shape:
+            raise ShapeError(f"mask has shape {tuple(mask.shape)}, expected {tuple(self.steps.shape)}")
+        for name, value in self.parameters.items():
+            self.parameters[name] = value.detach()[mask].requires_grad_(value.requires_grad)
+            self.first_moments[name] = self.first_moments[name][mask]
+            self.second_moments[name] = self.second_moments[name][mask]
+        self.steps = self.steps[mask]
+
+    @torch.no_grad()
+    def append(self, rows: Mapping[str, Tensor]) -> None:
+        """Append rows with zero moments and counts; `parameters` holds new leaves.
+
+        Args:
+            rows: new rows of every parameter, by name.
+
+        Raises:
+            ShapeError: when a parameter is missing or the numbers of rows differ.
+        """
+        if set(rows) != set(self.parameters):
+            raise ShapeError(f"rows of {sorted(rows)}, expected {sorted(self.parameters)}")
+        if len({len(value) for value in rows.values()}) > 1:
+            raise ShapeError("the new rows differ in their number")
+        born = 0
+        for name, value in self.parameters.items():
+            new = rows[name].detach().to(value.dtype)
+            if new.shape[1:] != value.shape[1:]:
+                raise ShapeError(
+                    f"rows of {name} have shape {tuple(new.shape)}, expected (M, "
+                    f"{', '.join(map(str, value.shape[1:]))})"
+                )
+            born = len(new)
+            grown = torch.cat([value.detach(), new])
+            self.parameters[name] = grown.requires_grad_(value.requires_grad)
+            zeros = torch.zeros_like(new)
+            self.first_moments[name] = torch.cat([self.first_moments[name], zeros])
+            self.second_moments[name] = torch.cat([self.second_moments[name], zeros])
+        self.steps = torch.cat([self.steps, self.steps.new_zeros(born)])

@@ -1,0 +1,96 @@
+"""The CUDA backend: gsplat's kernels behind the interface of `rasterize`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from extrags.raster.native import native_isa, rasterize_native
+from extrags.raster.reference import rasterize_reference
+from extrags.raster.rendering import DILATION_PX2, RasterInputs, RasterOptions, Rendering
+
+__all__ = ["rasterize_gsplat"]
+
+
+def rasterize_gsplat(inputs: RasterInputs, options: RasterOptions) -> Rendering:
+    """Render float32 CUDA tensors with gsplat; arguments as checked by `rasterize`.
+
+    gsplat has no median depth, no visibility and no transmittance at points. Asked for, they are computed
+    from the same Gaussians by the native kernels on the CPU (or by the reference where those are not
+    built); none of them is differentiable in any backend.
+    """
+    import gsplat
+
+    images, alphas, meta = gsplat.rasterization(
+        means=inputs.means,
+        quats=inputs.quats,
+        scales=inputs.scales,
+        opacities=inputs.opacities,
+        colors=inputs.sh if inputs.sh is not None else inputs.colors,
+        viewmats=inputs.viewmats,
+        Ks=inputs.Ks,
+        width=options.width,
+        height=options.height,
+        near_plane=options.near,
+        eps2d=DILATION_PX2,
+        sh_degree=options.sh_degree if inputs.sh is not None else None,
+        packed=False,
+        backgrounds=inputs.background,
+        render_mode="RGB+ED",
+        absgrad=options.absgrad,
+    )
+    extra = _extras(inputs, options)
+    return Rendering(
+        rgb=images[..., :3],
+        alpha=alphas[..., 0],
+        depth=images[..., 3],
+        means2d=_centres(meta["means2d"], options.absgrad),
+        radius_px=_radius(meta["radii"]).to(inputs.means.dtype),
+        median_depth=extra.get("median_depth"),
+        visibility_max=extra.get("visibility_max"),
+        visibility_sum=extra.get("visibility_sum"),
+        transmittance=extra.get("transmittance"),
+    )
+
+
+def _radius(radii: Tensor) -> Tensor:
+    # gsplat 1.5 gives a radius per axis, earlier versions one.
+    return radii.amax(-1) if radii.ndim == 3 else radii
+
+
+def _centres(projected: Tensor, absgrad: bool) -> Tensor:
+    """A tensor outside the graph that takes gsplat's gradients of the centres on backward."""
+    means2d = projected.detach().clone()
+    if projected.requires_grad:
+
+        def fill(gradient: Tensor | None) -> None:
+            if gradient is None:
+                return
+            means2d.grad = gradient if means2d.grad is None else means2d.grad + gradient
+            if absgrad:
+                absolute = projected.absgrad  # type: ignore[attr-defined]
+                before = getattr(means2d, "absgrad", None)
+                means2d.absgrad = absolute if before is None else before + absolute  # type: ignore[attr-defined]
+
+        projected.register_hook(fill)
+    return means2d
+
+
+@torch.no_grad()
+def _extras(inputs: RasterInputs, options: RasterOptions) -> dict[str, Any]:
+    if not (options.median_depth or options.visibility or inputs.query_points is not None):
+        return {}
+
+    def moved(value: Any) -> Any:
+        return None if value is None else value.detach().cpu()
+
+    on_cpu = replace(inputs, **{name: moved(value) for name, value in vars(inputs).items()})
+    plain = replace(options, absgrad=False)
+    renderer = rasterize_reference if native_isa() is None else rasterize_native
+    rendering = renderer(on_cpu, plain)
+    names = ("median_depth", "visibility_max", "visibility_sum", "transmittance")
+    found = {name: getattr(rendering, name) for name in names}
+    return {k: None if v is None else v.to(inputs.means.device) for k, v in found.items()}

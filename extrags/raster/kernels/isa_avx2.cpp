@@ -1,0 +1,3 @@
+#define EXTRAGS_ISA avx2
+#define EXTRAGS_ISA_NAME "avx2"
+#include "kernels.inl"

@@ -1,0 +1,181 @@
+// The data the kernels work on and the table of functions each instruction set provides.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+
+#include "runtime.h"
+
+namespace extrags {
+
+// Conventions shared with gsplat and with the torch reference (rendering.py).
+constexpr float kDilation = 0.3f;
+constexpr float kAlphaMax = 0.999f;
+constexpr float kAlphaMin = 1.f / 255.f;
+constexpr float kTransmittanceMin = 1e-4f;
+constexpr float kFieldOfViewMargin = 0.3f;
+constexpr float kAlphaEps = 1e-10f;
+// Larger projected covariances (px^2) are culled: beyond it float32 products overflow.
+constexpr float kCovarianceMax = 1e12f;
+
+// A tile is 8 x 8 blocks of 4 x 4 pixels: small enough for its Gaussians and their gradients to stay in the
+// first caches, large enough that few Gaussians touch several.
+constexpr int kTileBlocks = 8, kTilePx = 4 * kTileBlocks;
+
+struct Camera {
+  float rotation[9];  // camera from world, row-major
+  float translation[3];
+  float fx, fy, cx, cy;
+};
+
+// Arrays of the caller, row-major and contiguous.
+struct Scene {
+  int n;
+  const float* means;      // [n, 3]
+  const float* quats;      // [n, 4]
+  const float* scales;     // [n, 3], linear
+  const float* opacities;  // [n], in (0, 1)
+  const float* sh;         // [n, coefficients, 3], or null when colors is given
+  int coefficients;
+  int degree;
+  const float* colors;  // [n, 3]
+};
+
+// A Gaussian as one camera sees it, one cache line. The exponent of its alpha at a pixel is, in powers of
+// two, log2_opacity + xx dx^2 + xy dx dy + yy dy^2 with (dx, dy) = mean - pixel.
+struct alignas(64) Record {
+  float x, y;
+  float xx, xy, yy;
+  float log2_opacity;
+  float color[3];
+  float depth;
+  // The ellipse where alpha falls to 1/255: at height dy above the mean it spans
+  // slope dy +- sqrt(shape (half_height^2 - dy^2)); its rightmost point is at dy = right_dy.
+  float half_height, slope, shape, right_dy;
+  // Pairs of a Gaussian and a tile are numbered by Gaussian, then by row and column of the tile: that of tile
+  // (x, y) is pair + y tiles_across + x. In a tile's own copy `pair` is the number itself.
+  uint32_t pair, tiles_across;
+};
+static_assert(sizeof(Record) == 64, "one cache line per Gaussian");
+
+// Tiles (inclusive) a Gaussian touches; x1 < x0 when it is culled.
+struct TileRect {
+  uint16_t x0, y0, x1, y1;
+};
+
+struct DepthKey {
+  uint32_t depth_bits;
+  int32_t id;
+};
+
+// All that one camera's forward pass leaves for its backward pass, and working memory.
+struct View {
+  int width, height;
+  int tiles_x, tiles_y;
+  int n, chunk, chunks;  // Gaussians are handled in chunks of a fixed size
+  float near;
+  float background[3];
+  Camera camera;
+
+  Buffer records;      // Record [n]
+  Buffer rects;        // TileRect [n]
+  Buffer pair_starts;  // uint32 [n + 1]: where the (Gaussian, tile) pairs of a Gaussian start
+  Buffer counts;       // uint32 [chunks, tiles]
+  Buffer chunk_pairs;  // uint32 [chunks + 1]
+  Buffer tile_starts;  // uint32 [tiles + 1]: where the pairs of a tile start
+  Buffer keys;         // DepthKey [pairs], per tile
+  Buffer locals;       // Record [pairs], per tile, nearest first
+  Buffer block_starts;  // uint32 [tiles, blocks + 1]: where a block's entries start in its tile
+  Buffer block_kept;    // uint32 [tiles, blocks]: entries that some pixel composited
+  Buffer finals;        // float [tiles, blocks, 16]: final transmittance
+  Buffer lasts;         // float [tiles, blocks, 16]: how many kept entries a pixel went through
+  Buffer tile_entries;  // Buffer [tiles]: indices into the tile's locals, per block
+  int tile_entries_count;
+  Buffer pair_rows;  // float [pairs, 16], per Gaussian: gradients, or visibility
+  Buffer partials;   // float [chunks, 16]: camera gradients
+  Buffer query;      // working memory of transmittance queries
+  Buffer scratch[kMaxThreads];
+  double seconds[4];  // projection, tiles, tiles backward, projection backward of the last calls
+};
+
+struct Images {
+  float* rgb;           // [h, w, 3]
+  float* alpha;         // [h, w]
+  float* depth;         // [h, w]
+  float* median_depth;  // [h, w] or null
+  float* means2d;       // [n, 2]
+  float* radius;        // [n]
+  float* visibility_max;  // [n] or null
+  float* visibility_sum;  // [n] or null
+};
+
+struct ImageGradients {
+  const float* rgb;    // [h, w, 3] or null
+  const float* alpha;  // [h, w] or null
+  const float* depth;  // [h, w] or null
+  const float* depth_image;  // the forward's depth, needed with `depth`
+};
+
+// Gradients are written, or added to when `add` is set. Any may be null.
+struct SceneGradients {
+  bool add;
+  float* means;
+  float* quats;
+  float* scales;
+  float* opacities;
+  float* sh;
+  float* colors;      // written
+  float* viewmat;     // [4, 4], written
+  float* means2d;     // [n, 2], written
+  float* absolute2d;  // [n, 2], written
+};
+
+struct AdamRows {
+  float* values;
+  const float* gradients;
+  float* first;
+  float* second;
+  int64_t rows, columns;
+  const int32_t* steps;    // [rows], counted up already
+  const float* bias1;      // 1 / (1 - beta1^t), by t
+  const float* bias2;      // 1 / sqrt(1 - beta2^t), by t
+  const uint8_t* visible;  // [rows] or null
+  float rate, eps;
+  float beta1, beta2, rest1, rest2;  // rest = 1 - beta, rounded once
+};
+
+struct LossImages {
+  int height, width;
+  const float* image;   // [h, w, 3]
+  const float* target;  // [h, w, 3]
+  const float* mask;    // [h, w] or null
+  float* gradient;      // [h, w, 3]: of the sum
+  float dssim_weight;
+  double scale;  // 1 / (3 sum of weights)
+};
+
+struct KernelTable {
+  const char* name;
+  void (*forward)(View*, const Scene*, const Images*);
+  void (*backward)(View*, const Scene*, const ImageGradients*, const SceneGradients*);
+  void (*query)(View*, const float* points, int64_t count, float* transmittance);
+  double (*loss)(const LossImages*, Buffer* working);
+  void (*adam)(const AdamRows*);
+  int64_t (*first_nonfinite)(const float* values, int64_t count);
+  double (*fma_chain)(int64_t rounds);
+};
+
+// One per instruction set; see kernels.inl.
+#if defined(__x86_64__)
+namespace avx512 {
+extern const KernelTable table;
+}
+namespace avx2 {
+extern const KernelTable table;
+}
+#endif
+namespace portable {
+extern const KernelTable table;
+}
+
+}  // namespace extrags

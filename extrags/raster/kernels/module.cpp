@@ -1,0 +1,352 @@
+// Python bindings: shapes are checked in Python, lifetimes are held here, the GIL is released while kernels run.
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/optional.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/unique_ptr.h>
+#include <nanobind/stl/vector.h>
+
+#include <cmath>
+#include <cstdlib>
+#include <cstring>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "kernels.h"
+
+namespace nb = nanobind;
+using namespace extrags;
+
+namespace {
+
+using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using Counts = nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Flags = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+
+// The tables this processor can run, the fastest first.
+std::vector<const KernelTable*> usable_tables() {
+  std::vector<const KernelTable*> tables;
+#if defined(__x86_64__)
+  if (__builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+      __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw") &&
+      __builtin_cpu_supports("avx512cd") && __builtin_cpu_supports("fma")) {
+    tables.push_back(&avx512::table);
+  }
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+      __builtin_cpu_supports("bmi") && __builtin_cpu_supports("bmi2")) {
+    tables.push_back(&avx2::table);
+  }
+#endif
+  tables.push_back(&portable::table);
+  return tables;
+}
+
+const KernelTable* find_table(const std::string& name) {
+  std::string names;
+  for (const KernelTable* table : usable_tables()) {
+    if (name == table->name) return table;
+    names += names.empty() ? table->name : std::string(", ") + table->name;
+  }
+  throw std::invalid_argument("instruction set '" + name + "' is not usable here, expected one of " + names);
+}
+
+const KernelTable* initial_table() {
+  const char* wanted = std::getenv("EXTRAGS_ISA");
+  return wanted != nullptr && *wanted != '\0' ? find_table(wanted) : usable_tables().front();
+}
+
+const KernelTable*& active() {
+  static const KernelTable* table = initial_table();
+  return table;
+}
+
+struct ViewDeleter {
+  void operator()(View* view) const {
+    Buffer* all[] = {&view->records, &view->rects, &view->pair_starts, &view->counts, &view->chunk_pairs,
+                     &view->tile_starts, &view->keys, &view->locals, &view->block_starts, &view->block_kept,
+                     &view->finals, &view->lasts, &view->pair_rows, &view->partials, &view->query};
+    for (Buffer* buffer : all) release(buffer);
+    for (int tile = 0; tile < view->tile_entries_count; ++tile) {
+      release(static_cast<Buffer*>(view->tile_entries.data) + tile);
+    }
+    release(&view->tile_entries);
+    for (Buffer& buffer : view->scratch) release(&buffer);
+    delete view;
+  }
+};
+using ViewPointer = std::unique_ptr<View, ViewDeleter>;
+
+// Views whose memory waits for the next call: page faults cost more than the projection.
+class SpareViews {
+ public:
+  ViewPointer take() {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (spare_.empty()) return ViewPointer(new View{});
+    ViewPointer view = std::move(spare_.back());
+    spare_.pop_back();
+    return view;
+  }
+  void give_back(ViewPointer view) {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    if (spare_.size() < kMost) spare_.push_back(std::move(view));
+  }
+
+ private:
+  static constexpr size_t kMost = 4;
+  std::mutex mutex_;
+  std::vector<ViewPointer> spare_;
+};
+
+SpareViews& spare_views() {
+  static SpareViews* const views = new SpareViews;  // outlives all frames
+  return *views;
+}
+
+// What one camera's forward pass left.
+struct Frame {
+  ViewPointer view = spare_views().take();
+  const KernelTable* kernels = active();
+  Frame() = default;
+  Frame(Frame&&) = default;
+  ~Frame() {
+    if (view) spare_views().give_back(std::move(view));
+  }
+};
+
+template <class Array>
+auto* data_or_null(const std::optional<Array>& array) {
+  return array ? array->data() : nullptr;
+}
+
+void expect(bool ok, const char* what) {
+  if (!ok) throw std::invalid_argument(std::string(what) + " has an unexpected size");
+}
+
+Scene make_scene(const In& means, const In& quats, const In& scales, const In& opacities,
+                 const std::optional<In>& sh, int degree, const std::optional<In>& colors) {
+  Scene scene{};
+  scene.n = static_cast<int>(means.shape(0));
+  const size_t n = means.shape(0);
+  expect(n < (size_t{1} << 28) && means.size() == 3 * n, "means");
+  expect(quats.size() == 4 * n, "quats");
+  expect(scales.size() == 3 * n, "scales");
+  expect(opacities.size() == n, "opacities");
+  expect(sh.has_value() != colors.has_value(), "sh or colors");
+  if (sh) {
+    scene.coefficients = static_cast<int>(sh->shape(1));
+    expect(sh->size() == 3 * n * sh->shape(1) && (degree + 1) * (degree + 1) <= scene.coefficients, "sh");
+    scene.sh = sh->data();
+  }
+  if (colors) {
+    expect(colors->size() == 3 * n, "colors");
+    scene.colors = colors->data();
+  }
+  scene.means = means.data();
+  scene.quats = quats.data();
+  scene.scales = scales.data();
+  scene.opacities = opacities.data();
+  scene.degree = degree;
+  return scene;
+}
+
+void set_camera(View* view, const In& viewmat, const In& K) {
+  expect(viewmat.size() == 16, "viewmat");
+  expect(K.size() == 9, "K");
+  const float* v = viewmat.data();
+  for (int i = 0; i < 3; ++i) {
+    for (int j = 0; j < 3; ++j) view->camera.rotation[3 * i + j] = v[4 * i + j];
+    view->camera.translation[i] = v[4 * i + 3];
+  }
+  const float* k = K.data();
+  view->camera.fx = k[0];
+  view->camera.fy = k[4];
+  view->camera.cx = k[2];
+  view->camera.cy = k[5];
+}
+
+std::unique_ptr<Frame> render(const In& means, const In& quats, const In& scales, const In& opacities,
+                              std::optional<In> sh, int degree, std::optional<In> colors, const In& viewmat,
+                              const In& K, std::optional<In> background, int width, int height, float near,
+                              Out rgb, Out alpha, Out depth, Out means2d, Out radius,
+                              std::optional<Out> median_depth, std::optional<Out> visibility_max,
+                              std::optional<Out> visibility_sum) {
+  const Scene scene = make_scene(means, quats, scales, opacities, sh, degree, colors);
+  auto frame = std::make_unique<Frame>();
+  View* view = frame->view.get();
+  view->width = width;
+  view->height = height;
+  view->near = near;
+  set_camera(view, viewmat, K);
+  if (background) expect(background->size() == 3, "background");
+  for (int k = 0; k < 3; ++k) view->background[k] = background ? background->data()[k] : 0.f;
+  const size_t pixels = static_cast<size_t>(width) * static_cast<size_t>(height), n = means.shape(0);
+  expect(rgb.size() == 3 * pixels, "rgb");
+  expect(alpha.size() == pixels && depth.size() == pixels, "alpha or depth");
+  expect(!median_depth || median_depth->size() == pixels, "median_depth");
+  expect(means2d.size() == 2 * n && radius.size() == n, "means2d or radius");
+  expect(visibility_max.has_value() == visibility_sum.has_value(), "visibility");
+  expect(!visibility_max || (visibility_max->size() == n && visibility_sum->size() == n), "visibility");
+  const Images images{rgb.data(), alpha.data(), depth.data(), data_or_null(median_depth), means2d.data(),
+                      radius.data(), data_or_null(visibility_max), data_or_null(visibility_sum)};
+  nb::gil_scoped_release release_gil;
+  frame->kernels->forward(view, &scene, &images);
+  return frame;
+}
+
+void frame_backward(Frame& frame, const In& means, const In& quats, const In& scales, const In& opacities,
+                    std::optional<In> sh, int degree, std::optional<In> colors, std::optional<In> v_rgb,
+                    std::optional<In> v_alpha, std::optional<In> v_depth, std::optional<In> depth, bool add,
+                    std::optional<Out> g_means, std::optional<Out> g_quats, std::optional<Out> g_scales,
+                    std::optional<Out> g_opacities, std::optional<Out> g_sh, std::optional<Out> g_colors,
+                    std::optional<Out> g_viewmat, std::optional<Out> g_means2d,
+                    std::optional<Out> g_absolute2d) {
+  const Scene scene = make_scene(means, quats, scales, opacities, sh, degree, colors);
+  View* view = frame.view.get();
+  const size_t pixels = static_cast<size_t>(view->width) * static_cast<size_t>(view->height), n = means.shape(0);
+  expect(static_cast<size_t>(view->n) == n, "means");
+  expect(!v_rgb || v_rgb->size() == 3 * pixels, "gradient of rgb");
+  expect(!v_alpha || v_alpha->size() == pixels, "gradient of alpha");
+  expect(!v_depth || (v_depth->size() == pixels && depth && depth->size() == pixels), "gradient of depth");
+  expect(!g_means || g_means->size() == means.size(), "gradient of means");
+  expect(!g_quats || g_quats->size() == quats.size(), "gradient of quats");
+  expect(!g_scales || g_scales->size() == scales.size(), "gradient of scales");
+  expect(!g_opacities || g_opacities->size() == n, "gradient of opacities");
+  expect(!g_sh || (sh && g_sh->size() == sh->size()), "gradient of sh");
+  expect(!g_colors || g_colors->size() == 3 * n, "gradient of colors");
+  expect(!g_viewmat || g_viewmat->size() == 16, "gradient of viewmat");
+  expect(!g_means2d || g_means2d->size() == 2 * n, "gradient of means2d");
+  expect(!g_absolute2d || g_absolute2d->size() == 2 * n, "absolute gradient of means2d");
+  const ImageGradients in{data_or_null(v_rgb), data_or_null(v_alpha), data_or_null(v_depth),
+                          data_or_null(depth)};
+  const SceneGradients out{add,
+                           data_or_null(g_means),
+                           data_or_null(g_quats),
+                           data_or_null(g_scales),
+                           data_or_null(g_opacities),
+                           data_or_null(g_sh),
+                           data_or_null(g_colors),
+                           data_or_null(g_viewmat),
+                           data_or_null(g_means2d),
+                           data_or_null(g_absolute2d)};
+  nb::gil_scoped_release release_gil;
+  frame.kernels->backward(view, &scene, &in, &out);
+}
+
+void frame_query(Frame& frame, const In& points, Out transmittance) {
+  expect(points.size() == 3 * transmittance.size() && points.size() < (size_t{1} << 31), "points");
+  nb::gil_scoped_release release_gil;
+  frame.kernels->query(frame.view.get(), points.data(), static_cast<int64_t>(transmittance.size()),
+                       transmittance.data());
+}
+
+// How many (Gaussian, block) entries were composited
+int64_t frame_entries(const Frame& frame) {
+  const View* view = frame.view.get();
+  const uint32_t* kept = static_cast<const uint32_t*>(view->block_kept.data);
+  int64_t total = 0;
+  for (int tile = 0; tile < view->tiles_x * view->tiles_y; ++tile) {
+    for (int block = 0; block < kTileBlocks * kTileBlocks; ++block, ++kept) {
+      const int x = tile % view->tiles_x * kTilePx + block % kTileBlocks * 4;
+      const int y = tile / view->tiles_x * kTilePx + block / kTileBlocks * 4;
+      if (x < view->width && y < view->height) total += *kept;
+    }
+  }
+  return total;
+}
+
+std::vector<double> frame_seconds(const Frame& frame) {
+  return std::vector<double>(frame.view->seconds, frame.view->seconds + 4);
+}
+
+double l1_ssim(const In& image, const In& target, std::optional<In> mask, Out gradient, int height, int width,
+               float dssim_weight, double scale) {
+  const size_t pixels = static_cast<size_t>(width) * static_cast<size_t>(height);
+  expect(image.size() == 3 * pixels && target.size() == 3 * pixels, "image or target");
+  expect(gradient.size() == 3 * pixels, "gradient");
+  expect(!mask || mask->size() == pixels, "mask");
+  const LossImages images{height, width, image.data(), target.data(), data_or_null(mask), gradient.data(),
+                          dssim_weight, scale};
+  nb::gil_scoped_release release_gil;
+  struct Working {
+    Buffer buffer{nullptr, 0};
+    ~Working() { release(&buffer); }
+  };
+  thread_local Working working;
+  return active()->loss(&images, &working.buffer);
+}
+
+void adam(Out values, const In& gradients, Out first, Out second, const Counts& steps, const In& bias1,
+          const In& bias2, std::optional<Flags> visible, float rate, double beta1, double beta2, float eps) {
+  const size_t rows = steps.shape(0), size = values.size();
+  expect(rows > 0 && size % rows == 0, "values");
+  expect(gradients.size() == size && first.size() == size && second.size() == size, "gradients or moments");
+  expect(bias1.size() == bias2.size(), "bias corrections");
+  expect(!visible || visible->shape(0) == rows, "visible");
+  for (size_t i = 0; i < rows; ++i) {
+    expect(steps.data()[i] >= 0 && static_cast<size_t>(steps.data()[i]) < bias1.size(), "steps");
+  }
+  const AdamRows a{values.data(), gradients.data(), first.data(), second.data(),
+                   static_cast<int64_t>(rows), static_cast<int64_t>(size / rows), steps.data(),
+                   bias1.data(), bias2.data(), data_or_null(visible), rate, eps,
+                   static_cast<float>(beta1), static_cast<float>(beta2),
+                   static_cast<float>(1 - beta1), static_cast<float>(1 - beta2)};
+  nb::gil_scoped_release release_gil;
+  active()->adam(&a);
+}
+
+int64_t first_nonfinite(const In& values) {
+  nb::gil_scoped_release release_gil;
+  return active()->first_nonfinite(values.data(), static_cast<int64_t>(values.size()));
+}
+
+}  // namespace
+
+NB_MODULE(_native, m) {
+  // Frames may well be alive, in graphs nobody walked back, when the interpreter ends.
+  nb::set_leak_warnings(false);
+  m.doc() = "Compiled kernels of extrags.raster; use them through extrags.raster.";
+  nb::class_<Frame>(m, "Frame", "What the forward pass of one camera leaves for the backward pass.")
+      .def("backward", &frame_backward, nb::arg("means"), nb::arg("quats"), nb::arg("scales"),
+           nb::arg("opacities"), nb::arg("sh").none(), nb::arg("degree"), nb::arg("colors").none(),
+           nb::arg("v_rgb").none(), nb::arg("v_alpha").none(), nb::arg("v_depth").none(),
+           nb::arg("depth").none(), nb::arg("add"), nb::arg("g_means").none().noconvert(),
+           nb::arg("g_quats").none().noconvert(), nb::arg("g_scales").none().noconvert(),
+           nb::arg("g_opacities").none().noconvert(), nb::arg("g_sh").none().noconvert(),
+           nb::arg("g_colors").none().noconvert(), nb::arg("g_viewmat").none().noconvert(),
+           nb::arg("g_means2d").none().noconvert(), nb::arg("g_absolute2d").none().noconvert())
+      .def("entries", &frame_entries, "How many (Gaussian, 4 x 4 pixel block) entries were composited.")
+      .def("seconds", &frame_seconds,
+           "Of the projection, the tiles, the tiles backward and the projection backward.")
+      .def("query", &frame_query, nb::arg("points"), nb::arg("transmittance").noconvert());
+  m.def("render", &render, nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"),
+        nb::arg("sh").none(), nb::arg("degree"), nb::arg("colors").none(), nb::arg("viewmat"), nb::arg("K"),
+        nb::arg("background").none(), nb::arg("width"), nb::arg("height"), nb::arg("near"),
+        nb::arg("rgb").noconvert(), nb::arg("alpha").noconvert(), nb::arg("depth").noconvert(),
+        nb::arg("means2d").noconvert(), nb::arg("radius").noconvert(),
+        nb::arg("median_depth").none().noconvert(), nb::arg("visibility_max").none().noconvert(),
+        nb::arg("visibility_sum").none().noconvert());
+  m.def("l1_ssim", &l1_ssim, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(),
+        nb::arg("gradient").noconvert(), nb::arg("height"), nb::arg("width"), nb::arg("dssim_weight"),
+        nb::arg("scale"));
+  m.def("adam", &adam, nb::arg("values").noconvert(), nb::arg("gradients"), nb::arg("first").noconvert(),
+        nb::arg("second").noconvert(), nb::arg("steps").noconvert(), nb::arg("bias1"), nb::arg("bias2"),
+        nb::arg("visible").none().noconvert(), nb::arg("rate"), nb::arg("beta1"), nb::arg("beta2"),
+        nb::arg("eps"));
+  m.def("first_nonfinite", &first_nonfinite, nb::arg("values"));
+  m.def("fma_chain", [](int64_t rounds) { return active()->fma_chain(rounds); }, nb::arg("rounds"));
+  m.def("isa", [] { return std::string(active()->name); });
+  m.def("set_isa", [](const std::string& name) { active() = find_table(name); }, nb::arg("name"));
+  m.def("usable_isas", [] {
+    std::vector<std::string> names;
+    for (const KernelTable* table : usable_tables()) names.emplace_back(table->name);
+    return names;
+  });
+  m.def("set_num_threads", &set_num_threads, nb::arg("count"));
+  m.def("num_threads", &num_threads);
+}

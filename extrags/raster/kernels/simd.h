@@ -1,0 +1,426 @@
+// Sixteen floats at a time: one AVX-512 register, two of AVX2, four of SSE2 or NEON.
+//
+// AVX-512, AVX2 and NEON give the same bits: each operation is one correctly rounded IEEE operation, fused
+// multiply-adds are written out (the compiler must not contract others), sums are taken in the same order.
+// The SSE2 build has no fused multiply-add and differs by rounding.
+//
+// Included once per instruction set, inside a namespace of its own.
+
+#define EXTRAGS_INLINE static inline __attribute__((always_inline))
+
+constexpr float kLog2E = 1.4426950408889634f;
+constexpr float kLn2 = 0.6931471805599453f;
+
+#if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512VL__)
+
+// Vectors that fit into the registers beside a few others
+constexpr int kTogether = 8;
+
+struct Mask {
+  __mmask16 bits;
+};
+struct Vec {
+  __m512 v;
+  Vec() = default;
+  Vec(__m512 value) : v(value) {}
+  Vec(float value) : v(_mm512_set1_ps(value)) {}
+};
+
+EXTRAGS_INLINE Vec operator+(Vec a, Vec b) { return _mm512_add_ps(a.v, b.v); }
+EXTRAGS_INLINE Vec operator-(Vec a, Vec b) { return _mm512_sub_ps(a.v, b.v); }
+EXTRAGS_INLINE Vec operator*(Vec a, Vec b) { return _mm512_mul_ps(a.v, b.v); }
+EXTRAGS_INLINE Vec operator/(Vec a, Vec b) { return _mm512_div_ps(a.v, b.v); }
+EXTRAGS_INLINE Vec fma(Vec a, Vec b, Vec c) { return _mm512_fmadd_ps(a.v, b.v, c.v); }
+EXTRAGS_INLINE Vec fnma(Vec a, Vec b, Vec c) { return _mm512_fnmadd_ps(a.v, b.v, c.v); }
+EXTRAGS_INLINE Vec min(Vec a, Vec b) { return _mm512_min_ps(a.v, b.v); }
+EXTRAGS_INLINE Vec max(Vec a, Vec b) { return _mm512_max_ps(a.v, b.v); }
+EXTRAGS_INLINE Vec sqrt(Vec a) { return _mm512_sqrt_ps(a.v); }
+EXTRAGS_INLINE Vec abs(Vec a) { return _mm512_abs_ps(a.v); }
+EXTRAGS_INLINE Vec load(const float* p) { return _mm512_loadu_ps(p); }
+EXTRAGS_INLINE void store(float* p, Vec a) { _mm512_storeu_ps(p, a.v); }
+EXTRAGS_INLINE Vec load_first(const float* p, int n) {
+  return _mm512_maskz_loadu_ps(static_cast<__mmask16>((1u << n) - 1), p);
+}
+EXTRAGS_INLINE void store_first(float* p, Vec a, int n) {
+  _mm512_mask_storeu_ps(p, static_cast<__mmask16>((1u << n) - 1), a.v);
+}
+EXTRAGS_INLINE Mask ge(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GE_OQ)}; }
+EXTRAGS_INLINE Mask gt(Vec a, Vec b) { return {_mm512_cmp_ps_mask(a.v, b.v, _CMP_GT_OQ)}; }
+EXTRAGS_INLINE Mask operator&(Mask a, Mask b) { return {static_cast<__mmask16>(a.bits & b.bits)}; }
+EXTRAGS_INLINE Mask without(Mask a, Mask b) { return {static_cast<__mmask16>(a.bits & ~b.bits)}; }
+EXTRAGS_INLINE bool any(Mask a) { return a.bits != 0; }
+EXTRAGS_INLINE uint32_t to_bits(Mask a) { return a.bits; }
+EXTRAGS_INLINE Vec select(Mask m, Vec a, Vec b) { return _mm512_mask_blend_ps(m.bits, b.v, a.v); }
+EXTRAGS_INLINE Vec keep(Mask m, Vec a) { return _mm512_maskz_mov_ps(m.bits, a.v); }
+EXTRAGS_INLINE float sum(Vec a) {
+  const __m256 h = _mm256_add_ps(_mm512_castps512_ps256(a.v), _mm512_extractf32x8_ps(a.v, 1));
+  const __m128 q = _mm_add_ps(_mm256_castps256_ps128(h), _mm256_extractf128_ps(h, 1));
+  const __m128 d = _mm_add_ps(q, _mm_movehl_ps(q, q));
+  return _mm_cvtss_f32(_mm_add_ss(d, _mm_shuffle_ps(d, d, 1)));
+}
+EXTRAGS_INLINE float largest(Vec a) { return _mm512_reduce_max_ps(a.v); }
+EXTRAGS_INLINE Vec round(Vec a) {
+  return _mm512_roundscale_ps(a.v, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+}
+// a * 2^n for integral n with a normal result
+EXTRAGS_INLINE Vec scale_by_power(Vec a, Vec n) { return _mm512_scalef_ps(a.v, n.v); }
+// x = mantissa * 2^result with the mantissa in [0.75, 1.5), for normal positive x
+EXTRAGS_INLINE Vec split_power(Vec x, Vec* mantissa) {
+  const __m512i q = _mm512_sub_epi32(_mm512_castps_si512(x.v), _mm512_set1_epi32(0x3f400000));
+  const __m512i e = _mm512_srai_epi32(q, 23);
+  mantissa->v = _mm512_castsi512_ps(
+      _mm512_sub_epi32(_mm512_castps_si512(x.v), _mm512_slli_epi32(e, 23)));
+  return _mm512_cvtepi32_ps(e);
+}
+// Writes base + lane for the set bits, in order, and returns how many. May write all 16 places.
+EXTRAGS_INLINE int append_lanes(uint32_t* p, uint32_t bits, uint32_t base) {
+  const __m512i lanes = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15);
+  const __m512i values = _mm512_add_epi32(lanes, _mm512_set1_epi32(static_cast<int>(base)));
+  _mm512_storeu_si512(p, _mm512_maskz_compress_epi32(static_cast<__mmask16>(bits), values));
+  return __builtin_popcount(bits);
+}
+// low | high << 16 of the truncated values
+EXTRAGS_INLINE void store_packed(uint32_t* p, Vec low, Vec high) {
+  const __m512i a = _mm512_cvttps_epi32(low.v), b = _mm512_cvttps_epi32(high.v);
+  _mm512_storeu_si512(p, _mm512_or_si512(a, _mm512_slli_epi32(b, 16)));
+}
+// p[0], p[1], p[0], p[1], ...
+EXTRAGS_INLINE Vec broadcast_pair(const float* p) {
+  double pair;
+  memcpy(&pair, p, 8);
+  return _mm512_castpd_ps(_mm512_set1_pd(pair));
+}
+// Pairs a[i], b[i]. The j-th pair in memory is that of lane kLaneOfPair[j], which costs no permutation.
+EXTRAGS_INLINE void store_pairs(float* p, Vec a, Vec b) {
+  _mm512_storeu_ps(p, _mm512_unpacklo_ps(a.v, b.v));
+  _mm512_storeu_ps(p + 16, _mm512_unpackhi_ps(a.v, b.v));
+}
+EXTRAGS_INLINE void transpose16(const float* source, float* target) {
+  __m512 r[16], t[16];
+  for (int i = 0; i < 16; ++i) r[i] = _mm512_loadu_ps(source + 16 * i);
+  for (int i = 0; i < 16; i += 2) {
+    t[i] = _mm512_unpacklo_ps(r[i], r[i + 1]);
+    t[i + 1] = _mm512_unpackhi_ps(r[i], r[i + 1]);
+  }
+  for (int i = 0; i < 16; i += 4) {
+    for (int k = 0; k < 2; ++k) {
+      const __m512d a = _mm512_castps_pd(t[i + k]), b = _mm512_castps_pd(t[i + 2 + k]);
+      r[i + 2 * k] = _mm512_castpd_ps(_mm512_unpacklo_pd(a, b));
+      r[i + 2 * k + 1] = _mm512_castpd_ps(_mm512_unpackhi_pd(a, b));
+    }
+  }
+  // r[4 g + c] holds, per quarter q, column 4 q + c of rows 4 g .. 4 g + 3
+  for (int c = 0; c < 4; ++c) {
+    const __m512 a = _mm512_shuffle_f32x4(r[c], r[4 + c], 0x44);
+    const __m512 b = _mm512_shuffle_f32x4(r[c], r[4 + c], 0xee);
+    const __m512 d = _mm512_shuffle_f32x4(r[8 + c], r[12 + c], 0x44);
+    const __m512 e = _mm512_shuffle_f32x4(r[8 + c], r[12 + c], 0xee);
+    _mm512_storeu_ps(target + 16 * c, _mm512_shuffle_f32x4(a, d, 0x88));
+    _mm512_storeu_ps(target + 16 * (4 + c), _mm512_shuffle_f32x4(a, d, 0xdd));
+    _mm512_storeu_ps(target + 16 * (8 + c), _mm512_shuffle_f32x4(b, e, 0x88));
+    _mm512_storeu_ps(target + 16 * (12 + c), _mm512_shuffle_f32x4(b, e, 0xdd));
+  }
+}
+
+#else
+
+#if defined(__AVX2__) && defined(__FMA__)
+constexpr int kNative = 8;
+#else
+constexpr int kNative = 4;
+#endif
+constexpr int kParts = 16 / kNative;
+constexpr int kTogether = kNative == 8 ? 4 : 2;
+
+typedef float NativeFloat __attribute__((vector_size(kNative * 4)));
+typedef float UnalignedFloat __attribute__((vector_size(kNative * 4), aligned(4)));
+typedef int32_t NativeInt __attribute__((vector_size(kNative * 4)));
+
+struct Mask {
+  NativeInt m[kParts];
+};
+struct Vec {
+  NativeFloat v[kParts];
+  Vec() = default;
+  EXTRAGS_INLINE NativeFloat splat(float value) { return NativeFloat{} + value; }
+  Vec(float value) {
+    for (int i = 0; i < kParts; ++i) v[i] = splat(value);
+  }
+};
+
+#define EXTRAGS_EACH(expression)                     \
+  Vec r;                                             \
+  for (int i = 0; i < kParts; ++i) r.v[i] = (expression); \
+  return r
+#define EXTRAGS_EACH_MASK(expression)                \
+  Mask r;                                            \
+  for (int i = 0; i < kParts; ++i) r.m[i] = (expression); \
+  return r
+
+#if defined(__AVX2__) && defined(__FMA__)
+EXTRAGS_INLINE NativeFloat native_fma(NativeFloat a, NativeFloat b, NativeFloat c) {
+  return _mm256_fmadd_ps(a, b, c);
+}
+EXTRAGS_INLINE NativeFloat native_fnma(NativeFloat a, NativeFloat b, NativeFloat c) {
+  return _mm256_fnmadd_ps(a, b, c);
+}
+EXTRAGS_INLINE NativeFloat native_sqrt(NativeFloat a) { return _mm256_sqrt_ps(a); }
+EXTRAGS_INLINE NativeFloat native_min(NativeFloat a, NativeFloat b) { return _mm256_min_ps(a, b); }
+EXTRAGS_INLINE NativeFloat native_max(NativeFloat a, NativeFloat b) { return _mm256_max_ps(a, b); }
+EXTRAGS_INLINE uint32_t native_bits(NativeInt m) {
+  return static_cast<uint32_t>(_mm256_movemask_ps((__m256)m));
+}
+#elif defined(__aarch64__)
+EXTRAGS_INLINE NativeFloat native_fma(NativeFloat a, NativeFloat b, NativeFloat c) {
+  return (NativeFloat)vfmaq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b);
+}
+EXTRAGS_INLINE NativeFloat native_fnma(NativeFloat a, NativeFloat b, NativeFloat c) {
+  return (NativeFloat)vfmsq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b);
+}
+EXTRAGS_INLINE NativeFloat native_sqrt(NativeFloat a) {
+  return (NativeFloat)vsqrtq_f32((float32x4_t)a);
+}
+EXTRAGS_INLINE NativeFloat native_min(NativeFloat a, NativeFloat b) { return a < b ? a : b; }
+EXTRAGS_INLINE NativeFloat native_max(NativeFloat a, NativeFloat b) { return a > b ? a : b; }
+EXTRAGS_INLINE uint32_t native_bits(NativeInt m) {
+  return (m[0] & 1) | (m[1] & 2) | (m[2] & 4) | (m[3] & 8);
+}
+#else
+EXTRAGS_INLINE NativeFloat native_fma(NativeFloat a, NativeFloat b, NativeFloat c) {
+  return a * b + c;
+}
+EXTRAGS_INLINE NativeFloat native_fnma(NativeFloat a, NativeFloat b, NativeFloat c) {
+  return c - a * b;
+}
+#if defined(__SSE2__)
+EXTRAGS_INLINE NativeFloat native_sqrt(NativeFloat a) { return _mm_sqrt_ps(a); }
+EXTRAGS_INLINE NativeFloat native_min(NativeFloat a, NativeFloat b) { return _mm_min_ps(a, b); }
+EXTRAGS_INLINE NativeFloat native_max(NativeFloat a, NativeFloat b) { return _mm_max_ps(a, b); }
+EXTRAGS_INLINE uint32_t native_bits(NativeInt m) {
+  return static_cast<uint32_t>(_mm_movemask_ps((__m128)m));
+}
+#else
+EXTRAGS_INLINE NativeFloat native_sqrt(NativeFloat a) {
+  for (int k = 0; k < kNative; ++k) a[k] = __builtin_sqrtf(a[k]);
+  return a;
+}
+EXTRAGS_INLINE NativeFloat native_min(NativeFloat a, NativeFloat b) { return a < b ? a : b; }
+EXTRAGS_INLINE NativeFloat native_max(NativeFloat a, NativeFloat b) { return a > b ? a : b; }
+EXTRAGS_INLINE uint32_t native_bits(NativeInt m) {
+  return (m[0] & 1) | (m[1] & 2) | (m[2] & 4) | (m[3] & 8);
+}
+#endif
+#endif
+
+EXTRAGS_INLINE Vec operator+(Vec a, Vec b) { EXTRAGS_EACH(a.v[i] + b.v[i]); }
+EXTRAGS_INLINE Vec operator-(Vec a, Vec b) { EXTRAGS_EACH(a.v[i] - b.v[i]); }
+EXTRAGS_INLINE Vec operator*(Vec a, Vec b) { EXTRAGS_EACH(a.v[i] * b.v[i]); }
+EXTRAGS_INLINE Vec operator/(Vec a, Vec b) { EXTRAGS_EACH(a.v[i] / b.v[i]); }
+EXTRAGS_INLINE Vec fma(Vec a, Vec b, Vec c) { EXTRAGS_EACH(native_fma(a.v[i], b.v[i], c.v[i])); }
+EXTRAGS_INLINE Vec fnma(Vec a, Vec b, Vec c) { EXTRAGS_EACH(native_fnma(a.v[i], b.v[i], c.v[i])); }
+EXTRAGS_INLINE Vec min(Vec a, Vec b) { EXTRAGS_EACH(native_min(a.v[i], b.v[i])); }
+EXTRAGS_INLINE Vec max(Vec a, Vec b) { EXTRAGS_EACH(native_max(a.v[i], b.v[i])); }
+EXTRAGS_INLINE Vec sqrt(Vec a) { EXTRAGS_EACH(native_sqrt(a.v[i])); }
+EXTRAGS_INLINE Vec abs(Vec a) { EXTRAGS_EACH((NativeFloat)((NativeInt)a.v[i] & 0x7fffffff)); }
+EXTRAGS_INLINE Vec load(const float* p) {
+  EXTRAGS_EACH(*reinterpret_cast<const UnalignedFloat*>(p + kNative * i));
+}
+EXTRAGS_INLINE void store(float* p, Vec a) {
+  for (int i = 0; i < kParts; ++i) *reinterpret_cast<UnalignedFloat*>(p + kNative * i) = a.v[i];
+}
+EXTRAGS_INLINE Vec load_first(const float* p, int n) {
+  alignas(64) float t[16] = {};
+  for (int i = 0; i < n; ++i) t[i] = p[i];
+  return load(t);
+}
+EXTRAGS_INLINE void store_first(float* p, Vec a, int n) {
+  alignas(64) float t[16];
+  store(t, a);
+  for (int i = 0; i < n; ++i) p[i] = t[i];
+}
+EXTRAGS_INLINE Mask ge(Vec a, Vec b) { EXTRAGS_EACH_MASK(a.v[i] >= b.v[i]); }
+EXTRAGS_INLINE Mask gt(Vec a, Vec b) { EXTRAGS_EACH_MASK(a.v[i] > b.v[i]); }
+EXTRAGS_INLINE Mask operator&(Mask a, Mask b) { EXTRAGS_EACH_MASK(a.m[i] & b.m[i]); }
+EXTRAGS_INLINE Mask without(Mask a, Mask b) { EXTRAGS_EACH_MASK(a.m[i] & ~b.m[i]); }
+EXTRAGS_INLINE uint32_t to_bits(Mask a) {
+  uint32_t bits = 0;
+  for (int i = 0; i < kParts; ++i) bits |= native_bits(a.m[i]) << (kNative * i);
+  return bits;
+}
+EXTRAGS_INLINE bool any(Mask a) {
+  NativeInt some = a.m[0];
+  for (int i = 1; i < kParts; ++i) some |= a.m[i];
+  return native_bits(some) != 0;
+}
+EXTRAGS_INLINE Vec select(Mask m, Vec a, Vec b) { EXTRAGS_EACH(m.m[i] ? a.v[i] : b.v[i]); }
+EXTRAGS_INLINE Vec keep(Mask m, Vec a) { EXTRAGS_EACH((NativeFloat)(m.m[i] & (NativeInt)a.v[i])); }
+EXTRAGS_INLINE float sum(Vec a) {
+  alignas(64) float t[16];
+  store(t, a);
+  for (int half = 8; half > 0; half /= 2) {
+    for (int i = 0; i < half; ++i) t[i] += t[i + half];
+  }
+  return t[0];
+}
+EXTRAGS_INLINE float largest(Vec a) {
+  alignas(64) float t[16];
+  store(t, a);
+  float best = t[0];
+  for (int i = 1; i < 16; ++i) best = t[i] > best ? t[i] : best;
+  return best;
+}
+// To nearest even, for |a| < 2^22. Relies on IEEE rounding: never compile with -ffast-math.
+EXTRAGS_INLINE Vec round(Vec a) { EXTRAGS_EACH((a.v[i] + 12582912.f) - 12582912.f); }
+EXTRAGS_INLINE Vec scale_by_power(Vec a, Vec n) {
+  EXTRAGS_EACH((NativeFloat)((NativeInt)a.v[i] + (__builtin_convertvector(n.v[i], NativeInt) << 23)));
+}
+EXTRAGS_INLINE Vec split_power(Vec x, Vec* mantissa) {
+  Vec power;
+  for (int i = 0; i < kParts; ++i) {
+    const NativeInt bits = (NativeInt)x.v[i], e = (bits - 0x3f400000) >> 23;
+    mantissa->v[i] = (NativeFloat)(bits - (e << 23));
+    power.v[i] = __builtin_convertvector(e, NativeFloat);
+  }
+  return power;
+}
+EXTRAGS_INLINE int append_lanes(uint32_t* p, uint32_t bits, uint32_t base) {
+  int count = 0;
+  for (; bits != 0; bits &= bits - 1) p[count++] = base + static_cast<uint32_t>(__builtin_ctz(bits));
+  return count;
+}
+EXTRAGS_INLINE void store_packed(uint32_t* p, Vec low, Vec high) {
+  for (int i = 0; i < kParts; ++i) {
+    const NativeInt packed = __builtin_convertvector(low.v[i], NativeInt) |
+                             __builtin_convertvector(high.v[i], NativeInt) << 16;
+    memcpy(p + kNative * i, &packed, sizeof packed);
+  }
+}
+EXTRAGS_INLINE Vec broadcast_pair(const float* p) {
+#if defined(__AVX2__) && defined(__FMA__)
+  double pair;
+  memcpy(&pair, p, 8);
+  const NativeFloat both = _mm256_castpd_ps(_mm256_set1_pd(pair));
+#else
+  const NativeFloat both = {p[0], p[1], p[0], p[1]};
+#endif
+  EXTRAGS_EACH(both);
+}
+EXTRAGS_INLINE void store_pairs(float* p, Vec a, Vec b) {
+  for (int i = 0; i < kParts; ++i) {
+#if defined(__AVX2__) && defined(__FMA__)
+    _mm256_storeu_ps(p + 8 * i, _mm256_unpacklo_ps(a.v[i], b.v[i]));
+    _mm256_storeu_ps(p + 16 + 8 * i, _mm256_unpackhi_ps(a.v[i], b.v[i]));
+#else
+    *reinterpret_cast<UnalignedFloat*>(p + 4 * i) =
+        __builtin_shufflevector(a.v[i], b.v[i], 0, 4, 1, 5);
+    *reinterpret_cast<UnalignedFloat*>(p + 16 + 4 * i) =
+        __builtin_shufflevector(a.v[i], b.v[i], 2, 6, 3, 7);
+#endif
+  }
+}
+EXTRAGS_INLINE void transpose16(const float* source, float* target) {
+#if defined(__AVX2__) && defined(__FMA__)
+  for (int bi = 0; bi < 16; bi += 8) {
+    for (int bj = 0; bj < 16; bj += 8) {
+      __m256 r[8], t[8];
+      for (int i = 0; i < 8; ++i) r[i] = _mm256_loadu_ps(source + 16 * (bi + i) + bj);
+      for (int i = 0; i < 8; i += 2) {
+        t[i] = _mm256_unpacklo_ps(r[i], r[i + 1]);
+        t[i + 1] = _mm256_unpackhi_ps(r[i], r[i + 1]);
+      }
+      for (int i = 0; i < 8; i += 4) {
+        for (int k = 0; k < 2; ++k) {
+          r[i + 2 * k] = _mm256_shuffle_ps(t[i + k], t[i + 2 + k], 0x44);
+          r[i + 2 * k + 1] = _mm256_shuffle_ps(t[i + k], t[i + 2 + k], 0xee);
+        }
+      }
+      for (int c = 0; c < 4; ++c) {
+        float* row = target + 16 * (bj + c) + bi;
+        _mm256_storeu_ps(row, _mm256_permute2f128_ps(r[c], r[4 + c], 0x20));
+        _mm256_storeu_ps(row + 64, _mm256_permute2f128_ps(r[c], r[4 + c], 0x31));
+      }
+    }
+  }
+#else
+  for (int bi = 0; bi < 16; bi += 4) {
+    for (int bj = 0; bj < 16; bj += 4) {
+      NativeFloat r[4];
+      for (int i = 0; i < 4; ++i) {
+        r[i] = *reinterpret_cast<const UnalignedFloat*>(source + 16 * (bi + i) + bj);
+      }
+      const NativeFloat a = __builtin_shufflevector(r[0], r[1], 0, 4, 1, 5);
+      const NativeFloat b = __builtin_shufflevector(r[0], r[1], 2, 6, 3, 7);
+      const NativeFloat c = __builtin_shufflevector(r[2], r[3], 0, 4, 1, 5);
+      const NativeFloat d = __builtin_shufflevector(r[2], r[3], 2, 6, 3, 7);
+      NativeFloat column[4] = {
+          __builtin_shufflevector(a, c, 0, 1, 4, 5), __builtin_shufflevector(a, c, 2, 3, 6, 7),
+          __builtin_shufflevector(b, d, 0, 1, 4, 5), __builtin_shufflevector(b, d, 2, 3, 6, 7)};
+      for (int k = 0; k < 4; ++k) {
+        *reinterpret_cast<UnalignedFloat*>(target + 16 * (bj + k) + bi) = column[k];
+      }
+    }
+  }
+#endif
+}
+#undef EXTRAGS_EACH
+#undef EXTRAGS_EACH_MASK
+
+#endif
+
+constexpr int kLaneOfPair[16] = {0, 1, 4, 5, 8, 9, 12, 13, 2, 3, 6, 7, 10, 11, 14, 15};
+
+EXTRAGS_INLINE Vec negated(Vec a) { return Vec(0.f) - a; }
+EXTRAGS_INLINE Vec ramp() {
+  alignas(64) static const float lanes[16] = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+  return load(lanes);
+}
+// Lanes below n
+EXTRAGS_INLINE Mask first_lanes(int n) { return gt(Vec(static_cast<float>(n)), ramp()); }
+
+// 2^p for |p| < 120, relative error below 2e-7: a degree-5 minimax polynomial on [-1/2, 1/2].
+EXTRAGS_INLINE Vec exp2(Vec p) {
+  const Vec n = round(p), f = p - n;
+  Vec r(1.3276471e-3f);
+  r = fma(r, f, Vec(9.6755410e-3f));
+  r = fma(r, f, Vec(5.5507131e-2f));
+  r = fma(r, f, Vec(2.4022120e-1f));
+  r = fma(r, f, Vec(6.9314694e-1f));
+  r = fma(r, f, Vec(1.0000001f));
+  return scale_by_power(r, n);
+}
+// log2(x) for normal positive x: the series of 2 atanh((m - 1) / (m + 1)), |argument| <= 1/5.
+EXTRAGS_INLINE Vec log2(Vec x) {
+  Vec m;
+  const Vec power = split_power(x, &m);
+  const Vec s = (m - Vec(1.f)) / (m + Vec(1.f)), s2 = s * s;
+  Vec r = fma(s2, Vec(1.f / 11), Vec(1.f / 9));
+  r = fma(r, s2, Vec(1.f / 7));
+  r = fma(r, s2, Vec(1.f / 5));
+  r = fma(r, s2, Vec(1.f / 3));
+  r = fma(r, s2, Vec(1.f));
+  return fma(s * r, Vec(2 * kLog2E), power);
+}
+
+// Rows of 2, 3 or 4 floats for up to 16 Gaussians, into one vector per column; missing rows are zero.
+template <int kColumns>
+EXTRAGS_INLINE void load_rows(const float* p, int rows, Vec* columns) {
+  alignas(64) float t[kColumns][16] = {};
+  for (int i = 0; i < rows; ++i) {
+    for (int k = 0; k < kColumns; ++k) t[k][i] = p[kColumns * i + k];
+  }
+  for (int k = 0; k < kColumns; ++k) columns[k] = load(t[k]);
+}
+template <int kColumns>
+EXTRAGS_INLINE void store_rows(float* p, int rows, const Vec* columns, bool add) {
+  alignas(64) float t[kColumns][16];
+  for (int k = 0; k < kColumns; ++k) store(t[k], columns[k]);
+  if (add) {
+    for (int i = 0; i < rows; ++i) {
+      for (int k = 0; k < kColumns; ++k) p[kColumns * i + k] += t[k][i];
+    }
+  } else {
+    for (int i = 0; i < rows; ++i) {
+      for (int k = 0; k < kColumns; ++k) p[kColumns * i + k] = t[k][i];
+    }
+  }
+}

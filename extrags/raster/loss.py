@@ -1,0 +1,114 @@
+r"""L1 + SSIM loss with its gradient in one pass.
+
+For an image x, a target y and per-pixel weights m in [0, 1],
+
+.. math:: L = (1 - \lambda) \frac{\sum_p m_p \sum_c |x - y|}{3 \sum_p m_p}
+        + \lambda \frac{\sum_p m_p \sum_c (1 - \mathrm{SSIM}_{pc}) / 2}{3 \sum_p m_p}.
+
+The SSIM map is that of Wang et al. 2004: 11 x 11 Gaussian window of sigma 1.5, zeros outside the image,
+C1 = 0.01^2, C2 = 0.03^2 for a range of one, and is taken on the images as they are: the weights choose
+where the map counts, they do not change it. Where all weights are zero the loss is zero.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrags.errors import ShapeError
+from extrags.raster import native
+
+__all__ = ["l1_ssim_loss", "l1_ssim_loss_reference"]
+
+SSIM_C1 = 0.01**2
+SSIM_C2 = 0.03**2
+WINDOW_RADIUS_PX = 5
+WINDOW_SIGMA_PX = 1.5
+
+
+def l1_ssim_loss(
+    image: Float[Tensor, "*c h w 3"],
+    target: Float[Tensor, "*c h w 3"],
+    *,
+    dssim_weight: float = 0.2,
+    mask: Float[Tensor, "*c h w"] | None = None,
+) -> Float[Tensor, ""]:
+    """Weighted (1 - dssim_weight) L1 + dssim_weight (1 - SSIM) / 2; see the module for the formula.
+
+    float32 CPU tensors go through the native kernel, which computes loss and gradient in one pass;
+    everything else through `l1_ssim_loss_reference`. Only `image` gets a gradient.
+
+    Args:
+        image: rendered colour in [0, 1].
+        target: what it should be.
+        dssim_weight: lambda, in [0, 1].
+        mask: weights per pixel, in [0, 1] or larger; None weighs all alike.
+
+    Returns:
+        The loss.
+
+    Raises:
+        ShapeError: when shapes or dtypes do not fit together.
+
+    Source: Kerbl et al. 2023, eq. 7; Wang et al., Image quality assessment, TIP 2004.
+    """
+    _check(image, target, mask)
+    plain = image.device.type == "cpu" and image.dtype == torch.float32
+    if plain and native.native_isa() is not None:
+        return native.l1_ssim_loss_native(image, target, dssim_weight, mask)
+    return l1_ssim_loss_reference(image, target, dssim_weight=dssim_weight, mask=mask)
+
+
+def l1_ssim_loss_reference(
+    image: Float[Tensor, "*c h w 3"],
+    target: Float[Tensor, "*c h w 3"],
+    *,
+    dssim_weight: float = 0.2,
+    mask: Float[Tensor, "*c h w"] | None = None,
+) -> Float[Tensor, ""]:
+    """The same in plain torch, any floating dtype: the specification of `l1_ssim_loss`."""
+    _check(image, target, mask)
+    target = target.detach()
+    height, width = image.shape[-3:-1]
+    weights = torch.ones_like(image[..., 0]) if mask is None else mask.detach()
+    total = 3 * weights.sum()
+    x = image.reshape(-1, height, width, 3).permute(0, 3, 1, 2)
+    y = target.reshape(-1, height, width, 3).permute(0, 3, 1, 2)
+    m = weights.reshape(-1, 1, height, width)
+    dissimilarity = (1 - dssim_weight) * (x - y).abs() + dssim_weight * (1 - _ssim_map(x, y)) / 2
+    if float(total) == 0:
+        return (dissimilarity * m).sum()
+    return (dissimilarity * m).sum() / total
+
+
+def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
+    offsets = torch.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1, dtype=torch.float64)
+    taps = torch.exp(-0.5 * (offsets / WINDOW_SIGMA_PX) ** 2)
+    taps = (taps / taps.sum()).to(dtype=x.dtype, device=x.device)
+
+    def blur(image: Tensor) -> Tensor:
+        flat = image.reshape(-1, 1, *image.shape[-2:])
+        flat = torch.nn.functional.conv2d(flat, taps.reshape(1, 1, -1, 1), padding=(WINDOW_RADIUS_PX, 0))
+        flat = torch.nn.functional.conv2d(flat, taps.reshape(1, 1, 1, -1), padding=(0, WINDOW_RADIUS_PX))
+        return flat.reshape(image.shape)
+
+    mean_x, mean_y = blur(x), blur(y)
+    variance_x = blur(x * x) - mean_x * mean_x
+    variance_y = blur(y * y) - mean_y * mean_y
+    covariance = blur(x * y) - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x * mean_x + mean_y * mean_y + SSIM_C1)
+    return luminance * (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
+
+
+def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+    if image.ndim not in (3, 4) or image.shape[-1] != 3:
+        raise ShapeError(f"image has shape {tuple(image.shape)}, expected ([C,] H, W, 3)")
+    if target.shape != image.shape or target.dtype != image.dtype:
+        raise ShapeError(
+            f"target is {target.dtype} {tuple(target.shape)}, image is {image.dtype} {tuple(image.shape)}"
+        )
+    if mask is not None and (mask.shape != image.shape[:-1] or mask.dtype != image.dtype):
+        raise ShapeError(
+            f"mask is {mask.dtype} {tuple(mask.shape)}, expected {image.dtype} {tuple(image.shape[:-1])}"
+        )

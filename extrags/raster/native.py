@@ -1,0 +1,357 @@
+"""The native CPU backend: autograd round the compiled kernels.
+
+The kernels project, bin, sort and composite in one call per camera, and carry the gradients back in
+another. What a forward pass leaves in memory travels in a `Frame` to its backward pass.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from extrags.errors import ConfigError, MissingDependencyError
+from extrags.raster.rendering import RasterInputs, RasterOptions, Rendering, nonfinite_error
+
+try:
+    import extrags.raster._native as _compiled
+except ImportError:  # not built: the reference rasteriser still works
+    _kernels: ModuleType | None = None
+else:
+    _kernels = _compiled
+
+__all__ = [
+    "adam_step",
+    "compiled_kernels",
+    "l1_ssim_loss_native",
+    "native_isa",
+    "num_threads",
+    "rasterize_native",
+    "set_native_isa",
+    "set_num_threads",
+    "usable_isas",
+]
+
+
+def native_isa() -> str | None:
+    """The instruction set the kernels use, `avx512`, `avx2` or `portable`; None when they are not built.
+
+    The best one of the processor is chosen at import; the environment variable EXTRAGS_ISA overrides it.
+    """
+    return None if _kernels is None else str(_kernels.isa())
+
+
+def usable_isas() -> list[str]:
+    """Instruction sets this processor can run, the fastest first."""
+    return [] if _kernels is None else list(_kernels.usable_isas())
+
+
+def set_native_isa(name: str) -> None:
+    """Switch the kernels to another instruction set of `usable_isas()`.
+
+    Raises:
+        ConfigError: when this processor cannot run it.
+    """
+    try:
+        compiled_kernels().set_isa(name)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def set_num_threads(n: int) -> None:
+    """Let the kernels use up to n threads; the results do not depend on it.
+
+    The default is the number of cores this process may use, at most 8.
+
+    Raises:
+        ConfigError: when n is not 1 to 64.
+    """
+    if not 1 <= n <= 64:
+        raise ConfigError(f"the number of threads is {n}, expected 1 to 64")
+    compiled_kernels().set_num_threads(n)
+
+
+def num_threads() -> int:
+    """How many threads the kernels may use."""
+    return int(compiled_kernels().num_threads())
+
+
+def compiled_kernels() -> ModuleType:
+    """The compiled module itself, for benchmarks.
+
+    Raises:
+        MissingDependencyError: when it is not built.
+    """
+    if _kernels is None:
+        raise MissingDependencyError("the native kernels are not built: pip install extrags")
+    return _kernels
+
+
+def rasterize_native(inputs: RasterInputs, options: RasterOptions) -> Rendering:
+    """Render float32 CPU tensors with the native kernels; arguments as checked by `rasterize`."""
+    _refuse_nonfinite(inputs)
+    call = _Call.prepared(inputs, options)
+    rgb, alpha, depth = _Rasterize.apply(  # type: ignore[no-untyped-call]
+        call,
+        inputs.means,
+        inputs.quats,
+        inputs.scales,
+        inputs.opacities,
+        inputs.sh,
+        inputs.colors,
+        inputs.viewmats,
+        inputs.background,
+    )
+    return Rendering(
+        rgb=rgb,
+        alpha=alpha,
+        depth=depth,
+        means2d=call.means2d,
+        radius_px=call.radius_px,
+        median_depth=call.median_depth,
+        visibility_max=call.visibility_max,
+        visibility_sum=call.visibility_sum,
+        transmittance=call.transmittance,
+    )
+
+
+def _refuse_nonfinite(inputs: RasterInputs) -> None:
+    kernels = compiled_kernels()
+    for name, value in vars(inputs).items():
+        if value is None:
+            continue
+        plain = value.detach().contiguous()
+        if plain.numel() and kernels.first_nonfinite(plain) >= 0:
+            raise nonfinite_error(name, value)
+
+
+@dataclass
+class _Call:
+    """One rasterisation: its options, and the outputs that autograd does not see."""
+
+    options: RasterOptions
+    query_points: Tensor | None
+    Ks: Tensor
+    means2d: Tensor
+    radius_px: Tensor
+    median_depth: Tensor | None
+    visibility_max: Tensor | None
+    visibility_sum: Tensor | None
+    transmittance: Tensor | None
+    frames: list[Any] = field(default_factory=list)
+
+    @classmethod
+    def prepared(cls, inputs: RasterInputs, options: RasterOptions) -> _Call:
+        c, n = len(inputs.viewmats), len(inputs.means)
+        points = inputs.query_points
+        return cls(
+            options=options,
+            query_points=None if points is None else points.detach().contiguous(),
+            Ks=inputs.Ks.detach().contiguous(),
+            means2d=torch.empty(c, n, 2),
+            radius_px=torch.empty(c, n),
+            median_depth=torch.empty(c, options.height, options.width) if options.median_depth else None,
+            visibility_max=torch.empty(c, n) if options.visibility else None,
+            visibility_sum=torch.empty(c, n) if options.visibility else None,
+            transmittance=None if points is None else torch.empty(c, len(points)),
+        )
+
+    def take_gradients(self, gradients: Tensor, absolute: Tensor | None) -> None:
+        """Hand the gradients of the projected centres to the tensor the user holds."""
+        means2d = self.means2d
+        means2d.grad = gradients if means2d.grad is None else means2d.grad + gradients
+        if absolute is not None:
+            before = getattr(means2d, "absgrad", None)
+            means2d.absgrad = absolute if before is None else before + absolute  # type: ignore[attr-defined]
+
+
+def _of_camera(values: Tensor | None, camera: int) -> Tensor | None:
+    return None if values is None else values[camera]
+
+
+class _Rasterize(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        call: _Call,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        sh: Tensor | None,
+        colors: Tensor | None,
+        viewmats: Tensor,
+        background: Tensor | None,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        kernels, options = compiled_kernels(), call.options
+        arrays = [
+            None if value is None else value.detach().contiguous()
+            for value in (means, quats, scales, opacities, sh, colors, viewmats, background)
+        ]
+        means, quats, scales, opacities, sh, colors, viewmats, background = arrays  # type: ignore[assignment]
+        c = len(viewmats)
+        rgb = torch.empty(c, options.height, options.width, 3)
+        alpha = torch.empty(c, options.height, options.width)
+        depth = torch.empty_like(alpha)
+        differentiable = any(ctx.needs_input_grad)
+        for camera in range(c):
+            frame = kernels.render(
+                means,
+                quats,
+                scales,
+                opacities,
+                sh,
+                options.sh_degree,
+                colors if colors is None or colors.ndim == 2 else colors[camera],
+                viewmats[camera],
+                call.Ks[camera],
+                _of_camera(background, camera),
+                options.width,
+                options.height,
+                options.near,
+                rgb[camera],
+                alpha[camera],
+                depth[camera],
+                call.means2d[camera],
+                call.radius_px[camera],
+                _of_camera(call.median_depth, camera),
+                _of_camera(call.visibility_max, camera),
+                _of_camera(call.visibility_sum, camera),
+            )
+            if call.query_points is not None and call.transmittance is not None:
+                frame.query(call.query_points, call.transmittance[camera])
+            if differentiable:
+                call.frames.append(frame)
+        ctx.call = call
+        ctx.save_for_backward(*arrays, alpha, depth)
+        return rgb, alpha, depth
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_rgb: Tensor, v_alpha: Tensor, v_depth: Tensor) -> tuple[Tensor | None, ...]:
+        call: _Call = ctx.call
+        means, quats, scales, opacities, sh, colors, viewmats, _, alpha, depth = ctx.saved_tensors
+        needs = ctx.needs_input_grad[1:]
+        v_rgb, v_alpha, v_depth = (value.contiguous() for value in (v_rgb, v_alpha, v_depth))
+        c, n = len(viewmats), len(means)
+        shared = [
+            torch.empty_like(value) if needed else None
+            for value, needed in zip((means, quats, scales, opacities, sh), needs, strict=False)
+        ]
+        if c == 0:
+            shared = [None if value is None else value.zero_() for value in shared]
+        g_colors = torch.empty(c, n, 3) if needs[5] else None
+        g_viewmats = torch.empty(c, 4, 4) if needs[6] else None
+        g_means2d = torch.empty(c, n, 2)
+        g_absolute = torch.empty(c, n, 2) if call.options.absgrad else None
+        for camera in range(c):
+            call.frames[camera].backward(
+                means,
+                quats,
+                scales,
+                opacities,
+                sh,
+                call.options.sh_degree,
+                colors if colors is None or colors.ndim == 2 else colors[camera],
+                v_rgb[camera],
+                v_alpha[camera],
+                v_depth[camera],
+                depth[camera],
+                camera > 0,
+                *shared,
+                _of_camera(g_colors, camera),
+                _of_camera(g_viewmats, camera),
+                g_means2d[camera],
+                _of_camera(g_absolute, camera),
+            )
+        call.take_gradients(g_means2d, g_absolute)
+        if g_colors is not None and colors.ndim == 2:
+            g_colors = g_colors[0] if c == 1 else g_colors.sum(0)
+        g_background = None
+        if needs[7]:
+            g_background = (v_rgb * (1 - alpha)[..., None]).sum((1, 2))
+        return (None, *shared, g_colors, g_viewmats, g_background)
+
+
+def l1_ssim_loss_native(image: Tensor, target: Tensor, dssim_weight: float, mask: Tensor | None) -> Tensor:
+    """`l1_ssim_loss` of float32 CPU tensors; arguments as checked there."""
+    loss: Tensor = _L1Ssim.apply(image, target, dssim_weight, mask)  # type: ignore[no-untyped-call]
+    return loss
+
+
+class _L1Ssim(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float, mask: Tensor | None) -> Tensor:
+        kernels = compiled_kernels()
+        height, width = image.shape[-3:-1]
+        x = image.detach().reshape(-1, height, width, 3).contiguous()
+        y = target.detach().reshape(-1, height, width, 3).contiguous()
+        m = None if mask is None else mask.detach().reshape(-1, height, width).contiguous()
+        total = 3 * (float(x[..., 0].numel()) if m is None else float(m.sum(dtype=torch.float64)))
+        scale = 1 / total if total != 0 else 1.0
+        gradient = torch.empty_like(x)
+        loss = 0.0
+        for index in range(len(x)):
+            loss += kernels.l1_ssim(
+                x[index],
+                y[index],
+                _of_camera(m, index),
+                gradient[index],
+                height,
+                width,
+                dssim_weight,
+                scale,
+            )
+        ctx.save_for_backward(gradient.reshape(image.shape))
+        return image.new_tensor(loss)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * v_loss, None, None, None
+
+
+def adam_step(
+    values: Tensor,
+    gradients: Tensor,
+    first: Tensor,
+    second: Tensor,
+    steps: Tensor,
+    visible: Tensor | None,
+    bias: Sequence[Tensor],
+    rate: float,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """Step one parameter in place; see `SelectiveAdam`.
+
+    Args:
+        values: [N, ...], contiguous float32, like `gradients`, `first` and `second`.
+        gradients: of the loss.
+        first: first moments.
+        second: second moments.
+        steps: how often each row has been stepped, this step included, [N] int32.
+        visible: rows to step, [N] bool; None is all.
+        bias: 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) for every t up to the largest of `steps`.
+        rate: learning rate.
+        betas: decay of the moments.
+        eps: added to the root of the second moment.
+    """
+    compiled_kernels().adam(
+        values.detach(),
+        gradients.contiguous(),
+        first,
+        second,
+        steps,
+        bias[0],
+        bias[1],
+        None if visible is None else visible.contiguous().view(torch.uint8),
+        rate,
+        *betas,
+        eps,
+    )

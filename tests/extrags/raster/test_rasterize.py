@@ -1,0 +1,348 @@
+"""Backends against each other, and the faces all of them share."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from extrags.errors import ConfigError, MissingDependencyError, NonFiniteError, ShapeError
+from extrags.raster import Rendering, available_backends, native, rasterize, set_num_threads
+from tests.extrags.raster.scenes import RasterScene, relative_l2, tube, weighted_sum
+
+IMAGES = ("rgb", "alpha", "depth", "means2d", "radius_px")
+EXTRAS = ("median_depth", "visibility_max", "visibility_sum")
+
+
+def _query_points(n: int = 400) -> Tensor:
+    generator = torch.Generator().manual_seed(5)
+    return torch.rand(n, 3, generator=generator) * torch.tensor([2.0, 2, 6]) - torch.tensor([1.0, 1, 0.5])
+
+
+def _rendered(scene: RasterScene, backend: str, dtype: torch.dtype) -> tuple[Rendering, dict[str, Tensor]]:
+    leaves = scene.to(dtype, gradients=True)
+    rendering = leaves.render(
+        backend,
+        median_depth=True,
+        visibility=True,
+        absgrad=True,
+        query_points=_query_points().to(dtype),
+    )
+    weighted_sum(rendering).backward()
+    gradients = {name: leaf.grad for name, leaf in leaves.leaves() if leaf.grad is not None}
+    gradients["means2d"] = rendering.means2d.grad  # type: ignore[assignment]
+    gradients["absolute means2d"] = rendering.means2d.absgrad  # type: ignore[attr-defined]
+    return rendering, gradients
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param(tube(700, 67, 45, cameras=2), id="degree3-two-cameras"),
+        pytest.param(tube(300, 64, 48, sh_degree=2), id="degree2"),
+        pytest.param(tube(333, 33, 50, sh_degree=1), id="degree1"),
+        pytest.param(tube(17, 40, 30, sh_degree=0), id="degree0-few-large"),
+        pytest.param(tube(400, 50, 41, sh_degree=None), id="colors"),
+        pytest.param(
+            tube(400, 45, 40, sh_degree=None, cameras=3, colors_per_camera=True), id="colors-per-camera"
+        ),
+        pytest.param(tube(50, 1, 1), id="one-pixel"),
+    ],
+)
+def test_native_equals_reference(scene: RasterScene, isa: str) -> None:
+    found, found_gradients = _rendered(scene, "native", torch.float32)
+    expected, expected_gradients = _rendered(scene, "reference", torch.float64)
+    for name in IMAGES:
+        assert relative_l2(getattr(found, name), getattr(expected, name)) < 1e-5, name
+    for name in EXTRAS:
+        assert relative_l2(getattr(found, name), getattr(expected, name)) < 1e-4, name
+    assert torch.equal(found.visible, expected.visible)
+    assert found.transmittance is not None
+    assert expected.transmittance is not None
+    known = ~expected.transmittance.isnan()
+    assert torch.equal(~found.transmittance.isnan(), known)
+    assert relative_l2(found.transmittance[known], expected.transmittance[known]) < 1e-5
+    assert set(found_gradients) == set(expected_gradients)
+    for name, gradient in expected_gradients.items():
+        assert relative_l2(found_gradients[name], gradient) < 1e-3, name
+
+
+def _everything(scene: RasterScene) -> list[Tensor]:
+    rendering, gradients = _rendered(scene, "native", torch.float32)
+    tensors = [getattr(rendering, name) for name in (*IMAGES, *EXTRAS, "transmittance")]
+    return [*tensors, *gradients.values()]
+
+
+def test_same_bits_on_any_number_of_threads(isa: str, threads: None) -> None:
+    scene = tube(3000, 130, 101, cameras=2, seed=7)
+    results = []
+    for count in (1, 2, 3, 8):
+        set_num_threads(count)
+        results.append(_everything(scene))
+    for other in results[1:]:
+        for first, second in zip(results[0], other, strict=True):
+            assert torch.equal(first.nan_to_num(-1), second.nan_to_num(-1))
+
+
+def test_same_bits_on_all_sets_with_fused_multiply_add() -> None:
+    names = [name for name in native.usable_isas() if name != "portable"]
+    if len(names) < 2:
+        pytest.skip(f"this processor has only {names}")
+    scene = tube(2000, 97, 83, seed=8)
+    before = native.native_isa()
+    results = []
+    for name in names:
+        native.set_native_isa(name)
+        results.append(_everything(scene))
+    native.set_native_isa(str(before))
+    for first, second in zip(*results, strict=True):
+        assert torch.equal(first.nan_to_num(-1), second.nan_to_num(-1))
+
+
+def test_same_bits_from_concurrent_callers() -> None:
+    scenes = [tube(500 + 100 * i, 70, 60, seed=i) for i in range(4)]
+    alone = [_everything(scene) for scene in scenes]
+    together: list[list[Tensor] | None] = [None] * len(scenes)
+
+    def work(index: int) -> None:
+        for _ in range(3):
+            together[index] = _everything(scenes[index])
+
+    workers = [threading.Thread(target=work, args=(i,)) for i in range(len(scenes))]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join()
+    for first, second in zip(alone, together, strict=True):
+        assert second is not None
+        for a, b in zip(first, second, strict=True):
+            assert torch.equal(a.nan_to_num(-1), b.nan_to_num(-1))
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+@pytest.mark.parametrize("case", ["tiny_case", "basic_case"])
+def test_equals_renders_of_gsplat(case: str, backend: str, shared_data: Path) -> None:
+    """Images that gsplat's CUDA kernels made (published by the brush project)."""
+    data = load_file(shared_data / "gsplat_reference_renders" / f"{case}.safetensors")
+    height, width = data["out_img"].shape[:2]
+    dtype = torch.float64 if backend == "reference" else torch.float32
+    viewmat = torch.eye(4, dtype=dtype)
+    viewmat[:3, 3] = -torch.tensor([0.123, 0.456, -8.0], dtype=dtype)
+    K = torch.tensor([[width / 2, 0, width / 2], [0, width / 2, height / 2], [0, 0, 1]], dtype=dtype)
+    rendering = rasterize(
+        data["means"].to(dtype),
+        data["quats"].to(dtype),
+        data["scales"].to(dtype).exp(),
+        data["opacities"].to(dtype).sigmoid(),
+        data["coeffs"].to(dtype),
+        viewmat[None],
+        K[None],
+        width,
+        height,
+        backend=backend,  # type: ignore[arg-type]
+    )
+    image = torch.cat([rendering.rgb[0], rendering.alpha[0][..., None]], -1)
+    assert float((image - data["out_img"]).abs().max()) < 1e-5
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+@pytest.mark.parametrize("n", [0, 1, 15, 16, 17])
+def test_any_number_of_gaussians(n: int, backend: str) -> None:
+    scene = tube(n, 20, 18, sh_degree=1).to(torch.float32, gradients=True)
+    rendering = scene.render(backend, visibility=True, median_depth=True)
+    assert rendering.visible.shape == (1, n)
+    weighted_sum(rendering).backward()
+    assert scene.means.grad is None or bool(scene.means.grad.isfinite().all())
+    if n == 0:
+        torch.testing.assert_close(rendering.rgb[0, 3, 4], scene.background)
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_no_camera(backend: str) -> None:
+    scene = tube(10, 8, 8)
+    rendering = rasterize(
+        *(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh),
+        torch.zeros(0, 4, 4),
+        torch.zeros(0, 3, 3),
+        8,
+        8,
+        backend=backend,  # type: ignore[arg-type]
+    )
+    assert rendering.rgb.shape == (0, 8, 8, 3)
+
+
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_a_low_degree_ignores_the_higher_coefficients(backend: str) -> None:
+    scene = tube(60, 24, 20).to(torch.float32, gradients=True)
+    low = scene.render(backend, sh_degree=1)
+    weighted_sum(low).backward()
+    assert scene.sh is not None
+    assert scene.sh.grad is not None
+    assert float(scene.sh.grad[:, 4:].abs().max()) == 0
+    assert float(scene.sh.grad[:, :4].abs().max()) > 0
+    cut = scene.sh.detach()[:, :4].contiguous()
+    same = rasterize(
+        *(scene.means, scene.quats, scene.scales, scene.opacities, cut, scene.viewmats, scene.Ks),
+        scene.width,
+        scene.height,
+        background=scene.background,
+        backend=backend,  # type: ignore[arg-type]
+    )
+    assert torch.equal(low.rgb, same.rgb)
+
+
+def test_strided_inputs_are_welcome() -> None:
+    scene = tube(100, 30, 20)
+    strided = RasterScene(**{**vars(scene), "means": scene.means.T.contiguous().T})
+    assert torch.equal(strided.render("native").rgb, scene.render("native").rgb)
+
+
+def test_without_gradients_nothing_is_kept() -> None:
+    scene = tube(100, 30, 20).to(torch.float32, gradients=True)
+    with torch.no_grad():
+        rendering = scene.render("native")
+    assert not rendering.rgb.requires_grad
+
+
+def test_backward_twice_adds_up() -> None:
+    scene = tube(80, 30, 20).to(torch.float32, gradients=True)
+    rendering = scene.render("native")
+    rendering.rgb.sum().backward(retain_graph=True)
+    assert rendering.means2d.grad is not None
+    once, centres = scene.means.grad, rendering.means2d.grad.clone()
+    assert once is not None
+    once = once.clone()
+    rendering.rgb.sum().backward()
+    torch.testing.assert_close(scene.means.grad, 2 * once)
+    torch.testing.assert_close(rendering.means2d.grad, 2 * centres)
+
+
+class TestErrors:
+    @pytest.mark.parametrize(
+        ("name", "shape"),
+        [
+            ("quats", (10, 3)),
+            ("scales", (9, 3)),
+            ("opacities", (10, 1)),
+            ("sh", (10, 5, 3)),
+            ("viewmats", (4, 4)),
+            ("Ks", (2, 3, 3)),
+            ("background", (4,)),
+        ],
+    )
+    def test_shapes_by_name(self, name: str, shape: tuple[int, ...], unchecked: None) -> None:
+        scene = tube(10, 8, 8)
+        bad = RasterScene(**{**vars(scene), name: torch.ones(shape)})
+        with pytest.raises(ShapeError, match=name):
+            bad.render("native")
+
+    def test_size_degree_dtype(self, unchecked: None) -> None:
+        scene = tube(10, 8, 8)
+        with pytest.raises(ShapeError, match="image size 0x8"):
+            RasterScene(**{**vars(scene), "width": 0}).render("native")
+        with pytest.raises(ShapeError, match="sh_degree is 4"):
+            scene.render("native", sh_degree=4)
+        with pytest.raises(ShapeError, match="near"):
+            scene.render("native", near=0.0)
+        with pytest.raises(ShapeError, match="quats has dtype"):
+            RasterScene(**{**vars(scene), "quats": scene.quats.double()}).render("native")
+        with pytest.raises(ShapeError, match="exactly one of sh and colors"):
+            RasterScene(**{**vars(scene), "colors": torch.ones(10, 3)}).render("native")
+        with pytest.raises(ShapeError, match="query_points"):
+            scene.render("native", query_points=torch.ones(3))
+
+    @pytest.mark.parametrize("backend", ["native", "reference"])
+    @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf")])
+    @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh", "viewmats", "Ks"])
+    def test_non_finite_by_name(self, name: str, value: float, backend: str) -> None:
+        scene = tube(40, 8, 8).to(torch.float32)
+        array = getattr(scene, name)
+        array.reshape(-1)[-2] = value
+        with pytest.raises(NonFiniteError, match=rf"{name}\["):
+            scene.render(backend)
+
+    def test_backend(self, unchecked: None) -> None:
+        scene = tube(10, 8, 8)
+        with pytest.raises(ConfigError, match="backend is 'cuda'"):
+            scene.render("cuda")
+        with pytest.raises(ConfigError, match="float32 CPU"):
+            scene.to(torch.float64).render("native")
+        if "gsplat" not in available_backends():
+            with pytest.raises((ConfigError, MissingDependencyError), match="gsplat"):
+                scene.render("gsplat")
+
+    def test_threads_and_sets(self) -> None:
+        with pytest.raises(ConfigError, match="number of threads is 0"):
+            set_num_threads(0)
+        with pytest.raises(ConfigError, match="'sse9' is not usable here"):
+            native.set_native_isa("sse9")
+
+
+def _in_a_new_process(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, **environment},
+    )
+
+
+def test_environment_chooses_the_instruction_set() -> None:
+    code = "from extrags.raster import native_isa; print(native_isa())"
+    assert _in_a_new_process(code, EXTRAGS_ISA="portable").stdout.strip() == "portable"
+    failed = _in_a_new_process(code, EXTRAGS_ISA="sse9")
+    assert failed.returncode != 0
+    assert "'sse9' is not usable here" in failed.stderr
+
+
+def test_a_forked_child_has_threads_of_its_own(threads: None) -> None:
+    """The parent's threads do not survive a fork: waiting for them would hang the child."""
+    set_num_threads(2)
+    scene = tube(2000, 130, 101)
+    expected = scene.render("native").rgb
+    read, write = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)  # that a process with threads forks is the point
+        child = os.fork()
+    if child == 0:
+        same = torch.equal(scene.render("native").rgb, expected)
+        os.write(write, b"y" if same else b"n")
+        os._exit(0)
+    os.waitpid(child, 0)
+    assert os.read(read, 1) == b"y"
+
+
+def test_backends_that_work_here() -> None:
+    assert available_backends()[-1] == "reference"
+    assert "native" in available_backends(), "build the kernels: pip install -e ."
+    assert tube(10, 8, 8).to(torch.float64).render("auto").rgb.dtype == torch.float64
+
+
+@pytest.mark.gpu
+def test_gsplat_equals_native() -> None:
+    if "gsplat" not in available_backends():
+        pytest.skip("no CUDA device with gsplat")
+    scene = tube(2000, 130, 101, cameras=2)
+    expected = scene.to(torch.float32, gradients=True)
+    rendering = expected.render("native", absgrad=True, visibility=True)
+    weighted_sum(rendering).backward()
+    moved = {k: v.cuda() if isinstance(v, Tensor) else v for k, v in vars(scene).items()}
+    leaves = RasterScene(**moved).to(torch.float32, gradients=True)
+    found = leaves.render("gsplat", absgrad=True, visibility=True)
+    on_cpu = Rendering(**{k: v.cpu() if isinstance(v, Tensor) else v for k, v in vars(found).items()})
+    weighted_sum(on_cpu).backward()
+    for name in ("rgb", "alpha", "depth"):
+        assert relative_l2(getattr(on_cpu, name), getattr(rendering, name)) < 1e-4, name
+    for (name, leaf), (_, other) in zip(leaves.leaves(), expected.leaves(), strict=True):
+        assert leaf.grad is not None
+        assert other.grad is not None
+        assert relative_l2(leaf.grad.cpu(), other.grad) < 1e-3, name
