@@ -349,9 +349,9 @@ class TestUrl:
             Store("nosuch://bucket")
 
     def test_a_missing_driver_is_named(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        import fsspec.registry
+        from fsspec.registry import known_implementations
 
         driver = {"class": "no_such_driver.FileSystem", "err": "Install no_such_driver"}
-        monkeypatch.setitem(fsspec.registry.known_implementations, "undriven", driver)
+        monkeypatch.setitem(known_implementations, "undriven", driver)
         with pytest.raises(MissingDependencyError, match="Install no_such_driver"):
             Store("undriven://bucket/prefix")

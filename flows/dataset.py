@@ -1,0 +1,96 @@
+"""`reconstruct-dataset`: many sequences; a failure of one never stops the others."""
+
+from __future__ import annotations
+
+import logging
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+from typing import Annotated, Any
+
+from prefect import flow
+from prefect.artifacts import create_markdown_artifact
+from prefect.client.schemas.objects import State
+from pydantic import Field
+
+from flows.outcome import DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
+from flows.pages import dataset_page
+from flows.runners import PrefectRunner
+from flows.sequence import artifact_key, open_store, reconstruct_sequence
+from flows.settings import DEFAULT_STORE, ProfileName, StageName, pipeline_config, task_runner
+from flows.tables import dataset_markdown
+
+__all__ = ["reconstruct_dataset"]
+
+log = logging.getLogger(__name__)
+
+
+@flow(name="reconstruct-dataset", flow_run_name="{name}", log_prints=False, persist_result=False)
+def reconstruct_dataset(
+    sequences: Annotated[list[str], Field(min_length=1, description="names or paths")],
+    profile: Annotated[ProfileName, Field(description="named settings")] = "balanced",
+    settings: Annotated[dict[str, Any] | None, Field(description="overrides by dotted name")] = None,
+    seed: Annotated[int | None, Field(ge=0, description="seed of all stages")] = None,
+    store: Annotated[str, Field(description="directory or URL of the artefact store")] = DEFAULT_STORE,
+    refresh: Annotated[bool, Field(description="run every stage although its artefact is there")] = False,
+    until: Annotated[StageName, Field(description="last stage to run")] = "report",
+    runner: Annotated[str, Field(description="threads, dask or dask:ADDRESS")] = "threads",
+    at_once: Annotated[int, Field(ge=1, description="sequences in work at the same time")] = 1,
+    name: Annotated[str, Field(description="name of this run, for its table")] = "dataset",
+) -> DatasetOutcome:
+    """Take every sequence through all stages, each as a flow run of its own.
+
+    Returns:
+        One outcome per sequence, in the order given; failures among them. The summary is an artifact.
+    """
+    # Wrong settings and a store that cannot be written concern all sequences: say so once, at once.
+    pipeline_config(profile, settings, seed)
+    open_store(store)
+    one = reconstruct_sequence.with_options(task_runner=task_runner(runner))
+
+    def reconstruct(sequence: str) -> SequenceOutcome:
+        state: State[Any] = one(
+            sequence=sequence,
+            profile=profile,
+            settings=settings,
+            seed=seed,
+            store=store,
+            refresh=refresh,
+            until=until,
+            return_state=True,
+        )
+        return outcome_of(sequence, state)
+
+    if at_once == 1:
+        outcomes = [reconstruct(sequence) for sequence in sequences]
+    else:
+        with ThreadPoolExecutor(max_workers=at_once) as pool:
+            # Flow and observer travel in context variables, which threads do not inherit.
+            futures = [pool.submit(copy_context().run, reconstruct, sequence) for sequence in sequences]
+            outcomes = [future.result() for future in futures]
+    page = None
+    if until == "report":
+        page = dataset_page(outcomes, name, profile, PrefectRunner(store, refresh))
+    create_markdown_artifact(
+        dataset_markdown(outcomes),
+        key=artifact_key("dataset", name),
+        description=f"{len(outcomes)} sequences, profile {profile}",
+    )
+    return DatasetOutcome(outcomes, page)
+
+
+def outcome_of(sequence: str, state: State[Any]) -> SequenceOutcome:
+    """The outcome of a finished flow run, whether it ended well or not."""
+    found = state.result(raise_on_failure=False)
+    if isinstance(found, SequenceOutcome):
+        return found
+    if isinstance(found, SequenceFailedError):
+        return found.outcome
+    # Not a stage but the run itself failed (a crash of its task runner, say).
+    reason = str(found) if found is not None else state.name or "unknown"
+    log.error("%s: %s", sequence, reason)
+    return SequenceOutcome(
+        sequence,
+        "failed",
+        [StageRow("ingest", "failed", reason=reason)],
+        error=found if isinstance(found, Exception) else None,
+    )

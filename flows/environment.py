@@ -1,0 +1,64 @@
+"""Environment of runs from the command line; call before Prefect and torch are imported."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from extrags.errors import StoreError
+
+__all__ = ["prepare", "without_heartbeat"]
+
+
+def prepare(state: Path, *, debug: bool = False) -> None:
+    """Point Prefect at a home of its own and keep it quiet; what the user has set stays.
+
+    OpenMP threads are told to sleep while they wait: spinning, which is their default, makes training up to
+    five times slower as soon as anything else wants the cores.
+
+    Args:
+        state: local directory of the store; Prefect's database goes to `prefect/` in it. Left alone when
+            PREFECT_HOME or PREFECT_API_URL is set: then runs land where the user wants them.
+        debug: let Prefect log.
+
+    Raises:
+        StoreError: when the directory cannot be made.
+    """
+    chosen = {
+        "OMP_WAIT_POLICY": "passive",
+        # Without an API URL Prefect starts a server of its own for the time of the run. Its default of
+        # 20 s to get up is too short on a busy machine.
+        "PREFECT_SERVER_EPHEMERAL_ENABLED": "true",
+        "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "90",
+        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        "DO_NOT_TRACK": "1",
+        "PREFECT_CLI_PROMPT": "false",
+        "PREFECT_LOGGING_TO_API_ENABLED": "false",
+        # Failures are told in our own words; Prefect would add a traceback for each.
+        "PREFECT_LOGGING_LEVEL": "INFO" if debug else "CRITICAL",
+        "PREFECT_SERVER_LOGGING_LEVEL": "WARNING" if debug else "CRITICAL",
+    }
+    if not os.environ.get("PREFECT_API_URL") and not os.environ.get("PREFECT_HOME"):
+        home = state / "prefect"
+        try:
+            home.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StoreError(f"the store {state} cannot be written: {error.strerror or error}") from error
+        chosen["PREFECT_HOME"] = str(home)
+    for name, value in chosen.items():
+        os.environ.setdefault(name, value)
+
+
+@contextmanager
+def without_heartbeat() -> Iterator[None]:
+    """Flow runs inside the block send no heartbeat.
+
+    Waiting for its thread costs a second per flow run, and it cannot be switched off by environment. A
+    command that somebody waits for needs no zombie detection; deployments keep it.
+    """
+    from prefect.settings import PREFECT_FLOWS_HEARTBEAT_FREQUENCY, temporary_settings
+
+    with temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None}):
+        yield

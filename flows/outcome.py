@@ -1,0 +1,108 @@
+"""What a run reports: the JSON of `extrags run` (design section 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from extrags.errors import ExtragsError
+
+__all__ = ["DatasetOutcome", "SequenceFailedError", "SequenceOutcome", "StageRow", "StageState"]
+
+StageState = Literal["ran", "cached", "skipped", "failed"]
+
+
+@dataclass
+class StageRow:
+    """How one stage of one sequence went."""
+
+    stage: str
+    state: StageState
+    seconds: float = 0.0
+    """Time it took now; next to nothing when cached."""
+    reason: str = ""
+    """Why it was skipped or failed; what the plan said."""
+    made_seconds: float = 0.0
+    """Time it took when its artefacts were made."""
+    peak_mib: float | None = None
+    """Peak resident memory of the process when they were made."""
+    tasks: int = 0
+    """Task runs it consists of."""
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object."""
+        return {
+            "stage": self.stage,
+            "state": self.state,
+            "seconds": round(self.seconds, 3),
+            "reason": self.reason,
+            "made_seconds": round(self.made_seconds, 3),
+            "peak_mib": self.peak_mib,
+            "tasks": self.tasks,
+        }
+
+
+@dataclass
+class SequenceOutcome:
+    """How one sequence went."""
+
+    name: str
+    status: Literal["ok", "failed"] = "ok"
+    stages: list[StageRow] = field(default_factory=list)
+    metrics: dict[str, Any] = field(default_factory=lambda: {"coarse": None, "final": None})
+    """`{coarse: M, final: M}`; without fine-tuning `final` is the coarse scene's M."""
+    seconds: float = 0.0
+    report: str | None = None
+    """Where `report.html` stands."""
+    artefacts: dict[str, str] = field(default_factory=dict)
+    """URI of each stage's artefact."""
+    digests: dict[str, str] = field(default_factory=dict)
+    """Content digest of each stage's artefact: equal digests, equal bytes."""
+    plan: dict[str, Any] | None = None
+    error: Exception | None = None
+    """The exception of a failed stage, for those in the same process."""
+
+    def row(self, stage: str) -> StageRow | None:
+        """The row of a stage, if it has one."""
+        return next((row for row in self.stages if row.stage == stage), None)
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object; keys as in design section 7, and more beside them."""
+        return {
+            "name": self.name,
+            "status": self.status,
+            "seconds": round(self.seconds, 3),
+            "stages": [row.to_json() for row in self.stages],
+            "metrics": self.metrics,
+            "plan": self.plan,
+            "report": self.report,
+            "artefacts": self.artefacts,
+            "digests": self.digests,
+        }
+
+
+@dataclass
+class DatasetOutcome:
+    """How the sequences of a run went."""
+
+    sequences: list[SequenceOutcome]
+    report: str | None = None
+    """Where the page that compares them stands."""
+
+    def to_json(self, seconds: float) -> dict[str, Any]:
+        """A JSON object; keys as in design section 7, and `report` beside them."""
+        return {
+            "seconds": round(seconds, 3),
+            "sequences": [outcome.to_json() for outcome in self.sequences],
+            "report": self.report,
+        }
+
+
+class SequenceFailedError(ExtragsError, RuntimeError):
+    """A stage of a sequence failed; `outcome` holds everything else."""
+
+    def __init__(self, outcome: SequenceOutcome) -> None:
+        self.outcome = outcome
+        failed = next((row for row in outcome.stages if row.state == "failed"), None)
+        where = "" if failed is None else f" in {failed.stage}: {failed.reason}"
+        super().__init__(f"{outcome.name} failed{where}")

@@ -1,0 +1,157 @@
+"""Three ways to get an artefact: a Prefect task run, a plain call, or only from the store.
+
+The wiring of a sequence is written once against `Runner`. `PrefectRunner` is the real one;
+`DirectRunner` calls the same stages in this thread without any server; `StoreRunner` runs nothing and
+tells whether everything is there already.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+
+from prefect import Task
+
+from extrags.errors import ExtragsError
+from extrags.store import Ref, Store
+from tasks.stage import at, stage_key
+
+__all__ = [
+    "Call",
+    "DirectRunner",
+    "NotInStoreError",
+    "PrefectRunner",
+    "Result",
+    "Runner",
+    "StoreRunner",
+    "WorkerLostError",
+]
+
+
+@dataclass(frozen=True)
+class Call:
+    """One task with its inputs."""
+
+    task: Task[..., Ref]
+    inputs: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Result:
+    """What became of a call."""
+
+    ref: Ref
+    state: Literal["ran", "cached"]
+
+
+class NotInStoreError(ExtragsError, LookupError):
+    """An artefact would have to be made, but nothing may run."""
+
+
+class WorkerLostError(ExtragsError, RuntimeError):
+    """A worker died; its task never reached a final state."""
+
+
+class Runner(Protocol):
+    """Makes artefacts, several at once where it can."""
+
+    def run(self, calls: Sequence[Call], label: str) -> list[Result]:
+        """Make the artefacts of all calls, in their order.
+
+        Args:
+            calls: independent of each other.
+            label: name of the sequence.
+
+        Raises:
+            Exception: what the first failing call raised, after all have ended.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class PrefectRunner:
+    """Task runs of the current flow, on its task runner.
+
+    Args:
+        store: root of the store.
+        refresh: run stages although their artefacts are there.
+    """
+
+    store: str
+    refresh: bool = False
+
+    def run(self, calls: Sequence[Call], label: str) -> list[Result]:
+        """Submit all, wait for all."""
+        futures = [
+            at(call.task, self.store, refresh=self.refresh).submit(
+                store=self.store, label=label, **call.inputs
+            )
+            for call in calls
+        ]
+        for future in futures:
+            future.wait()
+        results = []
+        for call, future in zip(calls, futures, strict=True):
+            state = future.state
+            if not state.is_final():
+                # Dask retries a task whose worker died and leaves Prefect's state as it was (#21638).
+                raise WorkerLostError(
+                    f"the worker of {call.task.name} was lost; its task is still {state.name}"
+                )
+            ref = state.result()
+            results.append(Result(ref, "cached" if state.name == "Cached" else "ran"))
+        return results
+
+
+@dataclass(frozen=True)
+class DirectRunner:
+    """Plain calls in this thread; no server, no flow.
+
+    Args:
+        store: root of the store.
+        refresh: make artefacts although they are there.
+    """
+
+    store: str
+    refresh: bool = False
+
+    def run(self, calls: Sequence[Call], label: str) -> list[Result]:
+        """One after the other."""
+        store = Store(self.store)
+        results = []
+        for call in calls:
+            key = stage_key(call.task, call.inputs)
+            if self.refresh:
+                store.rm(key)
+            found = store.find(key)
+            ref = found or call.task.fn(store=self.store, label=label, **call.inputs)
+            results.append(Result(ref, "ran" if found is None else "cached"))
+        return results
+
+
+@dataclass(frozen=True)
+class StoreRunner:
+    """Only what is in the store already.
+
+    Args:
+        store: root of the store.
+    """
+
+    store: str
+
+    def run(self, calls: Sequence[Call], label: str) -> list[Result]:
+        """Look up all.
+
+        Raises:
+            NotInStoreError: at the first artefact that is missing.
+        """
+        store = Store(self.store)
+        results = []
+        for call in calls:
+            key = stage_key(call.task, call.inputs)
+            found = store.find(key)
+            if found is None:
+                raise NotInStoreError(f"{label}: {key} is not in the store")
+            results.append(Result(found, "cached"))
+        return results

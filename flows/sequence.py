@@ -1,0 +1,76 @@
+"""`reconstruct-sequence`: one sequence through all stages."""
+
+from __future__ import annotations
+
+import logging
+import re
+from typing import Annotated, Any
+
+from prefect import flow
+from prefect.artifacts import create_markdown_artifact
+from pydantic import Field
+
+from extrags.store import Store
+from flows.outcome import SequenceFailedError, SequenceOutcome
+from flows.runners import PrefectRunner
+from flows.settings import DEFAULT_STORE, ProfileName, StageName, pipeline_config
+from flows.tables import sequence_markdown
+from flows.wiring import run_sequence
+from tasks.locks import sweep_locks
+
+__all__ = ["artifact_key", "open_store", "reconstruct_sequence"]
+
+log = logging.getLogger(__name__)
+
+
+@flow(name="reconstruct-sequence", flow_run_name="{sequence}", log_prints=False, persist_result=False)
+def reconstruct_sequence(
+    sequence: Annotated[str, Field(description="DATASET/SEQUENCE[@SETTING], or the path of a folder")],
+    profile: Annotated[ProfileName, Field(description="named settings")] = "balanced",
+    settings: Annotated[
+        dict[str, Any] | None, Field(description='overrides such as {"coarse.iterations": 500}')
+    ] = None,
+    seed: Annotated[int | None, Field(ge=0, description="seed of all stages")] = None,
+    store: Annotated[str, Field(description="directory or URL of the artefact store")] = DEFAULT_STORE,
+    refresh: Annotated[bool, Field(description="run every stage although its artefact is there")] = False,
+    until: Annotated[StageName, Field(description="last stage to run")] = "report",
+) -> SequenceOutcome:
+    """Reconstruct, explore, restore and evaluate one sequence.
+
+    Returns:
+        What was made; also as a Markdown artifact.
+
+    Raises:
+        SequenceFailedError: when a stage failed; what was finished stays in the store.
+    """
+    config = pipeline_config(profile, settings, seed)
+    open_store(store)
+    outcome = run_sequence(
+        sequence, config, store, PrefectRunner(store, refresh), profile=profile, until=until
+    )
+    create_markdown_artifact(
+        sequence_markdown(outcome),
+        key=artifact_key("sequence", sequence),
+        description=f"{sequence}, profile {profile}",
+    )
+    if outcome.status == "failed":
+        raise SequenceFailedError(outcome) from outcome.error
+    return outcome
+
+
+def open_store(root: str) -> Store:
+    """The store of a run: writable, and without what killed runs left.
+
+    Raises:
+        StoreError: when it cannot be written. Prefect itself would run everything and keep nothing.
+    """
+    store = Store(root)
+    store.check_writable()
+    for name in [*store.sweep(), *sweep_locks(store.locks)]:
+        log.info("removed what a killed run left: %s", name)
+    return store
+
+
+def artifact_key(kind: str, name: str) -> str:
+    """A key as Prefect wants it: lower-case letters, digits and dashes."""
+    return f"{kind}-{re.sub(r'[^a-z0-9]+', '-', name.lower()).strip('-')}"

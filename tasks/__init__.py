@@ -1,0 +1,1 @@
+"""Stages as cached Prefect tasks: open refs, call the library, write an artefact, return its ref."""

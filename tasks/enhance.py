@@ -1,0 +1,81 @@
+"""enhance: the restorer is trained, clips are restored in batches, pseudo-observations are joined."""
+
+from __future__ import annotations
+
+from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.store import Ref, Slot
+from tasks.stage import stage
+from tasks.weights import Weights
+
+__all__ = ["assemble", "restore", "train"]
+
+
+@stage("enhance-train", version=1)
+def train(slot: Slot, scene: Ref, sequence: Ref, config: EnhanceConfig, coarse: CoarseConfig) -> None:
+    """Train the scene's restorer on pairs it makes itself; writes `restorer/`."""
+    from extrags.enhance.backends import train_enhancer
+    from extrags.scene import Scene
+    from extrags.sequence import Sequence
+
+    enhancer = train_enhancer(
+        Scene.load(slot.open(scene) / "scene"),
+        Sequence.load(slot.open(sequence) / "sequence"),
+        config,
+        coarse,
+    )
+    enhancer.save(slot.path / "restorer")
+
+
+# The weights' digest is in the key; where their file lies is not.
+@stage("enhance-restore", version=1, ignore=("weights",))
+def restore(
+    slot: Slot,
+    scene: Ref,
+    sequence: Ref,
+    explore: Ref,
+    restorer: Ref,
+    batch: int,
+    config: EnhanceConfig,
+    weights_digest: str | None,
+    weights: Weights,
+) -> None:
+    """Render, restore and weigh one batch of trajectories; writes `pseudo/`."""
+    from extrags.confidence import PerceptualDifference
+    from extrags.enhance.backends import load_enhancer
+    from extrags.enhance.clips import choose_views, make_pseudo_observations
+    from extrags.enhance.references import ReferenceViews
+    from extrags.explore import Exploration
+    from extrags.metrics.lpips import Lpips
+    from extrags.scene import Scene
+    from extrags.sequence import Sequence
+
+    coarse = Scene.load(slot.open(scene) / "scene")
+    posed = Sequence.load(slot.open(sequence) / "sequence")
+    trajectories = Exploration.load(slot.open(explore)).trajectories
+    views = choose_views([len(cameras) for cameras in trajectories], config.max_views)
+    first = batch * config.clips_per_batch
+    chosen = range(first, min(first + config.clips_per_batch, len(trajectories)))
+    lpips = None if weights.path is None else Lpips.load(weights.path, net=weights.net)
+    observations = make_pseudo_observations(
+        coarse,
+        ReferenceViews.gather(coarse, posed, posed.train),
+        [trajectories[index][views[index]] for index in chosen],
+        load_enhancer(slot.open(restorer) / "restorer"),
+        PerceptualDifference(lpips, weights.reason),
+        count=config.references,
+        first_index=first,
+    )
+    observations.save(slot.path / "pseudo")
+    slot.counts["views"] = len(observations)
+
+
+@stage("enhance", version=1)
+def assemble(slot: Slot, parts: list[Ref]) -> None:
+    """Join the batches; writes `pseudo/`."""
+    from extrags.enhance.pseudo import PseudoObservations
+
+    observations = PseudoObservations.concatenated(
+        [PseudoObservations.load(slot.open(part) / "pseudo") for part in parts]
+    )
+    observations.save(slot.path / "pseudo")
+    slot.counts.update(views=len(observations), changed_share=round(observations.changed_share, 4))

@@ -1,0 +1,28 @@
+"""freespace: occupancy and clearance."""
+
+from __future__ import annotations
+
+from extrags.config import FreespaceConfig
+from extrags.store import Ref, Slot
+from tasks.stage import stage
+
+__all__ = ["freespace"]
+
+
+@stage("freespace", version=1)
+def freespace(slot: Slot, scene: Ref, surface: Ref, sequence: Ref, config: FreespaceConfig) -> None:
+    """Carve the space the training views look through; writes `freespace/`."""
+    from extrags.freespace import carve
+    from extrags.scene import Scene
+    from extrags.sequence import Sequence
+    from extrags.surface import Mesh
+
+    posed = Sequence.load(slot.open(sequence) / "sequence")
+    space = carve(
+        Scene.load(slot.open(scene) / "scene"),
+        Mesh.load(slot.open(surface) / "mesh"),
+        posed.cameras[posed.train],
+        config,
+    )
+    space.save(slot.path / "freespace")
+    slot.counts.update(grid_size=space.grid_size, free_share=round(space.free_share, 4))

@@ -1,0 +1,166 @@
+"""A Prefect lock manager on `flock(2)`.
+
+Prefect's own file lock stays behind for ever when its holder is killed. The kernel drops a `flock`
+with the last file descriptor of its process, however the process ends. Needs a local file system or
+NFSv4; on object stores the locks of one machine stand in its cache directory, and machines that race
+for one key both compute it (harmless: artefacts are written whole, the first one stays).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import fcntl
+import os
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from prefect.locking.protocol import LockManager
+
+__all__ = ["FlockManager", "sweep_locks"]
+
+POLL_SECONDS = 0.05
+
+
+class FlockManager(LockManager):
+    """One lock file per key below a directory; the file is removed on release.
+
+    Args:
+        directory: where the lock files stand.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = Path(directory)
+        self._guard = threading.Lock()
+        self._held: dict[str, tuple[str, int]] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Locks belong to the process that took them; a copy in a worker starts with none.
+        return {"directory": self.directory}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["directory"])  # type: ignore[misc]
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> FlockManager:
+        # CachePolicy.configure() deep-copies the policy; all copies must know the same held locks.
+        return self
+
+    def acquire_lock(
+        self,
+        key: str,
+        holder: str,
+        acquire_timeout: float | None = None,
+        hold_timeout: float | None = None,
+    ) -> bool:
+        """Take the lock of a key; waits for as long as `acquire_timeout`, or without limit.
+
+        `hold_timeout` is not needed: a lock never outlives its process.
+        """
+        if self.is_lock_holder(key, holder):
+            return True
+        descriptor = _lock_file(self._path(key), acquire_timeout)
+        if descriptor is None:
+            return False
+        with self._guard:
+            self._held[key] = (holder, descriptor)
+        return True
+
+    async def aacquire_lock(
+        self,
+        key: str,
+        holder: str,
+        acquire_timeout: float | None = None,
+        hold_timeout: float | None = None,
+    ) -> bool:
+        """As `acquire_lock`, without blocking the event loop."""
+        return await asyncio.to_thread(self.acquire_lock, key, holder, acquire_timeout, hold_timeout)
+
+    def release_lock(self, key: str, holder: str) -> None:
+        """Give the lock back and remove its file.
+
+        Raises:
+            ValueError: when `holder` does not hold it (the protocol's contract).
+        """
+        with self._guard:
+            owner, descriptor = self._held.get(key, ("", -1))
+            if owner != holder:
+                raise ValueError(f"no lock held by {holder} for {key}")
+            del self._held[key]
+        # Unlinked while still locked: whoever waits on this inode sees that the path has gone or
+        # belongs to another inode, and starts afresh.
+        self._path(key).unlink(missing_ok=True)
+        os.close(descriptor)
+
+    def is_locked(self, key: str) -> bool:
+        """Whether anybody holds the lock of a key."""
+        with self._guard:
+            if key in self._held:
+                return True
+        try:
+            descriptor = os.open(self._path(key), os.O_RDWR)
+        except FileNotFoundError:
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        else:
+            return False
+        finally:
+            os.close(descriptor)
+
+    def is_lock_holder(self, key: str, holder: str) -> bool:
+        """Whether `holder` took the lock through this manager."""
+        with self._guard:
+            return self._held.get(key, ("", -1))[0] == holder
+
+    def wait_for_lock(self, key: str, timeout: float | None = None) -> bool:
+        """Wait until nobody holds the lock of a key; False when the time is up."""
+        end = None if timeout is None else time.monotonic() + timeout
+        while self.is_locked(key):
+            if end is not None and time.monotonic() >= end:
+                return False
+            time.sleep(POLL_SECONDS)
+        return True
+
+    async def await_for_lock(self, key: str, timeout: float | None = None) -> bool:
+        """As `wait_for_lock`, without blocking the event loop."""
+        return await asyncio.to_thread(self.wait_for_lock, key, timeout)
+
+    def _path(self, key: str) -> Path:
+        return self.directory / f"{key}.lock"
+
+
+def _lock_file(path: Path, timeout: float | None) -> int | None:
+    """Open and lock a file that is still the one at its path afterwards; None when the time is up."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    end = None if timeout is None else time.monotonic() + timeout
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                return descriptor
+            wait = False  # Its former holder removed the file between our open and our lock.
+        except BlockingIOError:
+            wait = True
+        except FileNotFoundError:
+            wait = False
+        os.close(descriptor)
+        if wait:
+            if end is not None and time.monotonic() >= end:
+                return None
+            time.sleep(POLL_SECONDS)
+
+
+def sweep_locks(directory: Path) -> list[str]:
+    """Remove the lock files that killed processes left (they lock nothing any more)."""
+    removed = []
+    for path in sorted(directory.glob("*.lock")) if directory.is_dir() else []:
+        descriptor = _lock_file(path, 0.0)
+        if descriptor is not None:
+            path.unlink(missing_ok=True)
+            os.close(descriptor)
+            removed.append(f"{directory.name}/{path.name}")
+    return removed

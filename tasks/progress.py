@@ -1,0 +1,91 @@
+"""Progress of stages, for whoever watches: the command line's bars, or the log."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+
+from extrags.events import Event, MetricRecorded, Progress, subscribed
+
+__all__ = ["Observer", "StageProgress", "notify", "observed", "reporting"]
+
+log = logging.getLogger("extrags.progress")
+
+LOG_EVERY_SECONDS = 15.0
+
+
+@dataclass(frozen=True, slots=True)
+class StageProgress:
+    """What happened in one stage of one sequence."""
+
+    label: str
+    """Name of the sequence."""
+    stage: str
+    state: str
+    """`running`, or how it ended: `ran`, `cached`, `skipped`, `failed`."""
+    done: int = 0
+    total: int = 0
+    detail: str = ""
+    """Loss, count or reason, ready to be shown."""
+    seconds: float = 0.0
+
+
+Observer = Callable[[StageProgress], None]
+
+_observer: ContextVar[Observer | None] = ContextVar("extrags_stage_observer", default=None)
+
+
+@contextmanager
+def observed(observer: Observer) -> Iterator[None]:
+    """Send the progress of all stages that start inside the block, also on other threads, to `observer`.
+
+    Stages in other processes (Dask) cannot reach it; they log instead.
+    """
+    token = _observer.set(observer)
+    try:
+        yield
+    finally:
+        _observer.reset(token)
+
+
+def notify(progress: StageProgress) -> None:
+    """Tell the observer; without one it goes to the log."""
+    observer = _observer.get()
+    if observer is not None:
+        observer(progress)
+        return
+    words = [progress.label, f"{progress.stage}:"]
+    if progress.state != "running":
+        words += [progress.state, f"in {progress.seconds:.1f} s"]
+    elif progress.total:
+        words.append(f"{progress.done}/{progress.total}")
+    else:
+        words.append("starts")
+    log.info("%s", " ".join([*words, progress.detail]).rstrip())
+
+
+@contextmanager
+def reporting(label: str, stage: str) -> Iterator[None]:
+    """Turn the library's events inside the block into progress of one stage."""
+    quiet_until = 0.0
+
+    def receive(event: Event) -> None:
+        nonlocal quiet_until
+        if _observer.get() is None:
+            # Loops may emit thousands of events; a log wants a line now and then.
+            now = time.monotonic()
+            if now < quiet_until:
+                return
+            quiet_until = now + LOG_EVERY_SECONDS
+        if isinstance(event, Progress):
+            detail = "  ".join(f"{name} {value:.4g}" for name, value in event.values.items())
+            notify(StageProgress(label, stage, "running", event.done, event.total, detail))
+        elif isinstance(event, MetricRecorded):
+            notify(StageProgress(label, stage, "running", detail=f"{event.name} {event.value:.4g}"))
+
+    with subscribed(receive):
+        yield

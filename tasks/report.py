@@ -1,0 +1,162 @@
+"""report: one self-contained page from the artefacts of a run."""
+
+from __future__ import annotations
+
+import json
+import platform
+from typing import Any
+
+from extrags.config import PipelineConfig
+from extrags.store import Ref, Slot, Store
+from tasks.stage import stage
+
+__all__ = ["PAGE", "dataset_report", "report"]
+
+PAGE = "report.html"
+
+
+# `rows` says how long the stages took in this run. The page shows it, but other times are no reason to
+# build another page.
+@stage("report", version=1, ignore=("rows",))
+def report(
+    slot: Slot,
+    parts: dict[str, Ref],
+    skipped: dict[str, str],
+    config: PipelineConfig,
+    profile: str,
+    rows: list[dict[str, Any]],
+) -> None:
+    """Build the page; writes `report.html`.
+
+    Args:
+        slot: where it goes.
+        parts: the artefacts to show: `sequence`, `coarse`, `plan`, `surface`, `freespace`, `explore`,
+            `enhance`, `finetune`, `renders_coarse`, `renders_final`, `metrics_coarse`, `metrics_final`;
+            all but `sequence` may be missing.
+        skipped: why stages were skipped, by name.
+        config: settings of the run, the plan's budgets included.
+        profile: name of the profile they started from.
+        rows: `{stage, state, seconds, reason, made_seconds}` of each stage.
+    """
+    from extrags.enhance.pseudo import PseudoObservations
+    from extrags.explore import Exploration
+    from extrags.freespace import FreeSpace
+    from extrags.metrics.protocol import RenderedViews
+    from extrags.report.build import build_report
+    from extrags.report.inputs import ReportInputs
+    from extrags.sequence import Sequence
+    from extrags.surface import Mesh
+
+    places = {name: slot.open(ref) for name, ref in parts.items()}
+
+    def text(name: str, file: str) -> Any:
+        return json.loads((places[name] / file).read_bytes()) if name in places else None
+
+    sequence = Sequence.load(places["sequence"] / "sequence")
+    exploration = Exploration.load(places["explore"]) if "explore" in places else None
+    coarse, final = (
+        RenderedViews.load(places[name] / "renders") if name in places else None
+        for name in ("renders_coarse", "renders_final")
+    )
+    inputs = ReportInputs(
+        name=sequence.name,
+        sequence=sequence,
+        coarse=coarse,
+        final=final,
+        coarse_metrics=text("metrics_coarse", "metrics.json"),
+        final_metrics=text("metrics_final", "metrics.json"),
+        pseudo=PseudoObservations.load(places["enhance"] / "pseudo") if "enhance" in places else None,
+        trajectories=[]
+        if exploration is None
+        else [cameras.world_from_camera for cameras in exploration.trajectories],
+        exploration=None if exploration is None else exploration.summary(),
+        grid=FreeSpace.load(places["freespace"] / "freespace") if "freespace" in places else None,
+        mesh=Mesh.load(places["surface"] / "mesh") if "surface" in places else None,
+        plan=text("plan", "plan.json"),
+        stages=rows,
+        history={
+            name: history
+            for name in ("coarse", "finetune")
+            if (history := text(name, "history.json")) is not None
+        },
+        environment=_environment(slot.store, parts),
+        config=config,
+        profile=profile,
+        absent=_absent(skipped),
+    )
+    page = build_report(inputs, config.report)
+    (slot.path / PAGE).write_text(page, encoding="utf-8")
+    slot.counts["kib"] = round(len(page.encode()) / 1024)
+
+
+def _environment(store: Store, parts: dict[str, Ref]) -> dict[str, str]:
+    """Software the scene was made with, and the machine this page is made on."""
+    made_with = store.manifest(parts["coarse" if "coarse" in parts else "sequence"]).software
+    return {**made_with, "machine": platform.machine(), "system": platform.system()}
+
+
+def _absent(skipped: dict[str, str]) -> dict[str, str]:
+    """Parts of the page that a skipped stage would have made."""
+    made_by = {
+        "mesh": "surface",
+        "grid": "freespace",
+        "trajectories": "explore",
+        "pseudo": "enhance",
+        "final": "finetune",
+    }
+    return {
+        part: f"{stage} was skipped: {skipped[stage]}" for part, stage in made_by.items() if stage in skipped
+    }
+
+
+@stage("dataset-report", version=1, ignore=("rows",))
+def dataset_report(
+    slot: Slot,
+    name: str,
+    profile: str,
+    sequences: list[str],
+    metrics: dict[str, Ref],
+    failures: dict[str, str],
+    rows: list[dict[str, Any]],
+) -> None:
+    """Build the page that compares sequences; writes `report.html`.
+
+    Args:
+        slot: where it goes.
+        name: title of the page.
+        profile: name of the profile of the settings.
+        sequences: their names, in the order they are shown.
+        metrics: `NAME coarse` and `NAME final`: where the metrics of each sequence are.
+        failures: what went wrong, by sequence.
+        rows: `SequenceOutcome.to_json()` of each: times, states and links, which are no reason to build
+            another page.
+    """
+    from extrags.report.dataset import DatasetRow, build_dataset_report
+
+    def figures(sequence: str, which: str) -> Any:
+        ref = metrics.get(f"{sequence} {which}")
+        return None if ref is None else json.loads((slot.open(ref) / "metrics.json").read_bytes())["metrics"]
+
+    page = build_dataset_report(
+        [
+            DatasetRow(
+                name=sequence,
+                status="failed" if sequence in failures else "completed",
+                seconds=sum(stage["made_seconds"] for stage in row["stages"]),
+                coarse=figures(sequence, "coarse"),
+                final=figures(sequence, "final"),
+                stages=row["stages"],
+                error=failures.get(sequence, ""),
+                link=_neighbour(row["report"]),
+            )
+            for sequence, row in zip(sequences, rows, strict=True)
+        ],
+        name=name,
+        profile=profile,
+    )
+    (slot.path / PAGE).write_text(page, encoding="utf-8")
+
+
+def _neighbour(page: str | None) -> str:
+    """Address of another artefact's page, seen from this one: artefacts stand side by side."""
+    return "" if page is None else "/".join(["..", *page.rsplit("/", 2)[1:]])

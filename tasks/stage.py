@@ -1,0 +1,254 @@
+"""`@stage`: a function that fills one artefact becomes a cached Prefect task that returns its ref.
+
+    @stage("coarse", version=1)
+    def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
+        result = reconstruct(Sequence.load(slot.open(sequence) / "sequence"), config)
+        result.scene.save(slot.path / "scene")
+
+is called as `coarse(store="...", label="...", sequence=ref, config=config)`, inside a flow or, through
+`coarse.fn(...)`, without any server.
+
+The artefact's manifest is the only cache record there is. `ArtefactRecords` shows it to Prefect as a
+result record, so a record can neither dangle nor be missing: Prefect says `Cached` exactly when the
+artefact is there, also after a kill between writing the artefact and Prefect's own commit.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Concatenate, ParamSpec
+
+from prefect import Task
+from prefect.cache_policies import CachePolicy
+from prefect.context import TaskRunContext
+from prefect.filesystems import WritableFileSystem
+from prefect.results import ResultRecord, ResultRecordMetadata  # type: ignore[attr-defined]
+from prefect.serializers import JSONSerializer
+from prefect.transactions import IsolationLevel, get_transaction
+from pydantic import BaseModel
+
+from extrags.errors import ConfigError
+from extrags.store import Ref, Slot, Store, canonical, digest_of
+from tasks.locks import FlockManager
+from tasks.memory import peak_memory
+from tasks.progress import reporting
+
+__all__ = ["ArtefactRecords", "StageKey", "at", "stage", "stage_key", "stage_versions"]
+
+P = ParamSpec("P")
+
+NOT_IN_KEY = frozenset({"store", "label"})
+"""Where the artefact goes and what people call it: neither changes what is in it."""
+
+_versions: dict[str, int] = {}
+
+
+@dataclass
+class StageKey(CachePolicy):
+    """Key = stage name + hand-bumped version + canonical inputs. No source text, no run id, no paths."""
+
+    name: str = ""
+    version: int = 0
+    ignore: tuple[str, ...] = ()
+    """Further arguments that do not change what is in the artefact."""
+
+    def compute_key(
+        self,
+        task_ctx: TaskRunContext | None,
+        inputs: dict[str, Any] | None,
+        flow_parameters: dict[str, Any] | None,
+        **_: Any,
+    ) -> str:
+        """The key.
+
+        Raises:
+            ConfigError: for inputs without a canonical form.
+        """
+        left_out = NOT_IN_KEY.union(self.ignore)
+        counted = {name: value for name, value in (inputs or {}).items() if name not in left_out}
+        return f"{self.name}-v{self.version}-{digest_of(counted)}"
+
+
+class ArtefactRecords(WritableFileSystem):
+    """The store, seen by Prefect as a place for result records.
+
+    Args:
+        root: the store's root.
+    """
+
+    _block_type_name = "extrags store"
+
+    root: str
+
+    def _resolve_path(self, path: str) -> None:
+        """Keys are names, not paths: nothing to resolve."""
+
+    def read_path(self, path: str, _sync: bool = True) -> bytes:  # type: ignore[override]
+        """The record of a key, made from its artefact.
+
+        Raises:
+            FileNotFoundError: without an artefact; Prefect then runs the task.
+        """
+        ref = Store(self.root).find(path)
+        if ref is None:
+            raise FileNotFoundError(path)
+        metadata = ResultRecordMetadata(storage_key=path, serializer=JSONSerializer())
+        return ResultRecord[Ref](metadata=metadata, result=ref).serialize()
+
+    async def aread_path(self, path: str) -> bytes:
+        """As `read_path`."""
+        return self.read_path(path)
+
+    def write_path(self, path: str, content: bytes, _sync: bool = True) -> None:  # type: ignore[override]
+        """Nothing to do: the stage has committed its artefact, and failures leave no record."""
+
+    async def awrite_path(self, path: str, content: bytes) -> None:
+        """As `write_path`."""
+
+
+def stage(
+    name: str, *, version: int, ignore: tuple[str, ...] = ()
+) -> Callable[[Callable[Concatenate[Slot, P], None]], Task[..., Ref]]:
+    """Make a function that fills a slot into a cached task.
+
+    Args:
+        name: name of the stage; part of the key.
+        version: raised by hand whenever the same inputs give another artefact.
+        ignore: arguments that are not part of the key, because others already say what matters (a path
+            beside the digest of what lies there).
+
+    Returns:
+        A decorator. Its task takes the function's own arguments by name, and besides `store` (root of
+        the store) and `label` (name of the sequence, for people); it returns a `Ref`. Arguments must be
+        refs, settings or plain values, since their canonical form is the key.
+
+    Raises:
+        ConfigError: when two stages share a name.
+    """
+
+    def decorate(body: Callable[Concatenate[Slot, P], None]) -> Task[..., Ref]:
+        if _versions.setdefault(name, version) != version:
+            raise ConfigError(f"two versions of stage {name}: {_versions[name]} and {version}")
+        key_of = StageKey(name=name, version=version, ignore=ignore)
+
+        @functools.wraps(body)
+        def run(*, store: str, label: str = "", **inputs: Any) -> Ref:
+            where = Store(store)
+            bound = signature.bind(**inputs)
+            bound.apply_defaults()
+            inputs = dict(bound.arguments)
+            key = key_of.compute_key(None, inputs, None)
+            found = where.find(key)
+            if found is not None and not _refreshing():
+                return found
+            refs, settings = _split({name: value for name, value in inputs.items() if name not in ignore})
+            with (
+                reporting(label, name),
+                where.slot(
+                    stage=name, version=version, key=key, label=label, config=settings, inputs=refs
+                ) as slot,
+            ):
+                with peak_memory() as peak:
+                    body(slot, **inputs)  # type: ignore[call-arg]
+                slot.counts["peak_mib"] = peak.mib
+            return slot.ref
+
+        own = list(inspect.signature(body).parameters.values())[1:]
+        own = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in own]
+        signature = inspect.Signature(own)
+        given = [
+            inspect.Parameter("store", inspect.Parameter.KEYWORD_ONLY, annotation=str),
+            inspect.Parameter("label", inspect.Parameter.KEYWORD_ONLY, annotation=str, default=""),
+        ]
+        run.__signature__ = inspect.Signature([*own, *given], return_annotation=Ref)  # type: ignore[attr-defined]
+        return Task(
+            fn=run,
+            name=name,
+            version=str(version),
+            task_run_name=f"{name} {{label}}",
+            cache_policy=key_of,
+            persist_result=True,
+            result_serializer=JSONSerializer(),
+            cache_result_in_memory=False,
+        )
+
+    return decorate
+
+
+def at(task: Task[..., Ref], store: str, *, refresh: bool = False) -> Task[..., Ref]:
+    """The task with its cache in a store; two processes never run one key at the same time there.
+
+    Args:
+        task: made by `stage`.
+        store: root of the store.
+        refresh: run it although its artefact is there.
+    """
+    policy = task.cache_policy
+    if not isinstance(policy, StageKey):
+        raise ConfigError(f"task {task.name} is not a stage")
+    bound = task.with_options(
+        cache_policy=policy.configure(
+            lock_manager=FlockManager(Store(store).locks), isolation_level=IsolationLevel.SERIALIZABLE
+        )
+    )
+    if refresh:
+        bound = bound.with_options(refresh_cache=True)
+    # As an option Prefect takes only blocks saved on a server; this one is nothing but a path.
+    bound.result_storage = ArtefactRecords(root=store)
+    return bound
+
+
+def stage_key(task: Task[..., Ref], inputs: Mapping[str, Any]) -> str:
+    """The key of a stage for the given inputs, defaults included, without running anything.
+
+    Raises:
+        ConfigError: for inputs without a canonical form, or a task that is no stage.
+    """
+    policy = task.cache_policy
+    if not isinstance(policy, StageKey):
+        raise ConfigError(f"task {task.name} is not a stage")
+    bound = inspect.signature(task.fn).bind(store="", **inputs)
+    bound.apply_defaults()
+    return policy.compute_key(None, dict(bound.arguments), None)
+
+
+def stage_versions() -> dict[str, int]:
+    """Current version of every stage that has been imported."""
+    return dict(_versions)
+
+
+def _refreshing() -> bool:
+    transaction = get_transaction()
+    return transaction is not None and transaction.overwrite
+
+
+def _split(inputs: Mapping[str, Any]) -> tuple[dict[str, Ref], dict[str, Any]]:
+    """Refs by argument (lists numbered, dicts by name), and everything else as JSON for the manifest."""
+    refs: dict[str, Ref] = {}
+    settings: dict[str, Any] = {}
+    for name, value in inputs.items():
+        if isinstance(value, Ref):
+            refs[name] = value
+        elif isinstance(value, list | tuple) and value and all(isinstance(item, Ref) for item in value):
+            refs |= {f"{name}[{index}]": item for index, item in enumerate(value)}
+        elif isinstance(value, dict) and value and all(isinstance(item, Ref) for item in value.values()):
+            refs |= {f"{name}.{part}": item for part, item in value.items()}
+        else:
+            settings[name] = _json(value)
+    return refs, settings
+
+
+def _json(value: Any) -> Any:
+    if isinstance(value, Ref):
+        return value.digest
+    if isinstance(value, BaseModel):
+        return value.model_dump(mode="json")
+    if isinstance(value, list | tuple):
+        return [_json(item) for item in value]
+    if isinstance(value, dict):
+        return {name: _json(item) for name, item in value.items()}
+    canonical(value)
+    return value

@@ -1,0 +1,42 @@
+"""LPIPS weights as part of cache keys: by their content, or as absent."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from extrags.config import EvaluateConfig
+from extrags.errors import WeightsError
+
+__all__ = ["Weights", "lpips_weights"]
+
+
+class Weights(BaseModel):
+    """Weights that were found, or why there are none."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    net: Literal["alex", "squeeze"]
+    path: str | None = None
+    digest: str | None = None
+    reason: str = ""
+
+
+def lpips_weights(config: EvaluateConfig) -> Weights:
+    """Look for LPIPS weights in the usual places.
+
+    Raises:
+        WeightsError: when the settings name a file that is not there.
+    """
+    from extrags.metrics.lpips import find_weights
+
+    try:
+        path = find_weights(config.lpips_weights, config.lpips_net)
+    except WeightsError as error:
+        if config.lpips_weights is not None:
+            raise
+        return Weights(net=config.lpips_net, reason=str(error))
+    digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
+    return Weights(net=config.lpips_net, path=str(path), digest=digest)

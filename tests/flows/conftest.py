@@ -1,0 +1,38 @@
+"""The only place where a Prefect server starts: once per test session, for the tests of flows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from prefect.settings import (
+    PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
+    PREFECT_LOGGING_TO_API_ENABLED,
+    temporary_settings,
+)
+from prefect.testing.utilities import prefect_test_harness
+
+from flows.outcome import SequenceOutcome
+from flows.runners import DirectRunner
+from flows.wiring import run_sequence
+from tests.flows.tiny import SEQUENCE, tiny_config
+
+
+@pytest.fixture(scope="session")
+def prefect_server() -> Iterator[None]:
+    with (
+        prefect_test_harness(server_startup_timeout=120),
+        # The heartbeat costs a second per flow run; it cannot be switched off by environment.
+        temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None, PREFECT_LOGGING_TO_API_ENABLED: False}),
+    ):
+        yield
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, SequenceOutcome]:
+    """A store in which the tiny sequence has gone through all stages."""
+    store = str(tmp_path_factory.mktemp("finished") / "store")
+    outcome = run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), profile="quick")
+    if outcome.error is not None:
+        raise outcome.error
+    return store, outcome

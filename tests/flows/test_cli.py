@@ -1,0 +1,268 @@
+"""The command line: verbs, exit codes, messages, JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from extrags.errors import ConfigError
+from extrags.store import Store
+from flows.cli import main
+from flows.commands.common import parsed_settings
+from flows.outcome import SequenceOutcome
+from tests.flows.tiny import SEQUENCE, TINY, without_report
+
+SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
+
+
+@pytest.fixture(autouse=True)
+def untouched_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The command sets up Prefect through the environment; put it back."""
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+def settled(store: str) -> list[str]:
+    return ["--profile", "quick", "--store", store, *SETTINGS]
+
+
+class TestStart:
+    def test_help_loads_nothing_heavy(self) -> None:
+        code = (
+            "import sys\n"
+            "from flows.cli import main\n"
+            "try: main(['--help'])\n"
+            "except SystemExit: pass\n"
+            "print(sorted({'torch', 'prefect', 'zarr', 'numpy', 'pydantic'} & set(sys.modules)))\n"
+        )
+        said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert said.stdout.rstrip().endswith("[]")
+        assert "extrags run phantom/0@sparse" in said.stdout
+
+    def test_data_and_cache_load_no_torch_and_no_prefect(self, tmp_path: Path) -> None:
+        code = (
+            "import sys\n"
+            "from flows.cli import main\n"
+            f"main(['data', 'list']); main(['cache', 'ls', '--store', {str(tmp_path)!r}])\n"
+            "print(sorted({'torch', 'prefect', 'open3d'} & set(sys.modules)))\n"
+        )
+        said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert said.stdout.rstrip().endswith("[]")
+        assert "phantom/0@sparse" in said.stdout
+
+    def test_no_verb_shows_help(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main([]) == 2
+        assert "verbs" in capsys.readouterr().out
+
+    def test_version(self, capsys: pytest.CaptureFixture[str]) -> None:
+        from extrags import __version__
+
+        assert main(["--version"]) == 0
+        assert capsys.readouterr().out.strip() == __version__
+
+    @pytest.mark.parametrize("verb", ["run", "plan", "report", "export", "data", "cache", "bench"])
+    def test_every_verb_has_help(self, verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.raises(SystemExit) as ended:
+            main([verb, "--help"])
+        assert ended.value.code == 0
+        assert "usage: extrags" in capsys.readouterr().out
+
+
+class TestUsage:
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["phantom/0@spars"], "no setting 'spars'"),
+            (["fantom/0@sparse"], "Did you mean phantom/0@sparse"),
+            ([SEQUENCE, "--set", "coarse.iteration=1"], "did you mean coarse.iterations"),
+            ([SEQUENCE, "--set", "coarse.iterations=-1"], "coarse.iterations"),
+            ([SEQUENCE, "--set", "coarse.iterations"], "expected NAME=VALUE"),
+            ([SEQUENCE, "--seed", "-1"], "the seed is -1"),
+            ([SEQUENCE, "--until", "finnish"], "no stage 'finnish'"),
+            ([SEQUENCE, "--at-once", "0"], "--at-once is 0"),
+            ([SEQUENCE, SEQUENCE], "named twice"),
+        ],
+    )
+    def test_wrong_usage_is_one_sentence_and_exit_code_2(
+        self, arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["run", *arguments, "--store", str(tmp_path / "store")]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert "Traceback" not in said
+        assert said.count("\n") == 1
+        assert not (tmp_path / "store" / "artefacts").exists()
+
+    def test_debug_shows_where(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError):
+            main(["run", SEQUENCE, "--seed", "-1", "--debug", "--store", str(tmp_path)])
+
+    def test_a_store_that_cannot_be_written(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        (tmp_path / "file").write_text("x")
+        assert main(["run", SEQUENCE, "--store", str(tmp_path / "file")]) == 1
+        assert "cannot be written" in capsys.readouterr().err
+
+    def test_settings_are_yaml(self) -> None:
+        given = ["a.b=1", "a.c=0.5", "a.d=true", "a.e=[1, 2]", "a.f=null", "a.g=text", "a.h=1e-3"]
+        parsed = parsed_settings(given)
+        assert parsed["a.b"] == 1
+        assert parsed["a.c"] == 0.5
+        assert parsed["a.d"] is True
+        assert parsed["a.e"] == [1, 2]
+        assert parsed["a.f"] is None
+        assert parsed["a.g"] == "text"
+        assert parsed["a.h"] == 1e-3
+
+
+class TestFinished:
+    """Verbs on a store in which everything is there: no server is needed."""
+
+    def test_run_is_all_cached(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store, first = finished
+        target = tmp_path / "deep" / "results.json"
+        assert main(["run", SEQUENCE, *settled(store), "--json", str(target), "--until", "evaluate"]) == 0
+        results = json.loads(target.read_text())
+        assert set(results) >= {"seconds", "sequences"}
+        (sequence,) = results["sequences"]
+        assert sequence["name"] == SEQUENCE
+        assert sequence["status"] == "ok"
+        assert {stage["state"] for stage in sequence["stages"]} == {"cached", "skipped"}
+        assert sequence["metrics"] == first.metrics
+        assert "9 cached, 1 skipped" in capsys.readouterr().err
+
+    def test_plan_says_why(
+        self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store, _ = finished
+        assert main(["plan", SEQUENCE, *settled(store)]) == 0
+        said = capsys.readouterr().out
+        assert "explore" in said
+        assert "% of the pixels" in said
+
+    def test_plan_as_json(
+        self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store, _ = finished
+        assert main(["plan", SEQUENCE, *settled(store), "--json", "-"]) == 0
+        plan = json.loads(capsys.readouterr().out)
+        assert plan["sequence"] == SEQUENCE
+        assert {line["stage"] for line in plan["decisions"]} >= {"explore", "enhance", "finetune"}
+
+    def test_report_is_built_again(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store, _ = finished
+        page = tmp_path / "page.html"
+        assert main(["report", SEQUENCE, *settled(store), "-o", str(page)]) == 0
+        assert capsys.readouterr().out.strip() == str(page)
+        assert "</html>" in page.read_text()
+
+    @pytest.mark.parametrize("scene", ["coarse", "final"])
+    def test_export_writes_ply(
+        self,
+        finished: tuple[str, SequenceOutcome],
+        tmp_path: Path,
+        scene: str,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        from extrags.gaussians import Gaussians
+
+        store, first = finished
+        target = tmp_path / "scene.ply"
+        assert main(["export", SEQUENCE, *settled(store), "--scene", scene, "-o", str(target)]) == 0
+        assert len(Gaussians.read_ply(target)) == first.metrics[scene]["n_gaussians"]
+        assert "Gaussians" in capsys.readouterr().out
+
+    @pytest.mark.parametrize("verb", ["report", "export"])
+    def test_what_is_not_there_is_said(
+        self, verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        more = ["-o", str(tmp_path / "x.ply")]
+        assert main([verb, SEQUENCE, *settled(str(tmp_path / "store")), *more]) == 1
+        assert "run it first" in capsys.readouterr().err
+
+
+class TestCache:
+    @pytest.fixture
+    def store(self, tmp_path: Path) -> str:
+        store = Store(tmp_path / "store")
+        for index in range(3):
+            with store.slot(stage="toy", version=1, key=f"toy-v1-{index}", label=f"phantom/{index}") as slot:
+                (slot.path / "file").write_text("x" * 2000)
+        return store.root
+
+    def test_ls(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "ls", "--store", store]) == 0
+        said = capsys.readouterr().out
+        assert "toy-v1-2" in said
+        assert "3 artefacts, 5.9 KiB" in said
+
+    def test_ls_as_json(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "ls", "phantom/1", "--store", store, "--json", "-"]) == 0
+        (item,) = json.loads(capsys.readouterr().out)
+        assert item["key"] == "toy-v1-1"
+
+    def test_verify_finds_damage(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "ls", "--verify", "--store", store]) == 0
+        (Path(store) / "artefacts" / "toy-v1-1" / "file").write_text("y")
+        assert main(["cache", "ls", "--verify", "--store", store]) == 1
+        assert "DAMAGED" in capsys.readouterr().out
+
+    def test_rm(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "rm", "*-0", "phantom/2", "--store", store]) == 0
+        assert "2 artefacts removed" in capsys.readouterr().out
+        assert [manifest.key for manifest in Store(store).ls()] == ["toy-v1-1"]
+
+    def test_gc_removes_former_versions(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        with Store(store).slot(stage="coarse", version=0, key="coarse-v0-a"):
+            pass
+        assert main(["cache", "gc", "--store", store]) == 0
+        assert "artefacts/coarse-v0-a" in capsys.readouterr().out
+        assert len(Store(store).ls()) == 3
+
+
+class TestData:
+    def test_show(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "show", SEQUENCE, "--json", "-"]) == 0
+        assert json.loads(capsys.readouterr().out)["has_depth"] is True
+
+    def test_show_unknown(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "show", "nowhere"]) == 2
+        assert "nowhere" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("prefect_server")
+class TestThroughPrefect:
+    def test_run_starts_a_flow(self, finished: tuple[str, SequenceOutcome], tmp_path: Path) -> None:
+        store, first = finished
+        target = tmp_path / "results.json"
+        arguments = ["run", SEQUENCE, *settled(store), "--always-flow", "--json", str(target)]
+        assert main(arguments) == 0
+        (sequence,) = json.loads(target.read_text())["sequences"]
+        assert {stage["state"] for stage in sequence["stages"]} == {"cached", "skipped"}
+        assert without_report(sequence["digests"]) == without_report(first.digests)
+
+    def test_a_failed_sequence_is_exit_code_1(
+        self,
+        finished: tuple[str, SequenceOutcome],
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        store, _ = finished
+        (tmp_path / "empty").mkdir()
+        target = tmp_path / "results.json"
+        folder = str(tmp_path / "empty")
+        assert main(["run", folder, SEQUENCE, *settled(store), "--json", str(target)]) == 1
+        first, second = json.loads(target.read_text())["sequences"]
+        assert (first["status"], second["status"]) == ("failed", "ok")
+        assert "the folder is empty" in capsys.readouterr().err

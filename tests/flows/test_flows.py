@@ -1,0 +1,158 @@
+"""The flows as Prefect runs them, on the tiny sequence."""
+
+from __future__ import annotations
+
+import gc
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from prefect.artifacts import Artifact
+from prefect.flows import Flow, load_flow_from_entrypoint
+
+from extrags.errors import ConfigError, StoreError
+from extrags.store import Store
+from flows.benchmark import benchmark
+from flows.dataset import reconstruct_dataset
+from flows.outcome import SequenceFailedError, SequenceOutcome
+from flows.sequence import artifact_key, reconstruct_sequence
+from flows.settings import STAGES, pipeline_config, task_runner
+from tests.flows.tiny import SEQUENCE, TINY, without_report
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+def states(outcome: SequenceOutcome) -> dict[str, str]:
+    return {row.stage: row.state for row in outcome.stages}
+
+
+@pytest.mark.usefixtures("prefect_server")
+class TestSequence:
+    def test_finds_what_other_runners_made(self, finished: tuple[str, SequenceOutcome]) -> None:
+        store, first = finished
+        outcome = reconstruct_sequence(sequence=SEQUENCE, profile="quick", settings=TINY, store=store)
+        assert states(outcome) == {**dict.fromkeys(STAGES, "cached"), "poses": "skipped"}
+        assert without_report(outcome.digests) == without_report(first.digests)
+        artifact: Any = Artifact.get(artifact_key("sequence", SEQUENCE))
+        assert "| finetune | cached |" in artifact.data
+
+    def test_makes_the_same_as_other_runners(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        _, first = finished
+        store = str(tmp_path / "store")
+        outcome = reconstruct_sequence(
+            sequence=SEQUENCE, profile="quick", settings=TINY, store=store, until="evaluate"
+        )
+        assert set(states(outcome).values()) == {"ran", "skipped"}
+        for stage in ("ingest", "coarse", "surface", "explore", "enhance", "finetune", "metrics_final"):
+            assert outcome.digests[stage] == first.digests[stage], stage
+        assert list((tmp_path / "store" / "locks").iterdir()) == []
+        assert list((tmp_path / "store" / "scratch").iterdir()) == []
+
+    def test_a_failure_is_the_runs_failure(self, tmp_path: Path) -> None:
+        (tmp_path / "empty").mkdir()
+        state = reconstruct_sequence(
+            sequence=str(tmp_path / "empty"), store=str(tmp_path / "store"), return_state=True
+        )
+        assert state.is_failed()
+        failure = state.result(raise_on_failure=False)
+        assert isinstance(failure, SequenceFailedError)
+        assert states(failure.outcome)["ingest"] == "failed"
+        assert Store(tmp_path / "store").ls() == []
+
+    def test_a_store_that_cannot_be_written_stops_it_at_once(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("x")
+        with pytest.raises(StoreError, match="cannot be written"):
+            reconstruct_sequence(sequence=SEQUENCE, store=str(tmp_path / "file"))
+
+    def test_a_wrong_setting_stops_it_at_once(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match=r"did you mean coarse\.iterations"):
+            reconstruct_sequence(
+                sequence=SEQUENCE, settings={"coarse.iteration": 1}, store=str(tmp_path / "store")
+            )
+
+
+@pytest.mark.usefixtures("prefect_server")
+class TestDataset:
+    # Prefect leaves the client sockets of flow runs on other threads to the garbage collector.
+    @pytest.mark.filterwarnings(
+        "ignore:Exception ignored in. <socket:pytest.PytestUnraisableExceptionWarning"
+    )
+    @pytest.mark.parametrize("at_once", [1, 2])
+    def test_a_failure_does_not_stop_the_others(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path, at_once: int
+    ) -> None:
+        store, first = finished
+        (tmp_path / "empty").mkdir()
+        found = reconstruct_dataset(
+            sequences=[str(tmp_path / "empty"), SEQUENCE],
+            profile="quick",
+            settings=TINY,
+            store=store,
+            at_once=at_once,
+            name=f"two-{at_once}",
+        )
+        assert [outcome.status for outcome in found.sequences] == ["failed", "ok"]
+        assert without_report(found.sequences[1].digests) == without_report(first.digests)
+        artifact: Any = Artifact.get(f"dataset-two-{at_once}")
+        assert "ingest: " in artifact.data
+        assert found.report is not None
+        page = Path(found.report).read_text()
+        assert SEQUENCE in page
+        assert "empty" in page
+        gc.collect()
+
+
+@pytest.mark.usefixtures("prefect_server")
+def test_benchmark_compares_methods(finished: tuple[str, SequenceOutcome]) -> None:
+    store, first = finished
+    found = benchmark(
+        sequences=[SEQUENCE],
+        profiles=["quick"],
+        methods=["coarse", "extrags", "classical", "real-only"],
+        seeds=[0],
+        settings=TINY,
+        store=store,
+    )
+    assert {"processor", "cores", "threads", "versions", "commit"} <= set(found["machine"])
+    cases = {case["method"]: case for case in found["cases"]}
+    assert list(cases) == ["coarse", "extrags", "classical", "real-only"]
+    assert cases["coarse"]["metrics"] == first.metrics["coarse"]
+    assert cases["extrags"]["metrics"] == first.metrics["final"]
+    assert cases["extrags"]["seconds"] > cases["coarse"]["seconds"] > 0
+    assert cases["extrags"]["peak_mib"] > 50
+    assert (cases["extrags"]["sequence"], cases["extrags"]["setting"]) == ("phantom/0", "sparse")
+    figures = [case["metrics"]["psnr"] for case in cases.values()]
+    assert len(set(figures)) == 4
+
+
+class TestParameters:
+    def test_seed_reaches_every_stage(self) -> None:
+        config = pipeline_config("quick", None, 7)
+        assert (config.coarse.seed, config.explore.seed, config.enhance.seed) == (7, 7, 7)
+
+    def test_an_override_beats_the_seed(self) -> None:
+        assert pipeline_config("quick", {"coarse.seed": 3}, 7).coarse.seed == 3
+
+    @pytest.mark.parametrize("name", ["thread", "threads:2", "process", ""])
+    def test_unknown_runners_are_refused(self, name: str) -> None:
+        with pytest.raises(ConfigError, match="no task runner"):
+            task_runner(name)
+
+
+def deployments() -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = yaml.safe_load((REPOSITORY / "prefect.yaml").read_text())["deployments"]
+    return found
+
+
+@pytest.mark.parametrize("deployment", deployments(), ids=lambda deployment: deployment["name"])
+def test_deployments_name_flows_and_valid_parameters(
+    deployment: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(REPOSITORY)
+    flow: Flow[..., Any] = load_flow_from_entrypoint(deployment["entrypoint"])
+    flow.validate_parameters(deployment["parameters"])
+    for schedule in deployment.get("schedules", []):
+        assert schedule["active"] is False

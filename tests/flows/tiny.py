@@ -1,0 +1,60 @@
+"""The whole pipeline at a size that takes seconds; `python -m tests.flows.tiny STORE` runs it alone."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from extrags.config import PipelineConfig, profile_config
+from flows.runners import DirectRunner
+from flows.wiring import run_sequence
+
+SEQUENCE = "phantom/0@sparse"
+
+TINY: dict[str, Any] = {
+    "ingest.width": 48,
+    "ingest.height": 40,
+    "coarse.iterations": 40,
+    "coarse.max_points": 500,
+    "coarse.sh_degree": 0,
+    "assess.probe_views": 3,
+    "assess.force": True,
+    "surface.max_width": 48,
+    "freespace.grid_size": 16,
+    "freespace.render_width": 32,
+    "explore.trajectories": 2,
+    "explore.length": 3,
+    "explore.wave": 2,
+    "explore.max_expansions": 3,
+    "explore.render_width": 32,
+    "explore.min_gain_share": 0.0,
+    "explore.safety_share": 0.02,
+    "enhance.folds": 1,
+    "enhance.fold_iterations": 10,
+    "enhance.cheap_views": 2,
+    "enhance.train_iterations": 2,
+    "enhance.batch": 2,
+    "enhance.crop": 32,
+    "enhance.channels": [8, 8, 16],
+    "enhance.max_views": 4,
+    "enhance.clips_per_batch": 1,
+    "finetune.iterations": 20,
+    "report.held_out_views": 1,
+    "report.virtual_views": 1,
+}
+
+
+def tiny_config(**overrides: Any) -> PipelineConfig:
+    """The tiny settings, and overrides with `__` for the dot."""
+    more = {name.replace("__", "."): value for name, value in overrides.items()}
+    return profile_config("quick").with_overrides({**TINY, **more})
+
+
+def without_report(digests: dict[str, str]) -> dict[str, str]:
+    """Digests that must agree between runs; the page holds the times of the run it was built in."""
+    return {name: digest for name, digest in digests.items() if name != "report"}
+
+
+if __name__ == "__main__":
+    ended = run_sequence(SEQUENCE, tiny_config(), sys.argv[1], DirectRunner(sys.argv[1]), until="evaluate")
+    print(*[f"{row.stage}={row.state}" for row in ended.stages])
