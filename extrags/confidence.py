@@ -1,0 +1,137 @@
+"""How much a restored view counts in the fine-tuning: per image and per pixel.
+
+Both are computed once, from the coarse scene, and stored.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from extrags.errors import ShapeError, WeightsError
+from extrags.metrics.lpips import Lpips
+from extrags.metrics.perceptual import perceptual_map
+
+__all__ = ["PerceptualDifference", "gaussian_iou", "image_confidence", "pixel_confidence"]
+
+LPIPS_SCALE = 0.25
+"""LPIPS at which the confidence reaches 1 - 1/e. Strong local changes have 0.3 to 1."""
+VIEWS_AT_ONCE = 8
+
+
+def gaussian_iou(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"]) -> Float[Tensor, "v"]:
+    r"""Share of the Gaussians seen by a reference view that the virtual view sees too.
+
+    .. math:: GIOU = |vis(V) \cap vis(ref)| / |vis(ref)|
+
+    Visibility is that of blending weights, so that Gaussians hidden behind a fold do not count.
+
+    Args:
+        virtual: Gaussians seen by each virtual view.
+        reference: Gaussians seen by its reference view.
+
+    Returns:
+        In [0, 1]; 0 where the reference sees nothing.
+
+    Raises:
+        ShapeError: when the shapes differ.
+
+    Source: paper equations 7 and 8.
+    """
+    if virtual.shape != reference.shape:
+        raise ShapeError(f"visibilities {tuple(virtual.shape)} and {tuple(reference.shape)} do not fit")
+    common = (virtual & reference).sum(dim=1)
+    return common / reference.sum(dim=1).clamp_min(1)
+
+
+def image_confidence(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"]) -> Float[Tensor, "v"]:
+    """U_img = 1 - GIOU: the less a virtual view repeats its reference, the more it counts.
+
+    Args:
+        virtual: Gaussians seen by each virtual view.
+        reference: Gaussians seen by its reference view.
+
+    Raises:
+        ShapeError: when the shapes differ.
+
+    Source: paper equation 9.
+    """
+    return 1 - gaussian_iou(virtual, reference)
+
+
+@dataclass(frozen=True)
+class PerceptualDifference:
+    """The measure behind U_pixel: LPIPS where its weights are there, else the weight-free map.
+
+    Args:
+        lpips: the metric, or None for the weight-free map.
+        reason: why there is no LPIPS; empty with it.
+    """
+
+    lpips: Lpips | None
+    reason: str = ""
+
+    @classmethod
+    def available(cls, weights: str | None = None) -> PerceptualDifference:
+        """LPIPS (AlexNet) when its weights can be found.
+
+        Args:
+            weights: npz file; None looks in the usual places.
+
+        Raises:
+            WeightsError: when a file was named and cannot be used.
+        """
+        try:
+            return cls(Lpips.load(weights, "alex"))
+        except WeightsError as error:
+            if weights is not None:
+                raise
+            return cls(None, str(error))
+
+    @property
+    def name(self) -> str:
+        """For the provenance: `lpips_alex` or `perceptual_map`."""
+        return "perceptual_map" if self.lpips is None else self.lpips.name
+
+
+def pixel_confidence(
+    rendered: Float[np.ndarray, "v h w 3"],
+    restored: Float[np.ndarray, "v h w 3"],
+    measure: PerceptualDifference,
+) -> Float[np.ndarray, "v h w"]:
+    r"""U_pixel: how much restoration changed each pixel, perceptually.
+
+    LPIPS has no upper bound, a weight must: :math:`1 - e^{-d / 0.25}`. The weight-free map is in [0, 1]
+    already.
+
+    Args:
+        rendered: coarse renderings in [0, 1].
+        restored: their pseudo-observations in [0, 1].
+        measure: LPIPS or the weight-free map.
+
+    Returns:
+        In [0, 1].
+
+    Raises:
+        ShapeError: when the images differ in shape, or are too small for the measure.
+
+    Source: paper equation 10.
+    """
+    if rendered.shape != restored.shape:
+        raise ShapeError(f"images {rendered.shape} and {restored.shape} do not fit")
+    maps = []
+    for start in range(0, len(rendered), VIEWS_AT_ONCE):
+        first = torch.from_numpy(np.ascontiguousarray(rendered[start : start + VIEWS_AT_ONCE]))
+        second = torch.from_numpy(np.ascontiguousarray(restored[start : start + VIEWS_AT_ONCE]))
+        with torch.no_grad():
+            if measure.lpips is None:
+                maps.append(perceptual_map(first, second))
+            else:
+                maps.append(1 - torch.exp(-measure.lpips.distance_map(first, second) / LPIPS_SCALE))
+    if not maps:
+        return np.zeros(rendered.shape[:3], np.float32)
+    return np.asarray(torch.cat(maps).clamp(0, 1).numpy(), dtype=np.float32)

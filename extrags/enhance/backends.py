@@ -1,0 +1,55 @@
+"""Which restorer a scene gets, and how a saved one comes back."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.enhance.classical import ClassicalEnhancer
+from extrags.enhance.embedded import EmbeddedEnhancer
+from extrags.enhance.pairs import make_pairs
+from extrags.enhance.protocol import Enhancer
+from extrags.enhance.references import ReferenceViews
+from extrags.errors import WeightsError
+from extrags.scene import Scene
+from extrags.sequence import Sequence
+
+__all__ = ["load_enhancer", "train_enhancer"]
+
+
+def train_enhancer(scene: Scene, sequence: Sequence, config: EnhanceConfig, coarse: CoarseConfig) -> Enhancer:
+    """The restorer of a scene: trained on the scene's own pairs, or the classical one if that is asked for.
+
+    Args:
+        scene: the coarse scene, trained on `sequence.train`.
+        sequence: posed frames; only training frames are used.
+        config: backend and budgets.
+        coarse: settings of the leave-out reconstructions.
+
+    Raises:
+        CaptureError: with too few training frames for the embedded backend.
+        DivergedError: when a reconstruction or the training does not stay finite.
+    """
+    if config.backend == "classical":
+        return ClassicalEnhancer()
+    pairs = make_pairs(scene, sequence, config, coarse)
+    transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
+    return EmbeddedEnhancer.train(pairs, transfer, config)
+
+
+def load_enhancer(path: Path) -> Enhancer:
+    """Read a restorer that `Enhancer.save` wrote.
+
+    Raises:
+        WeightsError: when there is none, or it does not fit this version.
+    """
+    description = path / "restorer.json"
+    if not description.exists():
+        raise WeightsError(f"{description}: no such file; train the restorer first (stage enhance)")
+    backend = json.loads(description.read_text()).get("backend")
+    if backend == ClassicalEnhancer.name:
+        return ClassicalEnhancer()
+    if backend == EmbeddedEnhancer.name:
+        return EmbeddedEnhancer.load(path)
+    raise WeightsError(f"{description}: unknown backend {backend!r}; known: classical, embedded")

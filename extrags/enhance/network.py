@@ -1,0 +1,164 @@
+"""The restorer's network: a small conditional U-Net that predicts the clean image.
+
+Two-by-two pixel blocks become channels at the entrance (full resolution costs most and says least),
+group normalisation and SiLU, the diffusion time by feature-wise scale and shift, attention at the
+coarsest level only. All residual branches and the output start at zero, so that an untrained network
+returns its base image.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+__all__ = ["SIZE_MULTIPLE", "RestorationNetwork", "build_network"]
+
+UNSHUFFLE = 2
+TIME_FEATURES = 64
+TIME_WIDTH = 128
+NORM_GROUPS = 8
+SIZE_MULTIPLE = UNSHUFFLE * 4
+"""Image sides must be multiples of this: one unshuffling, two halvings."""
+
+
+class ResidualBlock(nn.Module):
+    """Two 3x3 convolutions whose middle is scaled and shifted by the diffusion time."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.norm_in = nn.GroupNorm(NORM_GROUPS, inputs)
+        self.conv_in = nn.Conv2d(inputs, outputs, 3, padding=1)
+        self.norm_out = nn.GroupNorm(NORM_GROUPS, outputs)
+        self.conv_out = nn.Conv2d(outputs, outputs, 3, padding=1)
+        self.time = nn.Linear(TIME_WIDTH, 2 * outputs)
+        self.skip = nn.Conv2d(inputs, outputs, 1) if inputs != outputs else nn.Identity()
+
+    def forward(self, features: Tensor, time: Tensor) -> Tensor:
+        hidden = self.conv_in(functional.silu(self.norm_in(features)))
+        scale, shift = self.time(time)[:, :, None, None].chunk(2, dim=1)
+        hidden = self.norm_out(hidden) * (1 + scale) + shift
+        hidden = self.conv_out(functional.silu(hidden))
+        return self.skip(features) + hidden  # type: ignore[no-any-return]
+
+
+class SelfAttention(nn.Module):
+    """Attention over all positions of the coarsest level."""
+
+    def __init__(self, channels: int, heads: int = 4) -> None:
+        super().__init__()
+        self.heads = heads
+        self.norm = nn.GroupNorm(NORM_GROUPS, channels)
+        self.qkv = nn.Linear(channels, 3 * channels)
+        self.out = nn.Linear(channels, channels)
+
+    def forward(self, features: Tensor) -> Tensor:
+        n, channels, height, width = features.shape
+        tokens = self.norm(features).flatten(2).transpose(1, 2)
+        query, key, value = (
+            part.reshape(n, height * width, self.heads, channels // self.heads).transpose(1, 2)
+            for part in self.qkv(tokens).chunk(3, dim=-1)
+        )
+        attended = functional.scaled_dot_product_attention(query, key, value)
+        attended = self.out(attended.transpose(1, 2).reshape(n, height * width, channels))
+        mixed: Tensor = features + attended.transpose(1, 2).reshape(features.shape)
+        return mixed
+
+
+class RestorationNetwork(nn.Module):
+    """Residual to the base image from conditioning, noisy image and time.
+
+    Args:
+        condition_channels: channels of the conditioning.
+        widths: channels of the three levels; multiples of 8.
+    """
+
+    def __init__(self, condition_channels: int, widths: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.condition_channels = condition_channels
+        self.widths = widths
+        fine, middle, coarse = widths
+        blocks = UNSHUFFLE**2
+        self.time = nn.Sequential(
+            nn.Linear(TIME_FEATURES, TIME_WIDTH), nn.SiLU(), nn.Linear(TIME_WIDTH, TIME_WIDTH), nn.SiLU()
+        )
+        self.entrance = nn.Conv2d((condition_channels + 3) * blocks, fine, 3, padding=1)
+        self.down_fine = ResidualBlock(fine, fine)
+        self.to_middle = nn.Conv2d(fine, middle, 3, stride=2, padding=1)
+        self.down_middle = ResidualBlock(middle, middle)
+        self.to_coarse = nn.Conv2d(middle, coarse, 3, stride=2, padding=1)
+        self.down_coarse = ResidualBlock(coarse, coarse)
+        self.attention = SelfAttention(coarse)
+        self.up_coarse = ResidualBlock(coarse, coarse)
+        self.from_coarse = nn.Conv2d(coarse, middle, 3, padding=1)
+        self.up_middle = ResidualBlock(2 * middle, middle)
+        self.from_middle = nn.Conv2d(middle, fine, 3, padding=1)
+        self.up_fine = ResidualBlock(2 * fine, fine)
+        self.up_last = ResidualBlock(2 * fine, fine)
+        self.norm = nn.GroupNorm(NORM_GROUPS, fine)
+        self.exit = nn.Conv2d(fine, 3 * blocks, 3, padding=1)
+
+    def forward(
+        self,
+        condition: Float[Tensor, "n c h w"],
+        noisy: Float[Tensor, "n 3 h w"],
+        time: Float[Tensor, "n"],
+    ) -> Float[Tensor, "n 3 h w"]:
+        """What to add to the base image, in the normalised colour space of `noisy`."""
+        embedded = self.time(_sinusoids(time))
+        packed = functional.pixel_unshuffle(torch.cat([condition, noisy], dim=1), UNSHUFFLE)
+        entered = self.entrance(packed.contiguous(memory_format=torch.channels_last))
+        fine = self.down_fine(entered, embedded)
+        middle = self.down_middle(self.to_middle(fine), embedded)
+        coarse = self.down_coarse(self.to_coarse(middle), embedded)
+        coarse = self.up_coarse(self.attention(coarse), embedded)
+        hidden = self.from_coarse(_doubled(coarse))
+        hidden = self.up_middle(torch.cat([hidden, middle], dim=1), embedded)
+        hidden = self.from_middle(_doubled(hidden))
+        hidden = self.up_fine(torch.cat([hidden, fine], dim=1), embedded)
+        hidden = self.up_last(torch.cat([hidden, entered], dim=1), embedded)
+        hidden = self.exit(functional.silu(self.norm(hidden)))
+        return functional.pixel_shuffle(hidden, UNSHUFFLE)
+
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draw all weights from one generator; zero what must not act at the start."""
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d | nn.Linear):
+                fan_in = module.weight[0].numel()
+                nn.init.normal_(module.weight, std=(2 / fan_in) ** 0.5, generator=generator)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+            elif isinstance(module, nn.GroupNorm):
+                nn.init.ones_(module.weight)
+                nn.init.zeros_(module.bias)
+        for module in self.modules():
+            if isinstance(module, ResidualBlock):
+                nn.init.zeros_(module.conv_out.weight)
+                nn.init.zeros_(module.time.weight)
+            elif isinstance(module, SelfAttention):
+                nn.init.zeros_(module.out.weight)
+        nn.init.zeros_(self.exit.weight)
+
+
+def build_network(
+    condition_channels: int, widths: tuple[int, int, int], generator: torch.Generator
+) -> RestorationNetwork:
+    """A network whose weights come from `generator` alone (no global random state is touched)."""
+    with torch.device("meta"):
+        network = RestorationNetwork(condition_channels, widths)
+    network = network.to_empty(device="cpu")
+    network.initialise(generator)
+    return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+
+
+def _sinusoids(time: Tensor) -> Tensor:
+    frequencies = torch.exp(torch.arange(TIME_FEATURES // 2) * (-math.log(1000) / (TIME_FEATURES // 2 - 1)))
+    angles = time[:, None].float() * 1000 * frequencies
+    return torch.cat([angles.sin(), angles.cos()], dim=1)
+
+
+def _doubled(features: Tensor) -> Tensor:
+    return functional.interpolate(features, scale_factor=2, mode="nearest")

@@ -1,0 +1,182 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.config import CoarseConfig
+from extrags.enhance.backends import load_enhancer, train_enhancer
+from extrags.enhance.classical import ClassicalEnhancer
+from extrags.enhance.clips import render_clips
+from extrags.enhance.conditioning import CONDITION_CHANNELS, Conditioning
+from extrags.enhance.diffusion import Batch, TrainingSettings, restoration_loss, sample, train_network
+from extrags.enhance.embedded import EmbeddedEnhancer
+from extrags.enhance.gamut import Gamut
+from extrags.enhance.network import build_network
+from extrags.enhance.pairs import Pairs
+from extrags.enhance.protocol import Clip, Enhancer
+from extrags.errors import DivergedError, WeightsError
+from tests.extrags.enhance.conftest import SMALL, Tube, tube_cameras
+
+WIDTHS = (16, 24, 32)
+
+
+def _conditioning(n: int, height: int, width: int, seed: int = 0) -> Conditioning:
+    generator = torch.Generator().manual_seed(seed)
+    channels = torch.randn(n, CONDITION_CHANNELS, height, width, generator=generator)
+    return Conditioning(channels, torch.rand(n, 3, height, width, generator=generator), channels[:, :1])
+
+
+class TestNetwork:
+    def test_untrained_it_returns_the_base(self) -> None:
+        network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
+        conditioning = _conditioning(2, 40, 24)
+        noise = torch.randn(2, 3, 40, 24, generator=torch.Generator().manual_seed(2))
+        restored = sample(network, conditioning, noise, steps=1, half_precision=False)
+        torch.testing.assert_close(restored, conditioning.base, atol=1e-5, rtol=0)
+
+    @pytest.mark.parametrize(("height", "width"), [(32, 32), (33, 47)])
+    def test_any_size(self, height: int, width: int) -> None:
+        network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
+        torch.nn.init.normal_(network.exit.weight, std=0.1, generator=torch.Generator().manual_seed(3))
+        noise = torch.zeros(1, 3, height, width)
+        restored = sample(network, _conditioning(1, height, width), noise, steps=2, half_precision=False)
+        assert restored.shape == (1, 3, height, width)
+        assert restored.min() >= 0
+        assert restored.max() <= 1
+
+    def test_weights_come_from_the_generator_alone(self) -> None:
+        torch.manual_seed(11)
+        before = torch.random.get_rng_state()
+        first = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(7))
+        assert torch.equal(before, torch.random.get_rng_state())
+        second = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(7))
+        for one, two in zip(first.state_dict().values(), second.state_dict().values(), strict=True):
+            assert torch.equal(one, two)
+
+
+class TestTraining:
+    def test_overfits_three_pairs(self) -> None:
+        conditioning = _conditioning(3, 32, 32)
+        clean = torch.rand(3, 3, 4, 4, generator=torch.Generator().manual_seed(5))
+        clean = torch.nn.functional.interpolate(clean, size=(32, 32), mode="bilinear")
+        batch = Batch(conditioning, clean, torch.ones(3, 1, 32, 32))
+        network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
+        noise = torch.randn(3, 3, 32, 32, generator=torch.Generator().manual_seed(9))
+
+        def loss() -> float:
+            restored = sample(network, conditioning, noise, steps=1, half_precision=False)
+            return float(restoration_loss(restored, clean, batch.weight))
+
+        before = loss()
+        generator = torch.Generator().manual_seed(2)
+        train_network(network, lambda: batch, TrainingSettings(150, 4e-3, False), generator)
+        assert loss() < 0.4 * before
+
+    def test_a_diverging_loss_is_named(self) -> None:
+        conditioning = _conditioning(1, 32, 32)
+        broken = Conditioning(conditioning.channels, conditioning.base * torch.nan, conditioning.depth_mm)
+        batch = Batch(broken, conditioning.base, torch.ones(1, 1, 32, 32))
+        network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
+        with pytest.raises(DivergedError, match="iteration 0"):
+            train_network(network, lambda: batch, TrainingSettings(3, 1e-3, False), torch.Generator())
+
+    def test_pixels_without_weight_do_not_count(self) -> None:
+        clean = torch.full((1, 3, 16, 16), 0.5)
+        wrong = clean.clone()
+        wrong[..., :4] = 1
+        weight = torch.ones(1, 1, 16, 16)
+        weight[..., :10] = 0
+        assert restoration_loss(wrong, clean, weight) < 1e-2
+
+
+@pytest.fixture(scope="module")
+def trained(tube: Tube, tube_pairs: Pairs) -> EmbeddedEnhancer:
+    return EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL)
+
+
+@pytest.fixture(scope="module")
+def clip(tube: Tube) -> Clip:
+    return render_clips(tube.scene, tube.references, [tube_cameras(3, offset_mm=4.0)], count=4)[0]
+
+
+class TestEmbedded:
+    def test_one_step_beats_no_restoration(self, trained: EmbeddedEnhancer) -> None:
+        scores = trained.record["validation"]
+        assert scores["embedded_1"]["psnr"] > scores["none"]["psnr"] + 2
+
+    def test_the_better_number_of_steps_is_chosen(self, trained: EmbeddedEnhancer) -> None:
+        scores = trained.record["validation"]
+        best = max((1, 4), key=lambda steps: scores[f"embedded_{steps}"]["psnr"])
+        assert trained.steps == best
+
+    def test_training_twice_gives_the_same_bits(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
+    ) -> None:
+        again = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL)
+        for one, two in zip(
+            again.network.state_dict().values(), trained.network.state_dict().values(), strict=True
+        ):
+            assert torch.equal(one, two)
+
+    def test_saved_and_loaded_it_restores_the_same(
+        self, trained: EmbeddedEnhancer, clip: Clip, tmp_path
+    ) -> None:
+        trained.save(tmp_path / "restorer")
+        loaded = load_enhancer(tmp_path / "restorer")
+        assert isinstance(loaded, EmbeddedEnhancer)
+        assert isinstance(loaded, Enhancer)
+        assert np.array_equal(loaded.restore(clip).rgb, trained.restore(clip).rgb)
+        assert loaded.restore(clip).provenance == trained.restore(clip).provenance
+
+    def test_samples_give_a_deviation(self, trained: EmbeddedEnhancer, clip: Clip) -> None:
+        several = replace(trained, steps=4, samples=3).restore(clip)
+        assert several.deviation is not None
+        assert several.deviation.shape == several.rgb.shape[:3]
+        assert several.deviation.max() > 0
+        assert trained.restore(clip).deviation is None
+
+    def test_without_weights_it_says_what_to_do(self, tmp_path) -> None:
+        with pytest.raises(WeightsError, match="train the restorer"):
+            load_enhancer(tmp_path)
+        with pytest.raises(WeightsError, match="train the restorer"):
+            EmbeddedEnhancer.load(tmp_path)
+
+    def test_foreign_weights_are_refused(self, trained: EmbeddedEnhancer, tmp_path) -> None:
+        from safetensors.torch import save_file
+
+        trained.save(tmp_path)
+        save_file({"something": torch.zeros(1)}, str(tmp_path / "restorer.safetensors"))
+        with pytest.raises(WeightsError, match="not the weights"):
+            load_enhancer(tmp_path)
+
+
+class TestGamut:
+    def test_real_colours_stay_and_foreign_hues_do_not(self) -> None:
+        generator = torch.Generator().manual_seed(3)
+        shade = torch.rand(2, 1, 24, 24, generator=generator) * 0.6 + 0.3
+        tissue = shade * torch.tensor([1.0, 0.6, 0.5])[None, :, None, None]
+        gamut = Gamut.of_images(tissue, torch.ones(2, 1, 24, 24))
+        torch.testing.assert_close(gamut.bounded(tissue), tissue, atol=2e-3, rtol=0)
+        green = tissue[:, [1, 0, 2]]
+        bounded = gamut.bounded(green)
+        assert (bounded[:, 0] > bounded[:, 1]).all()
+        torch.testing.assert_close(bounded.mean(dim=1), green.mean(dim=1), atol=0.02, rtol=0)
+
+    def test_dark_frames_set_no_bounds(self) -> None:
+        dark = torch.zeros(1, 3, 8, 8)
+        image = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+        gamut = Gamut.of_images(dark, torch.ones(1, 1, 8, 8))
+        torch.testing.assert_close(gamut.bounded(image), image, atol=2e-3, rtol=0)
+
+
+def test_classical_backend_needs_no_training(tube: Tube, clip: Clip, tmp_path) -> None:
+    config = SMALL.model_copy(update={"backend": "classical"})
+    enhancer = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+    enhancer.save(tmp_path)
+    loaded = load_enhancer(tmp_path)
+    assert isinstance(loaded, ClassicalEnhancer)
+    assert isinstance(loaded, Enhancer)
+    assert np.array_equal(loaded.restore(clip).rgb, enhancer.restore(clip).rgb)

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
+
+from extrags.confidence import PerceptualDifference, gaussian_iou, image_confidence, pixel_confidence
+from extrags.errors import ShapeError, WeightsError
+
+
+class TestImageConfidence:
+    def test_by_hand(self) -> None:
+        virtual = torch.tensor([[1, 1, 0, 0, 1], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1]]).bool()
+        reference = torch.tensor([[1, 1, 1, 1, 0], [1, 0, 0, 0, 0], [1, 0, 1, 0, 0]]).bool()
+        assert gaussian_iou(virtual, reference).tolist() == [0.5, 0, 1]
+        assert image_confidence(virtual, reference).tolist() == [0.5, 1, 0]
+
+    def test_a_blind_reference_gives_full_weight(self) -> None:
+        nothing = torch.zeros(1, 4, dtype=torch.bool)
+        assert image_confidence(~nothing, nothing).tolist() == [1]
+
+    @given(seed=st.integers(0, 999), n=st.integers(1, 60))
+    def test_bounds(self, seed: int, n: int) -> None:
+        generator = torch.Generator().manual_seed(seed)
+        virtual, reference = (torch.rand(2, 3, n, generator=generator) < 0.5).unbind(0)
+        confidence = image_confidence(virtual, reference)
+        assert (confidence >= 0).all()
+        assert (confidence <= 1).all()
+
+    def test_shapes(self) -> None:
+        with pytest.raises((ShapeError, TypeCheckError)):
+            gaussian_iou(torch.zeros(1, 3).bool(), torch.zeros(1, 4).bool())
+
+
+class TestPixelConfidence:
+    def _images(self) -> tuple[np.ndarray, np.ndarray]:
+        v, u = np.mgrid[0:128, 0:320].astype(np.float32)
+        stripes = 0.5 + 0.2 * np.sin(u / 5) * np.cos(v / 7)
+        rendered = np.repeat(np.stack([stripes, 0.8 * stripes])[..., None], 3, axis=-1)
+        restored = rendered.copy()
+        restored[:, 32:96, 224:288] = 0.2 + 0.6 * (((u // 4 + v // 4) % 2)[32:96, 224:288, None])
+        return rendered, restored
+
+    def _check(self, measure: PerceptualDifference) -> None:
+        rendered, restored = self._images()
+        confidence = pixel_confidence(rendered, restored, measure)
+        assert confidence.shape == (2, 128, 320)
+        assert confidence.min() >= 0
+        assert confidence.max() <= 1
+        assert confidence[:, 48:80, 240:272].mean() > 3 * confidence[:, :, :80].mean()
+        assert pixel_confidence(rendered, rendered, measure).max() < 1e-3
+
+    def test_weight_free_map(self) -> None:
+        measure = PerceptualDifference(None, "no weights")
+        assert measure.name == "perceptual_map"
+        self._check(measure)
+
+    def test_lpips(self, shared_data: Path) -> None:
+        weights = next((shared_data / "lpips_weights").glob("*alex*.npz"))
+        measure = PerceptualDifference.available(str(weights))
+        assert measure.name == "lpips_alex"
+        self._check(measure)
+
+    def test_a_named_file_must_work(self, tmp_path: Path) -> None:
+        with pytest.raises(WeightsError):
+            PerceptualDifference.available(str(tmp_path / "none.npz"))
+
+    def test_without_weights_it_says_why(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def refuse(*_: object) -> None:
+            raise WeightsError("get them there")
+
+        monkeypatch.setattr("extrags.confidence.Lpips.load", refuse)
+        measure = PerceptualDifference.available()
+        assert measure.lpips is None
+        assert "get them there" in measure.reason
+
+    def test_shapes(self) -> None:
+        with pytest.raises((ShapeError, TypeCheckError)):
+            pixel_confidence(
+                np.zeros((1, 32, 32, 3), np.float32),
+                np.zeros((1, 32, 33, 3), np.float32),
+                PerceptualDifference(None),
+            )
+
+    def test_no_views(self) -> None:
+        none = np.zeros((0, 32, 32, 3), np.float32)
+        assert pixel_confidence(none, none, PerceptualDifference(None)).shape == (0, 32, 32)
