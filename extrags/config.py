@@ -83,11 +83,15 @@ class LightConfig(StageConfig):
     """Near-field light that rides on the camera (design section 6)."""
 
     enabled: bool = Field(True, description="False: colours do not depend on the distance")
-    exponent: float = Field(1.0, gt=0, description="starting exponent e of gain / (c + r^2)^e")
+    exponent: float = Field(
+        0.6,
+        gt=0,
+        description="starting exponent e of gain / (c + r^2)^e; about 1 / 2.2 after a display tone curve",
+    )
     learning_rate: float = Field(0.01, gt=0, description="of the global light parameters")
     exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
     exposure_prior: float = Field(
-        0.3, ge=0, description="weight that holds log-exposures near their mean of zero"
+        1.0, ge=0, description="weight that holds log-exposures near their mean of zero"
     )
 
 

@@ -41,10 +41,10 @@ class NearFieldLight:
     reference_distance: float
 
     @classmethod
-    def initial(cls, n_frames: int, reference_distance: float, *, exponent: float = 1.0) -> NearFieldLight:
-        """The starting light: inverse-square (times `exponent`), equal exposures."""
+    def initial(cls, n_frames: int, reference_distance: float, *, exponent: float = 0.6) -> NearFieldLight:
+        """The starting light: a softened power of the distance, equal exposures."""
         return cls(
-            torch.tensor(-3.0),
+            torch.tensor(-1.0),
             torch.tensor(float(exponent)).log(),
             torch.zeros(n_frames),
             float(reference_distance),
