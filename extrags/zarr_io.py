@@ -23,7 +23,7 @@ def open_group(path: Path, *, mode: Literal["r", "w", "a"]) -> zarr.Group:
 
 def write_array(group: zarr.Group, name: str, array: np.ndarray) -> None:
     """Write one array as a single chunk; `name` may hold slashes."""
-    array = np.ascontiguousarray(array)
+    array = np.asarray(array, order="C")  # ascontiguousarray would make a scalar one-dimensional
     target = group.create_array(
         name,
         shape=array.shape,
@@ -55,9 +55,9 @@ def write_frames(group: zarr.Group, name: str, stack: np.ndarray) -> None:
 
 
 def read_array(group: zarr.Group, name: str) -> Any:
-    """Read one array whole."""
-    array = group[name]
-    return np.asarray(array[...])  # type: ignore[index]
+    """Read one array whole, in the machine's own byte order (Open3D takes no other)."""
+    stored = np.asarray(group[name][...])  # type: ignore[index]
+    return stored.astype(stored.dtype.newbyteorder("="), copy=False)
 
 
 def _codec(dtype: np.dtype[Any]) -> BloscCodec:

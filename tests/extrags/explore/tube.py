@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+import torch
 
 from extrags.cameras import Cameras, look_at
 from extrags.config import ExploreConfig, FreespaceConfig, SurfaceConfig
@@ -85,7 +86,9 @@ def make_tube(
     rgb = np.clip(np.array([0.75, 0.4, 0.35]) + rng.normal(0, 0.05, (len(points), 3)), 0.05, 1)
     spacing = BEND_RADIUS_MM * ARC_RAD / along
     gaussians = Gaussians.from_points(points, rgb, np.full(len(points), 0.6 * spacing), opacity=0.95)
-    scene = Scene(gaussians, NearFieldLight.initial(n_views, 30.0) if light else None)
+    # Steeper than what a display image shows, so that views near to the wall do white out.
+    steep = NearFieldLight(torch.tensor(-3.0), torch.zeros(()), torch.zeros(n_views), 30.0)
+    scene = Scene(gaussians, steep if light else None)
 
     arcs = np.linspace(*view_arc, n_views) if n_views > 1 else np.array([view_arc[0]])
     poses = np.stack([look_at(centre_line(a), centre_line(a + 0.4), np.array([0.0, 0.0, 1.0])) for a in arcs])

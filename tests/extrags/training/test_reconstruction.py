@@ -67,10 +67,14 @@ class TestReconstruct:
             iterations=300, max_points=600, densify=QUIET,
             light=LightConfig(exposure_learning_rate=0.02, exposure_prior=0.001),
         )  # fmt: skip
-        light = reconstruct(dimmed, config).scene.light
-        assert light is not None
-        ratio = float(light.exposure(0) / light.exposure(2))
-        assert ratio == pytest.approx(0.8, abs=0.08)
+
+        def first_to_third(sequence: Sequence) -> float:
+            light = reconstruct(sequence, config).scene.light
+            assert light is not None
+            return float(light.exposure(0) / light.exposure(2))
+
+        # Against the undimmed frames: few views leave exposure and albedo some play either way.
+        assert first_to_third(dimmed) / first_to_third(tube_sequence) == pytest.approx(0.8, abs=0.08)
 
     def test_progress_is_told(self, tube_sequence: Sequence) -> None:
         seen: list[Event] = []

@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from extrags.illumination import NearFieldLight
+
+
+def light() -> NearFieldLight:
+    return NearFieldLight(
+        torch.tensor(-1.5), torch.tensor(0.7).log(), torch.tensor([0.1, -0.2, 0.4]), 25.0
+    )  # fmt: skip
+
+
+class TestNearFieldLight:
+    def test_round_trip_keeps_scalars_scalar(self, tmp_path: Path) -> None:
+        light().save(tmp_path / "light")
+        loaded = NearFieldLight.load(tmp_path / "light")
+        for name, value in light().parameters().items():
+            assert torch.equal(loaded.parameters()[name], value), name
+            assert loaded.parameters()[name].shape == value.shape
+        assert loaded.reference_distance == 25.0
+
+    def test_gauge_is_fixed(self) -> None:
+        assert float(light().falloff(torch.tensor(25.0))) == pytest.approx(1)
+        log_exposures = torch.stack([light().exposure(frame) for frame in range(3)]).log()
+        assert float(log_exposures.mean()) == pytest.approx(0, abs=1e-6)
+        assert float(light().exposure(None)) == 1
+
+    def test_formula_in_float64(self) -> None:
+        c, e = torch.tensor(-1.5).exp().double(), 0.7
+        distance = torch.tensor([2.0, 10.0, 60.0], dtype=torch.float64)
+        expected = ((1 + c) / ((distance / 25) ** 2 + c)) ** e
+        torch.testing.assert_close(light().falloff(distance.float()).double(), expected, rtol=1e-5, atol=0)
+
+    def test_farther_is_darker_and_far_away_it_is_a_power_law(self) -> None:
+        far = torch.tensor([5e3, 1e4])
+        first, second = light().falloff(far)
+        assert float(second / first) == pytest.approx(2 ** (-2 * 0.7), rel=1e-3)
+        distance = torch.linspace(0, 100, 50)
+        assert bool((light().falloff(distance).diff() < 0).all())
