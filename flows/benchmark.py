@@ -10,7 +10,6 @@ from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
 from extrags.errors import ConfigError
-from flows.machine import machine
 from flows.outcome import SequenceFailedError, SequenceOutcome
 from flows.runners import PrefectRunner, Runner
 from flows.sequence import artifact_key, open_store
@@ -75,6 +74,9 @@ def benchmark(
     create_markdown_artifact(
         benchmark_markdown(cases), key=artifact_key("benchmark", name), description=f"{len(cases)} cases"
     )
+    # Here, because it loads torch and the kernels, which looking up a deployment must not.
+    from extrags.raster.bench import machine
+
     return {"machine": machine(), "cases": cases}
 
 

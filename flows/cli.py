@@ -238,7 +238,10 @@ def _add_bench(verbs: Any) -> None:
         ("train", "time of one training iteration"),
     ):
         made = _verb(inner, name, f"bench.{name}", summary)
-        made.add_argument("--quick", action="store_true", help="small sizes only")
+        made.add_argument("--quick", action="store_true", help="the smallest size only")
+        made.add_argument(
+            "--threads", nargs="+", type=int, default=[1, 2], metavar="N", help="threads of the kernels"
+        )
         _add_json(made)
     made = _verb(
         inner,

@@ -12,23 +12,12 @@ __all__ = ["surface"]
 @stage("surface", version=1)
 def surface(slot: Slot, scene: Ref, sequence: Ref, config: SurfaceConfig) -> None:
     """Fuse the training views' rendered depth; writes `mesh/` and `mesh.ply`."""
-    from dataclasses import replace
-
-    import numpy as np
-
     from extrags.scene import Scene
     from extrags.sequence import Sequence
     from extrags.surface import fuse_surface
 
     posed = Sequence.load(slot.open(sequence) / "sequence")
-    cameras = posed.cameras[posed.train]
-    # zarr's arrays name their byte order ("<f8"), which Open3D refuses although it is the machine's own.
-    cameras = replace(
-        cameras,
-        K=cameras.K.view(np.float64),
-        world_from_camera=cameras.world_from_camera.view(np.float64),
-    )
-    mesh = fuse_surface(Scene.load(slot.open(scene) / "scene"), cameras, config)
+    mesh = fuse_surface(Scene.load(slot.open(scene) / "scene"), posed.cameras[posed.train], config)
     mesh.save(slot.path / "mesh")
     mesh.write_ply(slot.path / "mesh.ply")
     slot.counts.update(vertices=len(mesh.vertices), triangles=len(mesh.triangles))

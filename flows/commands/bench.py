@@ -22,7 +22,7 @@ def raster(given: argparse.Namespace) -> int:
     set_up_logging(debug=given.debug, terminal=True)
     from extrags.raster.bench import bench_raster
 
-    return _kernels(given, bench_raster(quick=given.quick))
+    return _kernels(given, bench_raster(quick=given.quick, threads=given.threads))
 
 
 def train(given: argparse.Namespace) -> int:
@@ -30,7 +30,7 @@ def train(given: argparse.Namespace) -> int:
     set_up_logging(debug=given.debug, terminal=True)
     from extrags.raster.bench import bench_train
 
-    return _kernels(given, bench_train(quick=given.quick))
+    return _kernels(given, bench_train(quick=given.quick, threads=given.threads))
 
 
 def pipeline(given: argparse.Namespace) -> int:

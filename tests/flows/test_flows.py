@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from pathlib import Path
 from typing import Any
 
@@ -76,10 +75,6 @@ class TestSequence:
 
 @pytest.mark.usefixtures("prefect_server")
 class TestDataset:
-    # Prefect leaves the client sockets of flow runs on other threads to the garbage collector.
-    @pytest.mark.filterwarnings(
-        "ignore:Exception ignored in. <socket:pytest.PytestUnraisableExceptionWarning"
-    )
     @pytest.mark.parametrize("at_once", [1, 2])
     def test_a_failure_does_not_stop_the_others(
         self, finished: tuple[str, SequenceOutcome], tmp_path: Path, at_once: int
@@ -102,7 +97,6 @@ class TestDataset:
         page = Path(found.report).read_text()
         assert SEQUENCE in page
         assert "empty" in page
-        gc.collect()
 
 
 @pytest.mark.usefixtures("prefect_server")

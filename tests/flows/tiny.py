@@ -14,8 +14,8 @@ SEQUENCE = "phantom/0@sparse"
 TINY: dict[str, Any] = {
     "ingest.width": 48,
     "ingest.height": 40,
-    "coarse.iterations": 40,
-    "coarse.max_points": 500,
+    "coarse.iterations": 120,
+    "coarse.max_points": 1500,
     "coarse.sh_degree": 0,
     "assess.probe_views": 3,
     "assess.force": True,
