@@ -117,4 +117,13 @@ class MissingDependencyError(ExtragsError, ImportError):
 
 
 class DivergedError(ExtragsError, ArithmeticError):
-    """An optimisation produced NaN or infinity; names the iteration and the parameter group."""
+    """An optimisation produced NaN or infinity; names the iteration and the parameter group.
+
+    Args:
+        message: which stage, iteration and parameter group.
+        last_good: the last state that was finite, for debugging; whatever the optimisation works on.
+    """
+
+    def __init__(self, message: str, last_good: object = None) -> None:
+        super().__init__(message)
+        self.last_good = last_good

@@ -6,6 +6,7 @@ import json
 
 from extrags.config import CoarseConfig
 from extrags.store import Ref, Slot
+from tasks.divergence import keeping_last_good
 from tasks.stage import stage
 
 __all__ = ["coarse"]
@@ -17,7 +18,8 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     from extrags.sequence import Sequence
     from extrags.training import reconstruct
 
-    result = reconstruct(Sequence.load(slot.open(sequence) / "sequence"), config)
+    with keeping_last_good(slot):
+        result = reconstruct(Sequence.load(slot.open(sequence) / "sequence"), config)
     result.scene.save(slot.path / "scene")
     (slot.path / "history.json").write_text(json.dumps(result.history))
     slot.counts["n_gaussians"] = len(result.scene.gaussians)

@@ -6,6 +6,7 @@ import json
 
 from extrags.config import CoarseConfig, FinetuneConfig
 from extrags.store import Ref, Slot
+from tasks.divergence import keeping_last_good
 from tasks.stage import stage
 
 __all__ = ["finetune"]
@@ -30,13 +31,14 @@ def finetune(
     from extrags.training import finetune as optimise_further
 
     observations = None if pseudo is None else PseudoObservations.load(slot.open(pseudo) / "pseudo")
-    result = optimise_further(
-        Scene.load(slot.open(scene) / "scene"),
-        Sequence.load(slot.open(sequence) / "sequence"),
-        observations,
-        config,
-        coarse,
-    )
+    with keeping_last_good(slot):
+        result = optimise_further(
+            Scene.load(slot.open(scene) / "scene"),
+            Sequence.load(slot.open(sequence) / "sequence"),
+            observations,
+            config,
+            coarse,
+        )
     result.scene.save(slot.path / "scene")
     (slot.path / "history.json").write_text(json.dumps(result.history))
     slot.counts["n_gaussians"] = len(result.scene.gaussians)

@@ -103,12 +103,13 @@ def optimise(scene: Scene, draw: Callable[[int], View], schedule: Schedule) -> T
     adam = SelectiveAdam(parameters, schedule.learning_rates(0))
     density = DensityControl(schedule.densify, schedule.extent, len(parameters["means"]), seed=schedule.seed)
     history: list[dict[str, float]] = []
+    last_good = scene.detached()
     for iteration in range(schedule.iterations):
         view = draw(iteration)
         adam.learning_rates = schedule.learning_rates(iteration)
         step = _step(Scene(Gaussians(**parameters), light), view, schedule, iteration)
         if not math.isfinite(step["loss"]):
-            raise DivergedError(_account(schedule, iteration, parameters))
+            raise DivergedError(_account(schedule, iteration, parameters), last_good)
         adam.step(visible=step["visible"])
         adam.zero_grad()
         if light_optimiser is not None:
@@ -125,11 +126,10 @@ def optimise(scene: Scene, draw: Callable[[int], View], schedule: Schedule) -> T
             }
             history.append(entry)
             emit(Progress(schedule.stage, iteration + 1, schedule.iterations, entry))
-    for name, value in parameters.items():
-        if not bool(torch.isfinite(value).all()):
-            raise DivergedError(
-                f"{schedule.stage}: {name} is not finite after {schedule.iterations} iterations"
-            )
+            if _finite(parameters):
+                last_good = Scene(Gaussians(**parameters), light).detached()
+    if not _finite(parameters):
+        raise DivergedError(_account(schedule, schedule.iterations, parameters), last_good)
     return TrainingResult(Scene(Gaussians(**parameters), light).detached(), history)
 
 
@@ -219,7 +219,11 @@ def _densified(
     return parameters
 
 
+def _finite(parameters: dict[str, Tensor]) -> bool:
+    return all(bool(torch.isfinite(value).all()) for value in parameters.values())
+
+
 def _account(schedule: Schedule, iteration: int, parameters: dict[str, Tensor]) -> str:
     bad = [name for name, value in parameters.items() if not bool(torch.isfinite(value).all())]
     where = f"parameter group {', '.join(bad)}" if bad else "all parameter groups still finite"
-    return f"{schedule.stage}: the loss is not finite at iteration {iteration} ({where})"
+    return f"{schedule.stage}: not finite any more at iteration {iteration} ({where})"

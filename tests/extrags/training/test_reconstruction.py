@@ -99,5 +99,8 @@ class TestReconstruct:
             return poisoned if iteration == 3 else views[0]
 
         schedule = coarse_schedule(CoarseConfig(iterations=10), 20.0, 15.0, "coarse")
-        with pytest.raises(DivergedError, match=r"coarse.*iteration 3"):
+        with pytest.raises(DivergedError, match=r"coarse.*iteration 3") as caught:
             optimise(result.scene, draw, schedule)
+        kept = caught.value.last_good
+        assert isinstance(kept, Scene)
+        assert all(bool(torch.isfinite(value).all()) for value in kept.gaussians.parameters().values())

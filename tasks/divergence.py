@@ -1,0 +1,24 @@
+"""What is kept of an optimisation that diverged."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from extrags.errors import DivergedError
+from extrags.store import Slot
+
+__all__ = ["keeping_last_good"]
+
+
+@contextmanager
+def keeping_last_good(slot: Slot) -> Iterator[None]:
+    """Leave the last finite scene among the debugging files of the failed stage."""
+    try:
+        yield
+    except DivergedError as error:
+        from extrags.scene import Scene
+
+        if isinstance(error.last_good, Scene):
+            error.last_good.save(slot.debug / "last_good_scene")
+        raise
