@@ -327,9 +327,19 @@ class _Run:
 
 
 def _render(backend: str, scene: dict[str, Tensor], size: BenchSize) -> Rendering:
-    names = ("means", "quats", "scales", "opacities", "sh", "viewmats", "Ks")
     kind: Any = "reference" if backend == "torch" else backend
-    return rasterize(*(scene[name] for name in names), size.width, size.height, backend=kind)
+    return rasterize(
+        scene["means"],
+        scene["quats"],
+        scene["scales"],
+        scene["opacities"],
+        scene["sh"],
+        scene["viewmats"],
+        scene["Ks"],
+        size.width,
+        size.height,
+        backend=kind,
+    )
 
 
 def _gradients(backend: str, scene: dict[str, Tensor], size: BenchSize) -> dict[str, Tensor]:
