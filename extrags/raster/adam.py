@@ -55,7 +55,8 @@ class SelectiveAdam:
             raise ConfigError(f"no learning rate for {', '.join(sorted(missing))}")
         self.first_moments = {k: torch.zeros_like(v) for k, v in self._detached().items()}
         self.second_moments = {k: torch.zeros_like(v) for k, v in self._detached().items()}
-        self.steps = torch.zeros(next(iter(rows.values()), 0), dtype=torch.int32)
+        device = next((value.device for value in self.parameters.values()), torch.device("cpu"))
+        self.steps = torch.zeros(next(iter(rows.values()), 0), dtype=torch.int32, device=device)
         self._bias = self._bias_corrections(1024)
         self._taken = 0
 
@@ -85,25 +86,22 @@ class SelectiveAdam:
         self._taken += 1
         if self._taken >= len(self._bias[0]):
             self._bias = self._bias_corrections(2 * self._taken)
+        quick = []
         for name, value in self.parameters.items():
             rate = self.learning_rates[name]
             if value.grad is None or rate == 0 or value.numel() == 0:
                 continue
             moments = self.first_moments[name], self.second_moments[name]
-            if value.dtype == torch.float32 and native.native_isa() is not None:
-                native.adam_step(
-                    value,
-                    value.grad,
-                    *moments,
-                    self.steps,
-                    visible,
-                    self._bias,
-                    rate,
-                    self.betas,
-                    self.eps,
-                )
+            if (
+                value.dtype == torch.float32
+                and value.device.type == "cpu"
+                and native.native_isa() is not None
+            ):
+                quick.append((value, value.grad, *moments, rate))
             else:
                 self._step_torch(value, value.grad, *moments, visible, rate)
+        if quick:
+            native.adam_step(quick, self.steps, visible, self._bias, self.betas, self.eps)
 
     def _step_torch(
         self,

@@ -229,7 +229,7 @@ def _bench_size(
         for (backend, count), run in runs.items():
             if backend in ("torch", "reference") and index >= 4:
                 continue
-            _use_threads(count)
+            _use_threads(backend, count)
             if index == 0:
                 peaks[backend, count] = _peak_mib(run.iteration)
             else:
@@ -248,7 +248,7 @@ def _bench_size(
         if exact is not None:
             case["error"] = _errors(_gradients(backend, scene, size), exact)
         if backend == "native" and training:
-            _use_threads(count)
+            _use_threads(backend, count)
             case["parts_ms"], entries = _parts(scene, size)
             measured = case["cpu_ms" if count == 1 else "ms"]["iteration"]
             case["roofline"] = _roofline(size, entries, count, measured)
@@ -256,8 +256,10 @@ def _bench_size(
     return cases
 
 
-def _use_threads(count: int) -> None:
-    torch.set_num_threads(count)
+def _use_threads(backend: str, count: int) -> None:
+    # Beside the native kernels torch has only small arrays to handle: its threads, which wait for each other
+    # at barriers, would cost more than they bring.
+    torch.set_num_threads(1 if backend == "native" else count)
     if native.native_isa() is not None:
         native.set_num_threads(count)
 
@@ -415,8 +417,11 @@ def _parts(scene: dict[str, Tensor], size: BenchSize, rounds: int = 8) -> tuple[
             *(3, None, v_rgb, None, None, None, False, *gradients, None, None, v_means2d, None),
         )
         carried = time.perf_counter()
-        for value, gradient, (first, second) in zip(parameters, gradients, moments, strict=True):
-            kernels.adam(*(value, gradient, first, second, steps, bias, bias, None, 1e-9, 0.9, 0.999, 1e-15))
+        stepped = [
+            (value, gradient, first, second, 1e-9)
+            for value, gradient, (first, second) in zip(parameters, gradients, moments, strict=True)
+        ]
+        kernels.adam(stepped, steps, bias, bias, None, 0.9, 0.999, 1e-15)
         project, tiles, tiles_backward, project_backward = frame.seconds()
         records.append(
             {

@@ -313,45 +313,38 @@ class _L1Ssim(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None]:
         (gradient,) = ctx.saved_tensors
-        return gradient * v_loss, None, None, None
+        # Nearly always one: not worth another pass over the image.
+        scaled = gradient if float(v_loss) == 1 else gradient * v_loss
+        return scaled, None, None, None
 
 
 def adam_step(
-    values: Tensor,
-    gradients: Tensor,
-    first: Tensor,
-    second: Tensor,
+    parameters: Sequence[tuple[Tensor, Tensor, Tensor, Tensor, float]],
     steps: Tensor,
     visible: Tensor | None,
-    bias: Sequence[Tensor],
-    rate: float,
+    bias: tuple[Tensor, Tensor],
     betas: tuple[float, float],
     eps: float,
 ) -> None:
-    """Step one parameter in place; see `SelectiveAdam`.
+    """Step parameters in place; see `SelectiveAdam`.
 
     Args:
-        values: [N, ...], contiguous float32, like `gradients`, `first` and `second`.
-        gradients: of the loss.
-        first: first moments.
-        second: second moments.
+        parameters: of each its values, gradients, first and second moments, all [N, ...], float32 and (but
+            for the gradients) contiguous, and its learning rate.
         steps: how often each row has been stepped, this step included, [N] int32.
         visible: rows to step, [N] bool; None is all.
         bias: 1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) for every t up to the largest of `steps`.
-        rate: learning rate.
         betas: decay of the moments.
         eps: added to the root of the second moment.
     """
     compiled_kernels().adam(
-        values.detach(),
-        gradients.contiguous(),
-        first,
-        second,
+        [
+            (values.detach(), gradients.contiguous(), first, second, rate)
+            for values, gradients, first, second, rate in parameters
+        ],
         steps,
-        bias[0],
-        bias[1],
+        *bias,
         None if visible is None else visible.contiguous().view(torch.uint8),
-        rate,
         *betas,
         eps,
     )

@@ -1,57 +1,73 @@
-// Adam over the rows of one parameter; the rule is in adam.py.
+// Adam over arrays that share their rows; the rule is in adam.py.
 
-struct AdamContext {
-  const AdamRows* rows;
-  int64_t per_task;
+struct AdamFactors {
+  Vec beta1, beta2, rest1, rest2, step, scale, eps;
 };
 
-// Steps `count` consecutive floats that share their bias corrections.
-static void adam_run(const AdamRows& a, int64_t begin, int64_t count, float rate, float root_scale) {
-  const Vec beta1(a.beta1), beta2(a.beta2), rest1(a.rest1), rest2(a.rest2);
-  const Vec step(rate), scale(root_scale), eps(a.eps), most(3e38f);
-  for (int64_t i = begin; i < begin + count; i += 16) {
-    const int lanes = begin + count - i < 16 ? static_cast<int>(begin + count - i) : 16;
-    const bool whole = lanes == 16;
-    const Vec g = whole ? load(a.gradients + i) : load_first(a.gradients + i, lanes);
-    const Vec m0 = whole ? load(a.first + i) : load_first(a.first + i, lanes);
-    const Vec v0 = whole ? load(a.second + i) : load_first(a.second + i, lanes);
-    const Vec p0 = whole ? load(a.values + i) : load_first(a.values + i, lanes);
-    const Vec m = fma(beta1, m0, rest1 * g);
-    const Vec v = min(fma(beta2, v0, rest2 * g * g), most);
-    const Vec p = p0 - step * m / fma(sqrt(v), scale, eps);
-    if (whole) {
-      store(a.first + i, m);
-      store(a.second + i, v);
-      store(a.values + i, p);
-    } else {
-      store_first(a.first + i, m, lanes);
-      store_first(a.second + i, v, lanes);
-      store_first(a.values + i, p, lanes);
-    }
-  }
+EXTRAGS_INLINE void adam_vector(const AdamFactors& f, Vec g, Vec* p, Vec* m, Vec* v) {
+  *m = fma(f.beta1, *m, f.rest1 * g);
+  // Held below infinity, where a huge gradient would leave it for good.
+  *v = min(fma(f.beta2, *v, f.rest2 * g * g), Vec(3e38f));
+  *p = *p - f.step * *m / fma(sqrt(*v), f.scale, f.eps);
 }
 
+// Steps rows [begin, end) of one array; they share their bias corrections.
+static void adam_run(const AdamStep& a, const AdamArray& array, int64_t begin, int64_t end, float bias1,
+                     float bias2) {
+  const AdamFactors f{Vec(a.beta1), Vec(a.beta2), Vec(a.rest1), Vec(a.rest2), Vec(array.rate * bias1),
+                      Vec(bias2), Vec(a.eps)};
+  const int64_t offset = begin * array.columns, count = (end - begin) * array.columns;
+  float *values = array.values + offset, *first = array.first + offset, *second = array.second + offset;
+  const float* gradients = array.gradients + offset;
+  int64_t i = 0;
+  for (; i + 16 <= count; i += 16) {
+    Vec p = load(values + i), m = load(first + i), v = load(second + i);
+    adam_vector(f, load(gradients + i), &p, &m, &v);
+    store(values + i, p);
+    store(first + i, m);
+    store(second + i, v);
+  }
+  if (i == count) return;
+  const int rest = static_cast<int>(count - i);
+  Vec p = load_first(values + i, rest), m = load_first(first + i, rest), v = load_first(second + i, rest);
+  adam_vector(f, load_first(gradients + i, rest), &p, &m, &v);
+  store_first(values + i, p, rest);
+  store_first(first + i, m, rest);
+  store_first(second + i, v, rest);
+}
+
+// Whether four rows from `row` on are to be stepped with the bias corrections of `steps`.
+EXTRAGS_INLINE bool four_alike(const AdamStep& a, int64_t row, int32_t steps) {
+  const int32_t* s = a.steps + row;
+  int32_t differ = (s[0] ^ steps) | (s[1] ^ steps) | (s[2] ^ steps) | (s[3] ^ steps);
+  if (a.visible != nullptr) {
+    uint32_t flags;
+    memcpy(&flags, a.visible + row, 4);
+    differ |= static_cast<int32_t>(flags ^ 0x01010101u);
+  }
+  return differ == 0;
+}
+
+constexpr int64_t kAdamRows = 1024;  // a task
+
 static void adam_task(void* data, int task, int) {
-  const AdamContext& c = *static_cast<AdamContext*>(data);
-  const AdamRows& a = *c.rows;
-  const int64_t end = (task + 1) * c.per_task < a.rows ? (task + 1) * c.per_task : a.rows;
-  for (int64_t row = task * c.per_task; row < end;) {
+  const AdamStep& a = *static_cast<const AdamStep*>(data);
+  const int64_t end = (task + 1) * kAdamRows < a.rows ? (task + 1) * kAdamRows : a.rows;
+  for (int64_t row = task * kAdamRows; row < end;) {
     if (a.visible != nullptr && a.visible[row] == 0) {
       ++row;
       continue;
     }
     const int32_t steps = a.steps[row];
     int64_t stop = row + 1;
+    while (stop + 4 <= end && four_alike(a, stop, steps)) stop += 4;
     while (stop < end && a.steps[stop] == steps && (a.visible == nullptr || a.visible[stop] != 0)) ++stop;
-    adam_run(a, row * a.columns, (stop - row) * a.columns, a.rate * a.bias1[steps], a.bias2[steps]);
+    for (int k = 0; k < a.count; ++k) adam_run(a, a.arrays[k], row, stop, a.bias1[steps], a.bias2[steps]);
     row = stop;
   }
 }
 
-static void adam(const AdamRows* rows) {
-  AdamContext c;
-  c.rows = rows;
-  // Some ten thousand floats a task
-  c.per_task = 1 + 12288 / rows->columns;
-  parallel_for(static_cast<int>((rows->rows + c.per_task - 1) / c.per_task), adam_task, &c);
+static void adam(const AdamStep* step) {
+  parallel_for(static_cast<int>((step->rows + kAdamRows - 1) / kAdamRows), adam_task,
+               const_cast<AdamStep*>(step));
 }

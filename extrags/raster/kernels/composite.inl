@@ -179,15 +179,15 @@ EXTRAGS_INLINE void put_block(float* image, const View* view, int x0, int y0, Ve
 }
 
 EXTRAGS_INLINE void put_color_block(float* image, const View* view, int x0, int y0, const Vec* color) {
-  alignas(64) float t[3][16];
-  for (int channel = 0; channel < 3; ++channel) store(t[channel], color[channel]);
+  alignas(64) float t[48];
+  store_triples(t, color);
   const int rows = view->height - y0 < 4 ? view->height - y0 : 4;
   const int columns = view->width - x0 < 4 ? view->width - x0 : 4;
-  for (int j = 0; j < rows; ++j) {
-    float* to = image + 3 * (static_cast<size_t>(y0 + j) * view->width + x0);
-    for (int i = 0; i < columns; ++i) {
-      for (int channel = 0; channel < 3; ++channel) to[3 * i + channel] = t[channel][4 * j + i];
-    }
+  float* to = image + 3 * (static_cast<size_t>(y0) * view->width + x0);
+  if (columns == 4) {
+    for (int j = 0; j < rows; ++j, to += 3 * view->width) memcpy(to, t + 12 * j, 48);
+  } else {
+    for (int j = 0; j < rows; ++j, to += 3 * view->width) memcpy(to, t + 12 * j, sizeof(float) * 3 * columns);
   }
 }
 
@@ -205,16 +205,16 @@ EXTRAGS_INLINE Vec get_block(const float* image, const View* view, int x0, int y
 }
 
 EXTRAGS_INLINE void get_color_block(const float* image, const View* view, int x0, int y0, Vec* color) {
-  alignas(64) float t[3][16] = {};
+  alignas(64) float t[48] = {};
   const int rows = view->height - y0 < 4 ? view->height - y0 : 4;
   const int columns = view->width - x0 < 4 ? view->width - x0 : 4;
-  for (int j = 0; j < rows; ++j) {
-    const float* from = image + 3 * (static_cast<size_t>(y0 + j) * view->width + x0);
-    for (int i = 0; i < columns; ++i) {
-      for (int channel = 0; channel < 3; ++channel) t[channel][4 * j + i] = from[3 * i + channel];
-    }
+  const float* from = image + 3 * (static_cast<size_t>(y0) * view->width + x0);
+  if (columns == 4) {
+    for (int j = 0; j < rows; ++j, from += 3 * view->width) memcpy(t + 12 * j, from, 48);
+  } else {
+    for (int j = 0; j < rows; ++j, from += 3 * view->width) memcpy(t + 12 * j, from, sizeof(float) * 3 * columns);
   }
-  for (int channel = 0; channel < 3; ++channel) color[channel] = load(t[channel]);
+  load_triples(t, color);
 }
 
 // Composites the blocks of a tile front to back. Entries no pixel used are dropped from the lists.
@@ -243,7 +243,6 @@ static void composite_tile(View* view, const Images* out, int tile, const TileFr
       uint32_t kept = 0;
       for (uint32_t k = 0; k < count; ++k) {
         const uint32_t local = entries[k];
-        __builtin_prefetch(locals + entries[k + kPrefetch]);
         const Record& r = locals[local];
         const Vec dx = Vec(r.x) - px, dy = Vec(r.y) - py;
         const Vec power = exponent(r, dx, dy);

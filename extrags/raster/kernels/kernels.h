@@ -130,17 +130,24 @@ struct SceneGradients {
   float* absolute2d;  // [n, 2], written
 };
 
-struct AdamRows {
-  float* values;
+struct AdamArray {
+  float* values;  // [rows, columns], like the next three
   const float* gradients;
   float* first;
   float* second;
-  int64_t rows, columns;
+  int64_t columns;
+  float rate;
+};
+
+struct AdamStep {
+  const AdamArray* arrays;
+  int count;
+  int64_t rows;
   const int32_t* steps;    // [rows], counted up already
   const float* bias1;      // 1 / (1 - beta1^t), by t
   const float* bias2;      // 1 / sqrt(1 - beta2^t), by t
   const uint8_t* visible;  // [rows] or null
-  float rate, eps;
+  float eps;
   float beta1, beta2, rest1, rest2;  // rest = 1 - beta, rounded once
 };
 
@@ -160,7 +167,7 @@ struct KernelTable {
   void (*backward)(View*, const Scene*, const ImageGradients*, const SceneGradients*);
   void (*query)(View*, const float* points, int64_t count, float* transmittance);
   double (*loss)(const LossImages*, Buffer* working);
-  void (*adam)(const AdamRows*);
+  void (*adam)(const AdamStep*);
   int64_t (*first_nonfinite)(const float* values, int64_t count);
   double (*fma_chain)(int64_t rounds);
 };

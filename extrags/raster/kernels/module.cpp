@@ -4,10 +4,11 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
 #include <nanobind/stl/unique_ptr.h>
 #include <nanobind/stl/vector.h>
 
-#include <cmath>
+#include <algorithm>
 #include <cstdlib>
 #include <cstring>
 #include <memory>
@@ -15,6 +16,7 @@
 #include <optional>
 #include <stdexcept>
 #include <string>
+#include <tuple>
 #include <vector>
 
 #include "kernels.h"
@@ -281,23 +283,34 @@ double l1_ssim(const In& image, const In& target, std::optional<In> mask, Out gr
   return active()->loss(&images, &working.buffer);
 }
 
-void adam(Out values, const In& gradients, Out first, Out second, const Counts& steps, const In& bias1,
-          const In& bias2, std::optional<Flags> visible, float rate, double beta1, double beta2, float eps) {
-  const size_t rows = steps.shape(0), size = values.size();
-  expect(rows > 0 && size % rows == 0, "values");
-  expect(gradients.size() == size && first.size() == size && second.size() == size, "gradients or moments");
+// Values, gradients, first and second moments, learning rate
+using AdamTuple = std::tuple<Out, In, Out, Out, float>;
+
+void adam(const std::vector<AdamTuple>& parameters, const Counts& steps, const In& bias1, const In& bias2,
+          std::optional<Flags> visible, double beta1, double beta2, float eps) {
+  const size_t rows = steps.shape(0);
+  std::vector<AdamArray> arrays;
+  for (const auto& [values, gradients, first, second, rate] : parameters) {
+    const size_t size = values.size();
+    expect(rows > 0 && size % rows == 0, "values");
+    expect(gradients.size() == size && first.size() == size && second.size() == size, "gradients or moments");
+    arrays.push_back({values.data(), gradients.data(), first.data(), second.data(),
+                      static_cast<int64_t>(size / rows), rate});
+  }
   expect(bias1.size() == bias2.size(), "bias corrections");
   expect(!visible || visible->shape(0) == rows, "visible");
+  int32_t least = 0, most = 0;
   for (size_t i = 0; i < rows; ++i) {
-    expect(steps.data()[i] >= 0 && static_cast<size_t>(steps.data()[i]) < bias1.size(), "steps");
+    least = std::min(least, steps.data()[i]);
+    most = std::max(most, steps.data()[i]);
   }
-  const AdamRows a{values.data(), gradients.data(), first.data(), second.data(),
-                   static_cast<int64_t>(rows), static_cast<int64_t>(size / rows), steps.data(),
-                   bias1.data(), bias2.data(), data_or_null(visible), rate, eps,
-                   static_cast<float>(beta1), static_cast<float>(beta2),
-                   static_cast<float>(1 - beta1), static_cast<float>(1 - beta2)};
+  expect(least >= 0 && static_cast<size_t>(most) < bias1.size(), "steps");
+  const AdamStep step{arrays.data(), static_cast<int>(arrays.size()), static_cast<int64_t>(rows),
+                      steps.data(), bias1.data(), bias2.data(), data_or_null(visible), eps,
+                      static_cast<float>(beta1), static_cast<float>(beta2),
+                      static_cast<float>(1 - beta1), static_cast<float>(1 - beta2)};
   nb::gil_scoped_release release_gil;
-  active()->adam(&a);
+  active()->adam(&step);
 }
 
 int64_t first_nonfinite(const In& values) {
@@ -334,9 +347,8 @@ NB_MODULE(_native, m) {
   m.def("l1_ssim", &l1_ssim, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(),
         nb::arg("gradient").noconvert(), nb::arg("height"), nb::arg("width"), nb::arg("dssim_weight"),
         nb::arg("scale"));
-  m.def("adam", &adam, nb::arg("values").noconvert(), nb::arg("gradients"), nb::arg("first").noconvert(),
-        nb::arg("second").noconvert(), nb::arg("steps").noconvert(), nb::arg("bias1"), nb::arg("bias2"),
-        nb::arg("visible").none().noconvert(), nb::arg("rate"), nb::arg("beta1"), nb::arg("beta2"),
+  m.def("adam", &adam, nb::arg("parameters"), nb::arg("steps").noconvert(), nb::arg("bias1"),
+        nb::arg("bias2"), nb::arg("visible").none().noconvert(), nb::arg("beta1"), nb::arg("beta2"),
         nb::arg("eps"));
   m.def("first_nonfinite", &first_nonfinite, nb::arg("values"));
   m.def("fma_chain", [](int64_t rounds) { return active()->fma_chain(rounds); }, nb::arg("rounds"));

@@ -167,8 +167,9 @@ void set_num_threads(int count) {
 }
 
 int num_threads() {
+  static const int standard = default_threads();
   const int limit = thread_limit.load();
-  return limit > 0 ? limit : default_threads();
+  return limit > 0 ? limit : standard;
 }
 
 void parallel_for(int count, Task task, void* context) {

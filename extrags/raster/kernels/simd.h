@@ -95,6 +95,56 @@ EXTRAGS_INLINE void store_pairs(float* p, Vec a, Vec b) {
   _mm512_storeu_ps(p, _mm512_unpacklo_ps(a.v, b.v));
   _mm512_storeu_ps(p + 16, _mm512_unpackhi_ps(a.v, b.v));
 }
+// Sixteen rows of three or four floats, to and from one vector per column
+EXTRAGS_INLINE void load_triples(const float* p, Vec* columns) {
+  const __m512 a = _mm512_loadu_ps(p), b = _mm512_loadu_ps(p + 16), c = _mm512_loadu_ps(p + 32);
+  // Float 3 i + k lies in a for the first places, then in b (16 and up), then in c.
+  const __m512i x1 = _mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0);
+  const __m512i x2 = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29);
+  const __m512i y1 = _mm512_setr_epi32(1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0);
+  const __m512i y2 = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30);
+  const __m512i z1 = _mm512_setr_epi32(2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0);
+  const __m512i z2 = _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31);
+  columns[0] = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, x1, b), x2, c);
+  columns[1] = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, y1, b), y2, c);
+  columns[2] = _mm512_permutex2var_ps(_mm512_permutex2var_ps(a, z1, b), z2, c);
+}
+EXTRAGS_INLINE void store_triples(float* p, const Vec* columns) {
+  const __m512 x = columns[0].v, y = columns[1].v, z = columns[2].v;
+  const __m512i a1 = _mm512_setr_epi32(0, 16, 0, 1, 17, 0, 2, 18, 0, 3, 19, 0, 4, 20, 0, 5);
+  const __m512i a2 = _mm512_setr_epi32(0, 1, 16, 3, 4, 17, 6, 7, 18, 9, 10, 19, 12, 13, 20, 15);
+  const __m512i b1 = _mm512_setr_epi32(21, 0, 6, 22, 0, 7, 23, 0, 8, 24, 0, 9, 25, 0, 10, 26);
+  const __m512i b2 = _mm512_setr_epi32(0, 21, 2, 3, 22, 5, 6, 23, 8, 9, 24, 11, 12, 25, 14, 15);
+  const __m512i c1 = _mm512_setr_epi32(0, 11, 27, 0, 12, 28, 0, 13, 29, 0, 14, 30, 0, 15, 31, 0);
+  const __m512i c2 = _mm512_setr_epi32(26, 1, 2, 27, 4, 5, 28, 7, 8, 29, 10, 11, 30, 13, 14, 31);
+  _mm512_storeu_ps(p, _mm512_permutex2var_ps(_mm512_permutex2var_ps(x, a1, y), a2, z));
+  _mm512_storeu_ps(p + 16, _mm512_permutex2var_ps(_mm512_permutex2var_ps(x, b1, y), b2, z));
+  _mm512_storeu_ps(p + 32, _mm512_permutex2var_ps(_mm512_permutex2var_ps(x, c1, y), c2, z));
+}
+EXTRAGS_INLINE void load_quads(const float* p, Vec* columns) {
+  const __m512 a = _mm512_loadu_ps(p), b = _mm512_loadu_ps(p + 16);
+  const __m512 c = _mm512_loadu_ps(p + 32), d = _mm512_loadu_ps(p + 48);
+  const __m512i even = _mm512_setr_epi32(0, 4, 8, 12, 16, 20, 24, 28, 1, 5, 9, 13, 17, 21, 25, 29);
+  const __m512i odd = _mm512_add_epi32(even, _mm512_set1_epi32(2));
+  const __m512 t0 = _mm512_permutex2var_ps(a, even, b), t1 = _mm512_permutex2var_ps(c, even, d);
+  const __m512 t2 = _mm512_permutex2var_ps(a, odd, b), t3 = _mm512_permutex2var_ps(c, odd, d);
+  columns[0] = _mm512_shuffle_f32x4(t0, t1, 0x44);
+  columns[1] = _mm512_shuffle_f32x4(t0, t1, 0xee);
+  columns[2] = _mm512_shuffle_f32x4(t2, t3, 0x44);
+  columns[3] = _mm512_shuffle_f32x4(t2, t3, 0xee);
+}
+EXTRAGS_INLINE void store_quads(float* p, const Vec* columns) {
+  const __m512i even = _mm512_setr_epi32(0, 8, 16, 24, 1, 9, 17, 25, 2, 10, 18, 26, 3, 11, 19, 27);
+  const __m512i odd = _mm512_add_epi32(even, _mm512_set1_epi32(4));
+  const __m512 t0 = _mm512_shuffle_f32x4(columns[0].v, columns[1].v, 0x44);
+  const __m512 t1 = _mm512_shuffle_f32x4(columns[2].v, columns[3].v, 0x44);
+  const __m512 t2 = _mm512_shuffle_f32x4(columns[0].v, columns[1].v, 0xee);
+  const __m512 t3 = _mm512_shuffle_f32x4(columns[2].v, columns[3].v, 0xee);
+  _mm512_storeu_ps(p, _mm512_permutex2var_ps(t0, even, t1));
+  _mm512_storeu_ps(p + 16, _mm512_permutex2var_ps(t0, odd, t1));
+  _mm512_storeu_ps(p + 32, _mm512_permutex2var_ps(t2, even, t3));
+  _mm512_storeu_ps(p + 48, _mm512_permutex2var_ps(t2, odd, t3));
+}
 EXTRAGS_INLINE void transpose16(const float* source, float* target) {
   __m512 r[16], t[16];
   for (int i = 0; i < 16; ++i) r[i] = _mm512_loadu_ps(source + 16 * i);
@@ -283,11 +333,40 @@ EXTRAGS_INLINE Vec split_power(Vec x, Vec* mantissa) {
   }
   return power;
 }
+#if defined(__AVX2__) && defined(__FMA__)
+// For each byte, the places of its set bits in front
+struct SetBits {
+  uint8_t places[256][8];
+};
+constexpr SetBits set_bits() {
+  SetBits table{};
+  for (int byte = 0; byte < 256; ++byte) {
+    int count = 0;
+    for (int bit = 0; bit < 8; ++bit) {
+      if ((byte >> bit & 1) != 0) table.places[byte][count++] = static_cast<uint8_t>(bit);
+    }
+  }
+  return table;
+}
+alignas(64) static constexpr SetBits kSetBits = set_bits();
+
+EXTRAGS_INLINE int append_lanes(uint32_t* p, uint32_t bits, uint32_t base) {
+  const uint32_t low = bits & 0xff, high = bits >> 8;
+  const __m256i a = _mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(kSetBits.places[low])));
+  const __m256i b = _mm256_cvtepu8_epi32(_mm_loadl_epi64(reinterpret_cast<const __m128i*>(kSetBits.places[high])));
+  const int count = __builtin_popcount(low);
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p), _mm256_add_epi32(a, _mm256_set1_epi32(static_cast<int>(base))));
+  _mm256_storeu_si256(reinterpret_cast<__m256i*>(p + count),
+                      _mm256_add_epi32(b, _mm256_set1_epi32(static_cast<int>(base) + 8)));
+  return count + __builtin_popcount(high);
+}
+#else
 EXTRAGS_INLINE int append_lanes(uint32_t* p, uint32_t bits, uint32_t base) {
   int count = 0;
   for (; bits != 0; bits &= bits - 1) p[count++] = base + static_cast<uint32_t>(__builtin_ctz(bits));
   return count;
 }
+#endif
 EXTRAGS_INLINE void store_packed(uint32_t* p, Vec low, Vec high) {
   for (int i = 0; i < kParts; ++i) {
     const NativeInt packed = __builtin_convertvector(low.v[i], NativeInt) |
@@ -318,6 +397,27 @@ EXTRAGS_INLINE void store_pairs(float* p, Vec a, Vec b) {
 #endif
   }
 }
+template <int kColumns>
+EXTRAGS_INLINE void load_interleaved(const float* p, Vec* columns) {
+  alignas(64) float t[kColumns][16];
+  for (int i = 0; i < 16; ++i) {
+    for (int k = 0; k < kColumns; ++k) t[k][i] = p[kColumns * i + k];
+  }
+  for (int k = 0; k < kColumns; ++k) columns[k] = load(t[k]);
+}
+template <int kColumns>
+EXTRAGS_INLINE void store_interleaved(float* p, const Vec* columns) {
+  alignas(64) float t[kColumns][16];
+  for (int k = 0; k < kColumns; ++k) store(t[k], columns[k]);
+  for (int i = 0; i < 16; ++i) {
+    for (int k = 0; k < kColumns; ++k) p[kColumns * i + k] = t[k][i];
+  }
+}
+// Sixteen rows of three or four floats, to and from one vector per column
+EXTRAGS_INLINE void load_triples(const float* p, Vec* columns) { load_interleaved<3>(p, columns); }
+EXTRAGS_INLINE void store_triples(float* p, const Vec* columns) { store_interleaved<3>(p, columns); }
+EXTRAGS_INLINE void load_quads(const float* p, Vec* columns) { load_interleaved<4>(p, columns); }
+EXTRAGS_INLINE void store_quads(float* p, const Vec* columns) { store_interleaved<4>(p, columns); }
 EXTRAGS_INLINE void transpose16(const float* source, float* target) {
 #if defined(__AVX2__) && defined(__FMA__)
   for (int bi = 0; bi < 16; bi += 8) {
@@ -401,9 +501,15 @@ EXTRAGS_INLINE Vec log2(Vec x) {
   return fma(s * r, Vec(2 * kLog2E), power);
 }
 
-// Rows of 2, 3 or 4 floats for up to 16 Gaussians, into one vector per column; missing rows are zero.
+// The same for up to sixteen rows of 2, 3 or 4 floats; missing rows are zero.
 template <int kColumns>
 EXTRAGS_INLINE void load_rows(const float* p, int rows, Vec* columns) {
+  if constexpr (kColumns == 3) {
+    if (rows == 16) return load_triples(p, columns);
+  }
+  if constexpr (kColumns == 4) {
+    if (rows == 16) return load_quads(p, columns);
+  }
   alignas(64) float t[kColumns][16] = {};
   for (int i = 0; i < rows; ++i) {
     for (int k = 0; k < kColumns; ++k) t[k][i] = p[kColumns * i + k];
@@ -412,15 +518,18 @@ EXTRAGS_INLINE void load_rows(const float* p, int rows, Vec* columns) {
 }
 template <int kColumns>
 EXTRAGS_INLINE void store_rows(float* p, int rows, const Vec* columns, bool add) {
+  if constexpr (kColumns == 3) {
+    if (rows == 16 && !add) return store_triples(p, columns);
+  }
+  if constexpr (kColumns == 4) {
+    if (rows == 16 && !add) return store_quads(p, columns);
+  }
   alignas(64) float t[kColumns][16];
   for (int k = 0; k < kColumns; ++k) store(t[k], columns[k]);
-  if (add) {
-    for (int i = 0; i < rows; ++i) {
-      for (int k = 0; k < kColumns; ++k) p[kColumns * i + k] += t[k][i];
-    }
-  } else {
-    for (int i = 0; i < rows; ++i) {
-      for (int k = 0; k < kColumns; ++k) p[kColumns * i + k] = t[k][i];
+  for (int i = 0; i < rows; ++i) {
+    for (int k = 0; k < kColumns; ++k) {
+      float& to = p[kColumns * i + k];
+      to = add ? to + t[k][i] : t[k][i];
     }
   }
 }
