@@ -23,7 +23,7 @@ system:
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --requirement requirements.lock
 	@mkdir -p .stamps && touch $@
 
-NATIVE := $(wildcard CMakeLists.txt extrags/raster/native/*)
+NATIVE := $(wildcard CMakeLists.txt extrags/raster/kernels/*)
 .stamps/installed: .stamps/venv pyproject.toml $(NATIVE)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps \
 		--no-build-isolation --editable .
