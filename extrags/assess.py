@@ -289,7 +289,3 @@ def decide(lacking_share: float, config: PipelineConfig) -> tuple[Decision, ...]
 def _small(cameras: Cameras, width: int) -> Cameras:
     width = min(width, cameras.width)
     return cameras.resized(width, max(1, round(cameras.height * width / cameras.width)))
-
-
-# The name `tasks.assess` was written against; goes when that uses `decide`.
-_decide = decide

@@ -363,7 +363,7 @@ def _set_by_path(tree: dict[str, Any], path: str, value: Any) -> None:
         if not isinstance(node, dict) or name not in node:
             known = sorted(node) if isinstance(node, dict) else []
             near = get_close_matches(name, known, n=1)
-            hint = f"; did you mean {'.'.join([*parents[:done], near[0]])}?" if near else ""
+            hint = f"; did you mean {'.'.join([*parents[:done], near[0]])}?" if near else "."
             raise ConfigError(f"no setting {path}{hint} Known here: {', '.join(known) or 'none'}")
         if done < len(parents):
             node = node[name]

@@ -26,7 +26,7 @@ HOLE_ALPHA = 0.5
 CARVED_MARGIN = 0.05
 """A new Gaussian nearer than a real view's surface by this share of its depth would hide it."""
 
-LEAK_STRIDE = 2
+HOLE_STRIDE_PX = 2
 """Hole pixels are taken on a grid of this step; thinning would drop most of them anyway."""
 
 
@@ -135,7 +135,7 @@ def hole_gaussians(
     """
     holes = (pseudo.alpha < HOLE_ALPHA) & (pseudo.depth_mm > 0)
     lattice = np.zeros_like(holes)
-    lattice[:, ::LEAK_STRIDE, ::LEAK_STRIDE] = True
+    lattice[:, ::HOLE_STRIDE_PX, ::HOLE_STRIDE_PX] = True
     chosen = np.flatnonzero(holes & lattice)
     if len(chosen) == 0 or room <= 0:
         return None
