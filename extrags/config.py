@@ -52,12 +52,19 @@ class IngestConfig(StageConfig):
         ge=1,
         le=16,
         description="divide the source's size by this; None: the source's usual divisor (sinus 4, "
-        "simcol3d 2, others 1); ignored when width is set",
+        "simcol3d 2, C3VD to a width of 225, others 1); ignored when width is set",
     )
     holdout_every: int = Field(
         8, ge=2, description="hold out every n-th frame where the source defines no split"
     )
     max_frames: int | None = Field(None, ge=2, description="read at most so many frames")
+    field_of_view_deg: float | None = Field(
+        None,
+        ge=20,
+        le=150,
+        description="horizontal field of view of the pinhole that fisheye sources are resampled to; None: "
+        "the source's usual one (C3VD and C3VDv2 100); other sources keep their own",
+    )
 
 
 class PosesConfig(StageConfig):
@@ -83,6 +90,14 @@ class LightConfig(StageConfig):
     """Near-field light that rides on the camera (design section 6)."""
 
     enabled: bool = Field(True, description="False: colours do not depend on the distance")
+    falloff: bool = Field(True, description="learn exponent and softening of the fall-off with distance")
+    spread: bool = Field(True, description="learn how much less the lamp shines to the side")
+    cosine: bool = Field(True, description="learn how much darker a surface is that turns away")
+    response: bool = Field(True, description="learn the shoulder of the camera's response")
+    exposure: bool = Field(True, description="learn a gain per training frame")
+    offset: bool = Field(
+        False, description="learn where the lamp stands beside the lens; did not pay where it was measured"
+    )
     exponent: float = Field(
         0.6,
         gt=0,
@@ -122,6 +137,34 @@ class DensifyConfig(StageConfig):
     split_scale_share: float = Field(
         0.01, gt=0, description="larger than this share of the extent: split, else clone"
     )
+    strategy: Literal["default", "mcmc"] = Field(
+        "default", description="default: clone, split, prune; mcmc: relocate dead Gaussians and shake"
+    )
+    absgrad: bool = Field(
+        False,
+        description="sum absolute gradients over pixels (AbsGS); wants a threshold about 4 times higher",
+    )
+    prune_scale_share: float = Field(
+        0.25, gt=0, description="Gaussians larger than this share of the extent are removed"
+    )
+    refine_scale2d_stop_share: float = Field(
+        0.0, ge=0, le=1, description="until this share of the iterations sizes in the image count too"
+    )
+    grow_scale2d: float = Field(
+        0.05, gt=0, description="radius, as a share of the longer image side, that is split"
+    )
+    prune_scale2d: float = Field(
+        0.15, gt=0, description="radius, as a share of the longer image side, that is removed"
+    )
+    reset_every: int = Field(
+        0, ge=0, description="iterations between resets of all opacities; 0: never, see DefaultStrategy"
+    )
+    reset_pause: int = Field(0, ge=0, description="no rounds in so many iterations after a reset")
+    noise: float = Field(5e5, ge=0, description="mcmc: noise, times the position learning rate")
+    opacity_penalty: float = Field(0.01, ge=0, description="mcmc: weight of the mean opacity in the loss")
+    scale_penalty: float = Field(
+        0.01, ge=0, description="mcmc: weight of the mean scale, in extents, in the loss"
+    )
 
 
 class CoarseConfig(StageConfig):
@@ -138,6 +181,12 @@ class CoarseConfig(StageConfig):
         0.1, ge=0, le=1, description="the term decays to this share, log-linearly"
     )
     max_points: int = Field(12_000, ge=10, description="starting points at most")
+    thickness: float = Field(
+        0.3,
+        gt=0,
+        le=1,
+        description="starting Gaussians are discs on the surface, so thick against their radius; 1: round",
+    )
     optimiser: OptimiserConfig = OptimiserConfig()
     densify: DensifyConfig = DensifyConfig()
     light: LightConfig = LightConfig()

@@ -104,8 +104,10 @@ class Gaussians:
         *,
         opacity: float = 0.5,
         sh_degree: int = 0,
+        normals: Float[np.ndarray, "n 3"] | None = None,
+        thickness: float = 1.0,
     ) -> Gaussians:
-        """Isotropic Gaussians at points.
+        """Gaussians at points: round ones, or discs on the surface.
 
         Args:
             points: centres in world units.
@@ -113,14 +115,20 @@ class Gaussians:
             radius: standard deviation of each, in world units.
             opacity: the same for all, in (0, 1).
             sh_degree: higher coefficients are zero.
+            normals: unit normals of the surface; their sign does not matter. None makes round ones.
+            thickness: standard deviation along the normal, as a share of the radius.
         """
         n = len(points)
         quats = torch.zeros(n, 4)
         quats[:, 0] = 1
+        scales = torch.tensor(radius, dtype=torch.float32).log()[:, None].repeat(1, 3)
+        if normals is not None:
+            quats = torch.tensor(_turned_to(normals), dtype=torch.float32)
+            scales[:, 2] += float(np.log(thickness))
         return cls(
             means=torch.tensor(points, dtype=torch.float32),
             quats=quats,
-            scales=torch.tensor(radius, dtype=torch.float32).log()[:, None].repeat(1, 3),
+            scales=scales,
             opacities=torch.full((n,), float(np.log(opacity / (1 - opacity)))),
             sh0=((torch.tensor(rgb, dtype=torch.float32) - 0.5) / SH_C0)[:, None, :],
             shN=torch.zeros(n, (sh_degree + 1) ** 2 - 1, 3),
@@ -215,3 +223,10 @@ class Gaussians:
             sh0=stacked("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
             shN=rest.transpose(1, 2).contiguous(),
         )
+
+
+def _turned_to(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
+    """Quaternions (w, x, y, z) of the shortest turns that bring the z axis onto the normals."""
+    facing = np.where(normals[:, 2:] < 0, -normals, normals)
+    half = np.stack([1 + facing[:, 2], -facing[:, 1], facing[:, 0], np.zeros(len(facing))], axis=1)
+    return np.asarray(half / np.linalg.norm(half, axis=1, keepdims=True))

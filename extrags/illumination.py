@@ -1,17 +1,14 @@
-r"""Near-field light that rides on the camera, and exposure per frame (design section 6).
+"""The light that rides on the camera, and the camera's response, as a scene learns them (design section 6).
 
-What a Gaussian sends to the lens is
-
-.. math:: I = g_f \, \frac{(1 + c)^e}{(r^2 / s^2 + c)^e} \, a
-
-with albedo a (with its spherical harmonics), distance r from the lens, the scene's reference distance
-s, softening c, exponent e and exposure g_f of frame f. The gauge is fixed: at r = s the fall-off is
-one, and the log-exposures of the training frames have mean zero.
+The formula, its gauge and its kernels are those of `extrags.raster.light`; here live the learned numbers:
+a handful for the whole scene and one exposure per training frame. The mean of the log-exposures is held at
+zero, and everything that could trade brightness against albedo is one at the reference distance, on the axis.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -19,9 +16,17 @@ import zarr
 from jaxtyping import Float
 from torch import Tensor
 
+from extrags.config import LightConfig
+from extrags.raster.light import SPREAD_MIN, CameraLight, developed, light_gain, undeveloped
 from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["NearFieldLight"]
+
+START_LOG_SOFTENING = -1.0
+START_SPREAD = 0.3
+START_COSINE = 0.3
+START_LOG_SHOULDER = -0.5
+"""Where learning starts: a lamp a little wide, walls a little Lambertian, a soft shoulder."""
 
 
 @dataclass(frozen=True)
@@ -32,29 +37,59 @@ class NearFieldLight:
         log_softening: log of c, scalar.
         log_exponent: log of e, scalar.
         log_exposure: log of g_f for each training frame, [F_train]; mean zero.
-        reference_distance: s, in world units.
+        reference_distance: in world units.
+        spread: k, scalar.
+        cosine: q, scalar.
+        offset: of the lamp from the lens, in the camera frame, in reference distances, [3].
+        log_shoulder: log of s, scalar; minus infinity is a straight response.
     """
 
     log_softening: Float[Tensor, ""]
     log_exponent: Float[Tensor, ""]
     log_exposure: Float[Tensor, "f"]
     reference_distance: float
+    spread: Float[Tensor, ""] = field(default_factory=lambda: torch.zeros(()))
+    cosine: Float[Tensor, ""] = field(default_factory=lambda: torch.zeros(()))
+    offset: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
+    log_shoulder: Float[Tensor, ""] = field(default_factory=lambda: torch.tensor(-math.inf))
 
     @classmethod
-    def initial(cls, n_frames: int, reference_distance: float, *, exponent: float = 0.6) -> NearFieldLight:
-        """The starting light: a softened power of the distance, equal exposures."""
+    def initial(
+        cls,
+        n_frames: int,
+        reference_distance: float,
+        config: LightConfig | None = None,
+    ) -> NearFieldLight:
+        """The starting light: a softened power of the distance, equal exposures.
+
+        Args:
+            n_frames: number of training frames.
+            reference_distance: the gauge, in world units.
+            config: which parts the model has; the others start, and stay, without effect.
+        """
+        config = LightConfig() if config is None else config
         return cls(
-            torch.tensor(-1.0),
-            torch.tensor(float(exponent)).log(),
+            torch.tensor(START_LOG_SOFTENING),
+            torch.tensor(config.exponent if config.falloff else 0.0).log(),
             torch.zeros(n_frames),
             float(reference_distance),
+            spread=torch.tensor(START_SPREAD if config.spread else 0.0),
+            cosine=torch.tensor(START_COSINE if config.cosine else 0.0),
+            log_shoulder=torch.tensor(START_LOG_SHOULDER if config.response else -math.inf),
         )
 
-    def falloff(self, distance: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Brightness at a distance from the lens relative to the reference distance."""
-        softening = self.log_softening.exp()
-        relative = (distance / self.reference_distance) ** 2
-        return ((1 + softening) / (relative + softening)) ** self.log_exponent.exp()
+    def of_cameras(self, exposure: Float[Tensor, "c"]) -> CameraLight:
+        """The light as C cameras carry it, at given exposures."""
+        return CameraLight(
+            exposure[:, None].expand(-1, 3),
+            self.log_softening.exp(),
+            self.log_exponent.exp(),
+            self.spread,
+            self.cosine,
+            self.offset,
+            self.log_shoulder.exp(),
+            self.reference_distance,
+        )
 
     def exposure(self, frame: int | None) -> Float[Tensor, ""]:
         """Gain of a training frame; None gives the mean exposure (held-out and virtual views)."""
@@ -62,11 +97,73 @@ class NearFieldLight:
             return torch.ones(())
         return (self.log_exposure[frame] - self.log_exposure.mean()).exp()
 
+    def exposures(self) -> Float[Tensor, "f"]:
+        """Gains of all training frames."""
+        return (self.log_exposure - self.log_exposure.mean()).exp()
+
+    def falloff(
+        self, distance: Float[Tensor, "*b"], axis_cosine: Float[Tensor, "*b"] | None = None
+    ) -> Float[Tensor, "*b"]:
+        """The factor on the albedo of surfaces that face the lens, of a lamp at the lens.
+
+        Args:
+            distance: from the lens, in world units.
+            axis_cosine: cosine between the ray and the optical axis; None is on the axis.
+        """
+        softening = self.log_softening.exp()
+        relative = (distance / self.reference_distance) ** 2
+        gain = ((1 + softening) / (relative + softening)) ** self.log_exponent.exp()
+        return gain if axis_cosine is None else gain * axis_cosine.clamp_min(SPREAD_MIN) ** self.spread
+
+    def gain(
+        self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None = None
+    ) -> Float[Tensor, "*b"]:
+        """The factor on the albedo of points in the camera frame, at unit exposure.
+
+        Args:
+            points: in the camera frame, in world units.
+            normals: there; None takes every surface to face the lamp.
+        """
+        return light_gain(points, normals, self._row(points))
+
+    def signal(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """What reached the sensor, from image values in [0, 1]: the response undone."""
+        return undeveloped(rgb, self.log_shoulder.exp().to(rgb))
+
+    def developed(self, signal: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Image values of what reaches the sensor."""
+        return developed(signal, self.log_shoulder.exp().to(signal))
+
+    def albedo(
+        self,
+        rgb: Float[Tensor, "n 3"],
+        points: Float[Tensor, "n 3"],
+        normals: Float[Tensor, "n 3"] | None = None,
+        *,
+        least_gain: float = 1e-3,
+    ) -> Float[Tensor, "n 3"]:
+        """Colours with light and response divided out.
+
+        Args:
+            rgb: image values in [0, 1], at unit exposure.
+            points: where they were seen, in the camera frame, in world units.
+            normals: there; None takes every surface to face the lamp.
+            least_gain: darker places are treated as if they received this much: noise is not albedo.
+        """
+        return self.signal(rgb) / self.gain(points, normals).clamp_min(least_gain)[:, None]
+
+    def _row(self, like: Tensor) -> Float[Tensor, "12"]:
+        return self.of_cameras(torch.ones(1)).packed()[0].to(like)
+
     def parameters(self) -> dict[str, Tensor]:
         """What is learned, by name."""
         return {
             "log_softening": self.log_softening,
             "log_exponent": self.log_exponent,
+            "spread": self.spread,
+            "cosine": self.cosine,
+            "offset": self.offset,
+            "log_shoulder": self.log_shoulder,
             "log_exposure": self.log_exposure,
         }
 
@@ -86,6 +183,6 @@ class NearFieldLight:
     def load(cls, path: Path) -> NearFieldLight:
         """Read what `save` wrote."""
         group = zarr.open_group(str(path), mode="r")
-        names = ("log_softening", "log_exponent", "log_exposure")
+        names = [name for name in cls.__dataclass_fields__ if name != "reference_distance"]
         values = {name: torch.from_numpy(read_array(group, name)) for name in names}
         return cls(**values, reference_distance=float(group.attrs["reference_distance"]))  # type: ignore[arg-type]

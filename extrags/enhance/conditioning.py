@@ -266,13 +266,13 @@ def condition(layers: Layers, transfer: LightTransfer) -> Conditioning:
     """
     alpha = layers.get("alpha")
     depth = completed_depth(layers.get("depth_mm"), alpha, transfer.scale_mm)
-    falloff = transfer.falloff(depth * layers.get("ray_length"))
+    falloff = transfer.falloff(depth * layers.get("ray_length"), 1 / layers.get("ray_length"))
     falloff = falloff.clamp(1 / FALLOFF_LIMIT, FALLOFF_LIMIT)
     weight = layers.get("blend_weight")
     color = weight * layers.get("blend") + (1 - weight) * layers.get("rendered")
     known = weight + (1 - weight) * alpha
     solid = _within_range(color / known.clamp_min(1e-3))
-    base = _within_range(push_pull(solid / falloff, known) * falloff)
+    base = _within_range(transfer.developed(push_pull(transfer.signal(solid) / falloff, known) * falloff))
     channels = torch.cat(
         [
             _normalised(layers.get("rendered")),

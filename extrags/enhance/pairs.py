@@ -294,8 +294,13 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
     depth = 1 / packed[chosen, 4]
     offsets = rays[chosen] * depth[:, None]
     distance = np.linalg.norm(offsets, axis=1)
-    falloff = views.transfer.falloff(torch.from_numpy(distance.astype(np.float32))).numpy()
-    albedo = packed[chosen, :3] / np.maximum(falloff, 1e-2)[:, None]
+    seen = (
+        torch.from_numpy(distance.astype(np.float32)),
+        torch.from_numpy((depth / distance).astype(np.float32)),
+    )
+    falloff = views.transfer.falloff(*seen).numpy()
+    signal = views.transfer.signal(torch.from_numpy(packed[chosen, :3])).numpy()
+    albedo = signal / np.maximum(falloff, 1e-2)[:, None]
     albedo = albedo / views.exposure.numpy()[view, None]
     # Without a light the colour of a distance cannot be divided out twice: it stays as it was seen.
     colors = albedo if views.transfer.light is not None else packed[chosen, :3]

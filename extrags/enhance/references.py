@@ -31,7 +31,7 @@ SOLID_ALPHA = 0.9
 
 @dataclass(frozen=True)
 class LightTransfer:
-    """Brightness at a distance from the lens, up to a constant.
+    """What distance, angle and the camera's response make of a surface's colour, up to a constant.
 
     Args:
         light: the scene's light; None where the scene has none.
@@ -43,11 +43,24 @@ class LightTransfer:
     exponent: float
     scale_mm: float
 
-    def falloff(self, distance: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Brightness relative to the reference distance."""
+    def falloff(self, distance: Float[Tensor, "*b"], axis_cosine: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Brightness relative to that at the reference distance, on the axis.
+
+        Args:
+            distance: from the lens, in world units.
+            axis_cosine: cosine between the ray and the optical axis; counts with `light` only.
+        """
         if self.light is not None:
-            return self.light.falloff(distance)
+            return self.light.falloff(distance, axis_cosine)
         return (distance / self.scale_mm) ** -self.exponent
+
+    def signal(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """Image values in [0, 1] with the camera's response undone."""
+        return rgb if self.light is None else self.light.signal(rgb)
+
+    def developed(self, signal: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+        """The image values of a signal."""
+        return signal if self.light is None else self.light.developed(signal)
 
 
 @dataclass(frozen=True)
@@ -177,7 +190,7 @@ def _exposures(scene: Scene, frames: Int[np.ndarray, "r"]) -> Float[Tensor, "r"]
             f"the scene's light has {len(light.log_exposure)} exposures for {len(frames)} reference frames; "
             "give the frames the scene was trained on, or their exposures"
         )
-    return (light.log_exposure - light.log_exposure.mean()).exp()
+    return light.exposures()
 
 
 def _depth_and_seen(

@@ -68,6 +68,17 @@ class _Seen:
     weight: Float[Tensor, "k p"]
     quality: Float[Tensor, "k p"]
     distance: Float[Tensor, "k p"]
+    axis_cosine: Float[Tensor, "k p"]
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """World points of a view's pixels, with distance, ray and angle to the axis as seen from its lens."""
+
+    points: Float[Tensor, "p 3"]
+    distance: Float[Tensor, "p"]
+    direction: Float[Tensor, "p 3"]
+    axis_cosine: Float[Tensor, "p"]
 
 
 def warp_references(
@@ -111,8 +122,7 @@ def covisibility(
     everything = torch.arange(len(references))
     rows = []
     for view in range(len(cameras)):
-        points, distance, direction = _surface(cameras[view], depth_mm[view], LATTICE_PX)
-        seen = _look_up(references, everything, points, distance, direction)
+        seen = _look_up(references, everything, _surface(cameras[view], depth_mm[view], LATTICE_PX))
         rows.append((seen.weight * seen.quality).mean(dim=1))
     return torch.stack(rows)
 
@@ -125,13 +135,15 @@ def _warp_one(
     gain: Float[Tensor, ""],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     size = depth_mm.shape[-2:]
-    points, distance, direction = _surface(camera, depth_mm, 1)
-    seen = _look_up(references, chosen, points, distance, direction)
+    here = _surface(camera, depth_mm, 1)
+    seen = _look_up(references, chosen, here)
     transfer = references.transfer
-    ratio = transfer.falloff(distance)[None] / transfer.falloff(seen.distance)
+    ratio = transfer.falloff(here.distance, here.axis_cosine)[None] / transfer.falloff(
+        seen.distance, seen.axis_cosine
+    )
     ratio = ratio * (gain / references.exposure[chosen])[:, None]
     ratio = ratio.clamp(1 / BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
-    rgb = seen.rgb * ratio[:, None]
+    rgb = transfer.developed(transfer.signal(seen.rgb) * ratio[:, None])
     # Too bright for the sensor: darkened as a whole, so that the hue stays.
     rgb = rgb / rgb.amax(dim=1, keepdim=True).clamp_min(1)
     trust = seen.weight * (seen.quality / GOOD_QUALITY).clamp(max=1)
@@ -141,7 +153,7 @@ def _warp_one(
     first = _weighted(luminance, votes)
     votes = votes * torch.exp(-((luminance - first).clamp_min(0) / HIGHLIGHT_STEP).square())
     blend = _weighted(rgb, votes[:, None])
-    log_ratio = _weighted((seen.distance / distance).log(), votes)
+    log_ratio = _weighted((seen.distance / here.distance).log(), votes)
     shaped = (
         rgb[0] * (trust[:1] > 0),
         trust[:1],
@@ -157,26 +169,23 @@ def _weighted(values: Tensor, votes: Tensor) -> Tensor:
     return (values * votes).sum(dim=0) / votes.sum(dim=0).clamp_min(1e-12)
 
 
-def _surface(
-    camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int
-) -> tuple[Float[Tensor, "p 3"], Float[Tensor, "p"], Float[Tensor, "p 3"]]:
-    """World points of a view's pixels, with distance from its lens and direction of its rays."""
+def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> _Surface:
     offset = stride // 2
     rays = torch.from_numpy(pixel_rays(camera)[0, offset::stride, offset::stride].astype(np.float32))
     offsets = (rays * depth_mm[0, offset::stride, offset::stride, None]).reshape(-1, 3)
     distance = offsets.norm(dim=-1).clamp_min(1e-9)
     center = torch.from_numpy(camera.centers[0].astype(np.float32))
-    return center + offsets, distance, offsets / distance[:, None]
+    cosine = 1 / rays.norm(dim=-1).reshape(-1)
+    return _Surface(center + offsets, distance, offsets / distance[:, None], cosine)
 
 
 def _look_up(
     references: ReferenceViews,
     chosen: Int[Tensor, "k"],
-    points: Float[Tensor, "p 3"],
-    distance: Float[Tensor, "p"],
-    direction: Float[Tensor, "p 3"],
+    surface: _Surface,
 ) -> _Seen:
-    """Colour and trust of world points in the chosen references."""
+    """Colour and trust of a surface in the chosen references."""
+    points = surface.points
     index = chosen.numpy()
     viewmats = references.viewmats[chosen]
     K = references.K[chosen]
@@ -200,12 +209,12 @@ def _look_up(
     weight = torch.where(in_front & known, agreement * sampled[:, 3], torch.zeros(()))
     away = points - references.centers[chosen][:, None]
     seen_from = away.norm(dim=-1).clamp_min(1e-9)
-    cosine = ((away / seen_from[..., None]) * direction).sum(dim=-1).clamp(-1, 1)
+    cosine = ((away / seen_from[..., None]) * surface.direction).sum(dim=-1).clamp(-1, 1)
     quality = torch.exp(
-        -(seen_from / distance).log().abs() / DISTANCE_TOLERANCE
+        -(seen_from / surface.distance).log().abs() / DISTANCE_TOLERANCE
         - (torch.arccos(cosine) / ANGLE_TOLERANCE_RAD).square()
     )
-    return _Seen(sampled[:, :3], weight, quality, seen_from)
+    return _Seen(sampled[:, :3], weight, quality, seen_from, z / seen_from)
 
 
 def fit_falloff_exponent(references: ReferenceViews, *, pairs: int = 24) -> float:
@@ -231,16 +240,16 @@ def fit_falloff_exponent(references: ReferenceViews, *, pairs: int = 24) -> floa
         camera = references.cameras[[int(first)]]
         inverse = references.packed[first, 4:5]
         depth = torch.where(inverse > 0, 1 / inverse.clamp_min(1e-12), torch.zeros(()))
-        points, distance, direction = _surface(camera, depth, 3)
+        surface = _surface(camera, depth, 3)
         own = references.packed[first, :3, 1::3, 1::3].reshape(3, -1).mean(dim=0)
         trusted = references.packed[first, 3, 1::3, 1::3].reshape(-1)
         for second in seconds:
-            seen = _look_up(references, torch.tensor([second]), points, distance, direction)
+            seen = _look_up(references, torch.tensor([second]), surface)
             other = seen.rgb[0].mean(dim=0)
             good = _informative(own, other, trusted * seen.weight[0])
             if int(good.sum()) < 30:
                 continue
-            x = (seen.distance[0][good] / distance[good]).log()
+            x = (seen.distance[0][good] / surface.distance[good]).log()
             y = (own[good] / other[good]).log()
             slopes.append(torch.stack([x - x.median(), y - y.median()]))
     if not slopes:

@@ -51,7 +51,9 @@ def lit_luminance(
         import torch
 
         with torch.no_grad():
-            falloff = light.falloff(torch.from_numpy(distance)).numpy()
+            cosine = torch.from_numpy(1 / np.linalg.norm(rays, axis=-1))
+            falloff = light.falloff(torch.from_numpy(distance), cosine).numpy()
+            brightness = light.signal(torch.from_numpy(brightness).clamp(max=1.0)).numpy()
     else:
         falloff = np.ones_like(distance)
         usable = valid & (brightness > 1e-3) & (distance > 0)

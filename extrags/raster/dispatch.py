@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrags.errors import ConfigError, MissingDependencyError
+from extrags.raster.light import CameraLight
 from extrags.raster.native import native_isa, rasterize_native
 from extrags.raster.reference import rasterize_reference
 from extrags.raster.rendering import (
@@ -63,13 +64,14 @@ def rasterize(
     visibility: bool = False,
     query_points: Float[Tensor, "q 3"] | None = None,
     absgrad: bool = False,
+    light: CameraLight | None = None,
 ) -> Rendering:
     """Render Gaussians with differentiable splatting, as `gsplat.rasterization` does.
 
-    Differentiable in means, quats, scales, opacities, sh or colors, background and viewmats; not in Ks,
-    query_points and the thresholds. The conventions are gsplat's: EWA projection with 0.3 px^2 added to
-    the covariance, alpha clipped to 0.999, contributions under 1/255 dropped, a pixel finished before its
-    transmittance would reach 1e-4, pixel centres at +0.5, camera axes right, down, forward.
+    Differentiable in means, quats, scales, opacities, sh or colors, background, light and viewmats; not
+    in Ks, query_points and the thresholds. The conventions are gsplat's: EWA projection with 0.3 px^2
+    added to the covariance, alpha clipped to 0.999, contributions under 1/255 dropped, a pixel finished
+    before its transmittance would reach 1e-4, pixel centres at +0.5, camera axes right, down, forward.
 
     Args:
         means: centres in world units.
@@ -92,6 +94,7 @@ def rasterize(
         visibility: fill `Rendering.visibility_max` and `visibility_sum`.
         query_points: world points at which `Rendering.transmittance` is wanted.
         absgrad: fill `means2d.absgrad` on backward.
+        light: the light the cameras carry; `sh` or `colors` are albedo then. Differentiable.
 
     Returns:
         The images and what was asked for; see `Rendering` for shapes and meaning.
@@ -104,7 +107,10 @@ def rasterize(
 
     Source: Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023; Ye et al., gsplat, JMLR 2025.
     """
-    inputs = RasterInputs(means, quats, scales, opacities, sh, colors, viewmats, Ks, background, query_points)
+    packed = None if light is None else light.packed()
+    inputs = RasterInputs(
+        means, quats, scales, opacities, sh, colors, viewmats, Ks, background, query_points, packed
+    )
     inputs, degree = checked_inputs(inputs, width, height, near, sh_degree)
     options = RasterOptions(width, height, degree, near, median_depth, visibility, absgrad)
     chosen = _chosen(backend, means)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from extrags.raster.native import native_isa, rasterize_native
-from extrags.raster.reference import rasterize_reference
+from extrags.raster.reference import camera_colors, rasterize_reference
 from extrags.raster.rendering import DILATION_PX2, RasterInputs, RasterOptions, Rendering
 
 __all__ = ["rasterize_gsplat"]
@@ -29,14 +29,14 @@ def rasterize_gsplat(inputs: RasterInputs, options: RasterOptions) -> Rendering:
         quats=inputs.quats,
         scales=inputs.scales,
         opacities=inputs.opacities,
-        colors=inputs.sh if inputs.sh is not None else inputs.colors,
+        colors=_colors(inputs, options.sh_degree),
         viewmats=inputs.viewmats,
         Ks=inputs.Ks,
         width=options.width,
         height=options.height,
         near_plane=options.near,
         eps2d=DILATION_PX2,
-        sh_degree=options.sh_degree if inputs.sh is not None else None,
+        sh_degree=options.sh_degree if inputs.sh is not None and inputs.light is None else None,
         packed=False,
         backgrounds=inputs.background,
         render_mode="RGB+ED",
@@ -54,6 +54,15 @@ def rasterize_gsplat(inputs: RasterInputs, options: RasterOptions) -> Rendering:
         visibility_sum=extra.get("visibility_sum"),
         transmittance=extra.get("transmittance"),
     )
+
+
+def _colors(inputs: RasterInputs, sh_degree: int) -> Tensor | None:
+    """Lit colours, which gsplat knows nothing of, are computed per camera, by the reference's formula."""
+    if inputs.light is None:
+        return inputs.sh if inputs.sh is not None else inputs.colors
+    everything = torch.arange(len(inputs.means), device=inputs.means.device)
+    cameras = range(len(inputs.viewmats))
+    return torch.stack([camera_colors(inputs, sh_degree, camera, everything) for camera in cameras])
 
 
 def _radius(radii: Tensor) -> Tensor:

@@ -105,6 +105,7 @@ def rasterize_native(inputs: RasterInputs, options: RasterOptions) -> Rendering:
         inputs.colors,
         inputs.viewmats,
         inputs.background,
+        inputs.light,
     )
     return Rendering(
         rgb=rgb,
@@ -186,13 +187,14 @@ class _Rasterize(torch.autograd.Function):
         colors: Tensor | None,
         viewmats: Tensor,
         background: Tensor | None,
+        light: Tensor | None,
     ) -> tuple[Tensor, Tensor, Tensor]:
         kernels, options = compiled_kernels(), call.options
         arrays = [
             None if value is None else value.detach().contiguous()
-            for value in (means, quats, scales, opacities, sh, colors, viewmats, background)
+            for value in (means, quats, scales, opacities, sh, colors, viewmats, background, light)
         ]
-        means, quats, scales, opacities, sh, colors, viewmats, background = arrays  # type: ignore[assignment]
+        means, quats, scales, opacities, sh, colors, viewmats, background, light = arrays  # type: ignore[assignment]
         c = len(viewmats)
         rgb = torch.empty(c, options.height, options.width, 3)
         alpha = torch.empty(c, options.height, options.width)
@@ -221,6 +223,7 @@ class _Rasterize(torch.autograd.Function):
                 _of_camera(call.median_depth, camera),
                 _of_camera(call.visibility_max, camera),
                 _of_camera(call.visibility_sum, camera),
+                _of_camera(light, camera),
             )
             if call.query_points is not None and call.transmittance is not None:
                 frame.query(call.query_points, call.transmittance[camera])
@@ -234,7 +237,7 @@ class _Rasterize(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_rgb: Tensor, v_alpha: Tensor, v_depth: Tensor) -> tuple[Tensor | None, ...]:
         call: _Call = ctx.call
-        means, quats, scales, opacities, sh, colors, viewmats, _, alpha, depth = ctx.saved_tensors
+        means, quats, scales, opacities, sh, colors, viewmats, _, _, alpha, depth = ctx.saved_tensors
         needs = ctx.needs_input_grad[1:]
         v_rgb, v_alpha, v_depth = (value.contiguous() for value in (v_rgb, v_alpha, v_depth))
         c, n = len(viewmats), len(means)
@@ -246,6 +249,7 @@ class _Rasterize(torch.autograd.Function):
             shared = [None if value is None else value.zero_() for value in shared]
         g_colors = torch.empty(c, n, 3) if needs[5] else None
         g_viewmats = torch.empty(c, 4, 4) if needs[6] else None
+        g_light = torch.empty(c, 12) if needs[8] else None
         g_means2d = torch.empty(c, n, 2)
         g_absolute = torch.empty(c, n, 2) if call.options.absgrad else None
         for camera in range(c):
@@ -267,6 +271,7 @@ class _Rasterize(torch.autograd.Function):
                 _of_camera(g_viewmats, camera),
                 g_means2d[camera],
                 _of_camera(g_absolute, camera),
+                _of_camera(g_light, camera),
             )
         call.take_gradients(g_means2d, g_absolute)
         if g_colors is not None and colors.ndim == 2:
@@ -274,7 +279,7 @@ class _Rasterize(torch.autograd.Function):
         g_background = None
         if needs[7]:
             g_background = (v_rgb * (1 - alpha)[..., None]).sum((1, 2))
-        return (None, *shared, g_colors, g_viewmats, g_background)
+        return (None, *shared, g_colors, g_viewmats, g_background, g_light)
 
 
 def l1_ssim_loss_native(image: Tensor, target: Tensor, dssim_weight: float, mask: Tensor | None) -> Tensor:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from extrags.errors import ShapeError
+from extrags.raster.light import lit_colors, shortest_axes
 from extrags.raster.rendering import (
     ALPHA_EPS,
     ALPHA_MAX,
@@ -24,9 +25,10 @@ from extrags.raster.rendering import (
     RasterOptions,
     Rendering,
 )
+from extrags.raster.rotations import rotation_matrices
 from extrags.raster.spherical_harmonics import sh_basis
 
-__all__ = ["rasterize_reference"]
+__all__ = ["camera_colors", "rasterize_reference"]
 
 TILE_PX = 16
 ELEMENTS_PER_CHUNK = 1 << 22
@@ -166,7 +168,7 @@ def _project(inputs: RasterInputs, options: RasterOptions, camera: int) -> _Proj
     jacobian = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1).reshape(
         -1, 2, 3
     )
-    axes = _rotation_matrices(inputs.quats[ids]) * inputs.scales[ids][:, None, :]
+    axes = rotation_matrices(inputs.quats[ids]) * inputs.scales[ids][:, None, :]
     half = jacobian @ rotation @ axes
     covariance = half @ half.transpose(1, 2)
     xx = covariance[:, 0, 0] + DILATION_PX2
@@ -192,32 +194,23 @@ def _project(inputs: RasterInputs, options: RasterOptions, camera: int) -> _Proj
         conics=conics,
         depths=z[keep],
         opacities=opacities[keep],
-        colors=_colors(inputs, options, camera, ids[keep]),
+        colors=camera_colors(inputs, options.sh_degree, camera, ids[keep]),
         extent_px=extent[keep],
     )
 
 
-def _rotation_matrices(quats: Tensor) -> Tensor:
-    """Of unnormalised (w, x, y, z); the null quaternion stands for the identity."""
-    norm = quats.square().sum(-1, keepdim=True).clamp_min(1e-24).sqrt()
-    w, x, y, z = (quats / norm).unbind(-1)
-    return torch.stack(
-        [
-            1 - 2 * (y * y + z * z),
-            2 * (x * y - w * z),
-            2 * (x * z + w * y),
-            2 * (x * y + w * z),
-            1 - 2 * (x * x + z * z),
-            2 * (y * z - w * x),
-            2 * (x * z - w * y),
-            2 * (y * z + w * x),
-            1 - 2 * (x * x + y * y),
-        ],
-        -1,
-    ).reshape(-1, 3, 3)
+def camera_colors(inputs: RasterInputs, sh_degree: int, camera: int, ids: Tensor) -> Tensor:
+    """What chosen Gaussians send to one camera: colours or harmonics, under its light if there is one."""
+    albedo = _albedo(inputs, sh_degree, camera, ids)
+    if inputs.light is None:
+        return albedo
+    rotation, translation = inputs.viewmats[camera, :3, :3], inputs.viewmats[camera, :3, 3]
+    points = inputs.means[ids] @ rotation.T + translation
+    normals = shortest_axes(inputs.quats[ids], inputs.scales[ids]) @ rotation.T
+    return lit_colors(albedo, points, normals, inputs.light[camera])
 
 
-def _colors(inputs: RasterInputs, options: RasterOptions, camera: int, ids: Tensor) -> Tensor:
+def _albedo(inputs: RasterInputs, sh_degree: int, camera: int, ids: Tensor) -> Tensor:
     if inputs.colors is not None:
         colors = inputs.colors if inputs.colors.ndim == 2 else inputs.colors[camera]
         return colors[ids]
@@ -227,7 +220,7 @@ def _colors(inputs: RasterInputs, options: RasterOptions, camera: int, ids: Tens
     # A rigid motion's inverse; off SO(3) the pose gradient is that of this expression.
     offset = inputs.means[ids] + rotation.T @ translation
     directions = offset / (offset.square().sum(-1, keepdim=True) + 1e-20).sqrt()
-    basis = sh_basis(directions, options.sh_degree)
+    basis = sh_basis(directions, sh_degree)
     return (torch.einsum("mk,mkc->mc", basis, inputs.sh[ids, : basis.shape[1]]) + 0.5).clamp_min(0)
 
 

@@ -86,6 +86,7 @@ class RasterInputs:
     Ks: Float[Tensor, "c 3 3"]
     background: Float[Tensor, "c 3"] | Float[Tensor, "3"] | None
     query_points: Float[Tensor, "q 3"] | None
+    light: Float[Tensor, "c 12"] | None = None
 
 
 @dataclass(frozen=True)
@@ -142,6 +143,7 @@ def checked_inputs(
         "viewmats": ((c, 4, 4),),
         "Ks": ((c, 3, 3),),
         "background": ((c, 3),),
+        "light": ((c, 12),),
     }
     for name, shapes in expected.items():
         value = getattr(inputs, name)

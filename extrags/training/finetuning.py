@@ -145,9 +145,11 @@ def hole_gaussians(
     points = cameras.centers[view] + pseudo.depth_mm.reshape(-1)[chosen, None] * rays
     rgb = np.asarray(pseudo.target, dtype=np.float64).reshape(-1, 3)[chosen]
     if scene.light is not None:
-        distance = np.linalg.norm(points - cameras.centers[view], axis=1).astype(np.float32)
-        falloff = scene.light.falloff(torch.from_numpy(distance)).detach().numpy()
-        rgb = rgb / np.maximum(falloff, 1e-2)[:, None]
+        local = np.einsum(
+            "nji,nj->ni", cameras.world_from_camera[view, :3, :3], points - cameras.centers[view]
+        )
+        lit = torch.from_numpy(rgb), torch.from_numpy(local)
+        rgb = scene.light.albedo(*lit, least_gain=1e-2).detach().numpy()
     unseen = ~_in_front_of_real_surface(points, scene, sequence)
     points, rgb = points[unseen], rgb[unseen]
     if len(points) < 4:

@@ -18,7 +18,8 @@ from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.raster import SelectiveAdam, l1_ssim_loss
 from extrags.scene import Scene
-from extrags.training.density import DensityControl
+from extrags.training.density import DensityStrategy
+from extrags.training.strategies import density_strategy
 from extrags.training.views import View
 
 __all__ = ["Schedule", "TrainingResult", "optimise"]
@@ -101,13 +102,19 @@ def optimise(scene: Scene, draw: Callable[[int], View], schedule: Schedule) -> T
     }
     light, light_optimiser = _trainable_light(scene.light, schedule)
     adam = SelectiveAdam(parameters, schedule.learning_rates(0))
-    density = DensityControl(schedule.densify, schedule.extent, len(parameters["means"]), seed=schedule.seed)
+    density = density_strategy(
+        schedule.densify,
+        schedule.extent,
+        schedule.iterations,
+        len(parameters["means"]),
+        seed=schedule.seed,
+    )
     history: list[dict[str, float]] = []
     last_good = scene.detached()
     for iteration in range(schedule.iterations):
         view = draw(iteration)
         adam.learning_rates = schedule.learning_rates(iteration)
-        step = _step(Scene(Gaussians(**parameters), light), view, schedule, iteration)
+        step = _step(Scene(Gaussians(**parameters), light), view, schedule, iteration, density)
         if not math.isfinite(step["loss"]):
             raise DivergedError(_account(schedule, iteration, parameters), last_good)
         adam.step(visible=step["visible"])
@@ -115,8 +122,8 @@ def optimise(scene: Scene, draw: Callable[[int], View], schedule: Schedule) -> T
         if light_optimiser is not None:
             light_optimiser.step()
             light_optimiser.zero_grad(set_to_none=True)
-        if schedule.densify.enabled:
-            parameters = _densified(density, adam, parameters, step, view, schedule, iteration)
+        density.step(adam, step["rendering"], iteration)
+        parameters = adam.parameters
         if iteration % HISTORY_EVERY == 0 or iteration == schedule.iterations - 1:
             entry = {
                 "iteration": float(iteration),
@@ -138,12 +145,16 @@ def _trainable_light(
 ) -> tuple[NearFieldLight | None, torch.optim.Adam | None]:
     if light is None:
         return None, None
-    values = {k: v.detach().clone().requires_grad_() for k, v in light.parameters().items()}
+    values = {k: v.detach().clone() for k, v in light.parameters().items()}
+    for name in _learned(schedule.light):
+        values[name].requires_grad_()
+    if schedule.light.exposure:
+        values["log_exposure"].requires_grad_()
     trainable = NearFieldLight(**values, reference_distance=light.reference_distance)
     config = schedule.light
     groups: list[dict[str, Any]] = [
         {
-            "params": [values["log_softening"], values["log_exponent"]],
+            "params": [values[name] for name in _learned(config)],
             "lr": config.learning_rate,
         },
         {"params": [values["log_exposure"]], "lr": config.exposure_learning_rate},
@@ -151,12 +162,32 @@ def _trainable_light(
     return trainable, torch.optim.Adam(groups, eps=1e-15)
 
 
-def _step(scene: Scene, view: View, schedule: Schedule, iteration: int) -> dict[str, Any]:
+def _learned(config: LightConfig) -> list[str]:
+    """Names of the global light parameters that the settings leave free."""
+    switches = {
+        "log_softening": config.falloff,
+        "log_exponent": config.falloff,
+        "spread": config.spread,
+        "cosine": config.cosine,
+        "offset": config.offset,
+        "log_shoulder": config.response,
+    }
+    return [name for name, free in switches.items() if free]
+
+
+def _step(
+    scene: Scene, view: View, schedule: Schedule, iteration: int, density: DensityStrategy
+) -> dict[str, Any]:
     """Render, compare and back-propagate one view."""
     exposure = None
     if scene.light is not None:
         exposure = scene.light.exposure(view.frame)[None]
-    rendering = scene.render(view.camera, exposure=exposure, sh_degree=iteration // schedule.sh_every)
+    rendering = scene.render(
+        view.camera,
+        exposure=exposure,
+        sh_degree=iteration // schedule.sh_every,
+        absgrad=density.needs_absgrad,
+    )
     rgb = rendering.rgb[0]
     loss = l1_ssim_loss(rgb, view.rgb, dssim_weight=schedule.dssim_weight, mask=view.weight)
     if view.depth_mm is not None and schedule.depth_weight > 0:
@@ -166,6 +197,9 @@ def _step(scene: Scene, view: View, schedule: Schedule, iteration: int) -> dict[
     loss = loss * view.loss_weight
     if scene.light is not None and view.frame is not None:
         loss = loss + schedule.light.exposure_prior * scene.light.log_exposure.square().mean()
+    penalty = density.penalty(scene.gaussians.parameters())
+    if penalty is not None:
+        loss = loss + penalty
     loss.backward()
 
     def psnr() -> float:
@@ -176,7 +210,7 @@ def _step(scene: Scene, view: View, schedule: Schedule, iteration: int) -> dict[
     return {
         "loss": float(loss.detach()),
         "visible": rendering.visible[0],
-        "gradient2d": rendering.means2d.grad,
+        "rendering": rendering,
         "psnr": psnr,
     }
 
@@ -191,32 +225,6 @@ def _inverse_depth_loss(rendered: Tensor, alpha: Tensor, target: Tensor, scale: 
         return rendered.sum() * 0
     difference = scale / rendered[valid] - scale / target[valid]
     return difference.abs().mean()
-
-
-def _densified(
-    density: DensityControl,
-    adam: SelectiveAdam,
-    parameters: dict[str, Tensor],
-    step: dict[str, Any],
-    view: View,
-    schedule: Schedule,
-    iteration: int,
-) -> dict[str, Tensor]:
-    config = schedule.densify
-    stop = config.stop_share * schedule.iterations
-    if iteration >= stop:
-        return parameters
-    density.observe(step["gradient2d"][0], step["visible"], view.camera.width, view.camera.height)
-    start = config.start_share * schedule.iterations
-    if iteration < start or (iteration + 1) % config.every:
-        return parameters
-    decision = density.decide(parameters)
-    if decision.changed:
-        adam.keep(decision.keep)
-        adam.append(decision.born)
-        parameters = adam.parameters
-    density.reset(len(parameters["means"]))
-    return parameters
 
 
 def _finite(parameters: dict[str, Tensor]) -> bool:

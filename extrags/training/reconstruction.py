@@ -44,13 +44,14 @@ def reconstruct(
     depth = median_depth(sequence, chosen)
     light = None
     if config.light.enabled:
-        light = NearFieldLight.initial(len(chosen), depth, exponent=config.light.exponent)
+        light = NearFieldLight.initial(len(chosen), depth, config.light)
     gaussians = starting_gaussians(
         sequence,
         chosen,
         config.max_points,
         light=light,
         sh_degree=config.sh_degree,
+        thickness=config.thickness,
         seed=config.seed,
     )
     views = real_views(sequence, chosen)

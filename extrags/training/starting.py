@@ -13,7 +13,10 @@ from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.sequence import Sequence
 
-__all__ = ["depth_from_points", "median_depth", "starting_gaussians", "thin_out"]
+__all__ = ["depth_from_points", "median_depth", "starting_gaussians", "surface_normals", "thin_out"]
+
+NORMAL_NEIGHBOURS = 12
+"""Points beside a point whose plane gives its normal."""
 
 MIN_POINTS_PER_VIEW = 20
 """A view with fewer visible sparse points gives no interpolated depth."""
@@ -48,11 +51,12 @@ def starting_gaussians(
     *,
     light: NearFieldLight | None = None,
     sh_degree: int = 0,
+    thickness: float = 1.0,
     seed: int = 0,
 ) -> Gaussians:
     """Gaussians from back-projected depth, or from sparse points where there is no depth.
 
-    Each point carries the mean albedo of its pixels: the colour with the light's fall-off divided out.
+    Each point carries the mean albedo of its pixels: the colour with light and response divided out.
     Radii follow the distance to the three nearest neighbours.
 
     Args:
@@ -61,6 +65,7 @@ def starting_gaussians(
         max_points: upper bound of the number of Gaussians.
         light: the light the optimisation starts with; None keeps colours as they are.
         sh_degree: degree of the (zero) higher harmonics.
+        thickness: along the surface's normal, as a share of the radius; 1 makes round Gaussians.
         seed: chooses among equivalent pixels.
 
     Raises:
@@ -85,9 +90,8 @@ def starting_gaussians(
     points = cameras.centers[view] + z[:, None] * rays
     rgb = sequence.rgb[frames].reshape(-1, 3)[chosen].astype(np.float64) / 255
     if light is not None:
-        distance = np.linalg.norm(points - cameras.centers[view], axis=1)
-        falloff = light.falloff(torch.from_numpy(distance.astype(np.float32))).detach().numpy()
-        rgb = rgb / np.maximum(falloff, 1e-3)[:, None]
+        local = np.einsum("nji,nj->ni", cameras.world_from_camera[view, :3, :3], z[:, None] * rays)
+        rgb = light.albedo(torch.from_numpy(rgb), torch.from_numpy(local)).detach().numpy()
     points, rgb = thin_out(points, rgb, max_points)
     neighbours = min(4, len(points))
     distance, _ = cKDTree(points).query(points, k=neighbours)
@@ -95,8 +99,24 @@ def starting_gaussians(
     radius = np.sqrt(np.mean(distance[:, 1:] ** 2, axis=1)) if neighbours > 1 else distance[:, 0]
     floor = 1e-3 * float(np.median(z))
     return Gaussians.from_points(
-        points, np.clip(rgb, 0, None), np.maximum(radius, floor), opacity=0.5, sh_degree=sh_degree
+        points,
+        np.clip(rgb, 0, None),
+        np.maximum(radius, floor),
+        opacity=0.5,
+        sh_degree=sh_degree,
+        normals=surface_normals(points) if thickness != 1 else None,
+        thickness=thickness,
     )
+
+
+def surface_normals(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Unit normals, of either sign, of the planes through each point's neighbours."""
+    neighbours = min(NORMAL_NEIGHBOURS + 1, len(points))
+    _, index = cKDTree(points).query(points, k=neighbours)
+    around = points[index.reshape(len(points), -1)]
+    around = around - around.mean(axis=1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around))
+    return np.asarray(axes[:, :, 0])
 
 
 def thin_out(

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
 
 
@@ -41,3 +42,25 @@ class TestNearFieldLight:
         assert float(second / first) == pytest.approx(2 ** (-2 * 0.7), rel=1e-3)
         distance = torch.linspace(0, 100, 50)
         assert bool((light().falloff(distance).diff() < 0).all())
+
+    def test_switched_off_parts_start_without_effect(self) -> None:
+        off = {"falloff": False, "spread": False, "cosine": False, "response": False}
+        dark = NearFieldLight.initial(2, 25.0, LightConfig(**off))
+        points = torch.tensor([[0.0, 0.0, 3.0], [30.0, 5.0, 40.0]])
+        normals = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
+        torch.testing.assert_close(dark.gain(points, normals), torch.ones(2))
+        assert torch.equal(dark.developed(points), points)
+
+    def test_albedo_is_what_the_light_and_the_response_leave(self) -> None:
+        start = NearFieldLight.initial(1, 25.0)
+        albedo = torch.tensor([[0.2, 0.4, 0.6], [0.9, 0.5, 0.1]])
+        points = torch.tensor([[4.0, -3.0, 20.0], [0.0, 10.0, 60.0]])
+        normals = torch.nn.functional.normalize(torch.tensor([[0.3, 0.2, -1.0], [0.0, -1.0, 0.3]]), dim=-1)
+        seen = start.developed(albedo * start.gain(points, normals)[:, None])
+        torch.testing.assert_close(start.albedo(seen, points, normals), albedo)
+
+    def test_falloff_is_the_gain_of_surfaces_that_face_the_lens(self) -> None:
+        start = NearFieldLight.initial(1, 25.0)
+        points = torch.tensor([[4.0, -3.0, 20.0], [0.0, 10.0, 60.0]])
+        distance = points.norm(dim=-1)
+        torch.testing.assert_close(start.falloff(distance, points[:, 2] / distance), start.gain(points))

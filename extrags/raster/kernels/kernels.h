@@ -28,6 +28,17 @@ struct Camera {
   float fx, fy, cx, cy;
 };
 
+// The light that rides on the camera; see light.py.
+struct CameraLight {
+  float exposure[3];
+  float softening, exponent, spread, cosine;
+  float offset[3];
+  float shoulder;
+  float reference_distance;  // a gauge, not learned
+};
+static_assert(sizeof(CameraLight) == 48, "the caller hands over twelve floats");
+constexpr int kPartials = 32;  // floats per chunk of Gaussians: 15 of the pose, 11 of the light from 16 on
+
 // Arrays of the caller, row-major and contiguous.
 struct Scene {
   int n;
@@ -76,6 +87,8 @@ struct View {
   float near;
   float background[3];
   Camera camera;
+  bool lit;
+  CameraLight light;
 
   Buffer records;      // Record [n]
   Buffer rects;        // TileRect [n]
@@ -92,7 +105,7 @@ struct View {
   Buffer tile_entries;  // Buffer [tiles]: indices into the tile's locals, per block
   int tile_entries_count;
   Buffer pair_rows;  // float [pairs, 16], per Gaussian: gradients, or visibility
-  Buffer partials;   // float [chunks, 16]: camera gradients
+  Buffer partials;   // float [chunks, kPartials]: gradients of camera and light
   Buffer query;      // working memory of transmittance queries
   Buffer scratch[kMaxThreads];
   double seconds[4];  // projection, tiles, tiles backward, projection backward of the last calls
@@ -126,6 +139,7 @@ struct SceneGradients {
   float* sh;
   float* colors;      // written
   float* viewmat;     // [4, 4], written
+  float* light;       // [12], written
   float* means2d;     // [n, 2], written
   float* absolute2d;  // [n, 2], written
 };

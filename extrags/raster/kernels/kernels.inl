@@ -218,15 +218,23 @@ static void backward(View* view, const Scene* scene, const ImageGradients* in, c
   ViewContext c{view, scene, nullptr, in, out};
   parallel_for(view->tiles_x * view->tiles_y, tile_backward_task, &c);
   const double carried = monotonic_seconds();
-  if (out->viewmat != nullptr) reserve(&view->partials, sizeof(float) * 16 * (view->chunks + 1));
+  reserve(&view->partials, sizeof(float) * kPartials * (view->chunks + 1));
   parallel_for(view->chunks, project_backward_task, &c);
   view->seconds[2] = carried - started;
   view->seconds[3] = monotonic_seconds() - carried;
+  const float* partials = static_cast<const float*>(view->partials.data);
+  if (out->light != nullptr) {
+    double light[11] = {};
+    for (int chunk = 0; chunk < view->chunks; ++chunk) {
+      for (int k = 0; k < 11; ++k) light[k] += static_cast<double>(partials[kPartials * chunk + 16 + k]);
+    }
+    for (int k = 0; k < 11; ++k) out->light[k] = finite_float(light[k]);
+    out->light[11] = 0;
+  }
   if (out->viewmat == nullptr) return;
   double pose[15] = {};
-  const float* partials = static_cast<const float*>(view->partials.data);
   for (int chunk = 0; chunk < view->chunks; ++chunk) {
-    for (int k = 0; k < 15; ++k) pose[k] += static_cast<double>(partials[16 * chunk + k]);
+    for (int k = 0; k < 15; ++k) pose[k] += static_cast<double>(partials[kPartials * chunk + k]);
   }
   const float *r = view->camera.rotation, *t = view->camera.translation;
   memset(out->viewmat, 0, sizeof(float) * 16);

@@ -177,7 +177,7 @@ std::unique_ptr<Frame> render(const In& means, const In& quats, const In& scales
                               const In& K, std::optional<In> background, int width, int height, float near,
                               Out rgb, Out alpha, Out depth, Out means2d, Out radius,
                               std::optional<Out> median_depth, std::optional<Out> visibility_max,
-                              std::optional<Out> visibility_sum) {
+                              std::optional<Out> visibility_sum, std::optional<In> light) {
   const Scene scene = make_scene(means, quats, scales, opacities, sh, degree, colors);
   auto frame = std::make_unique<Frame>();
   View* view = frame->view.get();
@@ -186,6 +186,9 @@ std::unique_ptr<Frame> render(const In& means, const In& quats, const In& scales
   view->near = near;
   set_camera(view, viewmat, K);
   if (background) expect(background->size() == 3, "background");
+  expect(!light || light->size() == 12, "light");
+  view->lit = light.has_value();
+  if (light) std::memcpy(&view->light, light->data(), sizeof view->light);
   for (int k = 0; k < 3; ++k) view->background[k] = background ? background->data()[k] : 0.f;
   const size_t pixels = static_cast<size_t>(width) * static_cast<size_t>(height), n = means.shape(0);
   expect(rgb.size() == 3 * pixels, "rgb");
@@ -207,7 +210,7 @@ void frame_backward(Frame& frame, const In& means, const In& quats, const In& sc
                     std::optional<Out> g_means, std::optional<Out> g_quats, std::optional<Out> g_scales,
                     std::optional<Out> g_opacities, std::optional<Out> g_sh, std::optional<Out> g_colors,
                     std::optional<Out> g_viewmat, std::optional<Out> g_means2d,
-                    std::optional<Out> g_absolute2d) {
+                    std::optional<Out> g_absolute2d, std::optional<Out> g_light) {
   const Scene scene = make_scene(means, quats, scales, opacities, sh, degree, colors);
   View* view = frame.view.get();
   const size_t pixels = static_cast<size_t>(view->width) * static_cast<size_t>(view->height), n = means.shape(0);
@@ -224,6 +227,7 @@ void frame_backward(Frame& frame, const In& means, const In& quats, const In& sc
   expect(!g_viewmat || g_viewmat->size() == 16, "gradient of viewmat");
   expect(!g_means2d || g_means2d->size() == 2 * n, "gradient of means2d");
   expect(!g_absolute2d || g_absolute2d->size() == 2 * n, "absolute gradient of means2d");
+  expect(!g_light || (view->lit && g_light->size() == 12), "gradient of light");
   const ImageGradients in{data_or_null(v_rgb), data_or_null(v_alpha), data_or_null(v_depth),
                           data_or_null(depth)};
   const SceneGradients out{add,
@@ -234,6 +238,7 @@ void frame_backward(Frame& frame, const In& means, const In& quats, const In& sc
                            data_or_null(g_sh),
                            data_or_null(g_colors),
                            data_or_null(g_viewmat),
+                           data_or_null(g_light),
                            data_or_null(g_means2d),
                            data_or_null(g_absolute2d)};
   nb::gil_scoped_release release_gil;
@@ -332,7 +337,8 @@ NB_MODULE(_native, m) {
            nb::arg("g_quats").none().noconvert(), nb::arg("g_scales").none().noconvert(),
            nb::arg("g_opacities").none().noconvert(), nb::arg("g_sh").none().noconvert(),
            nb::arg("g_colors").none().noconvert(), nb::arg("g_viewmat").none().noconvert(),
-           nb::arg("g_means2d").none().noconvert(), nb::arg("g_absolute2d").none().noconvert())
+           nb::arg("g_means2d").none().noconvert(), nb::arg("g_absolute2d").none().noconvert(),
+           nb::arg("g_light").none().noconvert() = nb::none())
       .def("entries", &frame_entries, "How many (Gaussian, 4 x 4 pixel block) entries were composited.")
       .def("seconds", &frame_seconds,
            "Of the projection, the tiles, the tiles backward and the projection backward.")
@@ -343,7 +349,7 @@ NB_MODULE(_native, m) {
         nb::arg("rgb").noconvert(), nb::arg("alpha").noconvert(), nb::arg("depth").noconvert(),
         nb::arg("means2d").noconvert(), nb::arg("radius").noconvert(),
         nb::arg("median_depth").none().noconvert(), nb::arg("visibility_max").none().noconvert(),
-        nb::arg("visibility_sum").none().noconvert());
+        nb::arg("visibility_sum").none().noconvert(), nb::arg("light").none() = nb::none());
   m.def("l1_ssim", &l1_ssim, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(),
         nb::arg("gradient").noconvert(), nb::arg("height"), nb::arg("width"), nb::arg("dssim_weight"),
         nb::arg("scale"));

@@ -115,6 +115,7 @@ EXTRAGS_INLINE Mask project(const View* view, const Scene* scene, int first, int
 
 // The colours
 #include "harmonics.inl"
+#include "light.inl"
 
 EXTRAGS_INLINE void mark_culled(View* view, const Images* out, int first, int rows) {
   TileRect* rects = static_cast<TileRect*>(view->rects.data);
@@ -164,6 +165,11 @@ static void project_chunk(View* view, const Scene* scene, const Images* out, int
       load_rows<3>(scene->colors + 3 * static_cast<size_t>(first), rows, color);
     } else {
       shade<kDegree>(scene, first, rows, p, color);
+    }
+    if (view->lit) {
+      Lit lit;
+      illuminate(view, p, lit);
+      develop(view, lit, color);
     }
     const Vec inverse = Vec(1.f) / p.determinant, inverse_yy = Vec(1.f) / p.yy;
     alignas(64) float fields[256], packed[256];
@@ -251,8 +257,9 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
   const int begin = chunk * view->chunk;
   const int end = begin + view->chunk < scene->n ? begin + view->chunk : scene->n;
   const Vec zero(0.f), two(2.f);
-  Vec pose[15];
+  Vec pose[15], v_light[11];
   for (int k = 0; k < 15; ++k) pose[k] = zero;
+  for (int k = 0; k < 11; ++k) v_light[k] = zero;
   for (int first = begin; first < end; first += 16) {
     const int rows = rows_of(end, first);
     alignas(64) float gathered[256], columns[256];
@@ -310,6 +317,20 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
     v_point[2] = keep(ok, load(columns + 144)) - fma(p.raw_x, p.j00 * v_u, p.raw_y * (p.j11 * v_v)) -
                  iz * fma(p.j00, v_j00, p.j11 * v_j11) + bend_x + keep(p.free_x, bend_x) + bend_y +
                  keep(p.free_y, bend_y);
+    Vec v_color[3], v_normal[3] = {zero, zero, zero};
+    for (int channel = 0; channel < 3; ++channel) v_color[channel] = finite(load(columns + 96 + 16 * channel));
+    Lit lit;
+    if (view->lit) {
+      Vec albedo[3];
+      if constexpr (kColors) {
+        load_rows<3>(scene->colors + 3 * static_cast<size_t>(first), rows, albedo);
+      } else {
+        shade<kDegree>(scene, first, rows, p, albedo);
+      }
+      illuminate(view, p, lit);
+      for (int channel = 0; channel < 3; ++channel) v_color[channel] = keep(ok, v_color[channel]);
+      illuminate_backward(view, lit, albedo, v_color, v_point, v_normal, v_light);
+    }
     Vec v_mean[3];
     for (int j = 0; j < 3; ++j) {
       v_mean[j] = fma(Vec(r[j]), v_point[0], fma(Vec(r[3 + j]), v_point[1], Vec(r[6 + j]) * v_point[2]));
@@ -325,6 +346,15 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
         v_rotation[3 * i + j] = v * p.scale[j];
       }
     }
+    if (view->lit) {
+      for (int i = 0; i < 3; ++i) {
+        const Vec v = fma(Vec(r[i]), v_normal[0],
+                          fma(Vec(r[3 + i]), v_normal[1], Vec(r[6 + i]) * v_normal[2]));
+        for (int j = 0; j < 3; ++j) {
+          v_rotation[3 * i + j] = v_rotation[3 * i + j] + keep(lit.shortest[j], v);
+        }
+      }
+    }
     const Vec *q = p.quat, *vr = v_rotation;
     Vec v_quat[4];
     v_quat[0] = two * (q[1] * (vr[7] - vr[5]) + q[2] * (vr[2] - vr[6]) + q[3] * (vr[3] - vr[1]));
@@ -338,8 +368,7 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
                                         fma(v_quat[2], q[2], v_quat[3] * q[3]))));
     for (int k = 0; k < 4; ++k) v_quat[k] = finite(keep(ok, fnma(radial, q[k], v_quat[k]) * p.inverse_norm));
     for (int k = 0; k < 3; ++k) v_scale[k] = finite(keep(ok, v_scale[k]));
-    Vec v_color[3], v_direction[3] = {zero, zero, zero};
-    for (int channel = 0; channel < 3; ++channel) v_color[channel] = finite(load(columns + 96 + 16 * channel));
+    Vec v_direction[3] = {zero, zero, zero};
     if constexpr (!kColors) {
       // No gradient where the colour was held at zero
       alignas(64) float color[3][16] = {};
@@ -369,6 +398,11 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
           for (int k = 0; k < 3; ++k) {
             term = fma(v_axes[3 * i + k], p.rotation[3 * j + k] * p.scale[k], term);
           }
+          if (view->lit) {
+            for (int k = 0; k < 3; ++k) {
+              term = fma(v_normal[i], keep(lit.shortest[k], p.rotation[3 * j + k]), term);
+            }
+          }
           pose[3 * i + j] = pose[3 * i + j] + finite(keep(ok, term));
         }
         pose[9 + i] = pose[9 + i] + finite(keep(ok, v_point[i]));
@@ -392,8 +426,12 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
       store_rows<2>(out->absolute2d + 2 * at, rows, absolute, false);
     }
   }
+  if (view->partials.data == nullptr) return;
+  float* partial = static_cast<float*>(view->partials.data) + kPartials * static_cast<size_t>(chunk);
   if constexpr (kPose) {
-    float* partial = static_cast<float*>(view->partials.data) + 16 * static_cast<size_t>(chunk);
     for (int k = 0; k < 15; ++k) partial[k] = sum(pose[k]);
+  }
+  if (view->lit) {
+    for (int k = 0; k < 11; ++k) partial[16 + k] = sum(finite(v_light[k]));
   }
 }

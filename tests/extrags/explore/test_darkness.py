@@ -5,12 +5,14 @@ import pytest
 import torch
 
 from extrags.cameras import Cameras, look_at, pixel_rays
+from extrags.config import LightConfig
 from extrags.explore.darkness import dark_direction, illumination_weight, lit_luminance
 from extrags.illumination import NearFieldLight
 
 from .tube import make_tube
 
 WIDTH, HEIGHT = 80, 64
+PLAIN = LightConfig(exponent=0.8, spread=False, cosine=False, response=False)
 CAMERA = Cameras(np.array([[[40.0, 0, 40], [0, 40.0, 32], [0, 0, 1]]]), np.eye(4)[None], WIDTH, HEIGHT)
 ROWS, COLUMNS = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
 DISTANCE_PER_DEPTH = np.linalg.norm(pixel_rays(CAMERA)[0], axis=-1)
@@ -76,10 +78,10 @@ class TestDarkDirection:
 
     @pytest.mark.parametrize("with_light", [True, False])
     def test_far_is_not_dark(self, with_light):
-        light = NearFieldLight.initial(1, 30.0) if with_light else None
+        light = NearFieldLight.initial(1, 30.0, PLAIN) if with_light else None
         depth = np.where(COLUMNS < 40, 20.0, 80.0)
         # Everything of one albedo, seen through inverse-square light, but for one spot.
-        falloff = NearFieldLight.initial(1, 30.0)
+        falloff = NearFieldLight.initial(1, 30.0, PLAIN)
         lit = falloff.falloff(torch.from_numpy(depth * DISTANCE_PER_DEPTH)).numpy()
         image = 0.5 * lit * np.where(disc(20, 30, 8), 0.3, 1.0)
         assert image[30, 20] > image[30, 60], "the spot is near and still brighter than what is far"
@@ -97,7 +99,7 @@ class TestDarkDirection:
         np.testing.assert_array_equal(dark_direction(CAMERA, grey(empty), empty, empty, None), 0)
 
     def test_a_light_is_divided_out_exactly(self):
-        light = NearFieldLight.initial(1, 30.0, exponent=0.8)
+        light = NearFieldLight.initial(1, 30.0, PLAIN)
         depth = np.linspace(10, 90, WIDTH)[None].repeat(HEIGHT, axis=0)
         image = 0.4 * light.falloff(torch.from_numpy(depth * DISTANCE_PER_DEPTH)).numpy()
         lit = lit_luminance(CAMERA, grey(image).astype(np.float64), depth, depth > 0, light)

@@ -1,38 +1,79 @@
 from __future__ import annotations
 
+import math
+
+import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from extrags.config import DensifyConfig
-from extrags.training.density import DensityControl, quaternion_matrix
+from extrags.raster import Rendering, SelectiveAdam
+from extrags.training.density import DefaultStrategy, DensityStrategy, Window, quaternion_matrix
+from extrags.training.relocation import MCMCStrategy
+from extrags.training.strategies import density_strategy
 from tests.extrags.training.conftest import tube_gaussians
 
-
-def control(n: int, **changes: object) -> DensityControl:
-    return DensityControl(DensifyConfig(**changes), extent=20.0, n_gaussians=n, seed=0)  # type: ignore[arg-type]
+EXTENT = 20.0
 
 
-def observed(density: DensityControl, n: int, strong: list[int]) -> None:
-    gradient = torch.zeros(n, 2)
-    gradient[strong, 0] = 1.0
-    density.observe(gradient, torch.ones(n, dtype=torch.bool), 48, 36)
+def strategy(n: int, **changes: object) -> DefaultStrategy:
+    config = DensifyConfig(**changes)  # type: ignore[arg-type]
+    return DefaultStrategy(config, EXTENT, 1000, n, seed=0)
 
 
-class TestDensityControl:
+def seen(
+    gradient: Tensor,
+    visible: Tensor | None = None,
+    *,
+    width: int = 48,
+    height: int = 36,
+    radius_px: Tensor | None = None,
+    absolute: Tensor | None = None,
+) -> Rendering:
+    """A rendering after its backward pass: gradients [C, N, 2], visibility [C, N]."""
+    c, n = gradient.shape[:2]
+    means2d = torch.zeros(c, n, 2)
+    means2d.grad = gradient
+    if absolute is not None:
+        means2d.absgrad = absolute  # type: ignore[attr-defined]
+    if radius_px is None:
+        radius_px = torch.ones(c, n) if visible is None else visible.float()
+    return Rendering(
+        rgb=torch.zeros(c, height, width, 3),
+        alpha=torch.zeros(c, height, width),
+        depth=torch.zeros(c, height, width),
+        means2d=means2d,
+        radius_px=radius_px,
+    )
+
+
+def strong(n: int, which: list[int]) -> Rendering:
+    gradient = torch.zeros(1, n, 2)
+    gradient[0, which, 0] = 1.0
+    return seen(gradient)
+
+
+def small_ones(n: int) -> dict[str, Tensor]:
+    parameters = tube_gaussians(n).parameters()
+    parameters["scales"] = torch.full((n, 3), 0.05).log()
+    return parameters
+
+
+class TestDefaultStrategy:
     def test_small_strong_gaussians_are_cloned(self) -> None:
-        parameters = tube_gaussians(10).parameters()
-        parameters["scales"] = torch.full((10, 3), 0.05).log()
-        density = control(10)
-        observed(density, 10, [2, 7])
-        decision = density.decide(parameters)
+        parameters = small_ones(10)
+        density = strategy(10)
+        density.observe(strong(10, [2, 7]))
+        decision = density.decide(parameters, 100)
         assert bool(decision.keep.all())
         assert torch.equal(decision.born["means"], parameters["means"][[2, 7]])
 
     def test_large_strong_gaussians_are_split(self) -> None:
         parameters = tube_gaussians(10).parameters()
-        density = control(10)
-        observed(density, 10, [4])
-        decision = density.decide(parameters)
+        density = strategy(10)
+        density.observe(strong(10, [4]))
+        decision = density.decide(parameters, 100)
         assert decision.keep.tolist() == [i != 4 for i in range(10)]
         assert len(decision.born["means"]) == 2
         torch.testing.assert_close(
@@ -46,28 +87,121 @@ class TestDensityControl:
         parameters = tube_gaussians(10).parameters()
         parameters["opacities"][1] = -8.0
         parameters["scales"][3] = 3.0
-        decision = control(10).decide(parameters)
+        decision = strategy(10).decide(parameters, 100)
         assert [i for i in range(10) if not decision.keep[i]] == [1, 3]
         assert len(decision.born["means"]) == 0
 
-    def test_the_cap_takes_the_strongest(self) -> None:
+    def test_huge_gaussians_wait_for_the_first_reset(self) -> None:
         parameters = tube_gaussians(10).parameters()
-        parameters["scales"] = torch.full((10, 3), 0.05).log()
-        density = DensityControl(DensifyConfig(max_gaussians=100), extent=20.0, n_gaussians=10, seed=0)
-        density._config = DensifyConfig(max_gaussians=100).model_copy(update={"max_gaussians": 11})
-        gradient = torch.arange(10.0)[:, None].expand(10, 2)
-        density.observe(gradient, torch.ones(10, dtype=torch.bool), 48, 36)
-        decision = density.decide(parameters)
-        assert torch.equal(decision.born["means"], parameters["means"][[9]])
+        parameters["scales"][3] = 3.0
+        density = strategy(10, reset_every=300)
+        assert bool(density.decide(parameters, 300).keep.all())
+        assert not bool(density.decide(parameters, 301).keep[3])
+
+    def test_a_huge_gaussian_whose_children_fit_is_split(self) -> None:
+        parameters = tube_gaussians(10).parameters()
+        parameters["scales"][3] = math.log(0.3 * EXTENT)
+        density = strategy(10)
+        density.observe(strong(10, [3]))
+        decision = density.decide(parameters, 100)
+        assert not bool(decision.keep[3])
+        assert len(decision.born["means"]) == 2
+
+    @pytest.mark.parametrize(("cap", "kept"), [(11, [9]), (12, [8, 9]), (10, [])])
+    def test_the_cap_takes_the_strongest(self, cap: int, kept: list[int]) -> None:
+        parameters = small_ones(10)
+        density = strategy(10)
+        density._config = DensifyConfig().model_copy(update={"max_gaussians": cap})
+        density.observe(seen(torch.arange(10.0)[None, :, None].expand(1, 10, 2)))
+        decision = density.decide(parameters, 100)
+        assert torch.equal(decision.born["means"], parameters["means"][kept])
+
+    def test_the_cap_holds_for_sizes_in_the_image_too(self) -> None:
+        parameters = small_ones(10)
+        density = strategy(10, refine_scale2d_stop_share=1.0, prune_scale2d=10.0)
+        density._config = density._config.model_copy(update={"max_gaussians": 12})
+        density.observe(seen(torch.zeros(1, 10, 2), radius_px=torch.arange(10.0)[None]))
+        decision = density.decide(parameters, 100)
+        # Three reach beyond a twentieth of 48 pixels and more; there is room for two.
+        assert [i for i in range(10) if not decision.keep[i]] == [8, 9]
+        assert len(decision.born["means"]) == 4
 
     def test_mean_gradient_counts_visible_views_only(self) -> None:
-        density = control(3, gradient_threshold=5.0)
-        gradient = torch.ones(3, 2)
-        visible = torch.tensor([True, True, False])
-        density.observe(gradient, visible, 2, 2)
-        density.observe(gradient * 0, torch.tensor([True, False, False]), 2, 2)
-        mean = density._gradient / density._count.clamp_min(1)
-        torch.testing.assert_close(mean, torch.tensor([2**0.5 / 2, 2**0.5, 0.0]))
+        parameters = small_ones(3)
+        visible = torch.tensor([[True, True, False]])
+        rounds = {}
+        for threshold in (1.0, 1.2, 1.5):
+            density = strategy(3, gradient_threshold=threshold)
+            density.observe(seen(torch.ones(1, 3, 2), visible, width=2, height=2))
+            density.observe(seen(torch.zeros(1, 3, 2), torch.tensor([[True, False, False]])))
+            rounds[threshold] = len(density.decide(parameters, 100).born["means"])
+        # Half of sqrt 2, sqrt 2 and nothing
+        assert rounds == {1.0: 1, 1.2: 1, 1.5: 0}
+
+    def test_absolute_gradients_are_used_when_asked_for(self) -> None:
+        parameters = small_ones(2)
+        rendering = seen(torch.zeros(1, 2, 2), absolute=torch.tensor([[[1.0, 0], [0, 0]]]))
+        for absgrad in (False, True):
+            density = strategy(2, absgrad=absgrad)
+            assert density.needs_absgrad is absgrad
+            density.observe(rendering)
+            assert len(density.decide(parameters, 100).born["means"]) == int(absgrad)
+
+    def test_steps_follow_the_window(self) -> None:
+        """Rounds every 10 iterations, from 100 to 600 of 1000; the optimiser keeps up."""
+        parameters = {k: v.requires_grad_() for k, v in small_ones(4).items()}
+        adam = SelectiveAdam(parameters, dict.fromkeys(parameters, 1e-3))
+        density = strategy(4, every=10)
+        sizes = []
+        for iteration in (98, 99, 100, 108, 109, 598, 599, 600, 609):
+            density.step(adam, strong(len(adam.steps), [0]), iteration)
+            sizes.append(len(adam.parameters["means"]))
+        assert sizes == [4, 4, 4, 4, 5, 5, 6, 6, 6]
+        assert len(adam.first_moments["quats"]) == len(adam.steps) == sizes[-1]
+
+    def test_reset_caps_opacities_and_pauses(self) -> None:
+        parameters = {k: v.requires_grad_() for k, v in small_ones(4).items()}
+        adam = SelectiveAdam(parameters, dict.fromkeys(parameters, 1e-3))
+        adam.first_moments["opacities"] += 1
+        adam.first_moments["means"] += 1
+        density = strategy(4, every=10, start_share=0.0, reset_every=100, reset_pause=20, prune_opacity=0.01)
+        density.step(adam, strong(4, []), 99)
+        assert float(adam.parameters["opacities"].detach().sigmoid().max()) == pytest.approx(0.02, rel=1e-5)
+        assert float(adam.first_moments["opacities"].abs().max()) == 0
+        assert float(adam.first_moments["means"].min()) == 1
+        density.step(adam, strong(4, [0]), 109)
+        assert len(adam.steps) == 4
+        density.step(adam, strong(4, [0]), 119)
+        assert len(adam.steps) == 5
+
+
+class TestWindow:
+    def test_of_shares(self) -> None:
+        window = Window.of(DensifyConfig(start_share=0.25, stop_share=0.5, every=10), 200)
+        assert [i for i in range(200) if window.round_after(i)] == [59, 69, 79, 89, 99]
+        assert window.open(99)
+        assert not window.open(100)
+
+
+class TestChoice:
+    @pytest.mark.parametrize(
+        ("config", "kind"),
+        [
+            (DensifyConfig(), DefaultStrategy),
+            (DensifyConfig(strategy="mcmc"), MCMCStrategy),
+            (DensifyConfig(strategy="mcmc", enabled=False), DensityStrategy),
+        ],
+    )
+    def test_the_configuration_decides(self, config: DensifyConfig, kind: type) -> None:
+        assert type(density_strategy(config, 1.0, 100, 5, seed=0)) is kind
+
+    def test_none_does_nothing(self) -> None:
+        parameters = small_ones(4)
+        adam = SelectiveAdam(parameters, dict.fromkeys(parameters, 1e-3))
+        idle = DensityStrategy()
+        idle.step(adam, strong(4, [0]), 499)
+        assert idle.penalty(parameters) is None
+        assert adam.parameters["means"] is parameters["means"]
 
 
 def test_quaternion_matrix_agrees_with_scipy() -> None:

@@ -1,0 +1,130 @@
+r"""The near-field light a camera carries, as the rasteriser applies it to every Gaussian.
+
+A Gaussian of albedo a (its spherical harmonics), at :math:`\mathbf d` from the lamp (in the camera frame, in
+reference distances), with normal n (its shortest axis), sends to the lens
+
+.. math::
+    x = g \, a \left(\frac{1 + c}{|\mathbf d|^2 + c}\right)^{e}
+        \left(\frac{d_z}{|\mathbf d|}\right)^{k}
+        \left(\frac{\cos^2 \alpha + \epsilon}{1 + \epsilon}\right)^{q / 2},
+    \qquad \cos\alpha = \frac{\mathbf n \cdot \mathbf d}{|\mathbf d|},
+    \qquad I = \frac{(1 + s) \, x}{1 + s \, x}
+
+with exposure g (one per colour), softening c, exponent e, spread k of the lamp, share q of the cosine law at
+the surface, and shoulder s of the camera's response. At the reference distance, on the axis, facing the lamp,
+x is g a, and I is x where x is one: the gauge. With k = q = s = 0 this is the plain softened fall-off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrags.raster.rotations import rotation_matrices
+
+__all__ = ["CameraLight", "developed", "light_gain", "lit_colors", "shortest_axes", "undeveloped"]
+
+SQUARE_MIN = 1e-6
+"""Nothing is nearer to the lamp than this (squared, in reference distances)."""
+
+SPREAD_MIN = 0.1
+"""Beyond this cosine to the lamp's axis the spread stays what it is."""
+
+COSINE_SOFTENING = 0.04
+"""epsilon: a wall seen edge-on does not turn black, and the gradient of its normal stays bounded."""
+
+LOG2_GAIN_MAX = 40.0
+"""Gains are held within 2^-40 and 2^40."""
+
+
+@dataclass(frozen=True)
+class CameraLight:
+    """The light of C cameras; all but the exposure is common to them.
+
+    Args:
+        exposure: g, one per camera and colour, [C, 3].
+        softening: c, not negative, scalar.
+        exponent: e, scalar.
+        spread: k, scalar.
+        cosine: q, scalar.
+        offset: where the lamp stands in the camera frame, in reference distances, [3].
+        shoulder: s, not negative, scalar.
+        reference_distance: in world units; not learned.
+    """
+
+    exposure: Float[Tensor, "c 3"]
+    softening: Float[Tensor, ""]
+    exponent: Float[Tensor, ""]
+    spread: Float[Tensor, ""]
+    cosine: Float[Tensor, ""]
+    offset: Float[Tensor, "3"]
+    shoulder: Float[Tensor, ""]
+    reference_distance: float
+
+    def packed(self) -> Float[Tensor, "c 12"]:
+        """One row per camera: exposure, softening, exponent, spread, cosine, offset, shoulder, reference."""
+        common = torch.cat(
+            [
+                torch.stack([self.softening, self.exponent, self.spread, self.cosine]),
+                self.offset,
+                torch.stack([self.shoulder, self.shoulder.new_tensor(self.reference_distance)]),
+            ]
+        )
+        return torch.cat([self.exposure, common.expand(len(self.exposure), -1)], dim=1)
+
+
+def lit_colors(
+    albedo: Float[Tensor, "n 3"],
+    points: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    light: Float[Tensor, "12"],
+) -> Float[Tensor, "n 3"]:
+    """What Gaussians send to one camera.
+
+    Args:
+        albedo: colours before the light, not negative.
+        points: centres in the camera frame, in world units.
+        normals: unit normals in the camera frame; their sign does not matter.
+        light: a row of `CameraLight.packed`.
+    """
+    signal = albedo * light[:3] * light_gain(points, normals, light)[:, None]
+    return developed(signal, light[10])
+
+
+def light_gain(
+    points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None, light: Float[Tensor, "12"]
+) -> Float[Tensor, "*b"]:
+    """The factor on the albedo at unit exposure; without normals all surfaces face the lamp."""
+    softening, exponent, spread, cosine = light[3:7]
+    offset = points / light[11] - light[7:10]
+    square = offset.square().sum(-1).clamp(SQUARE_MIN, 1e30)
+    fall = torch.log2(1 + softening) - torch.log2(square + softening)
+    axis = torch.log2((offset[..., 2] * square.rsqrt()).clamp_min(SPREAD_MIN))
+    logarithm = exponent * fall + spread * axis
+    if normals is not None:
+        squared_cosine = (normals * offset).sum(-1).square() / square
+        facing = torch.log2((squared_cosine + COSINE_SOFTENING) / (1 + COSINE_SOFTENING))
+        logarithm = logarithm + 0.5 * cosine * facing
+    return torch.exp2(logarithm.clamp(-LOG2_GAIN_MAX, LOG2_GAIN_MAX))
+
+
+def developed(signal: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
+    """The camera's response I(x)."""
+    return (1 + shoulder) * signal / (1 + shoulder * signal)
+
+
+def undeveloped(image: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
+    """The signal x whose response is I, for I in [0, 1]."""
+    return image / (1 + shoulder * (1 - image))
+
+
+def shortest_axes(quats: Float[Tensor, "n 4"], scales: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
+    """Normals of Gaussians in world coordinates: the axis of the smallest scale, the first of equals."""
+    rotation = rotation_matrices(quats)
+    # argmin may take any of equal entries; the kernels take the first.
+    first = (scales[:, 0] <= scales[:, 1]) & (scales[:, 0] <= scales[:, 2])
+    shortest = torch.where(first, 0, torch.where(scales[:, 1] <= scales[:, 2], 1, 2))
+    return rotation.gather(2, shortest[:, None, None].expand(-1, 3, 1))[..., 0]
