@@ -56,6 +56,8 @@ class Sequence:
         points: sparse points known from the source, [P, 3], or None.
         points_rgb: their colours, uint8, [P, 3], or None.
         truth: further ground truth of simulated sources, as JSON (light, exposure, ...).
+        specular: true on specular highlights, [F, H, W]; they carry no weight in training, but count in the
+            evaluation of held-out frames like any other pixel. None where they were not looked for.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -75,6 +77,7 @@ class Sequence:
     points: Float[np.ndarray, "p 3"] | None = None
     points_rgb: UInt8[np.ndarray, "p 3"] | None = None
     truth: dict[str, Any] = field(default_factory=dict)
+    specular: Bool[np.ndarray, "f h w"] | None = None
 
     def __post_init__(self) -> None:
         frames, height, width = self.rgb.shape[:3]
@@ -84,6 +87,7 @@ class Sequence:
             ("world_from_camera", self.world_from_camera, (frames, 4, 4)),
             ("depth_mm", self.depth_mm, (frames, height, width)),
             ("observed", self.observed, (frames, height, width)),
+            ("specular", self.specular, (frames, height, width)),
             ("recording", self.recording, (frames,)),
         ):
             if array is not None and array.shape != shape:
@@ -133,6 +137,34 @@ class Sequence:
         """The same sequence with poses."""
         return replace(self, world_from_camera=world_from_camera)
 
+    def training_part(self) -> Sequence:
+        """The training frames alone, with nothing that tells of the others.
+
+        This is all that reconstruction, exploration and restoration are given: what is held out cannot
+        leak into them, and settings that train on the same frames share what is made from them.
+        """
+        train = self.train
+
+        def of_train(stack: Any) -> Any:
+            return None if stack is None else stack[train]
+
+        recording = of_train(self.recording)
+        return replace(
+            self,
+            name=self.name.split("@")[0],
+            rgb=self.rgb[train],
+            K=self.K[train],
+            mask=self.mask[train],
+            split=Split("training", np.arange(len(train)), np.arange(0), self.split.version),
+            world_from_camera=of_train(self.world_from_camera),
+            depth_mm=of_train(self.depth_mm),
+            recording=None if recording is None else np.unique(recording, return_inverse=True)[1],
+            frame_names=tuple(self.frame_name(int(frame)) for frame in train),
+            observed=None,
+            truth={},
+            specular=of_train(self.specular),
+        )
+
     def save(self, path: Path) -> None:
         """Write a zarr v3 group; one frame per chunk for image stacks."""
         group = open_group(path, mode="w")
@@ -141,7 +173,7 @@ class Sequence:
         write_array(group, "K", self.K)
         write_array(group, "split/train", self.split.train.astype(np.int64))
         write_array(group, "split/test", self.split.test.astype(np.int64))
-        for name in ("depth_mm", "observed"):
+        for name in ("depth_mm", "observed", "specular"):
             stack = getattr(self, name)
             if stack is not None:
                 write_frames(group, name, stack)
@@ -170,6 +202,7 @@ class Sequence:
             for name in (
                 "depth_mm",
                 "observed",
+                "specular",
                 "world_from_camera",
                 "recording",
                 "points",

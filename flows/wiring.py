@@ -23,7 +23,7 @@ from tasks.evaluate import measure, render
 from tasks.explore import NEXT, branch, explore, merge, start
 from tasks.finetune import finetune
 from tasks.freespace import freespace
-from tasks.ingest import ingest
+from tasks.ingest import ingest, training_frames
 from tasks.poses import poses
 from tasks.progress import StageProgress, notify
 from tasks.report import report
@@ -150,7 +150,12 @@ class SequenceRun:
 
     def _coarse(self) -> None:
         with self._stage("coarse") as row:
-            inputs = {"sequence": self.refs["sequence"], "config": self.config.coarse}
+            # Only the training frames go on from here. Cutting them out takes no time, and does not count
+            # when it comes to whether the stage ran.
+            call = Call(training_frames, {"sequence": self.refs["sequence"]})
+            (part,) = self.runner.run([call], self.outcome.name)
+            self.refs["training"] = part.ref
+            inputs = {"sequence": self.refs["training"], "config": self.config.coarse}
             self.refs["coarse"] = self._one(row, Call(coarse, inputs))
 
     def _assess(self) -> None:
@@ -282,7 +287,7 @@ class SequenceRun:
     # Helpers.
 
     def _scene_inputs(self) -> dict[str, Any]:
-        return {"scene": self.refs["coarse"], "sequence": self.refs["sequence"]}
+        return {"scene": self.refs["coarse"], "sequence": self.refs["training"]}
 
     def _weights(self) -> Weights:
         return lpips_weights(self.config.evaluate)

@@ -1,4 +1,4 @@
-"""ingest: any source to a `Sequence`."""
+"""ingest: any source to a `Sequence`, and the part of it the reconstruction may see."""
 
 from __future__ import annotations
 
@@ -6,20 +6,22 @@ from typing import Any
 
 from data_catalog.catalog import Source
 from extrags.config import IngestConfig
-from extrags.store import Slot
+from extrags.store import Ref, Slot
 from tasks.stage import stage
 
-__all__ = ["ingest"]
+__all__ = ["ingest", "training_frames"]
 
 
 # The fingerprint holds the content of the files; where they lie does not matter.
-@stage("ingest", version=1, ignore=("source",))
+@stage("ingest", version=2, ignore=("source",))
 def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: IngestConfig) -> None:
-    """Read a source into `sequence/`."""
+    """Read a source into `sequence/`, and mark its specular highlights."""
     from data_catalog.catalog import read
+    from data_catalog.specular import saturated_mask, with_specular
 
-    sequence = read(source, config)
+    sequence = with_specular(read(source, config))
     sequence.save(slot.path / "sequence")
+    inside = max(1, int(sequence.mask.sum()))
     slot.counts.update(
         frames=len(sequence),
         train=len(sequence.train),
@@ -28,4 +30,17 @@ def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: Inge
         height=sequence.height,
         has_poses=int(sequence.world_from_camera is not None),
         has_depth=int(sequence.depth_mm is not None),
+        masked_share=float(1 - sequence.mask.mean()),
+        specular_share=0.0 if sequence.specular is None else float(sequence.specular.sum() / inside),
+        saturated_share=float((saturated_mask(sequence.rgb) & sequence.mask).sum() / inside),
     )
+
+
+@stage("training-frames", version=1)
+def training_frames(slot: Slot, sequence: Ref) -> None:
+    """Take the held-out frames away; writes `sequence/`."""
+    from extrags.sequence import Sequence
+
+    part = Sequence.load(slot.open(sequence) / "sequence").training_part()
+    part.save(slot.path / "sequence")
+    slot.counts.update(frames=len(part))

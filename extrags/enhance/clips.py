@@ -86,7 +86,7 @@ def render_clips(
                 cameras=cameras,
                 layers=observation.layers,
                 transfer=references.transfer,
-                reference=references.frames[observation.reference.numpy()],
+                reference=observation.reference.numpy(),
                 image_confidence=confidence.numpy().astype(np.float32),
             )
         )

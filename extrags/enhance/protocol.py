@@ -27,7 +27,7 @@ class Clip:
         cameras: the views, [T].
         layers: what is known about them, [T].
         transfer: how brightness changes with distance in this scene.
-        reference: frame of the sequence that sees most of the same surface, [T].
+        reference: position among the training frames of the one that sees most of the same surface, [T].
         image_confidence: U_img of each view, [T].
 
     Raises:

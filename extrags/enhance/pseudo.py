@@ -39,7 +39,7 @@ class PseudoObservations:
         uncertainty: 1 where the scene knows nothing about the pixel, [V, H, W].
         pixel_confidence: U_pixel, weight of the colour term of each pixel in [0, 1], [V, H, W].
         image_confidence: U_img, weight of each view in [0, 1], [V].
-        reference: frame of the sequence that sees most of the same surface, [V].
+        reference: position among the training frames of the one that sees most of the same surface, [V].
         clip: index of the clip each view belongs to, [V].
         provenance: backend, steps, seed, perceptual measure, ...; ready for JSON.
 

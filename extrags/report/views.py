@@ -184,7 +184,7 @@ def virtual_rows(pseudo: PseudoLike, sequence: Sequence, views: int, largest_byt
 
     Args:
         pseudo: the pseudo-observations.
-        sequence: holds the reference frames.
+        sequence: its training frames are the references.
         views: rows.
         largest_bytes: bound per image.
     """
@@ -192,7 +192,8 @@ def virtual_rows(pseudo: PseudoLike, sequence: Sequence, views: int, largest_byt
     rows = []
     for index in map(int, evenly_spaced(total, views)):
         u = np.asarray(pseudo.uncertainty[index], dtype=np.float64)
-        reference, clip = int(pseudo.reference[index]), int(pseudo.clip[index])
+        reference = int(sequence.train[int(pseudo.reference[index])])
+        clip = int(pseudo.clip[index])
         where = f"virtual view {index + 1}"
         before, after = as_uint8(pseudo.rendered[index]), as_uint8(pseudo.target[index])
         changed = float((np.abs(after.astype(int) - before).max(-1) > CHANGED_LEVELS).mean())

@@ -9,6 +9,7 @@ import zarr
 
 from extrags.errors import ShapeError
 from extrags.sequence import Sequence, Split
+from extrags.store.manifest import content_digest
 
 
 def small_sequence(frames: int = 4) -> Sequence:
@@ -77,3 +78,20 @@ class TestSequence:
     def test_wrong_number_of_names(self) -> None:
         with pytest.raises(ShapeError, match="frame names"):
             replace(small_sequence(), frame_names=("a",))
+
+
+def test_the_training_part_holds_nothing_of_the_held_out_frames(tmp_path: Path) -> None:
+    whole = small_sequence()
+    part = whole.training_part()
+    np.testing.assert_array_equal(part.rgb, whole.rgb[whole.train])
+    np.testing.assert_array_equal(part.train, np.arange(len(whole.train)))
+    assert len(part.test) == 0
+    assert part.observed is None
+    assert part.truth == {}
+    # What is held out does not change it, not even its name.
+    rgb = whole.rgb.copy()
+    rgb[whole.test] = 7
+    other = replace(whole, rgb=rgb, name=whole.name.split("@")[0] + "@other", truth={"light": 1})
+    for index, sequence in enumerate((whole, other)):
+        sequence.training_part().save(tmp_path / str(index))
+    assert content_digest(tmp_path / "0") == content_digest(tmp_path / "1")

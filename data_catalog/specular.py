@@ -1,0 +1,125 @@
+"""Specular highlights and saturated pixels.
+
+A mirror reflection of the light adds its own, nearly white colour to that of the tissue: it raises the
+weakest channel, which on tissue is low and changes slowly. A pixel is part of a highlight when its weakest
+channel stands out over its surroundings by more than the image's own texture does (a multiple of the median
+absolute deviation, and a floor), and when its colour is clearly paler than theirs. The surroundings are a
+median over a window, of which the brightest nearby counts: the lit side of a fold before a dark lumen is no
+highlight. Regions grow from such pixels into neighbours that stand out half as much, and are dilated by the
+width of a blurred rim.
+
+Saturated pixels (any channel at 250 or above) are told apart: their true value is not known, whatever shines
+there, and a simulated or overexposed wall may be saturated as a whole.
+
+Source: the contrast to a median-filtered image with an image-dependent threshold follows Arnold et al.,
+"Automatic segmentation and inpainting of specular highlights for endoscopic imaging", EURASIP Journal on
+Image and Video Processing 2010; the weakest channel as the measure of the achromatic part follows the
+dichromatic model (Tan and Ikeuchi, "Separating reflection components of textured surfaces using a single
+image", PAMI 2005).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from extrags.sequence import Sequence
+
+__all__ = ["SATURATED", "saturated_mask", "specular_mask", "specular_masks", "with_specular"]
+
+SATURATED = 250
+"""A channel at or above this (of 255) is taken for saturated."""
+_WINDOW_SHARE = 0.10
+_DEVIATIONS = 8.0
+_FLOOR = 36.0
+_PALER = 1.15
+_GROW_SHARE = 0.5
+_RIM_SHARE = 0.004
+_SURROUNDINGS_WIDTH = 320
+
+
+def specular_mask(
+    rgb: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None = None
+) -> Bool[np.ndarray, "h w"]:
+    """Highlights of one image.
+
+    Args:
+        rgb: the image.
+        mask: tissue; what lies outside neither counts for the threshold nor is marked.
+
+    Returns:
+        True on highlights.
+    """
+    import cv2
+
+    height, width = rgb.shape[:2]
+    inside = np.ones((height, width), dtype=bool) if mask is None else mask
+    if not inside.any():
+        return np.zeros((height, width), dtype=bool)
+    weakest, strongest = rgb.min(axis=2), rgb.max(axis=2)
+    median, around = _surroundings(weakest, inside)
+    _, brightest = _surroundings(strongest, inside)
+    excess = weakest.astype(np.float32) - around
+    texture = weakest[inside] - median[inside]
+    spread = 1.4826 * float(np.median(np.abs(texture - np.median(texture))))
+    threshold = max(_FLOOR, _DEVIATIONS * spread)
+    # Paler than its surroundings: the weakest channel grew by more than the strongest, in proportion.
+    paler = (weakest + 1.0) * (brightest + 1.0) > _PALER * (strongest + 1.0) * (around + 1.0)
+    seed = (excess > threshold) & (paler | (weakest >= SATURATED)) & inside
+    weak = (excess > _GROW_SHARE * threshold) & inside
+    _, labels = cv2.connectedComponents(weak.astype(np.uint8), connectivity=8)
+    found = np.isin(labels, np.setdiff1d(np.unique(labels[seed]), 0))
+    rim = max(1, round(_RIM_SHARE * width))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1, 2 * rim + 1))
+    return np.asarray((cv2.dilate(found.astype(np.uint8), kernel) > 0) & inside)
+
+
+def saturated_mask(rgb: UInt8[np.ndarray, "*f h w 3"]) -> Bool[np.ndarray, "*f h w"]:
+    """True where any channel is at or above `SATURATED`."""
+    return np.asarray(rgb.max(axis=-1) >= SATURATED)
+
+
+def specular_masks(
+    rgb: UInt8[np.ndarray, "f h w 3"], mask: Bool[np.ndarray, "f h w"]
+) -> Bool[np.ndarray, "f h w"]:
+    """`specular_mask` of each frame."""
+    return np.stack([specular_mask(image, inside) for image, inside in zip(rgb, mask, strict=True)])
+
+
+def with_specular(sequence: Sequence) -> Sequence:
+    """The sequence with its highlights marked."""
+    return replace(sequence, specular=specular_masks(sequence.rgb, sequence.mask))
+
+
+def _surroundings(
+    channel: UInt8[np.ndarray, "h w"], inside: Bool[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+    """Median over a window, and the brightest of them nearby.
+
+    What lies outside the mask is filled by the nearest inside. Both vary slowly and are found at a small
+    size, so that the work does not grow with the image.
+    """
+    import cv2
+    from scipy.ndimage import distance_transform_edt
+
+    height, width = channel.shape
+    small_width = min(width, _SURROUNDINGS_WIDTH)
+    size = (small_width, max(1, round(height * small_width / width)))
+    small = cv2.resize(channel, size, interpolation=cv2.INTER_AREA)
+    # Pixels that the mask cuts count as outside.
+    small_inside = cv2.resize(inside.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    if not small_inside.any():
+        blank = np.full(channel.shape, 255, dtype=np.float32)
+        return blank, blank
+    if not small_inside.all():
+        nearest = distance_transform_edt(~small_inside, return_distances=False, return_indices=True)
+        small = np.ascontiguousarray(small[tuple(nearest)])
+    window = max(3, round(_WINDOW_SHARE * small_width)) | 1
+    nearby = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (window, window))
+    median = cv2.medianBlur(small, window)
+    found = [np.asarray(part, dtype=np.float32) for part in (median, cv2.dilate(median, nearby))]
+    if size != (width, height):
+        found = [cv2.resize(part, (width, height), interpolation=cv2.INTER_LINEAR) for part in found]
+    return found[0], found[1]
