@@ -62,8 +62,8 @@ class IngestConfig(StageConfig):
         None,
         ge=20,
         le=150,
-        description="horizontal field of view of the pinhole that fisheye sources are resampled to; None: "
-        "the source's usual one (C3VD and C3VDv2 100); other sources keep their own",
+        description="horizontal field of view of the pinhole that distorted sources are resampled to; None: "
+        "the source's usual one (C3VD and C3VDv2 100; others: that of their central resolution)",
     )
 
 
@@ -103,7 +103,7 @@ class LightConfig(StageConfig):
         gt=0,
         description="starting exponent e of gain / (c + r^2)^e; about 1 / 2.2 after a display tone curve",
     )
-    learning_rate: float = Field(0.01, gt=0, description="of the global light parameters")
+    learning_rate: float = Field(0.04, gt=0, description="of the global light parameters")
     exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
     exposure_prior: float = Field(
         1.0, ge=0, description="weight that holds log-exposures near their mean of zero"
@@ -178,7 +178,7 @@ class CoarseConfig(StageConfig):
         0.1, ge=0, description="weight of the inverse-depth term, relative to the median depth"
     )
     depth_weight_final_share: float = Field(
-        0.1, ge=0, le=1, description="the term decays to this share, log-linearly"
+        0.5, ge=0, le=1, description="the term decays to this share, log-linearly"
     )
     max_points: int = Field(12_000, ge=10, description="starting points at most")
     thickness: float = Field(

@@ -11,9 +11,10 @@ import math
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import torch
 import zarr
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrags.config import LightConfig
@@ -22,10 +23,10 @@ from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["NearFieldLight"]
 
-START_LOG_SOFTENING = -1.0
-START_SPREAD = 0.3
-START_COSINE = 0.3
-START_LOG_SHOULDER = -0.5
+START_LOG_SOFTENING = -1.5
+START_SPREAD = 0.5
+START_COSINE = 0.5
+START_LOG_SHOULDER = 0.0
 """Where learning starts: a lamp a little wide, walls a little Lambertian, a soft shoulder."""
 
 
@@ -100,6 +101,36 @@ class NearFieldLight:
     def exposures(self) -> Float[Tensor, "f"]:
         """Gains of all training frames."""
         return (self.log_exposure - self.log_exposure.mean()).exp()
+
+    def exposures_of(
+        self,
+        frames: Int[np.ndarray, "m"],
+        train: Int[np.ndarray, "f"],
+        recording: Int[np.ndarray, "n"] | None = None,
+    ) -> Float[Tensor, "m"]:
+        """Gains for frames that were not trained on, by a rule that looks at none of their pixels.
+
+        A camera's automatic exposure moves slowly: between training frames of the same recording the
+        log-exposure is interpolated over the frame number, beyond the first and the last it stays theirs.
+        A recording without training frames gets the mean exposure.
+
+        Args:
+            frames: their numbers in the sequence.
+            train: numbers of the training frames, in the order of `log_exposure`.
+            recording: of every frame of the sequence; None is one recording.
+        """
+        owner = (
+            np.zeros(int(max(frames.max(initial=0), train.max())) + 1, int)
+            if recording is None
+            else recording
+        )
+        logs = self.exposures().detach().log().double().numpy()
+        result = np.zeros(len(frames))
+        for which in np.unique(owner[train]):
+            known, wanted = owner[train] == which, owner[frames] == which
+            order = np.argsort(train[known], kind="stable")
+            result[wanted] = np.interp(frames[wanted], train[known][order], logs[known][order])
+        return torch.from_numpy(np.exp(result).astype(np.float32))
 
     def falloff(
         self, distance: Float[Tensor, "*b"], axis_cosine: Float[Tensor, "*b"] | None = None

@@ -1,47 +1,37 @@
-"""Run time and error of the rasteriser and of a whole training iteration.
+"""Run time and error of the rasteriser and of a whole training iteration: `extrags bench raster|train`.
 
-Called by `extrags bench raster|train` and by tests/benchmarks/bench_raster.py. All backends render the same
-scene in turns, one call each per round, so that a busy machine slows all of them alike; reported are medians
-over the rounds and their spread. One-thread cases can be judged by `cpu_ms`, the processor time of the
-process, which a neighbour on the core does not change.
+All peers render the same scene in turns, one call each per round, so that a busy machine slows all of them
+alike; reported are medians over the rounds and their spread. One-thread cases can be judged by `cpu_ms`, the
+processor time of the process, which a neighbour on the core does not change.
 """
 
 from __future__ import annotations
 
+import ctypes
 import gc
+import logging
 import math
 import os
 import platform
 import resource
 import subprocess
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from extrags.errors import ConfigError
 from extrags.raster import native
-from extrags.raster.adam import SelectiveAdam
-from extrags.raster.dispatch import available_backends, rasterize
-from extrags.raster.loss import l1_ssim_loss, l1_ssim_loss_reference
-from extrags.raster.rendering import Rendering
+from extrags.raster.peers import Contestant, check_peers, errors, exact_gradients, gradients, use_threads
+from extrags.raster.roofline import part_times, roofline
 
-__all__ = ["BenchSize", "bench_raster", "bench_scene", "bench_train", "machine"]
+__all__ = ["STANDARD_SIZES", "BenchSize", "bench_raster", "bench_scene", "bench_train", "machine"]
 
-PEERS = ("native", "gsplat", "torch", "reference")
-"""`torch` is the reference in float32 with torch's own loss and Adam; `reference` the same in float64."""
-
-FLOPS_PER_LANE = {"forward": 38, "backward": 61}
-"""Counted per pixel and Gaussian, the gradient's share of the reduction included."""
-
-PARAMETERS_PER_GAUSSIAN = 59
-"""Floats: mean 3, quaternion 4, scales 3, opacity 1, harmonics of degree 3 48."""
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -101,7 +91,7 @@ def bench_scene(size: BenchSize, *, seed: int = 0) -> dict[str, Tensor]:
 
 
 def machine() -> dict[str, Any]:
-    """What the measurements were taken on."""
+    """What the measurements were taken on: processor, threads, versions, commit."""
     processor = platform.processor()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -142,19 +132,20 @@ def bench_raster(
     Args:
         sizes: the cases; None is `STANDARD_SIZES`.
         quick: of the standard sizes, the smallest only.
-        peers: backends beside the native one; see `PEERS`.
-        threads: numbers of threads for the native kernels; torch peers run with the first of them.
-        rounds: how often each backend runs; slow peers run at most three times.
-        with_error: compare image and gradients with the float64 reference.
+        peers: what runs beside the native kernels; see `extrags.raster.peers.PEERS`.
+        threads: numbers of threads, each a case of its own (the reference runs with the first only).
+        rounds: how often each peer is timed; slow peers stop earlier.
+        with_error: compare image and gradients with float64.
         seed: of the scene.
 
     Returns:
         `{machine, cases}` with, per case, `ms` and `cpu_ms` (medians of forward, backward, iteration),
-        `spread_ms` (10 % and 90 % quantile of the iteration), `error` (relative L2 of the image and of
-        each gradient) and `peak_mib` (memory taken beyond the scene itself).
+        `spread_ms` (10 % and 90 % quantile of the iteration), `peak_mib` (memory taken beyond the scene
+        itself), `times_native` (processor time over that of the native kernels with as many threads) and
+        `error` (relative L2 of the image and of each gradient).
 
     Raises:
-        ConfigError: for an unknown peer.
+        ConfigError: for a peer that is unknown or not available, or a number below 1.
     """
     return _bench(_sizes(sizes, quick), peers, threads, rounds, with_error, seed, training=False)
 
@@ -193,16 +184,16 @@ def _bench(
     *,
     training: bool,
 ) -> dict[str, Any]:
-    unknown = [peer for peer in peers if peer not in PEERS]
-    if unknown:
-        raise ConfigError(f"unknown peers {', '.join(unknown)}; expected {', '.join(PEERS)}")
-    if "gsplat" in peers and "gsplat" not in available_backends():
-        raise ConfigError("peer gsplat needs a CUDA device and the package gsplat")
+    entrants = ["native", *(peer for peer in dict.fromkeys(peers) if peer != "native")]
+    check_peers(entrants)
+    smallest = min([rounds, *threads, *(min(size.width, size.height, size.n_gaussians) for size in sizes)])
+    if smallest < 1:
+        raise ConfigError(f"sizes, numbers of Gaussians, threads and rounds start at 1, got {smallest}")
     before = native.num_threads(), torch.get_num_threads()
     cases: list[dict[str, Any]] = []
     try:
         for size in sizes:
-            cases += _bench_size(size, peers, threads, rounds, with_error, seed, training=training)
+            cases += _bench_size(size, entrants, threads, rounds, with_error, seed, training=training)
     finally:
         native.set_num_threads(before[0])
         torch.set_num_threads(before[1])
@@ -220,158 +211,48 @@ def _bench_size(
     training: bool,
 ) -> list[dict[str, Any]]:
     scene = bench_scene(size, seed=seed)
-    exact = _gradients("reference", scene, size) if with_error else None
-    entrants = [(backend, count) for backend in ("native",) for count in threads]
-    entrants += [(peer, threads[0]) for peer in peers if peer != "native"]
-    runs = {key: _Run(key[0], scene, size, training=training) for key in entrants}
+    exact = exact_gradients(scene) if with_error else None
+    keys = [(peer, n) for peer in peers for n in (threads[:1] if peer == "reference" else threads)]
+    contestants = {key: Contestant(key[0], scene, training=training) for key in keys}
     peaks: dict[tuple[str, int], float | None] = {}
+    gc.collect()
     for index in range(rounds + 2):
-        for (backend, count), run in runs.items():
-            if backend in ("torch", "reference") and index >= 4:
+        for (peer, count), contestant in contestants.items():
+            if contestant.finished:
                 continue
-            _use_threads(backend, count)
+            use_threads(peer, count)
             if index == 0:
-                peaks[backend, count] = _peak_mib(run.iteration)
+                peaks[peer, count] = _peak_mib(contestant.iteration)
             else:
-                run.iteration()
+                contestant.iteration()
     cases = []
-    for (backend, count), run in runs.items():
+    for (peer, count), contestant in contestants.items():
         case: dict[str, Any] = {
             "width": size.width,
             "height": size.height,
             "n_gaussians": size.n_gaussians,
-            "backend": backend,
+            "backend": peer,
             "threads": count,
-            **run.summary(warm_up=1 if backend in ("torch", "reference") else 2),
-            "peak_mib": peaks[backend, count],
+            **contestant.summary(),
+            "peak_mib": peaks[peer, count],
         }
+        use_threads(peer, count)
         if exact is not None:
-            case["error"] = _errors(_gradients(backend, scene, size), exact)
-        if backend == "native" and training:
-            _use_threads(backend, count)
-            case["parts_ms"], entries = _parts(scene, size)
+            case["error"] = errors(gradients(peer, scene), exact)
+        if peer == "native" and training:
+            case["parts_ms"], entries = part_times(scene)
             measured = case["cpu_ms" if count == 1 else "ms"]["iteration"]
-            case["roofline"] = _roofline(size, entries, count, measured)
+            case["roofline"] = roofline(size.n_gaussians, entries, count, measured)
         cases.append(case)
+    own = {case["threads"]: case["cpu_ms"]["iteration"] for case in cases if case["backend"] == "native"}
+    for case in cases:
+        case["times_native"] = case["cpu_ms"]["iteration"] / own[case["threads"]]
     return cases
-
-
-def _use_threads(backend: str, count: int) -> None:
-    # Beside the native kernels torch has only small arrays to handle: its threads, which wait for each other
-    # at barriers, would cost more than they bring.
-    torch.set_num_threads(1 if backend == "native" else count)
-    if native.native_isa() is not None:
-        native.set_num_threads(count)
-
-
-class _Run:
-    """Repeated iterations of one backend on its own copy of the scene."""
-
-    def __init__(self, backend: str, scene: dict[str, Tensor], size: BenchSize, *, training: bool) -> None:
-        dtype = torch.float64 if backend == "reference" else torch.float32
-        device = "cuda" if backend == "gsplat" else "cpu"
-        self.backend, self.size, self.training = backend, size, training
-        values = {k: v.to(device=device, dtype=dtype, copy=True) for k, v in scene.items()}
-        self.target = values.pop("target")
-        self.cameras = {name: values.pop(name) for name in ("viewmats", "Ks")}
-        self.parameters = {k: v.requires_grad_() for k, v in values.items()}
-        # Rates so small that the scene stays what it is, round after round
-        rates = dict.fromkeys(self.parameters, 1e-9)
-        self.adam: SelectiveAdam | torch.optim.Adam
-        if backend in ("native", "gsplat"):
-            self.adam = SelectiveAdam(self.parameters, rates)
-        else:
-            self.adam = torch.optim.Adam(list(self.parameters.values()), lr=1e-9, eps=1e-15)
-        self.wall: list[dict[str, float]] = []
-        self.cpu: list[dict[str, float]] = []
-
-    def iteration(self) -> None:
-        loss_function = l1_ssim_loss if self.backend in ("native", "gsplat") else l1_ssim_loss_reference
-        marks = [self._now()]
-        rendering = _render(self.backend, {**self.parameters, **self.cameras}, self.size)
-        marks.append(self._now())
-        loss = loss_function(rendering.rgb, self.target) if self.training else rendering.rgb.sum()
-        marks.append(self._now())
-        loss.backward()
-        marks.append(self._now())
-        if self.training:
-            if isinstance(self.adam, SelectiveAdam):
-                self.adam.step(rendering.visible[0])
-            else:
-                self.adam.step()
-        marks.append(self._now())
-        for value in self.parameters.values():
-            value.grad = None
-        names = ("forward", "loss", "backward", "adam")
-        for kind, record in enumerate((self.wall, self.cpu)):
-            steps = {name: marks[i + 1][kind] - marks[i][kind] for i, name in enumerate(names)}
-            record.append({**steps, "iteration": marks[-1][kind] - marks[0][kind]})
-
-    def _now(self) -> tuple[float, float]:
-        if self.backend == "gsplat":
-            torch.cuda.synchronize()
-        return 1e3 * time.perf_counter(), 1e3 * time.process_time()
-
-    def summary(self, *, warm_up: int) -> dict[str, Any]:
-        """Medians in milliseconds, without the first iterations."""
-
-        def medians(record: list[dict[str, float]]) -> dict[str, float]:
-            kept = record[warm_up:]
-            return {name: float(np.median([r[name] for r in kept])) for name in kept[0]}
-
-        iterations = [r["iteration"] for r in self.wall[warm_up:]]
-        return {
-            "ms": medians(self.wall),
-            "cpu_ms": medians(self.cpu),
-            "spread_ms": [float(q) for q in np.quantile(iterations, (0.1, 0.9))],
-            "rounds": len(iterations),
-        }
-
-
-def _render(backend: str, scene: dict[str, Tensor], size: BenchSize) -> Rendering:
-    kind: Any = "reference" if backend == "torch" else backend
-    return rasterize(
-        scene["means"],
-        scene["quats"],
-        scene["scales"],
-        scene["opacities"],
-        scene["sh"],
-        scene["viewmats"],
-        scene["Ks"],
-        size.width,
-        size.height,
-        backend=kind,
-    )
-
-
-def _gradients(backend: str, scene: dict[str, Tensor], size: BenchSize) -> dict[str, Tensor]:
-    """Image and gradients for fixed random weights on colour, alpha and depth."""
-    dtype = torch.float64 if backend == "reference" else torch.float32
-    device = "cuda" if backend == "gsplat" else "cpu"
-    values = {k: v.to(device=device, dtype=dtype, copy=True) for k, v in scene.items() if k != "target"}
-    leaves = {k: v.requires_grad_() for k, v in values.items() if k not in ("viewmats", "Ks")}
-    rendering = _render(backend, values, size)
-    generator = torch.Generator().manual_seed(1)
-    total = rendering.rgb.new_zeros(())
-    for image in (rendering.rgb, rendering.alpha, rendering.depth):
-        weights = torch.randn(image.shape, generator=generator).to(image)
-        total = total + (weights * image).sum()
-    total.backward()
-    found = {k: v.grad for k, v in leaves.items() if v.grad is not None}
-    return {"image": rendering.rgb.detach(), **found}
-
-
-def _errors(found: dict[str, Tensor], exact: dict[str, Tensor]) -> dict[str, Any]:
-    relative = {
-        name: float((found[name].double().cpu() - value).norm() / value.norm().clamp_min(1e-30))
-        for name, value in exact.items()
-    }
-    return {"image": relative.pop("image"), "grads": relative}
 
 
 def _peak_mib(function: Callable[[], None]) -> float | None:
     """Memory a call takes at its height beyond what the process held before."""
-    gc.collect()
+    _return_free_memory()
     reset, status = Path("/proc/self/clear_refs"), Path("/proc/self/status")
     if not os.access(reset, os.W_OK):
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -389,98 +270,9 @@ def _peak_mib(function: Callable[[], None]) -> float | None:
     return field("VmHWM") - before_mib
 
 
-def _parts(scene: dict[str, Tensor], size: BenchSize, rounds: int = 8) -> tuple[dict[str, float], int]:
-    """Where an iteration's time goes when the kernels are called directly, and the composited entries."""
-    kernels = native.compiled_kernels()
-    n, width, height = size.n_gaussians, size.width, size.height
-    names = ("means", "quats", "scales", "opacities", "sh")
-    parameters = [scene[name].clone() for name in names]
-    gradients = [torch.empty_like(value) for value in parameters]
-    moments = [(torch.zeros_like(value), torch.zeros_like(value)) for value in parameters]
-    rgb, v_rgb = torch.empty(height, width, 3), torch.empty(height, width, 3)
-    alpha, depth = torch.empty(height, width), torch.empty(height, width)
-    means2d, radius, v_means2d = torch.empty(n, 2), torch.empty(n), torch.empty(n, 2)
-    steps, bias = torch.ones(n, dtype=torch.int32), torch.ones(2)
-    records: list[dict[str, float]] = []
-    entries = 0
-    for _ in range(rounds + 2):
-        frame = kernels.render(
-            *parameters,
-            *(3, None, scene["viewmats"][0], scene["Ks"][0], None, width, height, 0.01),
-            *(rgb, alpha, depth, means2d, radius, None, None, None),
-        )
-        start = time.perf_counter()
-        kernels.l1_ssim(rgb, scene["target"][0], None, v_rgb, height, width, 0.2, 1 / (3 * width * height))
-        compared = time.perf_counter()
-        frame.backward(
-            *parameters,
-            *(3, None, v_rgb, None, None, None, False, *gradients, None, None, v_means2d, None),
-        )
-        carried = time.perf_counter()
-        stepped = [
-            (value, gradient, first, second, 1e-9)
-            for value, gradient, (first, second) in zip(parameters, gradients, moments, strict=True)
-        ]
-        kernels.adam(stepped, steps, bias, bias, None, 0.9, 0.999, 1e-15)
-        project, tiles, tiles_backward, project_backward = frame.seconds()
-        records.append(
-            {
-                "project": project,
-                "tiles": tiles,
-                "loss": compared - start,
-                "tiles_backward": tiles_backward,
-                "project_backward": project_backward,
-                "adam": time.perf_counter() - carried,
-            }
-        )
-        entries = int(frame.entries())
-    kept = records[2:]
-    return {name: 1e3 * float(np.median([r[name] for r in kept])) for name in kept[0]}, entries
-
-
-def _roofline(size: BenchSize, entries: int, threads: int, iteration_ms: float) -> dict[str, float]:
-    """The least time an iteration could take at the measured arithmetic peak and memory bandwidth.
-
-    Arithmetic: composited entries times sixteen lanes, forward and backward (projection, loss and Adam
-    left out). Memory: parameters read twice, gradients written and read, Adam's moments and parameters
-    read and written; none of it from a cache.
-    """
-    flops = 16 * entries * sum(FLOPS_PER_LANE.values())
-    traffic = 4 * PARAMETERS_PER_GAUSSIAN * size.n_gaussians * (2 + 2 + 6)
-    peak_gflops, bandwidth_gbs = threads * _peak_gflops(), _bandwidth_gbs()
-    arithmetic_ms, memory_ms = 1e-6 * flops / peak_gflops, 1e-6 * traffic / bandwidth_gbs
-    floor_ms = max(arithmetic_ms, memory_ms)
-    return {
-        "peak_gflops": peak_gflops,
-        "bandwidth_gbs": bandwidth_gbs,
-        "entries": float(entries),
-        "gflop": flops / 1e9,
-        "traffic_mib": traffic / 2**20,
-        "arithmetic_ms": arithmetic_ms,
-        "memory_ms": memory_ms,
-        "floor_ms": floor_ms,
-        "share": floor_ms / iteration_ms,
-    }
-
-
-def _peak_gflops() -> float:
-    """Best of a few runs of independent fused multiply-adds: 16 chains of 16 lanes, 2 flops each."""
-    kernels, rounds = native.compiled_kernels(), 200_000
-    best = math.inf
-    for _ in range(5):
-        start = time.thread_time()
-        kernels.fma_chain(rounds)
-        best = min(best, time.thread_time() - start)
-    return rounds * 16 * 16 * 2 / best / 1e9
-
-
-def _bandwidth_gbs() -> float:
-    """Best of a few copies of 64 MiB, read and written."""
-    source = torch.ones(16 * 2**20)
-    target = torch.empty_like(source)
-    best = math.inf
-    for _ in range(5):
-        start = time.thread_time()
-        target.copy_(source)
-        best = min(best, time.thread_time() - start)
-    return 2 * 4 * source.numel() / best / 1e9
+def _return_free_memory() -> None:
+    """Else memory that an earlier peer left in the heap would be used again and not be counted."""
+    try:
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+    except (OSError, AttributeError):  # another C library: the figure of later peers is a lower bound
+        logger.debug("no malloc_trim: peak memory of later peers may read low")

@@ -12,13 +12,14 @@ import math
 from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from torch import Tensor
 
 from extrags.config import DensifyConfig
 from extrags.raster import Rendering, SelectiveAdam
+from extrags.raster.rotations import rotation_matrices
 
-__all__ = ["DefaultStrategy", "DensityRound", "DensityStrategy", "Window", "quaternion_matrix"]
+__all__ = ["DefaultStrategy", "DensityRound", "DensityStrategy", "Window"]
 
 SPLIT_SHRINK = 1.6
 """A split Gaussian's children are this much smaller (3DGS, section 5.2)."""
@@ -245,7 +246,7 @@ class DefaultStrategy(DensityStrategy):
         scales = parents["scales"].exp()
         twice = {name: value.repeat(2, *[1] * (value.ndim - 1)) for name, value in parents.items()}
         noise = torch.randn(2 * len(scales), 3, generator=self._generator)
-        offset = torch.einsum("nij,nj->ni", quaternion_matrix(twice["quats"]), noise * scales.repeat(2, 1))
+        offset = torch.einsum("nij,nj->ni", rotation_matrices(twice["quats"]), noise * scales.repeat(2, 1))
         twice["means"] = twice["means"] + offset
         twice["scales"] = (scales.repeat(2, 1) / SPLIT_SHRINK).log()
         return twice
@@ -253,14 +254,3 @@ class DefaultStrategy(DensityStrategy):
 
 def _chosen(parameters: dict[str, Tensor], index: Bool[Tensor, "n"]) -> dict[str, Tensor]:
     return {name: value.detach()[index].clone() for name, value in parameters.items()}
-
-
-def quaternion_matrix(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z) of any length."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, dim=-1).reshape(-1, 3, 3)

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from extrags.config import DensifyConfig
 from extrags.raster import Rendering, SelectiveAdam
-from extrags.training.density import DensityRound, DensityStrategy, Window, quaternion_matrix
+from extrags.raster.rotations import rotation_matrices
+from extrags.training.density import DensityRound, DensityStrategy, Window
 
 __all__ = ["MCMCStrategy", "compute_relocation"]
 
@@ -138,7 +139,7 @@ class MCMCStrategy(DensityStrategy):
         """Add noise to the positions, shaped like each Gaussian, in proportion to the learning rate."""
         transparency = 1 - parameters["opacities"].sigmoid()
         share = torch.sigmoid(SHAKEN_STEEPNESS * (transparency - SHAKEN_TRANSPARENCY))
-        axes = quaternion_matrix(parameters["quats"]) * parameters["scales"].exp()[:, None, :]
+        axes = rotation_matrices(parameters["quats"]) * parameters["scales"].exp()[:, None, :]
         noise = torch.randn(parameters["means"].shape, generator=self._generator) * share[:, None]
         shaped = torch.einsum("nij,nkj,nk->ni", axes, axes, noise)
         parameters["means"] += shaped * (means_learning_rate * self._config.noise / self._extent**2)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -64,3 +65,13 @@ class TestNearFieldLight:
         points = torch.tensor([[4.0, -3.0, 20.0], [0.0, 10.0, 60.0]])
         distance = points.norm(dim=-1)
         torch.testing.assert_close(start.falloff(distance, points[:, 2] / distance), start.gain(points))
+
+    def test_exposure_of_held_out_frames(self) -> None:
+        """Interpolated inside a recording that was trained on, the mean elsewhere."""
+        train = np.array([0, 2, 6])
+        recording = np.array([0, 0, 0, 0, 0, 0, 0, 1, 1])
+        gains = light().exposures_of(np.array([1, 4, 7, 8]), train, recording)
+        own = light().exposures().log()
+        expected = torch.stack([(own[0] + own[1]) / 2, (own[1] + own[2]) / 2, own[0] * 0, own[0] * 0])
+        torch.testing.assert_close(gains.log(), expected)
+        torch.testing.assert_close(light().exposures_of(train, train), light().exposures())

@@ -245,6 +245,19 @@ EXTRAGS_INLINE void zero_gradients(const Scene* scene, const SceneGradients* out
   zero_rows(out->sh, 3 * scene->coefficients, first, rows);
 }
 
+// The inverse of the 2D covariance 0.3 + sum of h h^T, times a vector, through its adjugate
+// 0.3 + sum of h' h'^T with h' = (-h_y, h_x): no entry is a difference of large ones.
+EXTRAGS_INLINE void apply_conic(const Projected& p, Vec inverse, Vec x, Vec y, Vec* out_x, Vec* out_y) {
+  Vec a = Vec(kDilation) * x, b = Vec(kDilation) * y;
+  for (int k = 0; k < 3; ++k) {
+    const Vec across = fnma(p.half[3 + k], x, p.half[k] * y);
+    a = fnma(across, p.half[3 + k], a);
+    b = fma(across, p.half[k], b);
+  }
+  *out_x = a * inverse;
+  *out_y = b * inverse;
+}
+
 // Carries gradients from the image plane to the parameters of one chunk of Gaussians.
 template <int kDegree, bool kColors, bool kPose>
 static void project_chunk_backward(View* view, const Scene* scene, const SceneGradients* out, int chunk) {
@@ -286,18 +299,19 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
     const Vec s0 = load(columns), sx = load(columns + 16), sy = load(columns + 32);
     const Vec sxx = load(columns + 48), sxy = load(columns + 64), syy = load(columns + 80);
     const Vec inverse = Vec(1.f) / p.determinant;
-    const Vec a = p.yy * inverse, b = negated(p.xy * inverse), c = p.xx * inverse;
-    const Vec v_u = finite(keep(ok, fma(a, sx, b * sy))), v_v = finite(keep(ok, fma(b, sx, c * sy)));
-    // Covariance: -conic G conic with G = [[sxx, sxy], [sxy, syy]] / 2
-    const Vec g0 = fma(a, sxx, b * sxy), g1 = fma(a, sxy, b * syy);
-    const Vec g2 = fma(b, sxx, c * sxy), g3 = fma(b, sxy, c * syy), minus_half(-0.5f);
-    const Vec v_xx = keep(ok, minus_half * fma(g0, a, g1 * b));
-    const Vec v_xy = keep(ok, minus_half * fma(g0, b, g1 * c));
-    const Vec v_yy = keep(ok, minus_half * fma(g2, b, g3 * c));
+    Vec v_u, v_v;
+    apply_conic(p, inverse, sx, sy, &v_u, &v_v);
+    v_u = finite(keep(ok, v_u));
+    v_v = finite(keep(ok, v_v));
+    // The gradient of the covariance is -conic S conic / 2 with S the second moments, that of a column h of
+    // `half` -conic (S (conic h)): taken so, a needle's long axis does not drown in its short one's rounding.
     Vec v_axes[9], v_j00 = zero, v_j02 = zero, v_j11 = zero, v_j12 = zero;
     for (int j = 0; j < 3; ++j) {
-      const Vec v_a = two * fma(v_xx, p.half[j], v_xy * p.half[3 + j]);
-      const Vec v_b = two * fma(v_xy, p.half[j], v_yy * p.half[3 + j]);
+      Vec q_x, q_y, v_a, v_b;
+      apply_conic(p, inverse, p.half[j], p.half[3 + j], &q_x, &q_y);
+      apply_conic(p, inverse, fma(sxx, q_x, sxy * q_y), fma(sxy, q_x, syy * q_y), &v_a, &v_b);
+      v_a = keep(ok, negated(v_a));
+      v_b = keep(ok, negated(v_b));
       v_axes[j] = p.j00 * v_a;
       v_axes[3 + j] = p.j11 * v_b;
       v_axes[6 + j] = fma(p.j02, v_a, p.j12 * v_b);

@@ -4,12 +4,11 @@ import math
 
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from extrags.config import DensifyConfig
 from extrags.raster import Rendering, SelectiveAdam
-from extrags.training.density import DefaultStrategy, DensityStrategy, Window, quaternion_matrix
+from extrags.training.density import DefaultStrategy, DensityStrategy, Window
 from extrags.training.relocation import MCMCStrategy
 from extrags.training.strategies import density_strategy
 from tests.extrags.training.conftest import tube_gaussians
@@ -202,9 +201,3 @@ class TestChoice:
         idle.step(adam, strong(4, [0]), 499)
         assert idle.penalty(parameters) is None
         assert adam.parameters["means"] is parameters["means"]
-
-
-def test_quaternion_matrix_agrees_with_scipy() -> None:
-    quats = torch.randn(20, 4, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    expected = Rotation.from_quat(quats.numpy()[:, [1, 2, 3, 0]]).as_matrix()
-    torch.testing.assert_close(quaternion_matrix(quats), torch.from_numpy(expected))
