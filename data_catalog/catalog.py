@@ -1,7 +1,9 @@
 """The catalogue: names to sources, sources to sequences, and what a source is to a cache.
 
 A sequence is named `DATASET/SEQUENCE[@SETTING]` or is a path to a folder, whose format is recognised by
-what lies in it. `phantom/N@sparse` and `phantom/N@distanced` exist for every N and need no files.
+what lies in it. `phantom/N@sparse` and `phantom/N@distanced` exist for every N and need no files. Scenes of
+C3VD and C3VDv2 are made of several videos, one folder each: `c3vdv2/c1_cecum_t1@sparse` finds them below a
+data root, `FOLDER/c1_cecum_t1@sparse` in a folder that holds them.
 
 Named sets on disk are looked for in `$EXTRAGS_DATA`, then in `../shared/data` beside the working directory
 and beside the checkout.
@@ -19,6 +21,7 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict
 
+from data_catalog.c3vd.datasets import Recording, RecordingPair, datasets, find, find_recording, find_scene
 from data_catalog.formats import FolderFormat, folder_formats
 from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig, Setting
 from extrags.config import IngestConfig
@@ -67,6 +70,12 @@ class Descriptor(BaseModel):
     licence: str
     format: str
     """Reader: `phantom` or the name of a folder format."""
+    segment: str | None = None
+    """Part of the colon, where the dataset has parts."""
+    texture: str | None = None
+    """Texture of the segment, where there are several."""
+    videos: tuple[str, ...] = ()
+    """Which videos of the scene are used; the one that trains comes first."""
     folder: str | None = None
     """Folder below a data root; None where no files are needed."""
     available: bool = True
@@ -88,6 +97,10 @@ class Source(BaseModel):
     """Scene of the phantom."""
     setting: Setting | None = None
     """Setting of the phantom."""
+    pair: RecordingPair | None = None
+    """Two videos under a split manifest: `path` trains, `test_path` evaluates."""
+    test_path: str | None = None
+    """Folder of the video that evaluates."""
 
 
 _ON_DISK = (
@@ -129,7 +142,14 @@ def list_sequences() -> tuple[Descriptor, ...]:
     phantoms = (
         _describe_phantom(scene, setting) for scene in range(_LISTED_SCENES) for setting in get_args(Setting)
     )
-    return (*phantoms, *(_with_availability(descriptor) for descriptor in _ON_DISK))
+    videos: list[Recording | RecordingPair] = []
+    for dataset in datasets().values():
+        videos += [*dataset.pairs(), *dataset.recordings]
+    return (
+        *phantoms,
+        *(_with_availability(descriptor) for descriptor in _ON_DISK),
+        *(_describe_videos(item) for item in videos),
+    )
 
 
 def describe(name: str) -> Descriptor:
@@ -144,6 +164,9 @@ def describe(name: str) -> Descriptor:
     for descriptor in _ON_DISK:
         if name in (descriptor.name, descriptor.folder):
             return _with_availability(descriptor)
+    video = find(name)
+    if video is not None:
+        return _describe_videos(video)
     raise _unknown(name)
 
 
@@ -151,8 +174,9 @@ def resolve(name_or_path: str | Path) -> Source:
     """Find what a user named.
 
     Args:
-        name_or_path: `phantom/3@sparse` (without a setting: `sparse`), `sinus/hopkins`, `simcol3d/s1`, or
-            a path to a folder. A folder that exists wins over a name spelled the same.
+        name_or_path: `phantom/3@sparse` (without a setting: `sparse`), `sinus/hopkins`, `simcol3d/s1`,
+            `c3vdv2/c1_cecum_t1@sparse`, `FOLDER/c1_cecum_t1@sparse` for videos in a folder of their own, or
+            a path to a folder or a video. A path that exists wins over a name spelled the same.
 
     Raises:
         UnknownSequenceError: neither a known name nor an existing path; suggests the nearest name.
@@ -164,7 +188,7 @@ def resolve(name_or_path: str | Path) -> Source:
     if path.is_dir():
         return _resolve_folder(path)
     if path.exists():
-        raise SourceError("this is a file; expected a folder that holds a sequence", file=path)
+        return _resolve_file(path)
     phantom = _as_phantom(text)
     if phantom is not None:
         scene, setting = phantom
@@ -180,6 +204,12 @@ def resolve(name_or_path: str | Path) -> Source:
                     file=descriptor.folder,
                 )
             return Source(name=descriptor.name, format=descriptor.format, path=str(folder))
+    videos = find(text)
+    if videos is not None:
+        return _resolve_videos(videos, _data_roots())
+    scene_there = find_scene(path.name) if len(path.parts) > 1 and path.parent.is_dir() else None
+    if scene_there is not None:
+        return _resolve_videos(scene_there, [path.parent])
     raise _unknown(text)
 
 
@@ -207,7 +237,12 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> Seq
         check_sequence(sequence, file=source.name)
         return sequence
     folder = Path(str(source.path))
-    sequence = _format(source).read(folder, config, source.name)
+    if source.pair is not None:
+        from data_catalog.c3vd.reader import read_pair
+
+        sequence = read_pair(folder, Path(str(source.test_path)), source.pair, config)
+    else:
+        sequence = _format(source).read(folder, config, source.name)
     check_sequence(sequence, file=folder)
     return sequence
 
@@ -221,7 +256,8 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
 
     Returns:
         Plain JSON: for the phantom its settings and generator version; for a folder the reader's name and
-        version, and name, size and BLAKE2b digest of each file the reader looks at.
+        version, and name, size and BLAKE2b digest of each file the reader looks at; for two videos under a
+        split manifest the same of both, and the manifest's line.
 
     Raises:
         SourceError: the folder is not readable as a sequence.
@@ -236,14 +272,27 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
         }
     folder = Path(str(source.path))
     reader = _format(source)
+    fingerprint: dict[str, Any] = {"format": reader.name, "version": reader.version}
+    if source.pair is None:
+        root = folder if folder.is_dir() else folder.parent
+        # Of a single file the content counts, not what it is called.
+        listed = [
+            (f"source{file.suffix}" if file == folder else file.relative_to(root).as_posix(), file)
+            for file in reader.files(folder)
+        ]
+    else:
+        from data_catalog.c3vd.reader import pair_files
+
+        listed = pair_files(folder, Path(str(source.test_path)), source.pair)
+        fingerprint["split"] = source.pair.model_dump(mode="json")
     files = []
-    for file in reader.files(folder):
+    for name, file in listed:
         digest = hashlib.blake2b(digest_size=16)
         with file.open("rb") as stream:
             while block := stream.read(1 << 20):
                 digest.update(block)
-        files.append([file.relative_to(folder).as_posix(), file.stat().st_size, digest.hexdigest()])
-    return {"format": reader.name, "version": reader.version, "files": files}
+        files.append([name, file.stat().st_size, digest.hexdigest()])
+    return {**fingerprint, "files": files}
 
 
 def phantom_config(source: Source, config: IngestConfig) -> PhantomConfig:
@@ -308,6 +357,71 @@ def _describe_phantom(scene: int, setting: Setting) -> Descriptor:
     )
 
 
+def _describe_videos(item: Recording | RecordingPair) -> Descriptor:
+    if isinstance(item, RecordingPair):
+        used: tuple[Recording, ...] = (item.train, item.test)
+        frames, folder = item.frames, None
+        taken = "all" if item.train_every == 1 else f"every {item.train_every}th frame"
+        split = (
+            f"{taken} of {item.train.video} trains ({len(item.train_frames)} frames), all of "
+            f"{item.test.video} evaluates ({item.test.frames}); "
+            f"manifest {item.setting}, version {item.version}"
+        )
+    else:
+        used = (item,)
+        frames, folder = item.frames, item.stem
+        split = "every n-th frame held out (ingest.holdout_every)"
+    dataset = datasets()[used[0].dataset]
+    remarks = [
+        f"{video.video}: {dataset.remarks[video.video]}" for video in used if video.video in dataset.remarks
+    ]
+    title = f"{dataset.title}: {used[0].segment}, texture {used[0].texture}"
+    return Descriptor(
+        name=item.name,
+        description="; ".join([title, *remarks]),
+        frames=frames,
+        width=dataset.width,
+        height=dataset.height,
+        length_unit="mm",
+        axes="OpenCV camera axes, camera-to-world; fisheye resampled to a pinhole. Each video has a world of "
+        "its own: the one that trains keeps it",
+        has_depth=True,
+        has_poses=True,
+        split=split,
+        licence=dataset.licence,
+        format="c3vd",
+        segment=used[0].segment,
+        texture=used[0].texture,
+        videos=tuple(video.video for video in used),
+        folder=None if folder is None else f"{dataset.folders[0]}/{folder}",
+        available=all(_find_video(video, _data_roots()) is not None for video in used),
+    )
+
+
+def _find_video(video: Recording, roots: list[Path]) -> Path | None:
+    names = datasets()[video.dataset].folder_names(video)
+    return next((root / name for root in roots for name in names if (root / name).is_dir()), None)
+
+
+def _resolve_videos(item: Recording | RecordingPair, roots: list[Path]) -> Source:
+    folders = []
+    for video in (item.train, item.test) if isinstance(item, RecordingPair) else (item,):
+        folder = _find_video(video, roots)
+        if folder is None:
+            wanted = datasets()[video.dataset].folder_names(video)[0]
+            raise SourceNotFoundError(
+                f"{item.name} is not on this machine: no folder {wanted} in "
+                f"{', '.join(str(root) for root in roots)}. Put it there, set {DATA_ROOT_VARIABLE} to the "
+                f"folder that holds it, or give FOLDER/{item.name.partition('/')[2]} with the folder that "
+                "the videos lie in",
+                file=wanted,
+            )
+        folders.append(str(folder.resolve()))
+    if isinstance(item, RecordingPair):
+        return Source(name=item.name, format="c3vd", path=folders[0], test_path=folders[1], pair=item)
+    return Source(name=item.name, format="c3vd", path=folders[0])
+
+
 def _with_availability(descriptor: Descriptor) -> Descriptor:
     found = _find_folder(str(descriptor.folder)) is not None
     return descriptor.model_copy(update={"available": found})
@@ -339,10 +453,25 @@ def _resolve_folder(path: Path) -> Source:
                 ),
                 None,
             )
+            if candidate.name == "c3vd":
+                video = find_recording(path.resolve().name)
+                known = None if video is None else video.name
             return Source(name=known or path.resolve().name, format=candidate.name, path=str(path.resolve()))
     kinds = "; ".join(f"{candidate.name}: {candidate.summary}" for candidate in folder_formats())
     empty = "the folder is empty" if not any(path.iterdir()) else "no sequence recognised in this folder"
     raise SourceNotFoundError(f"{empty}; expected one of: {kinds}", file=path)
+
+
+def _resolve_file(path: Path) -> Source:
+    from data_catalog import video
+
+    if not video.FORMAT.recognises(path):
+        raise SourceError(
+            "this is a file; expected a folder that holds a sequence, or a video "
+            f"({', '.join(video.VIDEO_SUFFIXES)})",
+            file=path,
+        )
+    return Source(name=path.stem, format=video.FORMAT.name, path=str(path.resolve()))
 
 
 def _format(source: Source) -> FolderFormat:
@@ -361,5 +490,6 @@ def _unknown(name: str) -> UnknownSequenceError:
     return UnknownSequenceError(
         f"no sequence {name!r} in the catalogue and no such folder.{hint} "
         f"Known: phantom/N@sparse, phantom/N@distanced, {', '.join(d.name for d in _ON_DISK)}, "
+        f"{', '.join(f'{name}/...' for name in datasets())} (all of them: extrags data list), "
         "or the path of a folder"
     )

@@ -2,8 +2,8 @@
 
 What is refused: non-finite or mirrored poses, intrinsics that are no pinhole, depth with NaN, infinity or
 negative values (0 is the one mark for "unknown"; a reader whose format has others turns them into 0), a
-frame without any valid depth or mask, a split that leaks or points outside, and camera axes that depth
-itself contradicts.
+frame without any valid depth or mask, a split that leaks or points outside, and camera axes or a depth scale
+that depth itself contradicts. What is merely doubtful is told by `data_catalog.suspicions`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,17 @@ from extrags.cameras import as_rotation, invert_poses
 from extrags.errors import PoseError, SourceError
 from extrags.sequence import Sequence
 
-__all__ = ["check_axes", "check_depth", "check_intrinsics", "check_pose", "check_sequence"]
+__all__ = [
+    "axis_readings",
+    "check_axes",
+    "check_depth",
+    "check_depth_scale",
+    "check_intrinsics",
+    "check_pose",
+    "check_sequence",
+    "neighbouring_frames",
+    "reading_name",
+]
 
 # Below this depth re-projection error (relative, median) poses are right. Another reading of the axes is
 # named as the likely mistake when its error is small, and a small share of the error as given.
@@ -28,6 +38,19 @@ _CLEARLY_BETTER = 0.35
 _MIN_INSIDE_SHARE = 0.15
 _CHECKED_PAIRS = 6
 _CHECKED_POINTS = 400
+# Factors by which depth may be off: a tenth of a thousandth to ten thousand, in steps of 5 %.
+_DEPTH_FACTORS = np.exp(np.arange(-190, 191) * 0.05)
+_CLEARLY_OTHER_FACTOR = 1.5
+_KNOWN_FACTORS = {
+    1000.0: "depth in metres beside poses in millimetres",
+    0.001: "depth in millimetres beside poses in metres",
+    10.0: "depth in centimetres beside poses in millimetres",
+    0.1: "depth in millimetres beside poses in centimetres",
+    100.0: "depth in metres beside poses in centimetres",
+    0.01: "depth in centimetres beside poses in metres",
+    1 / 256: "16-bit codes that were not divided by 256",
+    100 / 65535: "16-bit codes of 0 to 100 mm that were not decoded",
+}
 
 
 def check_sequence(sequence: Sequence, *, file: object = None) -> None:
@@ -52,6 +75,7 @@ def check_sequence(sequence: Sequence, *, file: object = None) -> None:
         if sequence.depth_mm is not None:
             check_depth(sequence.depth_mm[index], frame=name, file=file)
     check_axes(sequence, file=file)
+    check_depth_scale(sequence, file=file)
 
 
 def check_pose(
@@ -146,7 +170,7 @@ def check_axes(sequence: Sequence, *, file: object = None) -> None:
     """
     if sequence.world_from_camera is None or sequence.depth_mm is None:
         return
-    pairs = _pairs(sequence)
+    pairs = neighbouring_frames(sequence)
     if not pairs:
         return
     poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
@@ -154,7 +178,7 @@ def check_axes(sequence: Sequence, *, file: object = None) -> None:
     if as_given < _SUSPICIOUS_ERROR:
         return
     best_error, best_name = as_given, ""
-    for axes in _axis_readings():
+    for axes in axis_readings():
         turn = np.eye(4)
         turn[:3, :3] = axes
         for inverted, base in ((False, poses), (True, invert_poses(poses))):
@@ -162,7 +186,7 @@ def check_axes(sequence: Sequence, *, file: object = None) -> None:
                 continue
             error = _reprojection_error(sequence, base @ turn, pairs)
             if error < best_error:
-                best_error, best_name = error, _reading_name(axes, inverted)
+                best_error, best_name = error, reading_name(axes, inverted)
     if best_error < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
         raise PoseError(
             f"the poses contradict the depth: carried from frame to frame it is off by {as_given:.0%} "
@@ -170,6 +194,45 @@ def check_axes(sequence: Sequence, *, file: object = None) -> None:
             "Expected OpenCV axes (x right, y down, z forward), camera to world",
             file=file,
             field="world_from_camera",
+        )
+
+
+def check_depth_scale(sequence: Sequence, *, file: object = None) -> None:
+    """Refuse depth in another unit than the poses.
+
+    Depth carried from frame to frame meets the next frame's depth only when both have one unit. Where it does
+    not, but does so with all depth times one factor, that factor is named. Frames without parallax tell
+    nothing.
+
+    Raises:
+        SourceError: another factor, at least 1.5 times more or less, fits much better.
+    """
+    pairs = neighbouring_frames(sequence)
+    if sequence.world_from_camera is None or sequence.depth_mm is None or not pairs:
+        return
+    poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
+    as_given = _reprojection_error(sequence, poses, pairs)
+    if as_given < _SUSPICIOUS_ERROR:
+        return
+
+    def error_with(factor: float) -> float:
+        # Depth times a factor beside these poses is this depth beside poses that move by less.
+        moved = poses.copy()
+        moved[:, :3, 3] /= factor
+        return _reprojection_error(sequence, moved, pairs)
+
+    errors = np.array([error_with(float(factor)) for factor in _DEPTH_FACTORS])
+    factor, best = float(_DEPTH_FACTORS[errors.argmin()]), float(errors.min())
+    clearly_other = max(factor, 1 / factor) >= _CLEARLY_OTHER_FACTOR
+    if clearly_other and best < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
+        nearest = min(_KNOWN_FACTORS, key=lambda known: abs(np.log(known / factor)))
+        hint = f", as of {_KNOWN_FACTORS[nearest]}" if abs(np.log(nearest / factor)) < 0.2 else ""
+        raise SourceError(
+            f"depth and poses are in different units: carried from frame to frame depth is off by "
+            f"{as_given:.0%} (median), but only by {best:.1%} when it is multiplied by about "
+            f"{factor:.3g}{hint}. Expected depth in the unit of the poses",
+            file=file,
+            field="depth_mm",
         )
 
 
@@ -196,13 +259,13 @@ def _check_split(sequence: Sequence, file: object) -> None:
         )
 
 
-def _pairs(sequence: Sequence) -> list[tuple[int, int]]:
-    """Neighbouring frames of one recording, spread over the sequence."""
+def neighbouring_frames(sequence: Sequence, at_most: int = _CHECKED_PAIRS) -> list[tuple[int, int]]:
+    """Neighbouring frames of one recording, at most so many pairs, spread over the sequence."""
     recording = np.zeros(len(sequence), dtype=int) if sequence.recording is None else sequence.recording
     neighbours = [(k, k + 1) for k in range(len(sequence) - 1) if recording[k] == recording[k + 1]]
-    if len(neighbours) <= _CHECKED_PAIRS:
+    if len(neighbours) <= at_most:
         return neighbours
-    chosen = np.round(np.linspace(0, len(neighbours) - 1, _CHECKED_PAIRS)).astype(int)
+    chosen = np.round(np.linspace(0, len(neighbours) - 1, at_most)).astype(int)
     return [neighbours[int(k)] for k in chosen]
 
 
@@ -244,7 +307,7 @@ def _reprojection_error(
     return float(np.mean(errors))
 
 
-def _axis_readings() -> list[Float[np.ndarray, "3 3"]]:
+def axis_readings() -> list[Float[np.ndarray, "3 3"]]:
     """The 24 rotations that map axes to axes; OpenGL's flip of y and z is one of them."""
     readings = []
     for order in itertools.permutations(range(3)):
@@ -256,7 +319,8 @@ def _axis_readings() -> list[Float[np.ndarray, "3 3"]]:
     return readings
 
 
-def _reading_name(axes: Float[np.ndarray, "3 3"], inverted: bool) -> str:
+def reading_name(axes: Float[np.ndarray, "3 3"], inverted: bool) -> str:
+    """What a user calls a reading of `axis_readings`."""
     letters = "xyz"
     parts = []
     for k in range(3):

@@ -23,6 +23,8 @@ class FolderFormat:
         recognises: whether a folder holds this format, from file names only.
         files: every file that `read` may look at, as a sorted list.
         read: the folder, the settings and the sequence's name to a checked `Sequence`.
+        conventions: axes and units on disk, in one line.
+        notes: what reading has to find out about this folder, as sentences; raises what `read` raises.
     """
 
     name: str
@@ -31,10 +33,32 @@ class FolderFormat:
     recognises: Callable[[Path], bool]
     files: Callable[[Path], list[Path]]
     read: Callable[[Path, IngestConfig, str], Sequence]
+    conventions: str = ""
+    notes: Callable[[Path], tuple[str, ...]] | None = None
 
 
 def folder_formats() -> tuple[FolderFormat, ...]:
     """All formats, the most specific first: a folder is read by the first that recognises it."""
-    from data_catalog import frames_folder, posed_folder, simcol, sinus
+    from data_catalog import (
+        colmap_model,
+        endonerf,
+        frames_folder,
+        posed_folder,
+        simcol,
+        sinus,
+        transforms_json,
+        video,
+    )
+    from data_catalog.c3vd import reader as c3vd
 
-    return (posed_folder.FORMAT, sinus.FORMAT, simcol.FORMAT, frames_folder.FORMAT)
+    return (
+        posed_folder.FORMAT,
+        sinus.FORMAT,
+        simcol.FORMAT,
+        c3vd.FORMAT,
+        transforms_json.FORMAT,
+        endonerf.FORMAT,
+        colmap_model.FORMAT,
+        video.FORMAT,
+        frames_folder.FORMAT,
+    )

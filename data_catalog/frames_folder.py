@@ -5,7 +5,8 @@ Images lie in the folder itself, or in `images/` or `rgb/` below it, and are tak
 `field_of_view_deg` (horizontal), in pixels of the files with centres at +0.5; and `mask.png` (white is
 tissue). Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log; lens
 distortion is not undone here. Without a mask, the dark frame round the picture is found from all frames: dark
-everywhere, always, and joined to the image border.
+everywhere, always, and joined to the image border; so are a round picture and burnt-in text
+(`data_catalog.content`).
 """
 
 from __future__ import annotations
@@ -15,9 +16,10 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float
 
 from data_catalog.checks import check_intrinsics
+from data_catalog.content import content_mask
 from data_catalog.formats import FolderFormat
 from data_catalog.images import Resampling, colour_files, read_colour, read_mask, spread
 from data_catalog.splits import every_nth
@@ -25,12 +27,11 @@ from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.sequence import Sequence
 
-__all__ = ["ASSUMED_FIELD_OF_VIEW_DEG", "FORMAT", "view_mask"]
+__all__ = ["ASSUMED_FIELD_OF_VIEW_DEG", "FORMAT", "read_intrinsics"]
 
 logger = logging.getLogger(__name__)
 
 ASSUMED_FIELD_OF_VIEW_DEG = 90.0
-_DARK = 14
 _NOT_FRAMES = ("mask.png",)
 
 
@@ -59,14 +60,16 @@ def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
     kept = [files[index] for index in spread(len(files), config.max_frames)]
     first = read_colour(kept[0], frame=kept[0].name)
     resampling = Resampling.planned(first.shape[1], first.shape[0], config)
-    K = _intrinsics(folder, first.shape[1], first.shape[0])
+    K = read_intrinsics(folder, first.shape[1], first.shape[0])
     # Shrunk before they are stacked: a long video at full size would not fit into memory.
     colours = np.stack(
         [resampling.colour(read_colour(file, frame=file.name), file=file, frame=file.name) for file in kept]
     )
     mask_file = folder / "mask.png"
     mask = (
-        resampling.mask(read_mask(mask_file), file=mask_file) if mask_file.is_file() else view_mask(colours)
+        resampling.mask(read_mask(mask_file), file=mask_file)
+        if mask_file.is_file()
+        else content_mask(colours)
     )
     return Sequence(
         name=name,
@@ -82,30 +85,26 @@ def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
 
 FORMAT = FolderFormat(
     name="frames",
-    version=1,
+    version=2,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
     read=_read,
+    conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
 )
 
 
-def view_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """False in the dark frame round an endoscope's picture.
+def read_intrinsics(folder: Path, width: int, height: int) -> Float[np.ndarray, "3 3"]:
+    """K from `intrinsics.json` in a folder, or of the assumed field of view where there is none.
 
-    A pixel is outside when it is dark in every frame and joined to the image border by such pixels: a dark
-    lumen in the middle stays inside.
+    Args:
+        folder: where the file is looked for.
+        width: of the images it belongs to, in pixels.
+        height: of the images it belongs to, in pixels.
+
+    Raises:
+        SourceError: the file is damaged or describes no pinhole.
     """
-    import cv2
-
-    dark = (rgb.max(axis=(0, 3)) < _DARK).astype(np.uint8)
-    _, labels = cv2.connectedComponents(dark, connectivity=4)
-    border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
-    outside = np.isin(labels, np.setdiff1d(border, 0)) & (dark > 0)
-    return np.asarray(~outside)
-
-
-def _intrinsics(folder: Path, width: int, height: int) -> Float[np.ndarray, "3 3"]:
     file = folder / "intrinsics.json"
     if not file.is_file():
         logger.warning(

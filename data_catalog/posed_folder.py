@@ -130,6 +130,7 @@ FORMAT = FolderFormat(
     recognises=_recognises,
     files=_files,
     read=_read,
+    conventions="OpenCV camera axes, camera to world, pixel centres at +0.5; z-depth",
 )
 
 

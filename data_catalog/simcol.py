@@ -115,6 +115,7 @@ FORMAT = FolderFormat(
     recognises=_recognises,
     files=_files,
     read=_read,
+    conventions="Unity axes (left-handed, y up), cm; turned into OpenCV's and mm on reading",
 )
 
 

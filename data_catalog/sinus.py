@@ -86,6 +86,7 @@ FORMAT = FolderFormat(
     recognises=_recognises,
     files=_files,
     read=_read,
+    conventions="OpenCV camera axes, camera to world; arbitrary unit",
 )
 
 

@@ -182,7 +182,7 @@ class CoarseConfig(StageConfig):
     )
     max_points: int = Field(12_000, ge=10, description="starting points at most")
     thickness: float = Field(
-        0.3,
+        0.1,
         gt=0,
         le=1,
         description="starting Gaussians are discs on the surface, so thick against their radius; 1: round",

@@ -164,13 +164,14 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         block_count=20_000,
         device=o3c.Device("CPU:0"),
     )
-    # Open3D has its pixel centres at integers. It refuses arrays whose byte order is spelled out, as
-    # those read by zarr have it; astype always leaves the machine's own.
+    # Open3D's voxel grid, unlike its older integration, has pixel centres at +0.5 as we have. It refuses
+    # arrays whose byte order is spelled out, as those read by zarr have it; astype always leaves the
+    # machine's own.
     K = cameras.K.astype(np.float64)
-    K[:, :2, 2] -= 0.5
     viewmats = cameras.viewmats.astype(np.float64)
     for index in range(len(cameras)):
-        if not (depth_mm[index] > 0).any():
+        # A view with nothing nearer than the limit touches no block, which Open3D takes for an error.
+        if not ((depth_mm[index] > 0) & (depth_mm[index] < far_mm)).any():
             continue
         image = o3d.t.geometry.Image(o3c.Tensor(depth_mm[index].astype(np.float32, order="C")))
         intrinsic, extrinsic = o3c.Tensor(K[index]), o3c.Tensor(viewmats[index])
@@ -189,7 +190,7 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
 
 def _canonical(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
-) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "t 3"]]:
+) -> tuple[Float[np.ndarray, "unique 3"], Int[np.ndarray, "distinct 3"]]:
     """Sorted vertices and triangles: Open3D's order varies from run to run, the positions do not."""
     # Adding zero turns -0.0 into 0.0, which would sort apart from it.
     unique, index = np.unique(vertices + np.float32(0), axis=0, return_inverse=True)

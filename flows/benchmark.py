@@ -1,41 +1,40 @@
-"""`benchmark`: run time against error over methods, profiles and seeds (JSON of design section 7)."""
+"""`benchmark`: methods compared over sequences, profiles and seeds (JSON of design section 7, and more)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 from prefect import flow
 from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
 from extrags.errors import ConfigError
-from flows.outcome import SequenceFailedError, SequenceOutcome
+from flows.methods import METHODS, MethodName, method_config
+from flows.outcome import SequenceOutcome
+from flows.pages import benchmark_page
 from flows.runners import PrefectRunner, Runner
 from flows.sequence import artifact_key, open_store
-from flows.settings import DEFAULT_STORE, ProfileName, pipeline_config
-from flows.tables import METRICS, figure, markdown_table
+from flows.settings import DEFAULT_STORE, ProfileName
+from flows.tables import benchmark_markdown
 from flows.wiring import run_sequence
 
-__all__ = ["METHODS", "MethodName", "benchmark", "case_of", "run_method"]
-
-MethodName = Literal["coarse", "extrags", "classical", "real-only"]
-
-METHODS: dict[str, str] = {
-    "coarse": "the coarse scene alone",
-    "extrags": "explored, restored by the diffusion, fine-tuned",
-    "classical": "the same with the classical fill instead of the diffusion",
-    "real-only": "fine-tuned on the real views alone: the control",
-}
-
-_EXPLORING = ("surface", "freespace", "explore", "enhance")
-_LEFT_OUT = {
-    "coarse": dict.fromkeys([*_EXPLORING, "finetune"], "the run measures the coarse scene"),
-    "real-only": dict.fromkeys(_EXPLORING, "the run is a control on real views alone"),
-}
+__all__ = ["Case", "benchmark", "case_of", "check_methods", "run_method"]
 
 NOT_COUNTED = frozenset({"evaluate", "report"})
 """Stages that measure a method are no part of its run time."""
+PREFERRED_BASELINE = "3dgs"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run of a benchmark."""
+
+    method: str
+    profile: str
+    seed: int
+    outcome: SequenceOutcome
 
 
 @flow(name="benchmark", flow_run_name="{name}", log_prints=False, persist_result=False)
@@ -47,37 +46,108 @@ def benchmark(
         "extrags",
     ],
     seeds: Annotated[list[int], Field(min_length=1, description="one run per seed")] = [0],  # noqa: B006
-    settings: Annotated[dict[str, Any] | None, Field(description="overrides for all runs")] = None,
+    settings: Annotated[
+        dict[str, Any] | None,
+        Field(description="overrides for all runs; they do not reach what a method pins"),
+    ] = None,
+    variants: Annotated[
+        dict[str, dict[str, Any]] | None,
+        Field(
+            description='further methods by name, e.g. {"no-light": {"coarse.light.enabled": false}}: '
+            "`coarse`, or the method under the key `method`, with other settings"
+        ),
+    ] = None,
+    baseline: Annotated[
+        str | None,
+        Field(description="method the others are compared with; 3dgs if it is there, else the first"),
+    ] = None,
     store: Annotated[str, Field(description="directory or URL of the artefact store")] = DEFAULT_STORE,
-    name: Annotated[str, Field(description="name of this run, for its table")] = "benchmark",
+    name: Annotated[str, Field(description="name of this run, for its table and page")] = "benchmark",
 ) -> dict[str, Any]:
-    """Measure every combination.
+    """Measure every combination, and compare the methods pair by pair.
 
     What is in the store already is not run again: its time is what it took when it was made. Delete it
-    (`extrags cache rm`) to measure anew.
+    (`extrags cache rm`) to measure anew. A run that fails does not stop the others.
 
     Returns:
-        `{machine, cases: [{method, profile, sequence, setting, seed, seconds, peak_mib, metrics}]}`.
+        `{machine, cases: [{method, profile, sequence, setting, seed, seconds, peak_mib, metrics, ...}],
+        comparison, report}`; `metrics` is None for a failed run, whose `error` says why. `comparison` is
+        `extrags.metrics.comparison.compare_runs`; beside `report` stand `per_view.json` and
+        `comparison.json`.
 
     Raises:
-        SequenceFailedError: when a run fails.
+        ConfigError: for an unknown method or baseline, or a setting that is wrong.
     """
+    baseline = check_methods(methods, variants or {}, baseline)
     open_store(store)
     runner = PrefectRunner(store)
-    cases = [
-        run_method(method, sequence, profile, seed, settings, store, runner)
+    wanted = [*methods, *(variants or {})]
+    for method in wanted:
+        for profile in profiles:
+            # Wrong settings concern all runs: say so before the first hour.
+            _config_of(method, profile, settings, variants or {}, 0)
+    found = [
+        run_method(method, sequence, profile, seed, settings, store, runner, variants=variants)
         for sequence in sequences
         for profile in profiles
         for seed in seeds
-        for method in methods
+        for method in wanted
     ]
+    cases = [case_of(case) for case in found]
+    words = {method: summary_of(method, variants or {}) for method in wanted}
+    page = benchmark_page([case.outcome for case in found], cases, words, baseline, name, runner)
     create_markdown_artifact(
-        benchmark_markdown(cases), key=artifact_key("benchmark", name), description=f"{len(cases)} cases"
+        benchmark_markdown(cases, baseline),
+        key=artifact_key("benchmark", name),
+        description=f"{len(cases)} runs",
     )
-    # Here, because it loads torch and the kernels, which looking up a deployment must not.
+    # Here, because they load torch and the kernels, which looking up a deployment must not.
+    from extrags.metrics.comparison import compare_runs
     from extrags.raster.bench import machine
 
-    return {"machine": machine(), "cases": cases}
+    return {
+        "machine": machine(),
+        "cases": cases,
+        "comparison": compare_runs(cases, baseline),
+        "report": page,
+    }
+
+
+def check_methods(
+    methods: Sequence[str], variants: dict[str, dict[str, Any]], baseline: str | None = None
+) -> str:
+    """The baseline, after a look at the names.
+
+    Raises:
+        ConfigError: for unknown methods, names that are there twice, or a baseline that is not run.
+    """
+    for method in methods:
+        if method not in METHODS:
+            raise ConfigError(f"no method {method!r}; known: {', '.join(METHODS)}")
+    wanted = [*methods, *variants]
+    taken = [name for name in variants if name in METHODS]
+    if taken:
+        raise ConfigError(f"a variant cannot have a method's name: {', '.join(taken)}")
+    if len(set(wanted)) != len(wanted):
+        raise ConfigError(f"a method is named twice: {', '.join(wanted)}")
+    for name, changed in variants.items():
+        base = changed.get("method", "coarse")
+        if base not in METHODS:
+            raise ConfigError(f"variant {name}: no method {base!r}; known: {', '.join(METHODS)}")
+    if baseline is None:
+        return PREFERRED_BASELINE if PREFERRED_BASELINE in wanted else wanted[0]
+    if baseline not in wanted:
+        raise ConfigError(f"the baseline {baseline!r} is not among the methods: {', '.join(wanted)}")
+    return baseline
+
+
+def summary_of(method: str, variants: dict[str, dict[str, Any]]) -> str:
+    """What a method or variant is, in words."""
+    if method not in variants:
+        return METHODS[method].summary
+    base, settings = _variant(method, variants)
+    changed = ", ".join(f"{name} = {value}" for name, value in settings.items())
+    return f"{base} with {changed or 'nothing changed'}"
 
 
 def run_method(
@@ -88,19 +158,16 @@ def run_method(
     settings: dict[str, Any] | None,
     store: str,
     runner: Runner,
-) -> dict[str, Any]:
-    """One case: run it, or take it from the store.
+    *,
+    variants: dict[str, dict[str, Any]] | None = None,
+) -> Case:
+    """One case: run it, or take it from the store. A failing stage is in the outcome and is not raised.
 
     Raises:
-        ConfigError: for an unknown method.
-        SequenceFailedError: when a stage fails.
+        ConfigError: for an unknown method or setting.
     """
-    if method not in METHODS:
-        raise ConfigError(f"no method {method!r}; known: {', '.join(METHODS)}")
-    overrides = dict(settings or {})
-    if method == "classical":
-        overrides["enhance.backend"] = "classical"
-    config = pipeline_config(profile, overrides, seed)
+    base, _ = _variant(method, variants or {})
+    config = _config_of(method, profile, settings, variants or {}, seed)
     outcome = run_sequence(
         sequence,
         config,
@@ -108,49 +175,52 @@ def run_method(
         runner,
         profile=profile,
         until="evaluate",
-        leave_out=_LEFT_OUT.get(method),
+        leave_out=METHODS[base].leave_out or None,
     )
-    if outcome.status == "failed":
-        raise SequenceFailedError(outcome) from outcome.error
-    return case_of(outcome, method, profile, seed)
+    return Case(method, profile, seed, outcome)
 
 
-def case_of(outcome: SequenceOutcome, method: str, profile: str, seed: int) -> dict[str, Any]:
-    """A finished run as a benchmark case.
+def case_of(case: Case) -> dict[str, Any]:
+    """A run as JSON.
 
     `seconds` is what its stages took when they were made, without evaluation and report; `peak_mib` the
-    largest resident memory of the process meanwhile.
+    largest resident memory of the process meanwhile; `evaluation` where the figures of each view are.
     """
+    outcome = case.outcome
     rows = [row for row in outcome.stages if row.stage not in NOT_COUNTED]
     peaks = [row.peak_mib for row in rows if row.peak_mib is not None]
     name, _, setting = outcome.name.partition("@")
+    failed = next((row for row in outcome.stages if row.state == "failed"), None)
+    measured = outcome.artefacts.get("metrics_final", outcome.artefacts.get("metrics_coarse"))
     return {
-        "method": method,
-        "profile": profile,
+        "method": case.method,
+        "profile": case.profile,
         "sequence": name,
         "setting": setting or None,
-        "seed": seed,
+        "seed": case.seed,
         "seconds": round(sum(row.made_seconds for row in rows), 3),
         "peak_mib": max(peaks) if peaks else None,
-        "metrics": outcome.metrics["final"],
+        "metrics": outcome.metrics["final"] if failed is None else None,
+        "evaluation": None if measured is None else f"{measured}/metrics.json",
+        "error": "" if failed is None else f"{failed.stage}: {failed.reason}",
     }
 
 
-def benchmark_markdown(cases: Sequence[dict[str, Any]]) -> str:
-    """One row per case."""
-    return markdown_table(
-        ["sequence", "setting", "profile", "method", "seed", "seconds", "MiB", *METRICS],
-        [
-            [
-                case["sequence"],
-                case["setting"] or "",
-                case["profile"],
-                case["method"],
-                case["seed"],
-                f"{case['seconds']:.1f}",
-                "" if case["peak_mib"] is None else f"{case['peak_mib']:.0f}",
-                *(figure(name, (case["metrics"] or {}).get(name)) for name in METRICS),
-            ]
-            for case in cases
-        ],
-    )
+def _variant(method: str, variants: dict[str, dict[str, Any]]) -> tuple[str, dict[str, Any]]:
+    """The method behind a name, and the settings a variant changes."""
+    if method not in variants:
+        return method, {}
+    changed = dict(variants[method])
+    return str(changed.pop("method", "coarse")), changed
+
+
+def _config_of(
+    method: str,
+    profile: str,
+    settings: dict[str, Any] | None,
+    variants: dict[str, dict[str, Any]],
+    seed: int,
+) -> Any:
+    base, changed = _variant(method, variants)
+    # A variant is a method with something changed: its settings come last.
+    return method_config(base, profile, settings, seed).with_overrides(changed)

@@ -14,15 +14,21 @@ from typing import Any
 __all__ = ["main", "parser"]
 
 OK, FAILED, USAGE = 0, 1, 2
+METHOD_NAMES = ("extrags", "coarse", "3dgs", "classical", "real-only")
+"""Those of `flows.methods`, written down again: importing it would load pydantic. A test compares them."""
 
 EXAMPLES = """examples:
   extrags run phantom/0@sparse --profile quick
   extrags run phantom/0@sparse phantom/0@distanced --seed 1 --json results.json
   extrags run frames/ --set coarse.iterations=500 --set enhance.backend=classical
   extrags plan phantom/0@sparse
+  extrags evaluate phantom/0@sparse --renders my_renders/ --json -
+  extrags benchmark phantom/0@sparse phantom/1@sparse --methods 3dgs,coarse --seeds 0,1,2
+  extrags data check my_video.mp4 my_colmap_scene/
+  extrags export phantom/0@sparse --to colmap --out scene/
   extrags cache rm 'explore*'
 
-A sequence is DATASET/SEQUENCE[@SETTING] (see `extrags data list`) or the path of a folder.
+A sequence is DATASET/SEQUENCE[@SETTING] (see `extrags data list`) or the path of a folder or a video.
 Exit codes: 0 all well, 1 a sequence failed, 2 wrong usage."""
 
 
@@ -43,6 +49,8 @@ def parser() -> argparse.ArgumentParser:
     _add_export(verbs)
     _add_data(verbs)
     _add_cache(verbs)
+    _add_evaluate(verbs)
+    _add_benchmark(verbs)
     _add_bench(verbs)
     return root
 
@@ -122,6 +130,12 @@ def _add_settings(made: argparse.ArgumentParser) -> None:
         help="override one setting, e.g. coarse.iterations=500; repeatable",
     )
     made.add_argument("--seed", type=int, metavar="N", help="seed of all stages (default: each stage's own)")
+    made.add_argument(
+        "--method",
+        choices=METHOD_NAMES,
+        default="extrags",
+        help="the whole pipeline (default), the coarse scene alone, plain 3DGS, ...",
+    )
     _add_store(made)
 
 
@@ -183,23 +197,72 @@ def _add_report(verbs: Any) -> None:
 
 
 def _add_export(verbs: Any) -> None:
-    made = _verb(verbs, "export", "export.export", "write a reconstructed scene as PLY")
+    made = _verb(
+        verbs,
+        "export",
+        "export.export",
+        "write a reconstructed scene as PLY, or a sequence as COLMAP model or transforms.json",
+        description="Write a finished run's scene as PLY, or a sequence with its poses, images, masks, depth "
+        "and points for COLMAP or nerfstudio. Poses that a run has estimated are taken from its store.",
+    )
     made.add_argument("sequence", metavar="SEQUENCE")
     _add_settings(made)
     made.add_argument(
-        "--scene", choices=("final", "coarse"), default="final", help="which scene (default: final)"
+        "--to",
+        choices=("ply", "colmap", "colmap-text", "transforms"),
+        default="ply",
+        help="ply: the scene; the others: the sequence (default: ply)",
     )
-    made.add_argument("-o", "--output", required=True, metavar="FILE.ply", help="file to write")
+    made.add_argument(
+        "--scene", choices=("final", "coarse"), default="final", help="which scene, for ply (default: final)"
+    )
+    made.add_argument(
+        "-o", "--output", "--out", required=True, metavar="FILE.ply|DIR", help="file, or folder to write into"
+    )
 
 
 def _add_data(verbs: Any) -> None:
-    data = verbs.add_parser("data", help="what sequences there are", description="What sequences there are.")
-    inner = data.add_subparsers(dest="what", metavar="list|show", required=True)
-    made = _verb(inner, "list", "data.list_all", "all named sequences")
+    data = verbs.add_parser(
+        "data",
+        help="what sequences there are, and whether a source is right",
+        description="What sequences there are, what is in one, and what is wrong with one.",
+    )
+    inner = data.add_subparsers(dest="what", metavar="list|show|check", required=True)
+    made = _verb(inner, "list", "data.list_all", "all named sequences, and whether they can be read here")
+    made.add_argument("pattern", nargs="?", default="*", help="shell pattern or beginning of a name")
+    made.add_argument("--here", action="store_true", help="only those whose data are on this machine")
     _add_json(made)
-    made = _verb(inner, "show", "data.show", "what is known about one sequence")
+    made = _verb(inner, "show", "data.show", "what is known about one sequence, and what its frames hold")
     made.add_argument("sequence", metavar="SEQUENCE")
+    _add_ingest(made)
+    made.add_argument(
+        "--picture",
+        metavar="FILE.png",
+        help="write a contact sheet: masks blue, highlights green, held-out framed",
+    )
     _add_json(made)
+    made = _verb(
+        inner,
+        "check",
+        "data.check",
+        "say what is wrong with a source",
+        description="Read a source and say what is wrong with it: axes, pose direction, depth scale, mask "
+        "polarity, intrinsics, exposure, parallax, names. Exit code 1 when anything is.",
+    )
+    made.add_argument("sources", nargs="+", metavar="PATH|SEQUENCE")
+    _add_ingest(made)
+    _add_json(made)
+
+
+def _add_ingest(made: argparse.ArgumentParser) -> None:
+    made.add_argument(
+        "--set",
+        dest="settings",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="override one setting of ingest, e.g. ingest.downscale=2; repeatable",
+    )
 
 
 def _add_cache(verbs: Any) -> None:
@@ -228,42 +291,155 @@ def _add_cache(verbs: Any) -> None:
     _add_store(made)
 
 
+def _add_evaluate(verbs: Any) -> None:
+    made = _verb(
+        verbs,
+        "evaluate",
+        "evaluate.evaluate",
+        "measure renders made elsewhere, or show the figures of a finished run",
+        description="Measure a folder of renders of the held-out frames by the protocol of "
+        "extrags/metrics/PROTOCOL.md; without --renders, show the figures of a run that is in the store.",
+    )
+    made.add_argument("sequence", metavar="SEQUENCE")
+    made.add_argument(
+        "--renders",
+        metavar="FOLDER",
+        help="8-bit images of the sequence's size, named after the held-out frames or numbered in order",
+    )
+    made.add_argument(
+        "--depth", metavar="FOLDER", help="z-depth of the same frames: .npy, or 16-bit PNG or TIFF; 0: none"
+    )
+    made.add_argument(
+        "--depth-step", type=float, metavar="MM", help="what one level of an integer depth image stands for"
+    )
+    _add_settings(made)
+    _add_json(made)
+
+
+def _add_benchmark(verbs: Any) -> None:
+    made = _verb(
+        verbs,
+        "benchmark",
+        "benchmark.benchmark",
+        "compare methods over sequences and seeds",
+        description="Run every method on every sequence with every seed, and compare them pair by pair. What "
+        "is in the store already is taken from there with the time it took when it was made.",
+    )
+    _add_benchmark_runs(made)
+
+
+def _add_benchmark_runs(made: argparse.ArgumentParser) -> None:
+    many: dict[str, Any] = {"nargs": "+"}
+    made.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    made.add_argument(
+        "--methods",
+        **many,
+        default=["coarse", "extrags"],
+        metavar="METHOD",
+        help=f"of {', '.join(METHOD_NAMES)} (default: coarse extrags)",
+    )
+    made.add_argument(
+        "--variant",
+        dest="variants",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("NAME", "METHOD|SETTING=VALUE"),
+        help="a further method: coarse, or METHOD, with other settings; repeatable",
+    )
+    made.add_argument(
+        "--baseline", metavar="METHOD", help="what the others are compared with (default: 3dgs)"
+    )
+    made.add_argument("--seeds", **many, default=["0"], metavar="N", help="e.g. 0,1,2 (default: 0)")
+    made.add_argument(
+        "--profiles", **many, default=["quick"], metavar="PROFILE", help="named settings (default: quick)"
+    )
+    made.add_argument(
+        "--set",
+        dest="settings",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="override one setting of all runs; repeatable",
+    )
+    made.add_argument("--name", default="benchmark", help="title of the page")
+    _add_store(made)
+    _add_runner(made)
+    _add_json(made)
+
+
+_KERNELS: dict[str, Any] = {
+    "formatter_class": argparse.RawDescriptionHelpFormatter,
+    "epilog": """examples:
+  --size 160x128 --gaussians 10000
+  --size 160x128,320x256 --gaussians 10000,30000 --threads 1 2 --json -
+  --quick --peers torch,reference
+
+peers: torch (batched tiles, float32), reference (the specification, float64), gsplat (CUDA).
+A size goes with the number of Gaussians at the same place in the list.""",
+}
+
+
+def _add_kernel_cases(made: argparse.ArgumentParser, *, with_error: bool) -> None:
+    many: dict[str, Any] = {"nargs": "+", "action": "extend"}
+    made.add_argument(
+        "--size",
+        metavar="WxH",
+        **many,
+        help="image sizes (default: 160x128 320x256 640x512, with 10000 30000 100000 Gaussians)",
+    )
+    made.add_argument("--gaussians", metavar="N", **many, help="numbers of Gaussians, one per size")
+    made.add_argument("--quick", action="store_true", help="the smallest standard size only")
+    made.add_argument(
+        "--peers",
+        metavar="PEER",
+        **many,
+        help="what to run beside the native kernels (default: torch; native: nothing)",
+    )
+    made.add_argument("--threads", metavar="N", **many, help="numbers of threads to measure (default: 1 2)")
+    made.add_argument("--rounds", type=int, default=20, metavar="N", help="timed rounds (default: 20)")
+    made.add_argument(
+        "--error",
+        action=argparse.BooleanOptionalAction,
+        default=with_error,
+        help=f"compare image and gradients with float64 (default: {'yes' if with_error else 'no'})",
+    )
+
+
 def _add_bench(verbs: Any) -> None:
     bench = verbs.add_parser(
         "bench", help="benchmarks", description="Measure speed and error of the parts or of the whole."
     )
-    inner = bench.add_subparsers(dest="what", metavar="raster|train|pipeline", required=True)
-    for name, summary in (
-        ("raster", "time and error of the rasteriser's backends"),
-        ("train", "time of one training iteration"),
+    inner = bench.add_subparsers(dest="what", metavar="raster|train|stability|pipeline", required=True)
+    for name, summary, with_error in (
+        ("raster", "time and error of the rasteriser, forward and backward", True),
+        ("train", "time of a whole training iteration: render, loss, backward, Adam", False),
     ):
-        made = _verb(inner, name, f"bench.{name}", summary)
-        made.add_argument("--quick", action="store_true", help="the smallest size only")
-        made.add_argument(
-            "--threads", nargs="+", type=int, default=[1, 2], metavar="N", help="threads of the kernels"
-        )
+        made = _verb(inner, name, f"bench.{name}", summary, **_KERNELS)
+        _add_kernel_cases(made, with_error=with_error)
         _add_json(made)
     made = _verb(
         inner,
+        "stability",
+        "bench.stability",
+        "numbers at the edges of what the rasteriser can be given",
+        description="Render and differentiate scenes at the edges of what float32 holds, and say what is not "
+        "finite or not what the float64 specification gives. Exit code 1 if a case fails.",
+    )
+    made.add_argument("--axis", nargs="+", metavar="NAME", help="these axes only (default: all)")
+    made.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="threads of the kernels (default: 1)"
+    )
+    _add_json(made)
+    made = _verb(
+        inner,
         "pipeline",
-        "bench.pipeline",
-        "run time against error of whole runs",
+        "benchmark.benchmark",
+        "run time against error of whole runs: the same as `extrags benchmark`",
         description="Run the whole job over methods, profiles and seeds; what is in the store already is "
         "taken from there with the time it took when it was made.",
     )
-    made.add_argument("sequences", nargs="+", metavar="SEQUENCE")
-    made.add_argument("--profiles", nargs="+", default=["quick"], choices=("quick", "balanced", "paper"))
-    made.add_argument(
-        "--methods",
-        nargs="+",
-        default=["coarse", "extrags"],
-        help="coarse, extrags, classical, real-only (default: coarse extrags)",
-    )
-    made.add_argument("--seeds", nargs="+", type=int, default=[0], metavar="N")
-    made.add_argument("--set", dest="settings", metavar="NAME=VALUE", action="append", default=[])
-    _add_store(made)
-    _add_runner(made)
-    _add_json(made)
+    _add_benchmark_runs(made)
 
 
 if __name__ == "__main__":

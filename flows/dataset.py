@@ -12,11 +12,12 @@ from prefect.artifacts import create_markdown_artifact
 from prefect.client.schemas.objects import State
 from pydantic import Field
 
+from flows.methods import MethodName, method_config, profile_label, refuse_pinned
 from flows.outcome import DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
 from flows.runners import PrefectRunner
 from flows.sequence import artifact_key, open_store, reconstruct_sequence
-from flows.settings import DEFAULT_STORE, ProfileName, StageName, pipeline_config, task_runner
+from flows.settings import DEFAULT_STORE, ProfileName, StageName, task_runner
 from flows.tables import dataset_markdown
 
 __all__ = ["reconstruct_dataset"]
@@ -36,6 +37,9 @@ def reconstruct_dataset(
     runner: Annotated[str, Field(description="threads, dask or dask:ADDRESS")] = "threads",
     at_once: Annotated[int, Field(ge=1, description="sequences in work at the same time")] = 1,
     name: Annotated[str, Field(description="name of this run, for its table")] = "dataset",
+    method: Annotated[
+        MethodName, Field(description="the whole pipeline, or one it is compared with")
+    ] = "extrags",
 ) -> DatasetOutcome:
     """Take every sequence through all stages, each as a flow run of its own.
 
@@ -43,7 +47,8 @@ def reconstruct_dataset(
         One outcome per sequence, in the order given; failures among them. The summary is an artifact.
     """
     # Wrong settings and a store that cannot be written concern all sequences: say so once, at once.
-    pipeline_config(profile, settings, seed)
+    refuse_pinned(method, settings or {})
+    method_config(method, profile, settings, seed)
     open_store(store)
     one = reconstruct_sequence.with_options(task_runner=task_runner(runner))
 
@@ -56,6 +61,7 @@ def reconstruct_dataset(
             store=store,
             refresh=refresh,
             until=until,
+            method=method,
             return_state=True,
         )
         return outcome_of(sequence, state)
@@ -69,7 +75,8 @@ def reconstruct_dataset(
             outcomes = [future.result() for future in futures]
     page = None
     if until == "report":
-        page = dataset_page(outcomes, name, profile, PrefectRunner(store, refresh))
+        label = profile_label(profile, method)
+        page = dataset_page(outcomes, name, label, PrefectRunner(store, refresh))
     create_markdown_artifact(
         dataset_markdown(outcomes),
         key=artifact_key("dataset", name),

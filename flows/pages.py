@@ -1,15 +1,20 @@
-"""The page that compares the sequences of a run."""
+"""The pages that compare the sequences of a run, and the methods of a benchmark."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from extrags.store import Ref
 from flows.outcome import SequenceOutcome
 from flows.runners import Call, Runner
+from tasks.benchmark import benchmark_report
 from tasks.report import PAGE, dataset_report
 
-__all__ = ["dataset_page"]
+__all__ = ["benchmark_page", "dataset_page"]
+
+COMPARED_VIEWS = 4
+"""Held-out views of each sequence that are shown side by side."""
 
 
 def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, runner: Runner) -> str:
@@ -28,9 +33,7 @@ def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, r
         NotInStoreError: from a runner that only looks.
     """
     metrics = {
-        f"{outcome.name} {which}": Ref(
-            uri=outcome.artefacts[f"metrics_{which}"], digest=outcome.digests[f"metrics_{which}"]
-        )
+        f"{outcome.name} {which}": _ref(outcome, f"metrics_{which}")
         for outcome in outcomes
         for which in ("coarse", "final")
         if f"metrics_{which}" in outcome.artefacts
@@ -52,3 +55,78 @@ def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, r
     }
     (page,) = runner.run([Call(dataset_report, inputs)], name)
     return f"{page.ref.uri}/{PAGE}"
+
+
+def benchmark_page(
+    outcomes: Sequence[SequenceOutcome],
+    cases: Sequence[Mapping[str, Any]],
+    methods: Mapping[str, str],
+    baseline: str,
+    name: str,
+    runner: Runner,
+) -> str:
+    """Make the page of a benchmark.
+
+    Of each sequence and setting, the first seed and profile in which both came to figures is shown in
+    pictures: the baseline beside the last of the other methods.
+
+    Args:
+        outcomes: of the runs.
+        cases: the same as JSON, in the same order.
+        methods: what each method is, in words.
+        baseline: method the others are compared with.
+        name: title.
+        runner: how artefacts are made.
+
+    Returns:
+        Where it stands.
+    """
+    contender = [method for method in methods if method != baseline][-1:]
+    pictures = [pair for method in contender for pair in _pairs(cases, baseline, method)]
+    shown = sorted({pair[side] for pair in pictures for side in ("baseline", "contender")}, key=int)
+    keys = ("method", "profile", "sequence", "setting", "seed")
+    inputs = {
+        "name": name,
+        "baseline": baseline,
+        "methods": dict(methods),
+        "runs": [{key: case[key] for key in keys} for case in cases],
+        "metrics": {
+            str(index): _final(outcome, "metrics")
+            for index, (outcome, case) in enumerate(zip(outcomes, cases, strict=True))
+            if case["metrics"] is not None
+        },
+        "failures": {str(index): case["error"] for index, case in enumerate(cases) if case["error"]},
+        "pictures": pictures,
+        "sequences": {index: _ref(outcomes[int(index)], "sequence") for index in shown},
+        "renders": {index: _final(outcomes[int(index)], "renders") for index in shown},
+        "views": COMPARED_VIEWS,
+        "rows": [{key: case[key] for key in ("seconds", "peak_mib")} for case in cases],
+    }
+    (page,) = runner.run([Call(benchmark_report, inputs)], name)
+    return f"{page.ref.uri}/{PAGE}"
+
+
+def _pairs(cases: Sequence[Mapping[str, Any]], baseline: str, contender: str) -> list[dict[str, str]]:
+    """Runs by index that share all but the method, one pair for each sequence and setting."""
+    measured = {
+        (case["sequence"], case["setting"], case["profile"], case["seed"], case["method"]): str(index)
+        for index, case in enumerate(cases)
+        if case["metrics"] is not None
+    }
+    pairs: dict[tuple[Any, ...], dict[str, str]] = {}
+    for key, index in measured.items():
+        *shared, method = key
+        other = measured.get((*shared, contender))
+        if method == baseline and other is not None:
+            label = f"profile {key[2]}, seed {key[3]}"
+            pairs.setdefault(key[:2], {"baseline": index, "contender": other, "label": label})
+    return list(pairs.values())
+
+
+def _final(outcome: SequenceOutcome, kind: str) -> Ref:
+    """Metrics or renders of the final scene; where nothing was fine-tuned, of the coarse one."""
+    return _ref(outcome, f"{kind}_final" if f"{kind}_final" in outcome.artefacts else f"{kind}_coarse")
+
+
+def _ref(outcome: SequenceOutcome, name: str) -> Ref:
+    return Ref(uri=outcome.artefacts[name], digest=outcome.digests[name])

@@ -11,9 +11,10 @@ from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
 from extrags.store import Store
+from flows.methods import METHODS, MethodName, method_config, profile_label, refuse_pinned
 from flows.outcome import SequenceFailedError, SequenceOutcome
 from flows.runners import PrefectRunner
-from flows.settings import DEFAULT_STORE, ProfileName, StageName, pipeline_config
+from flows.settings import DEFAULT_STORE, ProfileName, StageName
 from flows.tables import sequence_markdown
 from flows.wiring import run_sequence
 from tasks.locks import sweep_locks
@@ -34,6 +35,9 @@ def reconstruct_sequence(
     store: Annotated[str, Field(description="directory or URL of the artefact store")] = DEFAULT_STORE,
     refresh: Annotated[bool, Field(description="run every stage although its artefact is there")] = False,
     until: Annotated[StageName, Field(description="last stage to run")] = "report",
+    method: Annotated[
+        MethodName, Field(description="the whole pipeline, or one it is compared with")
+    ] = "extrags",
 ) -> SequenceOutcome:
     """Reconstruct, explore, restore and evaluate one sequence.
 
@@ -43,10 +47,17 @@ def reconstruct_sequence(
     Raises:
         SequenceFailedError: when a stage failed; what was finished stays in the store.
     """
-    config = pipeline_config(profile, settings, seed)
+    refuse_pinned(method, settings or {})
+    config = method_config(method, profile, settings, seed)
     open_store(store)
     outcome = run_sequence(
-        sequence, config, store, PrefectRunner(store, refresh), profile=profile, until=until
+        sequence,
+        config,
+        store,
+        PrefectRunner(store, refresh),
+        profile=profile_label(profile, method),
+        until=until,
+        leave_out=METHODS[method].leave_out,
     )
     create_markdown_artifact(
         sequence_markdown(outcome),

@@ -7,9 +7,20 @@ from typing import Any
 
 from flows.outcome import SequenceOutcome
 
-__all__ = ["METRICS", "dataset_markdown", "figure", "markdown_table", "sequence_markdown"]
+__all__ = [
+    "DIFFERENCES",
+    "METRICS",
+    "benchmark_markdown",
+    "dataset_markdown",
+    "difference_text",
+    "figure",
+    "markdown_table",
+    "sequence_markdown",
+    "spread_text",
+]
 
 METRICS = ("psnr", "ssim", "lpips_alex", "flip", "depth_absrel")
+DIFFERENCES = ("psnr", "observed.psnr", "observed.aligned.psnr", "ssim", "lpips_alex", "depth_absrel")
 _DIGITS = {"psnr": 2}
 
 
@@ -68,3 +79,76 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
             ]
         )
     return markdown_table(["sequence", "status", "seconds", *METRICS[:3], "problem"], rows)
+
+
+def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
+    """Paired differences of each dataset, spread of each sequence, and one row per run."""
+    from extrags.metrics.comparison import compare_runs
+
+    comparison = compare_runs(cases, baseline)
+    paired = markdown_table(
+        ["dataset", "profile", "method", "sequences", *DIFFERENCES],
+        [
+            [
+                row["dataset"],
+                row["profile"],
+                row["method"],
+                row["n_sequences"],
+                *(difference_text(name, row["figures"].get(name)) for name in DIFFERENCES),
+            ]
+            for row in comparison["paired_datasets"]
+        ],
+    )
+    spread = markdown_table(
+        ["sequence", "setting", "profile", "method", "seeds", *METRICS],
+        [
+            [
+                row["sequence"],
+                row["setting"] or "",
+                row["profile"],
+                row["method"],
+                row["n_seeds"],
+                *(spread_text(name, row["figures"].get(name)) for name in METRICS),
+            ]
+            for row in comparison["sequences"]
+        ],
+    )
+    runs = markdown_table(
+        ["sequence", "setting", "profile", "method", "seed", "seconds", "MiB", *METRICS, "problem"],
+        [
+            [
+                case["sequence"],
+                case["setting"] or "",
+                case["profile"],
+                case["method"],
+                case["seed"],
+                f"{case['seconds']:.1f}",
+                "" if case["peak_mib"] is None else f"{case['peak_mib']:.0f}",
+                *(figure(name, (case["metrics"] or {}).get(name)) for name in METRICS),
+                case["error"],
+            ]
+            for case in cases
+        ],
+    )
+    return (
+        f"## Differences to {baseline}\n\nMean over sequences and its 95 % interval.\n\n{paired}\n\n"
+        f"## Spread over seeds\n\n{spread}\n\n## Runs\n\n{runs}\n"
+    )
+
+
+def difference_text(name: str, found: dict[str, Any] | None) -> str:
+    """A mean difference with its sign, and the interval if there is one."""
+    if found is None:
+        return figure(name, None)
+    digits = _DIGITS.get(name.rpartition(".")[2], 4)
+    text = f"{found['mean']:+.{digits}f}"
+    return (
+        text if found["low"] is None else f"{text} [{found['low']:+.{digits}f}, {found['high']:+.{digits}f}]"
+    )
+
+
+def spread_text(name: str, found: dict[str, Any] | None) -> str:
+    """A mean, and the deviation if there is one."""
+    if found is None or found["deviation"] is None:
+        return figure(name, None if found is None else found["mean"])
+    return f"{figure(name, found['mean'])} ± {figure(name, found['deviation'])}"

@@ -12,7 +12,7 @@ from tasks.stage import stage
 __all__ = ["coarse"]
 
 
-@stage("coarse", version=1)
+@stage("coarse", version=2)
 def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     """Optimise the coarse scene; writes `scene/` and `history.json`."""
     from extrags.sequence import Sequence

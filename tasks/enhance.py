@@ -10,7 +10,7 @@ from tasks.weights import Weights
 __all__ = ["assemble", "restore", "train"]
 
 
-@stage("enhance-train", version=1)
+@stage("enhance-train", version=2)
 def train(slot: Slot, scene: Ref, sequence: Ref, config: EnhanceConfig, coarse: CoarseConfig) -> None:
     """Train the scene's restorer on pairs it makes itself; writes `restorer/`."""
     from extrags.enhance.backends import train_enhancer
@@ -27,7 +27,7 @@ def train(slot: Slot, scene: Ref, sequence: Ref, config: EnhanceConfig, coarse: 
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=1, ignore=("weights",))
+@stage("enhance-restore", version=2, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,

@@ -24,7 +24,7 @@ __all__ = ["NEXT", "branch", "explore", "merge", "start"]
 NEXT = "next.json"
 
 
-@stage("explore-start", version=1)
+@stage("explore-start", version=2)
 def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig) -> None:
     """Choose the anchors; writes `state/` and `next.json`."""
     from extrags.explore import start_exploration
@@ -33,7 +33,7 @@ def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: Explore
     _write_state(slot, start_exploration(context, cameras))
 
 
-@stage("explore-branch", version=1)
+@stage("explore-branch", version=2)
 def branch(
     slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, anchor: int, config: ExploreConfig
 ) -> None:

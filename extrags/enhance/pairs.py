@@ -323,6 +323,8 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
 def _paired(sequence: Sequence, layers: Layers, frames: Int[np.ndarray, "m"], *, cheap: bool) -> Pairs:
     rgb = sequence.rgb[frames]
     valid = sequence.mask[frames] & (rgb.max(axis=-1) < SATURATED)
+    if sequence.specular is not None:
+        valid &= ~sequence.specular[frames]
     train = np.asarray(sequence.train, dtype=np.int64)
     position = np.searchsorted(np.sort(train), frames)
     return Pairs(

@@ -1,17 +1,7 @@
 """The evaluation protocol: which pixels count, how, and what the numbers are called.
 
-Version 1. For each held-out view:
-
-* Pixels. Primary figures are taken inside the sequence's validity mask; pixels outside it are set to 0
-  in render and target, so that windows and receptive fields reaching over the edge see the same there.
-  `whole` holds the figures of the whole image as it stands. `observed` and `unobserved` part the mask by
-  whether any training frame saw the surface behind the pixel; a part smaller than 0.3 % of the image has
-  no figure.
-* Photometric figures: PSNR over the pixels; SSIM, LPIPS and FLIP as means of their maps over the pixels
-  (LPIPS: of each layer's map). See `extrags.metrics.image`, `.lpips`, `.flip`.
-* Exposure. `aligned` holds the same figures after one least-squares gain per image, fitted inside the
-  mask (`extrags.metrics.exposure`); the parts reuse that gain.
-* Depth: rendered expected z-depth where alpha >= 0.5, against true depth inside the mask.
+`PROTOCOL.md` beside this file is the protocol in words, one section per rule; this module is the protocol in
+code. The two change together, with `PROTOCOL_VERSION`.
 
 Figures of a sequence are means over the views that have one. What cannot be had is None, and `reasons`
 says why.
@@ -19,7 +9,7 @@ says why.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -36,20 +26,31 @@ from extrags.metrics.exposure import align_exposure, exposure_gain
 from extrags.metrics.flip import flip_map
 from extrags.metrics.image import mean_of_known, means_per_image, psnr_per_image, ssim_map
 from extrags.metrics.lpips import Lpips
+from extrags.metrics.surface import SurfaceErrors, SurfaceResult
 from extrags.sequence import Sequence
 from extrags.zarr_io import open_group, read_array, write_frames
 
 __all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
 
-PROTOCOL_VERSION = 1
+PROTOCOL_VERSION = 3
 """Raised by hand whenever a figure could change for the same renders."""
 SMALLEST_PART = 0.003
 """Share of the image below which a part of the pixels has no figure: a handful of pixels is noise."""
 SURFACE_ALPHA = 0.5
 """A pixel has a rendered depth from this alpha on."""
+COLOR_LEVELS = 255
+"""Renders are measured as 8-bit images, so that PNGs of them have the same figures."""
 _PIXELS_AT_ONCE = 400_000
 
 _DEPTH_KEYS = ("depth_absrel", "depth_rmse", "depth_delta125", "depth_coverage")
+_NO_ERRORS: dict[str, Any] = {item.name: None for item in fields(SurfaceErrors)}
+_NO_SURFACE: dict[str, Any] = {
+    **_NO_ERRORS,
+    "coverage": None,
+    "observed_share": None,
+    "threshold_mm": None,
+    "unobserved": _NO_ERRORS,
+}
 
 
 @dataclass(frozen=True)
@@ -60,7 +61,7 @@ class RenderedViews:
         rgb: colours, [V, H, W, 3], float32.
         alpha: opacities, [V, H, W], float32.
         depth_mm: expected z-depth in the unit of the sequence, [V, H, W], float32.
-        n_gaussians: size of the scene that was rendered.
+        n_gaussians: size of the scene that was rendered; None for renders made elsewhere.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -69,7 +70,7 @@ class RenderedViews:
     rgb: Float[np.ndarray, "v h w 3"]
     alpha: Float[np.ndarray, "v h w"]
     depth_mm: Float[np.ndarray, "v h w"]
-    n_gaussians: int
+    n_gaussians: int | None
 
     def __post_init__(self) -> None:
         if self.alpha.shape != self.rgb.shape[:-1] or self.depth_mm.shape != self.rgb.shape[:-1]:
@@ -99,9 +100,7 @@ class RenderedViews:
             raise SourceNotFoundError("no renders here", file=path)
         group = zarr.open_group(str(path), mode="r")
         count: Any = group.attrs["n_gaussians"]
-        return cls(
-            read_array(group, "rgb"), read_array(group, "alpha"), read_array(group, "depth_mm"), int(count)
-        )
+        return cls(read_array(group, "rgb"), read_array(group, "alpha"), read_array(group, "depth_mm"), count)
 
 
 @dataclass(frozen=True)
@@ -111,9 +110,10 @@ class EvaluationResult:
     Args:
         sequence: name of the sequence.
         metrics: `{psnr, ssim, lpips_alex, flip, depth_absrel, ..., n_gaussians, aligned: {...},
-            observed: {...}, unobserved: {...}, whole: {...}}`; None for what cannot be had.
-        per_view: the same per view, with `frame` and `name`.
+            observed: {...}, unobserved: {...}, whole: {...}, surface: {...}}`; None for what cannot be had.
+        per_view: the same per view, with `frame` and `name`; without `surface`, which a view has none of.
         reasons: why a figure is None, by its key.
+        true_surface: what the surface was held against: `mesh` or `depth`; None without surface figures.
         protocol: version of the protocol.
     """
 
@@ -121,6 +121,7 @@ class EvaluationResult:
     metrics: dict[str, Any]
     per_view: list[dict[str, Any]]
     reasons: dict[str, str] = field(default_factory=dict)
+    true_surface: str | None = None
     protocol: int = PROTOCOL_VERSION
 
     def to_json(self) -> dict[str, Any]:
@@ -129,6 +130,7 @@ class EvaluationResult:
             "protocol": self.protocol,
             "sequence": self.sequence,
             "n_views": len(self.per_view),
+            "true_surface": self.true_surface,
             "metrics": self.metrics,
             "reasons": self.reasons,
             "per_view": self.per_view,
@@ -142,16 +144,20 @@ def evaluate_views(
     lpips: Lpips | None,
     *,
     lpips_reason: str = "no LPIPS weights were given",
+    surface: SurfaceResult | None = None,
+    surface_reason: str = "no surface was given",
 ) -> EvaluationResult:
     """Compare rendered views with the frames they stand for, by the protocol of this module.
 
     Args:
-        renders: one render per frame of `frames`, at the sequence's size; colours outside [0, 1] are
-            clipped.
+        renders: one render per frame of `frames`, at the sequence's size; colours are clipped to [0, 1] and
+            rounded to 8 bits.
         sequence: holds the frames, masks and what is known of depth and of observed surface.
         frames: indices into the sequence.
         lpips: the metric with its weights, or None.
         lpips_reason: said in `reasons` when `lpips` is None.
+        surface: figures of the scene's surface, from `extrags.metrics.surface`.
+        surface_reason: said in `reasons` when `surface` is None.
 
     Returns:
         Metrics per view and their means.
@@ -169,8 +175,15 @@ def evaluate_views(
         emit(Progress("evaluate", len(per_view), len(frames)))
     metrics = _mean_tree([{k: v for k, v in view.items() if k not in ("frame", "name")} for view in per_view])
     metrics["n_gaussians"] = renders.n_gaussians
+    metrics["surface"] = _NO_SURFACE if surface is None else surface.to_json()
+    reasons = _reasons(metrics, sequence, frames, lpips, lpips_reason)
+    reasons |= _surface_reasons(surface, surface_reason)
     return EvaluationResult(
-        sequence.name, metrics, per_view, _reasons(metrics, sequence, frames, lpips, lpips_reason)
+        sequence.name,
+        metrics,
+        per_view,
+        reasons,
+        true_surface=None if surface is None else surface.kind,
     )
 
 
@@ -194,6 +207,7 @@ def _evaluate_chunk(
 ) -> list[dict[str, Any]]:
     chosen = frames[part]
     render = torch.from_numpy(renders.rgb[part].astype(np.float32)).clamp(0, 1)
+    render = (render * COLOR_LEVELS).round() / COLOR_LEVELS
     target = torch.from_numpy(sequence.rgb[chosen].astype(np.float32) / 255)
     valid = torch.from_numpy(np.ascontiguousarray(sequence.mask[chosen]))
     parts, shares = _parts_of(sequence, chosen)
@@ -307,6 +321,8 @@ def _reasons(
         reasons["psnr"] = "the validity masks of all views are empty"
     if metrics["lpips_alex"] is None and metrics["psnr"] is not None:
         reasons["lpips_alex"] = lpips_reason if lpips is None else f"LPIPS was taken with {lpips.net}"
+    if metrics["n_gaussians"] is None:
+        reasons["n_gaussians"] = "the renders were made elsewhere"
     if metrics["depth_absrel"] is None:
         reasons["depth_absrel"] = (
             "the sequence has no true depth"
@@ -322,3 +338,13 @@ def _reasons(
             else:
                 reasons[name] = f"no view has {SMALLEST_PART:.1%} of its pixels {name}"
     return reasons
+
+
+def _surface_reasons(surface: SurfaceResult | None, reason: str) -> dict[str, str]:
+    if surface is None:
+        return {"surface": reason}
+    if surface.coverage is None:
+        return {"surface": "no camera of the sequence sees the true surface"}
+    if surface.observed.accuracy_mm is None:
+        return {"surface.accuracy_mm": "the scene has no surface where the true one was observed"}
+    return {}

@@ -161,6 +161,7 @@ def with_estimated_poses(sequence: Sequence, estimate: PoseEstimate) -> Sequence
         depth_mm=of_kept(sequence.depth_mm),
         recording=of_kept(sequence.recording),
         observed=of_kept(sequence.observed),
+        specular=of_kept(sequence.specular),
         world_from_camera=estimate.world_from_camera[kept],
         split=Split(split.name, renumbered(split.train), renumbered(split.test), split.version),
         frame_names=tuple(sequence.frame_name(int(frame)) for frame in kept),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool
@@ -11,7 +12,16 @@ from torch import Tensor
 from extrags.errors import ConfigError, ShapeError
 from extrags.raster import native
 
-__all__ = ["SelectiveAdam"]
+__all__ = ["Joined", "SelectiveAdam"]
+
+
+@dataclass(frozen=True)
+class Joined:
+    """Parameters side by side in one array, and their moments, all [N, K, ...] and contiguous."""
+
+    values: Tensor
+    first_moments: Tensor
+    second_moments: Tensor
 
 
 class SelectiveAdam:
@@ -22,11 +32,16 @@ class SelectiveAdam:
     a row first seen late, or born in densification, starts as at step one. With all rows visible this is
     `torch.optim.Adam`. The result depends on nothing but the inputs, whatever the number of threads.
 
+    Parameters that are joined lie side by side in one array: the kernels that want them together need no
+    copy. They stay parameters of their own, with their own names, rates, moments and leaves.
+
     Args:
         parameters: leaf tensors [N, ...] by name, contiguous; stepped in place.
         learning_rates: one per parameter, by name; a rate of 0 leaves the parameter as it is.
         betas: decay of the first and second moment.
         eps: added to the root of the second moment.
+        joined: names of float32 CPU parameters [N, K_i, ...] to be joined along K, by the name of the whole;
+            `parameters` holds new leaves for them.
 
     Raises:
         ShapeError: when the parameters differ in their number of rows.
@@ -42,6 +57,7 @@ class SelectiveAdam:
         *,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-15,
+        joined: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         self.parameters: dict[str, Tensor] = dict(parameters)
         self.learning_rates: dict[str, float] = dict(learning_rates)
@@ -59,6 +75,9 @@ class SelectiveAdam:
         self.steps = torch.zeros(next(iter(rows.values()), 0), dtype=torch.int32, device=device)
         self._bias = self._bias_corrections(1024)
         self._taken = 0
+        self._parts = {name: tuple(parts) for name, parts in (joined or {}).items()}
+        self.joined: dict[str, Joined] = {}
+        self._join()
 
     def _bias_corrections(self, n_steps: int) -> tuple[Tensor, Tensor]:
         """1 / (1 - beta1^t) and 1 / sqrt(1 - beta2^t) for t up to `n_steps`; 1 for t = 0."""
@@ -71,35 +90,69 @@ class SelectiveAdam:
         return {name: value.detach() for name, value in self.parameters.items()}
 
     @torch.no_grad()
-    def step(self, visible: Bool[Tensor, "n"] | None = None) -> None:
+    def _join(self) -> None:
+        """Lay parameters and moments that belong together into one array each."""
+        for whole, parts in self._parts.items():
+            arrays = []
+            for held in (self.parameters, self.first_moments, self.second_moments):
+                array = torch.cat([held[part].detach() for part in parts], dim=1)
+                arrays.append(array)
+                begin = 0
+                for part in parts:
+                    old = held[part]
+                    piece = array[:, begin : begin + old.shape[1]].detach()
+                    held[part] = piece.requires_grad_(old.requires_grad)
+                    begin += old.shape[1]
+            self.joined[whole] = Joined(*arrays)
+
+    def _joined_rates(self, whole: str) -> list[float]:
+        rates: list[float] = []
+        for part in self._parts[whole]:
+            columns = self.parameters[part].shape[1:].numel()
+            rates += [self.learning_rates[part]] * columns
+        return rates
+
+    @torch.no_grad()
+    def step(
+        self, visible: Bool[Tensor, "n"] | None = None, gradients: Mapping[str, Tensor] | None = None
+    ) -> None:
         """Update the parameters from their `.grad`; a parameter without one is left alone.
 
         Args:
             visible: rows to update; None updates all.
+            gradients: use these instead of `.grad`, by name; those of joined parameters come as one array
+                under the name of the whole. A parameter without one is left alone.
 
         Raises:
             ShapeError: when `visible` does not have one flag per row.
         """
         if visible is not None and visible.shape != self.steps.shape:
             raise ShapeError(f"visible has shape {tuple(visible.shape)}, expected {tuple(self.steps.shape)}")
-        self.steps += 1 if visible is None else visible.to(torch.int32)
+        self.steps += 1 if visible is None else visible
         self._taken += 1
         if self._taken >= len(self._bias[0]):
             self._bias = self._bias_corrections(2 * self._taken)
-        quick = []
+        quick: list[tuple[Tensor, Tensor, Tensor, Tensor, float | list[float]]] = []
         for name, value in self.parameters.items():
+            gradient = value.grad if gradients is None else gradients.get(name)
             rate = self.learning_rates[name]
-            if value.grad is None or rate == 0 or value.numel() == 0:
+            if gradient is None or rate == 0 or value.numel() == 0:
                 continue
             moments = self.first_moments[name], self.second_moments[name]
             if (
                 value.dtype == torch.float32
                 and value.device.type == "cpu"
+                and value.is_contiguous()
                 and native.native_isa() is not None
             ):
-                quick.append((value, value.grad, *moments, rate))
+                quick.append((value, gradient, *moments, rate))
             else:
-                self._step_torch(value, value.grad, *moments, visible, rate)
+                self._step_torch(value, gradient, *moments, visible, rate)
+        for whole, array in self.joined.items():
+            gradient = None if gradients is None else gradients.get(whole)
+            if gradient is not None and array.values.numel():
+                moments = array.first_moments, array.second_moments
+                quick.append((array.values, gradient, *moments, self._joined_rates(whole)))
         if quick:
             native.adam_step(quick, self.steps, visible, self._bias, self.betas, self.eps)
 
@@ -145,6 +198,7 @@ class SelectiveAdam:
             self.first_moments[name] = self.first_moments[name][mask]
             self.second_moments[name] = self.second_moments[name][mask]
         self.steps = self.steps[mask]
+        self._join()
 
     @torch.no_grad()
     def append(self, rows: Mapping[str, Tensor]) -> None:
@@ -175,3 +229,4 @@ class SelectiveAdam:
             self.first_moments[name] = torch.cat([self.first_moments[name], zeros])
             self.second_moments[name] = torch.cat([self.second_moments[name], zeros])
         self.steps = torch.cat([self.steps, self.steps.new_zeros(born)])
+        self._join()

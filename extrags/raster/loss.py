@@ -19,7 +19,7 @@ from torch import Tensor
 from extrags.errors import ShapeError
 from extrags.raster import native
 
-__all__ = ["l1_ssim_loss", "l1_ssim_loss_reference"]
+__all__ = ["inverse_depth_loss", "l1_ssim_loss", "l1_ssim_loss_reference"]
 
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
@@ -80,6 +80,34 @@ def l1_ssim_loss_reference(
     if float(total) == 0:
         return (dissimilarity * m).sum()
     return (dissimilarity * m).sum() / total
+
+
+def inverse_depth_loss(
+    depth: Float[Tensor, "*c h w"],
+    alpha: Float[Tensor, "*c h w"],
+    target: Float[Tensor, "*c h w"],
+    *,
+    scale: float,
+) -> Float[Tensor, ""]:
+    """Mean absolute difference of inverse depths, in units of the inverse of a typical depth.
+
+    Only where both surfaces are there: a hole has no depth that could be wrong. The native kernel of the
+    same name computes it together with its gradient; see `extrags.raster.direct`.
+
+    Args:
+        depth: rendered z-depth; the only one to get a gradient.
+        alpha: rendered opacity; pixels at 0.5 or below do not count.
+        target: true z-depth, 0 where it is not known.
+        scale: the typical depth.
+
+    Returns:
+        The loss; zero where nothing can be compared.
+    """
+    valid = (target > 0) & (alpha.detach() > 0.5) & (depth.detach() > 1e-3 * scale)
+    if not bool(valid.any()):
+        return depth.sum() * 0
+    difference = scale / depth[valid] - scale / target.detach()[valid]
+    return difference.abs().mean()
 
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:

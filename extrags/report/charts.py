@@ -1,4 +1,4 @@
-"""Charts of a report: training curves, views compared, coverage gains, run time against error.
+"""Charts of a report: training curves, views compared, coverage gains, methods, run time against error.
 
 Drawn by matplotlib without its global figure state, as SVG whose bytes depend on the input only.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import textwrap
 import threading
 from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as AbstractSequence
@@ -24,6 +25,9 @@ __all__ = [
     "drawing_style",
     "gain_chart",
     "history_chart",
+    "method_colors",
+    "methods_chart",
+    "pairs_chart",
     "sequences_chart",
     "svg_image",
     "views_chart",
@@ -32,6 +36,7 @@ __all__ = [
 COARSE_COLOR = "#8794a3"
 FINAL_COLOR = "#0b6e75"
 WORSE_COLOR = "#b4481e"
+METHOD_COLORS = (FINAL_COLOR, "#c2702a", "#6b4ea0", "#3d7dbd", "#9a3b5b", "#7a7f2a")
 INK = "#1d2733"
 QUIET = "#5b6774"
 RULE = "#d9dee4"
@@ -241,6 +246,97 @@ def sequences_chart(
         right.set_title("Final PSNR (dB) by run time")
         right.set_xlabel("seconds")
         right.set_xlim(left=0)
+        return svg_image(figure)
+
+
+def method_colors(methods: AbstractSequence[str], baseline: str) -> dict[str, str]:
+    """A colour per method: grey for the baseline, the accent for the first of the others."""
+    others = [method for method in methods if method != baseline]
+    colors = {method: METHOD_COLORS[index % len(METHOD_COLORS)] for index, method in enumerate(others)}
+    return {baseline: COARSE_COLOR, **colors}
+
+
+def methods_chart(
+    groups: AbstractSequence[str],
+    values: Mapping[str, Mapping[str, AbstractSequence[float]]],
+    seconds: Mapping[str, Mapping[str, AbstractSequence[float]]],
+    colors: Mapping[str, str],
+    title: str,
+) -> DataImage:
+    """A figure of every run by group, one line per group and one mark per run, and the same by run time.
+
+    Args:
+        groups: names of the lines, from the top.
+        values: by method and group, the figure of each run.
+        seconds: the same for the run times.
+        colors: of the methods.
+        title: name and unit of the figure.
+    """
+    with drawing_style():
+        figure = _figure(9.6, max(2.6, 1.0 + (0.1 + 0.13 * len(colors)) * len(groups)))
+        left, right = figure.subplots(1, 2, width_ratios=[1.6, 1])
+        row = np.arange(len(groups))[::-1]
+        for place, (method, color) in enumerate(colors.items()):
+            # Methods of a group stand below each other; their runs share a height.
+            height = (0.5 - (place + 0.5) / len(colors)) * 0.7
+            for index, group in enumerate(groups):
+                found = np.asarray(values.get(method, {}).get(group, ()), dtype=np.float64)
+                if not found.size:
+                    continue
+                at = np.full(found.size, row[index] + height)
+                left.hlines(at[0], found.min(), found.max(), color=color, linewidth=2.2, alpha=0.35)
+                left.scatter(found, at, s=14, color=color, alpha=0.8, linewidth=0)
+                left.scatter([found.mean()], at[:1], s=40, marker="|", color=color, linewidth=1.8)
+                took = np.asarray(seconds[method][group], dtype=np.float64)
+                right.scatter(took, found, s=16, color=color, alpha=0.8, linewidth=0)
+            left.scatter([], [], s=22, color=color, label=method)
+        left.set_yticks(row, list(groups))
+        left.set_ylim(-0.6, len(groups) - 0.4)
+        left.grid(axis="x")
+        left.set_title(title)
+        left.legend(
+            ncols=len(colors), loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.1, handletextpad=0.1
+        )
+        right.set_title("The same by run time")
+        right.set_xlabel("seconds")
+        right.set_xlim(left=0)
+        return svg_image(figure)
+
+
+def pairs_chart(
+    panels: AbstractSequence[tuple[str, bool]],
+    rows: AbstractSequence[tuple[str, AbstractSequence[tuple[float, float | None, float | None] | None]]],
+) -> DataImage:
+    """Paired differences with their 95 % intervals, one panel per figure, zero marked.
+
+    Args:
+        panels: title of each figure, and whether more is better.
+        rows: name of each line, from the top, and by panel mean, low and high; None where there is no
+            difference, no interval for a single pair.
+    """
+    from matplotlib.ticker import MaxNLocator
+
+    with drawing_style():
+        figure = _figure(9.6, max(1.8, 0.95 + 0.2 * len(rows)))
+        axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        place = np.arange(len(rows))[::-1]
+        for column, (panel, (title, higher_is_better)) in enumerate(zip(axes, panels, strict=True)):
+            panel.axvline(0, color=QUIET, linewidth=0.8)
+            for at, (_, cells) in zip(place, rows, strict=True):
+                cell = cells[column]
+                if cell is None:
+                    continue
+                mean, low, high = cell
+                color = FINAL_COLOR if (mean > 0) == higher_is_better else WORSE_COLOR
+                if low is not None and high is not None:
+                    panel.hlines(at, low, high, color=color, linewidth=2.2, alpha=0.4)
+                panel.scatter([mean], [at], s=22, color=color, zorder=3)
+            panel.set_title(textwrap.fill(title, 22))
+            panel.set_ylim(-0.6, len(rows) - 0.4)
+            panel.xaxis.set_major_locator(MaxNLocator(4, min_n_ticks=2))
+            panel.grid(axis="x")
+            panel.grid(visible=False, axis="y")
+        axes[0].set_yticks(place, [name for name, _ in rows])
         return svg_image(figure)
 
 

@@ -10,7 +10,8 @@ from extrags.errors import CaptureError
 from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
 from extrags.sequence import Sequence
-from extrags.training.optimise import Schedule, TrainingResult, optimise
+from extrags.training.optimise import TrainingResult, optimise
+from extrags.training.schedule import Schedule
 from extrags.training.starting import median_depth, starting_gaussians
 from extrags.training.views import epochs, real_views
 

@@ -41,13 +41,15 @@ class View:
 
 
 def real_views(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> list[View]:
-    """The training frames as views; saturated pixels carry no weight."""
+    """The training frames as views; saturated pixels and specular highlights carry no weight."""
     cameras = sequence.cameras
     views = []
     for position, frame in enumerate(frames):
         index = int(frame)
         mask = sequence.mask[index]
         weight = mask & (sequence.rgb[index].max(axis=-1) < SATURATED)
+        if sequence.specular is not None:
+            weight &= ~sequence.specular[index]
         depth = None
         if sequence.depth_mm is not None:
             depth = torch.from_numpy(np.where(mask, sequence.depth_mm[index], 0).astype(np.float32))

@@ -1,80 +1,132 @@
-"""`bench raster`, `bench train`, `bench pipeline`."""
+"""`bench raster`, `bench train`, `bench stability`."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import re
 import sys
 from collections.abc import Sequence
 from typing import Any
 
 from rich.table import Table
 
-from extrags.store import Store
-from flows.commands.common import parsed_settings, set_up_logging, store_root, write_json
-from flows.environment import prepare, without_heartbeat
+from extrags.errors import ConfigError
+from flows.commands.common import set_up_logging, write_json
 from flows.terminal import console
 
-__all__ = ["pipeline", "raster", "train"]
+__all__ = ["raster", "stability", "train"]
 
 
 def raster(given: argparse.Namespace) -> int:
     """`extrags bench raster`."""
-    set_up_logging(debug=given.debug, terminal=True)
-    from extrags.raster.bench import bench_raster
-
-    return _kernels(given, bench_raster(quick=given.quick, threads=given.threads))
+    return _kernels(given, training=False)
 
 
 def train(given: argparse.Namespace) -> int:
     """`extrags bench train`."""
+    return _kernels(given, training=True)
+
+
+def stability(given: argparse.Namespace) -> int:
+    """`extrags bench stability`."""
     set_up_logging(debug=given.debug, terminal=True)
-    from extrags.raster.bench import bench_train
+    _let_waiting_threads_sleep()
+    from extrags.raster.stability import bench_stability
 
-    return _kernels(given, bench_train(quick=given.quick, threads=given.threads))
+    found = bench_stability(given.axis, threads=given.threads)
+    if given.json != "-":
+        names = ("axis", "value", "ok", "error", "note")
+        _print(names, [[case[name] for name in names] for case in found["cases"]])
+    write_json(found, given.json)
+    return 0 if all(case["ok"] for case in found["cases"]) else 1
 
 
-def pipeline(given: argparse.Namespace) -> int:
-    """`extrags bench pipeline`."""
-    terminal = sys.stderr.isatty()
-    set_up_logging(debug=given.debug, terminal=terminal)
-    root = store_root(given)
-    settings = parsed_settings(given.settings)
-    prepare(Store(root).state, debug=given.debug)
-    from flows.benchmark import benchmark
-    from flows.console import watched
-    from flows.settings import task_runner
+def _kernels(given: argparse.Namespace, *, training: bool) -> int:
+    set_up_logging(debug=given.debug, terminal=True)
+    _let_waiting_threads_sleep()
+    sizes = _sizes(given)
+    threads = [_number("--threads", text) for text in _items(given.threads or ["1", "2"])]
+    peers = _items(given.peers if given.peers is not None else ["torch"])
+    from extrags.raster.bench import BenchSize, bench_raster, bench_train
 
-    with without_heartbeat(), watched(terminal=terminal):
-        found = benchmark.with_options(task_runner=task_runner(given.runner))(
-            sequences=given.sequences,
-            profiles=given.profiles,
-            methods=given.methods,
-            seeds=given.seeds,
-            settings=settings,
-            store=root,
+    found = (bench_train if training else bench_raster)(
+        None if sizes is None else [BenchSize(*size) for size in sizes],
+        quick=given.quick,
+        peers=peers,
+        threads=threads,
+        rounds=given.rounds,
+        with_error=given.error,
+    )
+    if given.json != "-":
+        _print_kernels(found["cases"])
+    write_json(found, given.json)
+    return 0
+
+
+def _let_waiting_threads_sleep() -> None:
+    # Read when torch is loaded. Threads that spin while they wait starve the peers they are measured beside.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+def _sizes(given: argparse.Namespace) -> list[tuple[int, int, int]] | None:
+    """Sizes and numbers of Gaussians in pairs; None where the standard ones are wanted."""
+    if given.size is None and given.gaussians is None:
+        return None
+    if given.quick:
+        raise ConfigError("--quick is the smallest standard size: it does not go with --size or --gaussians")
+    sizes, counts = _items(given.size or []), _items(given.gaussians or [])
+    if len(sizes) != len(counts):
+        raise ConfigError(
+            f"--size names {len(sizes)} sizes and --gaussians {len(counts)} numbers; they go in pairs"
         )
-    if given.json != "-":
-        names = ("sequence", "setting", "profile", "method", "seed", "seconds", "peak_mib")
-        rows = [[case[name] for name in names] for case in found["cases"]]
-        shown = ("psnr", "ssim", "lpips_alex", "depth_absrel")
-        for row, case in zip(rows, found["cases"], strict=True):
-            row += [(case["metrics"] or {}).get(name) for name in shown]
-        _print([*names, *shown], rows)
-    write_json(found, given.json)
-    return 0
+    pairs = []
+    for size, count in zip(sizes, counts, strict=True):
+        match = re.fullmatch(r"(\d+)x(\d+)", size)
+        if match is None:
+            raise ConfigError(f"--size {size}: expected WIDTHxHEIGHT, e.g. 160x128")
+        pairs.append((int(match[1]), int(match[2]), _number("--gaussians", count)))
+    return pairs
 
 
-def _kernels(given: argparse.Namespace, found: dict[str, Any]) -> int:
-    if given.json != "-":
-        names = ("width", "height", "n_gaussians", "backend", "threads")
-        times = ("forward", "backward", "iteration")
-        rows = [
-            [*(case[name] for name in names), *(case["ms"].get(name) for name in times)]
-            for case in found["cases"]
+def _items(given: list[str]) -> list[str]:
+    """`["a,b", "c"]` to `["a", "b", "c"]`."""
+    return [item for text in given for item in text.split(",") if item]
+
+
+def _number(option: str, text: str) -> int:
+    if not text.isdecimal():
+        raise ConfigError(f"{option} {text}: expected a whole number")
+    return int(text)
+
+
+def _print_kernels(cases: list[dict[str, Any]]) -> None:
+    header = ["size", "Gaussians", "backend", "threads", "forward ms", "backward ms", "iteration ms"]
+    header += ["10 % - 90 %", "cpu ms", "x native", "peak MiB"]
+    with_error = any("error" in case for case in cases)
+    rows = []
+    for case in cases:
+        low, high = case["spread_ms"]
+        row = [f"{case['width']}x{case['height']}", case["n_gaussians"], case["backend"], case["threads"]]
+        row += [case["ms"][name] for name in ("forward", "backward", "iteration")]
+        row += [
+            f"{low:.4g} - {high:.4g}",
+            case["cpu_ms"]["iteration"],
+            case["times_native"],
+            case["peak_mib"],
         ]
-        _print([*names, *(f"{name} ms" for name in times)], rows)
-    write_json(found, given.json)
-    return 0
+        if with_error:
+            row += [case["error"]["image"], max(case["error"]["grads"].values())]
+        rows.append(row)
+    _print([*header, *(("image error", "worst gradient") if with_error else ())], rows)
+    for case in cases:
+        if "roofline" in case:
+            parts = ", ".join(f"{name} {value:.3g}" for name, value in case["parts_ms"].items())
+            console().print(
+                f"{case['width']}x{case['height']}, {case['threads']} threads: {parts} ms; floor "
+                f"{case['roofline']['floor_ms']:.3g} ms, {case['roofline']['share']:.0%} of the time taken",
+                soft_wrap=True,
+            )
 
 
 def _print(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
@@ -89,4 +141,6 @@ def _print(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
 def _text(value: Any) -> str:
     if value is None:
         return "-"
+    if isinstance(value, bool):
+        return "yes" if value else "NO"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

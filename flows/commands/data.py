@@ -1,46 +1,159 @@
-"""`data list`, `data show`."""
+"""`data list`, `data show`, `data check`."""
 
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from rich.markup import escape
 from rich.table import Table
 
-from data_catalog.catalog import describe, list_sequences, resolve
-from extrags.errors import UnknownSequenceError
-from flows.commands.common import write_json
+from data_catalog.catalog import Descriptor, describe, list_sequences, resolve
+from extrags.errors import SourceNotFoundError, StoreError, UnknownSequenceError
+from flows.commands.common import parsed_settings, set_up_logging, write_json
 from flows.terminal import console
 
-__all__ = ["list_all", "show"]
+if TYPE_CHECKING:
+    from extrags.config import IngestConfig
+    from extrags.sequence import Sequence
+
+__all__ = ["check", "list_all", "show"]
 
 
 def list_all(given: argparse.Namespace) -> int:
     """`extrags data list`."""
-    sequences = list_sequences()
+    from fnmatch import fnmatchcase
+
+    sequences = [
+        item
+        for item in list_sequences()
+        if (not given.here or item.available)
+        and (fnmatchcase(item.name, given.pattern) or item.name.startswith(given.pattern))
+    ]
     if given.json != "-":
         table = Table(box=None, pad_edge=False, header_style="bold")
-        for column in ("name", "frames", "size", "here", "description"):
-            table.add_column(column)
+        for column in ("name", "frames", "size", "depth", "poses", "here", "description"):
+            table.add_column(column, justify="right" if column == "frames" else "left")
         for item in sequences:
-            size = f"{item.width}x{item.height}"
-            here = "yes" if item.available else "no"
-            table.add_row(item.name, str(item.frames), size, here, item.description)
-        console().print(table)
+            table.add_row(
+                item.name,
+                str(item.frames),
+                f"{item.width}x{item.height}",
+                "yes" if item.has_depth else "no",
+                "yes" if item.has_poses else "no",
+                "[green]yes[/]" if item.available else "no",
+                escape(item.description),
+            )
+        out = console()
+        out.print(table)
+        here = sum(item.available for item in sequences)
+        out.print(f"{len(sequences)} sequences, {here} of them can be read here")
     write_json([item.model_dump(mode="json") for item in sequences], given.json)
     return 0
 
 
 def show(given: argparse.Namespace) -> int:
     """`extrags data show`."""
+    set_up_logging(debug=given.debug, terminal=True)
+    found = _known(given.sequence)
+    measured: dict[str, Any] | None = None
     try:
-        found = describe(given.sequence).model_dump(mode="json")
-    except UnknownSequenceError:
-        # Not in the catalogue, but perhaps a folder.
-        found = resolve(given.sequence).model_dump(mode="json", exclude_none=True)
+        source = resolve(given.sequence)
+    except SourceNotFoundError:
+        # A catalogue entry whose files are elsewhere is still worth describing.
+        if found is None or given.picture:
+            raise
+    else:
+        from data_catalog.catalog import read
+        from data_catalog.inspection import facts
+
+        sequence = read(source, _ingest(given))
+        measured = facts(sequence)
+        if given.picture:
+            _write_picture(sequence, Path(given.picture))
+    described: dict[str, Any] = (
+        source.model_dump(mode="json", exclude_none=True)
+        if found is None
+        else found.model_dump(mode="json", exclude_none=True)
+    )
     if given.json != "-":
         table = Table(box=None, show_header=False, pad_edge=False)
-        for name, value in found.items():
-            table.add_row(f"[bold]{name}[/]", str(value))
+        for name, value in ((key, value) for key, value in described.items() if value not in ([], "")):
+            table.add_row(f"[bold]{name}[/]", escape(str(value)))
+        if measured is not None:
+            table.add_row("", "")
+            for name, value in measured.items():
+                table.add_row(f"[bold]{name}[/]", _figure(name, value))
         console().print(table)
-    write_json(found, given.json)
+        if given.picture:
+            console().print(f"picture: {given.picture}", soft_wrap=True)
+    write_json({**described, "measured": measured}, given.json)
     return 0
+
+
+def check(given: argparse.Namespace) -> int:
+    """`extrags data check`; exit code 1 when anything is wrong."""
+    if given.debug:
+        set_up_logging(debug=True, terminal=True)
+    from data_catalog.inspection import inspect
+
+    inspections = [inspect(name, _ingest(given)) for name in given.sources]
+    if given.json != "-":
+        out = console()
+        for found in inspections:
+            form = "" if found.format is None else f" ({found.format})"
+            state = "[green]nothing is wrong[/]" if found.ok else f"[red]{len(found.findings)} found[/]"
+            out.print(f"[bold]{escape(found.name)}[/]{form}: {state}")
+            if found.conventions:
+                out.print(f"  read as: {escape(found.conventions)}", soft_wrap=True)
+            for note in found.notes:
+                out.print(f"  note: {escape(note)}", soft_wrap=True)
+            for finding in found.findings:
+                colour = "red" if finding.kind == "error" else "yellow"
+                out.print(
+                    f"  [{colour}]{finding.kind}[/] {escape(finding.topic)}: {escape(str(finding))}",
+                    soft_wrap=True,
+                )
+            if found.facts is not None:
+                shares = ("masked_share", "specular_share", "saturated_share")
+                told = ", ".join(f"{name.removesuffix('_share')} {found.facts[name]:.1%}" for name in shares)
+                out.print(f"  {found.facts['frames']} frames; pixels {told}")
+    write_json([{"ok": found.ok, **found.model_dump(mode="json")} for found in inspections], given.json)
+    return 0 if all(found.ok for found in inspections) else 1
+
+
+def _known(name: str) -> Descriptor | None:
+    """The catalogue's entry; None for a path."""
+    try:
+        return describe(name)
+    except UnknownSequenceError:
+        return None
+
+
+def _ingest(given: argparse.Namespace) -> IngestConfig:
+    from flows.settings import pipeline_config
+
+    return pipeline_config("balanced", parsed_settings(given.settings)).ingest
+
+
+def _write_picture(sequence: Sequence, target: Path) -> None:
+    from PIL import Image
+
+    from data_catalog.inspection import contact_sheet
+
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(contact_sheet(sequence)).save(target)
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{target} cannot be written: {error}") from error
+
+
+def _figure(name: str, value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_figure(key, part)}" for key, part in value.items())
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if name.endswith("_share"):
+        return f"{value:.2%}"
+    return f"{value:.5g}" if isinstance(value, float) else str(value)

@@ -15,8 +15,9 @@ from extrags.errors import ConfigError, ExtragsError, StoreError, UnknownSequenc
 from extrags.store import Store
 from flows.commands.common import parsed_settings, set_up_logging, store_root, write_json
 from flows.environment import prepare, without_heartbeat
+from flows.methods import METHODS, method_config, profile_label, refuse_pinned
 from flows.outcome import DatasetOutcome
-from flows.settings import STAGES, StageName, pipeline_config
+from flows.settings import STAGES, StageName
 
 __all__ = ["execute", "plan", "report", "run"]
 
@@ -66,7 +67,14 @@ def report(given: argparse.Namespace) -> int:
     from flows.wiring import SequenceRun
 
     _check_names([given.sequence])
-    sequence = SequenceRun(given.sequence, config, root, StoreRunner(root), given.profile)
+    sequence = SequenceRun(
+        given.sequence,
+        config,
+        root,
+        StoreRunner(root),
+        profile_label(given.profile, given.method),
+        leave_out=METHODS[given.method].leave_out,
+    )
     try:
         outcome = sequence.run("evaluate")
     except NotInStoreError as error:
@@ -111,7 +119,7 @@ def execute(
     prepare(store.state, debug=given.debug)
     if not refresh and not always_flow:
         # Nothing to make: no need to wait for a server.
-        found = _from_store(sequences, config, root, given.profile, until)
+        found = _from_store(sequences, config, root, given.profile, given.method, until)
         if found is not None:
             return found
     from flows.console import watched
@@ -128,6 +136,7 @@ def execute(
             until=until,
             runner=given.runner,
             at_once=at_once,
+            method=given.method,
         )
     if given.debug:
         for sequence in outcome.sequences:
@@ -137,7 +146,7 @@ def execute(
 
 
 def _from_store(
-    sequences: list[str], config: PipelineConfig, root: str, profile: str, until: StageName
+    sequences: list[str], config: PipelineConfig, root: str, profile: str, method: str, until: StageName
 ) -> DatasetOutcome | None:
     """Outcomes from the store alone; None as soon as anything is missing or wrong."""
     from flows.pages import dataset_page
@@ -149,15 +158,24 @@ def _from_store(
         """Looking is no progress."""
 
     runner = StoreRunner(root)
+    label = profile_label(profile, method)
     try:
         with observed(ignore):
             outcomes = [
-                run_sequence(sequence, config, root, runner, profile=profile, until=until)
+                run_sequence(
+                    sequence,
+                    config,
+                    root,
+                    runner,
+                    profile=label,
+                    until=until,
+                    leave_out=METHODS[method].leave_out,
+                )
                 for sequence in sequences
             ]
             if any(outcome.status == "failed" for outcome in outcomes):
                 return None
-            page = dataset_page(outcomes, "dataset", profile, runner) if until == "report" else None
+            page = dataset_page(outcomes, "dataset", label, runner) if until == "report" else None
     except NotInStoreError:
         return None
     return DatasetOutcome(outcomes, page)
@@ -165,7 +183,8 @@ def _from_store(
 
 def _config(given: argparse.Namespace) -> PipelineConfig:
     settings: dict[str, Any] = parsed_settings(given.settings)
-    return pipeline_config(given.profile, settings, given.seed)
+    refuse_pinned(given.method, settings)
+    return method_config(given.method, given.profile, settings, given.seed)
 
 
 def _check_names(sequences: list[str]) -> None:

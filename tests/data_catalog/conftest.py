@@ -15,6 +15,7 @@ from PIL import Image
 from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.recording import record
 from extrags.sequence import Sequence
+from tests.data_catalog.layouts import first_frames
 
 SMALL = {"width": 64, "height": 51}
 
@@ -27,6 +28,15 @@ def sparse() -> Sequence:
 @pytest.fixture(scope="session")
 def distanced() -> Sequence:
     return record(PhantomConfig(scene=0, setting="distanced", **SMALL), "phantom/0@distanced")
+
+
+@pytest.fixture(scope="session")
+def clip() -> Sequence:
+    """Ten neighbouring frames with depth, poses and texture enough to match: what importers are given."""
+    config = PhantomConfig(
+        scene=1, width=96, height=77, train_every=20, test_frames=1, shadows=False, supersample=1
+    )
+    return first_frames(record(config, "phantom/1"), 10)
 
 
 @pytest.fixture(scope="session")

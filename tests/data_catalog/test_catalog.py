@@ -63,9 +63,9 @@ class TestNames:
         assert resolve("simcol3d/s1").path == str(shared_data / "simcol3d_s1")
 
     def test_file_instead_of_folder(self, tmp_path) -> None:
-        file = tmp_path / "video.mp4"
+        file = tmp_path / "notes.txt"
         file.write_bytes(b"0")
-        with pytest.raises(SourceError, match="expected a folder"):
+        with pytest.raises(SourceError, match=r"expected a folder .* or a video \(\.mp4"):
             resolve(file)
 
 

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read
-from data_catalog.frames_folder import view_mask
+from data_catalog.content import view_mask
 from data_catalog.images import Resampling, natural_key, spread
 from data_catalog.sinus import read_points, read_view_names
 from extrags.config import IngestConfig

@@ -68,7 +68,9 @@ class TestStart:
         assert main(["--version"]) == 0
         assert capsys.readouterr().out.strip() == __version__
 
-    @pytest.mark.parametrize("verb", ["run", "plan", "report", "export", "data", "cache", "bench"])
+    @pytest.mark.parametrize(
+        "verb", ["run", "plan", "report", "export", "data", "cache", "evaluate", "benchmark", "bench"]
+    )
     def test_every_verb_has_help(self, verb: str, capsys: pytest.CaptureFixture[str]) -> None:
         with pytest.raises(SystemExit) as ended:
             main([verb, "--help"])
@@ -266,3 +268,60 @@ class TestThroughPrefect:
         first, second = json.loads(target.read_text())["sequences"]
         assert (first["status"], second["status"]) == ("failed", "ok")
         assert "the folder is empty" in capsys.readouterr().err
+
+
+class TestBench:
+    """The kernels' benchmarks at sizes that take no time."""
+
+    SMALL = ("--size", "24x16,32x20", "--gaussians", "40", "60", "--rounds", "2", "--threads", "1")
+
+    def test_raster_as_json(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["bench", "raster", *self.SMALL, "--peers", "torch,reference", "--json", "-"]) == 0
+        found = json.loads(capsys.readouterr().out)
+        assert {"processor", "cores", "threads", "versions", "commit"} <= set(found["machine"])
+        named = [(case["width"], case["n_gaussians"], case["backend"]) for case in found["cases"]]
+        peers = ("native", "torch", "reference")
+        assert named == [(w, n, peer) for w, n in ((24, 40), (32, 60)) for peer in peers]
+        for case in found["cases"]:
+            assert {"forward", "backward", "iteration"} <= set(case["ms"])
+            assert case["error"]["image"] < 1e-5
+            assert set(case["error"]["grads"]) == {"means", "quats", "scales", "opacities", "sh"}
+            assert "peak_mib" in case
+
+    def test_train_as_a_table(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["bench", "train", *self.SMALL, "--peers", "native"]) == 0
+        said = capsys.readouterr().out
+        assert "x native" in said
+        assert "32x20, 1 threads: project" in said
+        assert "worst gradient" not in said
+        assert main(["bench", "train", *self.SMALL, "--peers", "native", "--error"]) == 0
+        assert "worst gradient" in capsys.readouterr().out
+
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["--size", "24x16", "--gaussians", "40", "60"], "--size names 1 sizes and --gaussians 2"),
+            (["--size", "24x16"], "--gaussians 0 numbers"),
+            (["--size", "24", "--gaussians", "40"], "expected WIDTHxHEIGHT"),
+            (["--size", "24x16", "--gaussians", "many"], "expected a whole number"),
+            (["--size", "24x16", "--gaussians", "0"], "start at 1"),
+            (["--quick", "--size", "24x16", "--gaussians", "40"], "--quick is the smallest"),
+            (["--quick", "--threads", "two"], "expected a whole number"),
+            (["--quick", "--peers", "warp"], "unknown peers warp"),
+        ],
+    )
+    def test_wrong_usage(
+        self, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["bench", "raster", *arguments]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert said.count("\n") == 1
+
+    def test_stability(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        target = tmp_path / "stability.json"
+        assert main(["bench", "stability", "--axis", "flat", "not finite", "--json", str(target)]) == 0
+        cases = json.loads(target.read_text())["cases"]
+        assert {case["axis"] for case in cases} == {"flat", "not finite"}
+        assert all(set(case) >= {"axis", "value", "ok", "error", "note"} for case in cases)
+        assert "means[19, 2] is nan" in capsys.readouterr().out

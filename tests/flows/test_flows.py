@@ -12,7 +12,6 @@ from prefect.flows import Flow, load_flow_from_entrypoint
 
 from extrags.errors import ConfigError, StoreError
 from extrags.store import Store
-from flows.benchmark import benchmark
 from flows.dataset import reconstruct_dataset
 from flows.outcome import SequenceFailedError, SequenceOutcome
 from flows.sequence import artifact_key, reconstruct_sequence
@@ -97,29 +96,6 @@ class TestDataset:
         page = Path(found.report).read_text()
         assert SEQUENCE in page
         assert "empty" in page
-
-
-@pytest.mark.usefixtures("prefect_server")
-def test_benchmark_compares_methods(finished: tuple[str, SequenceOutcome]) -> None:
-    store, first = finished
-    found = benchmark(
-        sequences=[SEQUENCE],
-        profiles=["quick"],
-        methods=["coarse", "extrags", "classical", "real-only"],
-        seeds=[0],
-        settings=TINY,
-        store=store,
-    )
-    assert {"processor", "cores", "threads", "versions", "commit"} <= set(found["machine"])
-    cases = {case["method"]: case for case in found["cases"]}
-    assert list(cases) == ["coarse", "extrags", "classical", "real-only"]
-    assert cases["coarse"]["metrics"] == first.metrics["coarse"]
-    assert cases["extrags"]["metrics"] == first.metrics["final"]
-    assert cases["extrags"]["seconds"] > cases["coarse"]["seconds"] > 0
-    assert cases["extrags"]["peak_mib"] > 50
-    assert (cases["extrags"]["sequence"], cases["extrags"]["setting"]) == ("phantom/0", "sparse")
-    figures = [case["metrics"]["psnr"] for case in cases.values()]
-    assert len(set(figures)) == 4
 
 
 class TestParameters:

@@ -1,36 +1,44 @@
 // Adam over arrays that share their rows; the rule is in adam.py.
 
 struct AdamFactors {
-  Vec beta1, beta2, rest1, rest2, step, scale, eps;
+  Vec beta1, beta2, rest1, rest2, scale, eps;
 };
 
-EXTRAGS_INLINE void adam_vector(const AdamFactors& f, Vec g, Vec* p, Vec* m, Vec* v) {
+EXTRAGS_INLINE void adam_vector(const AdamFactors& f, Vec step, Vec g, Vec* p, Vec* m, Vec* v) {
   *m = fma(f.beta1, *m, f.rest1 * g);
   // Held below infinity, where a huge gradient would leave it for good.
   *v = min(fma(f.beta2, *v, f.rest2 * g * g), Vec(3e38f));
-  *p = *p - f.step * *m / fma(sqrt(*v), f.scale, f.eps);
+  *p = *p - step * *m / fma(sqrt(*v), f.scale, f.eps);
 }
 
 // Steps rows [begin, end) of one array; they share their bias corrections.
+template <bool kRates>
 static void adam_run(const AdamStep& a, const AdamArray& array, int64_t begin, int64_t end, float bias1,
                      float bias2) {
-  const AdamFactors f{Vec(a.beta1), Vec(a.beta2), Vec(a.rest1), Vec(a.rest2), Vec(array.rate * bias1),
-                      Vec(bias2), Vec(a.eps)};
+  const AdamFactors f{Vec(a.beta1), Vec(a.beta2), Vec(a.rest1), Vec(a.rest2), Vec(bias2), Vec(a.eps)};
+  const Vec bias(bias1);
+  Vec step(array.rate * bias1);
   const int64_t offset = begin * array.columns, count = (end - begin) * array.columns;
   float *values = array.values + offset, *first = array.first + offset, *second = array.second + offset;
   const float* gradients = array.gradients + offset;
-  int64_t i = 0;
+  int64_t i = 0, column = 0;
   for (; i + 16 <= count; i += 16) {
     Vec p = load(values + i), m = load(first + i), v = load(second + i);
-    adam_vector(f, load(gradients + i), &p, &m, &v);
+    if (kRates) {
+      step = load(array.rates + column) * bias;
+      column += 16;
+      while (column >= array.columns) column -= array.columns;
+    }
+    adam_vector(f, step, load(gradients + i), &p, &m, &v);
     store(values + i, p);
     store(first + i, m);
     store(second + i, v);
   }
   if (i == count) return;
+  if (kRates) step = load(array.rates + column) * bias;
   const int rest = static_cast<int>(count - i);
   Vec p = load_first(values + i, rest), m = load_first(first + i, rest), v = load_first(second + i, rest);
-  adam_vector(f, load_first(gradients + i, rest), &p, &m, &v);
+  adam_vector(f, step, load_first(gradients + i, rest), &p, &m, &v);
   store_first(values + i, p, rest);
   store_first(first + i, m, rest);
   store_first(second + i, v, rest);
@@ -62,7 +70,11 @@ static void adam_task(void* data, int task, int) {
     int64_t stop = row + 1;
     while (stop + 4 <= end && four_alike(a, stop, steps)) stop += 4;
     while (stop < end && a.steps[stop] == steps && (a.visible == nullptr || a.visible[stop] != 0)) ++stop;
-    for (int k = 0; k < a.count; ++k) adam_run(a, a.arrays[k], row, stop, a.bias1[steps], a.bias2[steps]);
+    for (int k = 0; k < a.count; ++k) {
+      const AdamArray& array = a.arrays[k];
+      const auto run = array.rates == nullptr ? adam_run<false> : adam_run<true>;
+      run(a, array, row, stop, a.bias1[steps], a.bias2[steps]);
+    }
     row = stop;
   }
 }

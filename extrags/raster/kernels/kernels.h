@@ -151,6 +151,7 @@ struct AdamArray {
   float* second;
   int64_t columns;
   float rate;
+  const float* rates;  // of each column, and 15 more that begin anew; or null: `rate` for all
 };
 
 struct AdamStep {
@@ -175,12 +176,22 @@ struct LossImages {
   double scale;  // 1 / (3 sum of weights)
 };
 
+struct DepthImages {
+  int64_t pixels;
+  const float* depth;   // rendered
+  const float* alpha;   // rendered
+  const float* target;  // 0 where there is none
+  float* gradient;      // of weight times the mean
+  float scale, weight;
+};
+
 struct KernelTable {
   const char* name;
   void (*forward)(View*, const Scene*, const Images*);
   void (*backward)(View*, const Scene*, const ImageGradients*, const SceneGradients*);
   void (*query)(View*, const float* points, int64_t count, float* transmittance);
   double (*loss)(const LossImages*, Buffer* working);
+  double (*inverse_depth)(const DepthImages*, Buffer* working, int64_t* compared);
   void (*adam)(const AdamStep*);
   int64_t (*first_nonfinite)(const float* values, int64_t count);
   double (*fma_chain)(int64_t rounds);

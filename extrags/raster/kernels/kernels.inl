@@ -29,6 +29,7 @@ namespace EXTRAGS_ISA {
 
 #include "adam.inl"
 #include "loss.inl"
+#include "inverse_depth.inl"
 
 struct ViewContext {
   View* view;
@@ -281,7 +282,8 @@ static double fma_chain(int64_t rounds) {
   return total;
 }
 
-const KernelTable table = {EXTRAGS_ISA_NAME, forward, backward, query, loss, adam, first_nonfinite, fma_chain};
+const KernelTable table = {EXTRAGS_ISA_NAME, forward, backward, query, loss, inverse_depth, adam,
+                           first_nonfinite, fma_chain};
 
 }  // namespace EXTRAGS_ISA
 }  // namespace extrags

@@ -6,6 +6,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/tuple.h>
 #include <nanobind/stl/unique_ptr.h>
+#include <nanobind/stl/variant.h>
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
@@ -17,6 +18,7 @@
 #include <stdexcept>
 #include <string>
 #include <tuple>
+#include <variant>
 #include <vector>
 
 #include "kernels.h"
@@ -271,6 +273,16 @@ std::vector<double> frame_seconds(const Frame& frame) {
   return std::vector<double>(frame.view->seconds, frame.view->seconds + 4);
 }
 
+// Working memory of the calling thread
+Buffer* thread_working() {
+  struct Working {
+    Buffer buffer{nullptr, 0};
+    ~Working() { release(&buffer); }
+  };
+  thread_local Working working;
+  return &working.buffer;
+}
+
 double l1_ssim(const In& image, const In& target, std::optional<In> mask, Out gradient, int height, int width,
                float dssim_weight, double scale) {
   const size_t pixels = static_cast<size_t>(width) * static_cast<size_t>(height);
@@ -280,27 +292,48 @@ double l1_ssim(const In& image, const In& target, std::optional<In> mask, Out gr
   const LossImages images{height, width, image.data(), target.data(), data_or_null(mask), gradient.data(),
                           dssim_weight, scale};
   nb::gil_scoped_release release_gil;
-  struct Working {
-    Buffer buffer{nullptr, 0};
-    ~Working() { release(&buffer); }
-  };
-  thread_local Working working;
-  return active()->loss(&images, &working.buffer);
+  return active()->loss(&images, thread_working());
 }
 
-// Values, gradients, first and second moments, learning rate
-using AdamTuple = std::tuple<Out, In, Out, Out, float>;
+std::tuple<double, int64_t> inverse_depth(const In& depth, const In& alpha, const In& target, Out gradient,
+                                          float scale, float weight) {
+  const size_t pixels = depth.size();
+  expect(alpha.size() == pixels && target.size() == pixels && gradient.size() == pixels, "a depth image");
+  const DepthImages images{static_cast<int64_t>(pixels), depth.data(),    alpha.data(), target.data(),
+                           gradient.data(),              scale,           weight};
+  nb::gil_scoped_release release_gil;
+  int64_t compared = 0;
+  const double loss = active()->inverse_depth(&images, thread_working(), &compared);
+  return {loss, compared};
+}
+
+// Values, gradients, first and second moments, learning rate or one per column
+using AdamTuple = std::tuple<Out, In, Out, Out, std::variant<float, std::vector<float>>>;
 
 void adam(const std::vector<AdamTuple>& parameters, const Counts& steps, const In& bias1, const In& bias2,
           std::optional<Flags> visible, double beta1, double beta2, float eps) {
   const size_t rows = steps.shape(0);
   std::vector<AdamArray> arrays;
+  std::vector<std::vector<float>> column_rates;
+  column_rates.reserve(parameters.size());
   for (const auto& [values, gradients, first, second, rate] : parameters) {
     const size_t size = values.size();
     expect(rows > 0 && size % rows == 0, "values");
     expect(gradients.size() == size && first.size() == size && second.size() == size, "gradients or moments");
-    arrays.push_back({values.data(), gradients.data(), first.data(), second.data(),
-                      static_cast<int64_t>(size / rows), rate});
+    const size_t columns = size / rows;
+    AdamArray array{values.data(), gradients.data(),             first.data(),
+                    second.data(), static_cast<int64_t>(columns), 0.f,          nullptr};
+    if (const float* one = std::get_if<float>(&rate)) {
+      array.rate = *one;
+    } else {
+      std::vector<float> rates = std::get<1>(rate);
+      expect(rates.size() == columns && columns > 0, "learning rates");
+      // The kernel loads sixteen from any column on.
+      for (size_t k = 0; k < 15; ++k) rates.push_back(rates[k]);
+      column_rates.push_back(std::move(rates));
+      array.rates = column_rates.back().data();
+    }
+    arrays.push_back(array);
   }
   expect(bias1.size() == bias2.size(), "bias corrections");
   expect(!visible || visible->shape(0) == rows, "visible");
@@ -353,6 +386,8 @@ NB_MODULE(_native, m) {
   m.def("l1_ssim", &l1_ssim, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(),
         nb::arg("gradient").noconvert(), nb::arg("height"), nb::arg("width"), nb::arg("dssim_weight"),
         nb::arg("scale"));
+  m.def("inverse_depth", &inverse_depth, nb::arg("depth"), nb::arg("alpha"), nb::arg("target"),
+        nb::arg("gradient").noconvert(), nb::arg("scale"), nb::arg("weight"));
   m.def("adam", &adam, nb::arg("parameters"), nb::arg("steps").noconvert(), nb::arg("bias1"),
         nb::arg("bias2"), nb::arg("visible").none().noconvert(), nb::arg("beta1"), nb::arg("beta2"),
         nb::arg("eps"));

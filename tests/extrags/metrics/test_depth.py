@@ -1,4 +1,4 @@
-"""Depth errors by hand."""
+"""Depth errors by hand and against torchmetrics."""
 
 from __future__ import annotations
 
@@ -41,3 +41,21 @@ def test_mask() -> None:
     assert errors is not None
     assert errors.absrel == 0
     assert errors.coverage == pytest.approx(2 / 3)
+
+
+def test_agrees_with_torchmetrics() -> None:
+    import torch
+    from torchmetrics.functional import mean_absolute_percentage_error, mean_squared_error
+
+    rng = np.random.default_rng(0)
+    truth = rng.uniform(5, 80, (3, 20, 30))
+    found = truth * rng.lognormal(0, 0.2, truth.shape)
+    mask = rng.random(truth.shape) < 0.7
+    errors = depth_errors(found, truth, mask)
+    assert errors is not None
+    rendered, true = torch.from_numpy(found[mask]), torch.from_numpy(truth[mask])
+    assert errors.absrel == pytest.approx(float(mean_absolute_percentage_error(rendered, true)), rel=1e-6)
+    assert errors.rmse == pytest.approx(float(mean_squared_error(rendered, true, squared=False)), rel=1e-6)
+    # Within a factor of 1.25 either way: |log ratio| below log 1.25.
+    near = np.isclose(np.log(found[mask]), np.log(truth[mask]), rtol=0, atol=np.log(1.25))
+    assert errors.delta125 == pytest.approx(near.mean(), abs=1e-12)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
@@ -18,6 +19,14 @@ def test_recovers_a_gain(gain: float, seed: int) -> None:
     found = exposure_gain(target / gain, target)
     assert found.shape == (2, 1)
     torch.testing.assert_close(found, torch.full((2, 1), gain), rtol=1e-5, atol=0)
+
+
+def test_agrees_with_numpy_least_squares() -> None:
+    generator = torch.Generator().manual_seed(3)
+    render, target = torch.rand(2, 12, 10, 3, generator=generator, dtype=torch.float64)
+    mask = torch.rand(12, 10, generator=generator) < 0.6
+    solution, *_ = np.linalg.lstsq(render[mask].reshape(-1, 1).numpy(), target[mask].reshape(-1).numpy())
+    assert exposure_gain(render, target, mask).item() == pytest.approx(float(solution[0]), rel=1e-9)
 
 
 def test_one_gain_per_image_and_per_channel() -> None:

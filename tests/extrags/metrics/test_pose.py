@@ -38,6 +38,24 @@ def test_umeyama_recovers_a_similarity(seed: int, scale: float, n: int, flat: bo
     assert found.scale == pytest.approx(scale, rel=1e-6)
 
 
+def test_agrees_with_scikit_image_and_scipy() -> None:
+    from skimage.transform import SimilarityTransform
+
+    rng = np.random.default_rng(4)
+    source = rng.normal(size=(15, 3)) * (3, 1, 0.3)
+    target = random_similarity(7, 2.5).apply(source) + rng.normal(0, 0.2, (15, 3))
+    theirs = SimilarityTransform.from_estimate(source, target)
+    ours = umeyama(source, target)
+    assert ours.scale == pytest.approx(theirs.scale, rel=1e-9)
+    np.testing.assert_allclose(ours.apply(source), theirs(source), atol=1e-9)
+    # Without scale it is the orthogonal Procrustes problem that scipy solves.
+    rigid = umeyama(source, target, with_scale=False)
+    turned, distance = Rotation.align_vectors(target - target.mean(0), source - source.mean(0))
+    np.testing.assert_allclose(rigid.rotation, turned.as_matrix(), atol=1e-9)
+    residual = np.linalg.norm(rigid.apply(source) - target)
+    assert residual == pytest.approx(distance, rel=1e-9)
+
+
 def test_umeyama_never_mirrors() -> None:
     source = np.random.default_rng(0).normal(size=(10, 3))
     found = umeyama(source, source * (1, 1, -1))

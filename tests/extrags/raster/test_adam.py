@@ -165,3 +165,55 @@ def test_errors(unchecked: None) -> None:
         adam.append({**bad, "means": torch.zeros(2, 3)})
     with pytest.raises(ShapeError, match="rows of sh"):
         adam.append({**bad, "sh": torch.zeros(1, 4, 3)})
+
+
+JOINED = {"sh": ("sh0", "shN")}
+JOINED_RATES = {"means": 1e-3, "sh0": 2e-3, "shN": 1e-4}
+
+
+def _split_parameters(n: int, coefficients: int) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(9)
+    shapes = {"means": (n, 3), "sh0": (n, 1, 3), "shN": (n, coefficients - 1, 3)}
+    return {k: torch.randn(*s, generator=generator).requires_grad_() for k, s in shapes.items()}
+
+
+@pytest.mark.parametrize("coefficients", [1, 4, 9, 16])
+def test_joined_parameters_step_as_if_apart(coefficients: int, isa: str) -> None:
+    apart = SelectiveAdam(_split_parameters(70, coefficients), JOINED_RATES)
+    together = SelectiveAdam(_split_parameters(70, coefficients), JOINED_RATES, joined=JOINED)
+    born = {k: v.detach()[:5].clone() for k, v in apart.parameters.items()}
+    for step in range(12):
+        n = len(apart.steps)
+        _set_gradients(apart.parameters, step)
+        gradients = {name: value.grad for name, value in apart.parameters.items() if value.grad is not None}
+        whole = torch.cat([gradients["sh0"], gradients["shN"]], dim=1)
+        visible = _visible(n, step)
+        apart.step(visible)
+        together.step(visible, {"means": gradients["means"], "sh": whole})
+        if step in (3, 7):
+            for adam in (apart, together):
+                adam.keep(torch.arange(n) % 3 != 0)
+                adam.append(born)
+        if step == 5:
+            for adam in (apart, together):
+                with torch.no_grad():
+                    adam.parameters["shN"][2] = 0.5
+                adam.first_moments["sh0"][2] = 0
+    for name, value in apart.parameters.items():
+        assert torch.equal(together.parameters[name], value), name
+        assert torch.equal(together.first_moments[name], apart.first_moments[name]), name
+        assert together.parameters[name].is_leaf
+        assert together.parameters[name].requires_grad
+    whole = torch.cat([apart.parameters["sh0"], apart.parameters["shN"]], dim=1)
+    assert torch.equal(together.joined["sh"].values, whole)
+
+
+def test_joined_parameters_take_gradients_of_their_own() -> None:
+    """As autograd leaves them: what a penalty or a test may do."""
+    apart = SelectiveAdam(_split_parameters(20, 4), JOINED_RATES)
+    together = SelectiveAdam(_split_parameters(20, 4), JOINED_RATES, joined=JOINED)
+    for adam in (apart, together):
+        _set_gradients(adam.parameters, 0)
+        adam.step(_visible(20, 0))
+    for name, value in apart.parameters.items():
+        torch.testing.assert_close(together.parameters[name], value, rtol=1e-6, atol=1e-7)

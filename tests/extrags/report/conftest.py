@@ -9,6 +9,7 @@ import pytest
 
 from extrags.cameras import look_at, pixel_rays, rotation_about
 from extrags.config import PipelineConfig
+from extrags.metrics.protocol import PROTOCOL_VERSION
 from extrags.report import ReportInputs
 from extrags.sequence import Sequence, Split
 
@@ -103,7 +104,7 @@ def result_of(psnr: float, n_gaussians: int) -> dict[str, object]:
     """As `EvaluationResult.to_json` writes it."""
     per_view = [{"frame": int(f), "name": f"b_{f:03d}"} | metrics_of(psnr + f - 8) for f in TEST]
     return {
-        "protocol": 1,
+        "protocol": PROTOCOL_VERSION,
         "sequence": "tube/0@sparse",
         "n_views": len(TEST),
         "metrics": metrics_of(psnr) | {"n_gaussians": n_gaussians},

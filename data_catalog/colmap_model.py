@@ -1,0 +1,350 @@
+"""Reader and writer of COLMAP workspaces: a sparse model with its images.
+
+::
+
+    my_scene/
+        sparse/0/{cameras,images,points3D}.bin      or .txt; also sparse/, colmap/sparse/0/, or beside images/
+        images/NAME                                 as named in the model; also rgb/, or the folder itself
+        masks/NAME.png                              optional: COLMAP's camera masks, white is tissue
+        stereo/depth_maps/NAME.geometric.bin        optional: COLMAP's depth maps, z-depth in the model's unit
+        train_list.txt, test_list.txt               optional: held-out frames by name, one to a line
+        length_unit.txt                             optional: `mm`; otherwise the scale is arbitrary
+
+COLMAP's poses are camera-from-world in OpenCV axes with pixel centres at +0.5; they are inverted once on
+reading and nothing else is turned or scaled. Every model of `data_catalog.lens` is understood; images of
+distorted cameras are resampled to a pinhole, those of pinhole cameras are taken as they are. Of several
+models (`sparse/0`, `sparse/1`, ...) the one with the most images is read. The sparse points become the
+starting points. Images that the model does not name have no pose and are left out, which the log says.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from data_catalog.colmap_files import ColmapImage, ColmapModel, read_model, write_model
+from data_catalog.formats import FolderFormat
+from data_catalog.images import COLOUR_SUFFIXES, natural_key
+from data_catalog.lens import Lens
+from data_catalog.posed_frames import PosedFrame, assembled, save_images
+from extrags.cameras import pixel_rays
+from extrags.config import IngestConfig
+from extrags.errors import SourceError, SourceNotFoundError
+from extrags.sequence import Sequence
+
+__all__ = ["FORMAT", "model_folder", "points_of", "read_depth_map", "write_colmap", "write_depth_map"]
+
+logger = logging.getLogger(__name__)
+
+LENGTH_UNIT_FILE = "length_unit.txt"
+_PLACES = ("sparse", "colmap/sparse", "colmap", "dense/sparse", ".")
+_DEPTH_KINDS = ("geometric", "photometric")
+_NO_OBSERVATIONS = np.zeros((0, 2)), np.zeros(0, dtype=np.int64)
+
+
+def model_folder(folder: Path) -> Path | None:
+    """The model to read: the one with the most images among those in the usual places; None without any."""
+    found = []
+    for place in _PLACES:
+        base = folder / place
+        if not base.is_dir():
+            continue
+        inside = [sub for sub in base.iterdir() if sub.is_dir() and sub.name.isdigit()]
+        candidates = [base, *sorted(inside, key=lambda sub: int(sub.name))]
+        found += [place for place in candidates if _is_model(place)]
+        if found:
+            break
+    # Ties go to the first, which is the lowest number.
+    return max(found, key=_image_count, default=None)
+
+
+def _is_model(folder: Path) -> bool:
+    return any(
+        (folder / f"cameras.{suffix}").is_file() and (folder / f"images.{suffix}").is_file()
+        for suffix in ("bin", "txt")
+    )
+
+
+def _image_count(folder: Path) -> int:
+    file = folder / "images.bin"
+    if file.is_file():
+        with file.open("rb") as stream:
+            return int.from_bytes(stream.read(8), "little")
+    lines = (folder / "images.txt").read_text(errors="replace").splitlines()
+    return sum(not line.startswith("#") for line in lines) // 2
+
+
+def _recognises(folder: Path) -> bool:
+    return folder.is_dir() and model_folder(folder) is not None
+
+
+def _image_root(folder: Path, names: list[str]) -> Path:
+    places = [folder / "images", folder / "rgb", folder]
+    existing = [place for place in places if place.is_dir()]
+    return max(existing, key=lambda place: sum((place / name).is_file() for name in names[:20]))
+
+
+def _files(folder: Path) -> list[Path]:
+    model = model_folder(folder)
+    if model is None:
+        return []
+    fixed = [folder / name for name in (LENGTH_UNIT_FILE, "train_list.txt", "test_list.txt")]
+    fixed += [
+        model / f"{name}.{suffix}" for name in ("cameras", "images", "points3D") for suffix in ("bin", "txt")
+    ]
+    found = {file for file in fixed if file.is_file()}
+    images = (folder / "images", folder / "rgb", folder / "masks", folder / "stereo" / "depth_maps")
+    for place in images:
+        if place.is_dir():
+            found |= {file for file in place.rglob("*") if file.is_file()}
+    found |= {file for file in folder.iterdir() if file.suffix.lower() in COLOUR_SUFFIXES}
+    return sorted(found)
+
+
+def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+    place = model_folder(folder)
+    if place is None:
+        raise SourceNotFoundError("no COLMAP model in this folder", file=folder)
+    model = read_model(place)
+    images = sorted(model.images, key=lambda image: natural_key(image.name))
+    root = _image_root(folder, [image.name for image in images])
+    _tell_about_unposed(root, {image.name for image in images})
+    recordings = sorted({str(Path(image.name).parent) for image in images}, key=natural_key)
+    splits = _splits(folder, images)
+    frames = [
+        PosedFrame(
+            name=image.name,
+            file=root / image.name,
+            lens=model.lenses[image.camera],
+            world_from_camera=image.world_from_camera,
+            mask_file=_mask_file(folder, image.name),
+            depth_file=_depth_file(folder, image.name),
+            recording=recordings.index(str(Path(image.name).parent)),
+            split=splits.get(image.name),
+        )
+        for image in images
+    ]
+    for frame in frames:
+        if not frame.file.is_file():
+            raise SourceNotFoundError(
+                f"the model in {place.name}/ names this image, but there is no such file",
+                file=frame.file,
+                frame=frame.name,
+                field="name",
+            )
+    return assembled(
+        frames,
+        config,
+        name=name,
+        pose_file=next(file for file in (place / "images.bin", place / "images.txt") if file.is_file()),
+        metric=_is_metric(folder),
+        read_depth=lambda file, frame: read_depth_map(file, frame=frame),
+        points=model.points if len(model.points) else None,
+        points_rgb=model.points_rgb if len(model.points) else None,
+    )
+
+
+FORMAT = FolderFormat(
+    name="colmap",
+    version=1,
+    summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/colmap_model.py",
+    recognises=_recognises,
+    files=_files,
+    read=_read,
+    conventions="COLMAP poses (camera from world, OpenCV axes, inverted on reading), pixel "
+    "centres at +0.5; arbitrary unit unless length_unit.txt says mm",
+)
+
+
+def write_colmap(
+    sequence: Sequence,
+    folder: Path,
+    *,
+    binary: bool = True,
+    points: Float[np.ndarray, "p 3"] | None = None,
+    points_rgb: UInt8[np.ndarray, "p 3"] | None = None,
+) -> None:
+    """Write a posed sequence as the workspace described above.
+
+    Cameras become PINHOLE, one for each K. Numbers keep all their digits, so that a model that is read back
+    differs by rounding only. Depth goes to `stereo/depth_maps`.
+
+    Args:
+        sequence: with poses.
+        folder: made if need be; `sparse/0`, `images`, `masks` and `stereo/depth_maps` are written into it.
+        binary: False writes a text model.
+        points: sparse points in world coordinates; None takes the sequence's own.
+        points_rgb: their colours; grey where None.
+
+    Raises:
+        ShapeError: while the sequence has no poses.
+    """
+    cameras = sequence.cameras
+    if points is None:
+        points, points_rgb = sequence.points, sequence.points_rgb
+    names = save_images(sequence, folder)
+    distinct, group = np.unique(cameras.K[:, [0, 1, 0, 1], [0, 1, 2, 2]], axis=0, return_inverse=True)
+    lenses = {
+        number: Lens("PINHOLE", tuple(float(value) for value in row), sequence.width, sequence.height)
+        for number, row in enumerate(distinct, start=1)
+    }
+    located = np.zeros((0, 3)) if points is None else np.asarray(points, dtype=np.float64)
+    coloured = np.full((len(located), 3), 128, dtype=np.uint8) if points_rgb is None else points_rgb
+    pixels, seen = _NO_OBSERVATIONS
+    model = ColmapModel(
+        lenses,
+        [
+            ColmapImage(image, int(group[index]) + 1, cameras.world_from_camera[index], pixels, seen)
+            for index, image in enumerate(names)
+        ],
+        located,
+        coloured,
+    )
+    write_model(model, folder / "sparse" / "0", binary=binary)
+    for index, image in enumerate(names):
+        if sequence.depth_mm is not None:
+            write_depth_map(
+                folder / "stereo" / "depth_maps" / f"{image}.geometric.bin", sequence.depth_mm[index]
+            )
+    for split, indices in (("train", sequence.train), ("test", sequence.test)):
+        listed = "".join(f"{names[int(index)]}\n" for index in indices)
+        (folder / f"{split}_list.txt").write_text(listed, encoding="utf-8")
+    if sequence.metric:
+        (folder / LENGTH_UNIT_FILE).write_text("mm\n", encoding="utf-8")
+
+
+def points_of(
+    sequence: Sequence, at_most: int = 20_000
+) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]] | None:
+    """Points to hand over with a sequence: its own, else its training frames' depth on a grid.
+
+    Args:
+        sequence: with poses.
+        at_most: number of points taken from depth.
+
+    Returns:
+        Positions in world coordinates and colours, or None where the source has neither.
+    """
+    if sequence.points is not None:
+        grey = np.full(sequence.points.shape, 128, dtype=np.uint8)
+        return sequence.points, grey if sequence.points_rgb is None else sequence.points_rgb
+    if sequence.depth_mm is None:
+        return None
+    cameras = sequence.cameras
+    pixels = len(sequence.train) * sequence.height * sequence.width
+    stride = max(1, int(np.ceil(np.sqrt(pixels / at_most))))
+    grid = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    located, coloured = [], []
+    for index in sequence.train.tolist():
+        depth = sequence.depth_mm[index][grid]
+        known = (depth > 0) & sequence.mask[index][grid]
+        rays = pixel_rays(cameras[index])[0][grid][known]
+        located.append(cameras.centers[index] + rays * depth[known][:, None].astype(np.float64))
+        coloured.append(sequence.rgb[index][grid][known])
+    return np.concatenate(located), np.concatenate(coloured)
+
+
+def read_depth_map(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:
+    """Read COLMAP's dense map: `width&height&channels&`, then float32 row by row.
+
+    Raises:
+        SourceError: the header is none, or values are missing.
+    """
+    content = file.read_bytes()
+    parts = content[:64].split(b"&", 3)
+    try:
+        width, height, channels = (int(part) for part in parts[:3])
+    except ValueError as error:
+        raise SourceError(
+            "expected a header `width&height&1&`, as COLMAP writes it", file=file, frame=frame, field="depth"
+        ) from error
+    start = sum(len(part) + 1 for part in parts[:3])
+    if channels != 1 or len(content) - start != 4 * width * height:
+        raise SourceError(
+            f"{len(content) - start} bytes of values; expected {4 * width * height} for {width} x {height} "
+            f"pixels of one channel (found {channels})",
+            file=file,
+            frame=frame,
+            field="depth",
+        )
+    return np.frombuffer(content, "<f4", width * height, start).reshape(height, width).astype(np.float32)
+
+
+def write_depth_map(file: Path, depth: Float[np.ndarray, "h w"]) -> None:
+    """Write what `read_depth_map` reads."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    header = f"{depth.shape[1]}&{depth.shape[0]}&1&".encode()
+    file.write_bytes(header + np.ascontiguousarray(depth, dtype="<f4").tobytes())
+
+
+def _mask_file(folder: Path, name: str) -> Path | None:
+    candidates = (folder / "masks" / f"{name}.png", folder / "masks" / Path(name).with_suffix(".png"))
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def _depth_file(folder: Path, name: str) -> Path | None:
+    places = (folder / "stereo" / "depth_maps" / f"{name}.{kind}.bin" for kind in _DEPTH_KINDS)
+    return next((file for file in places if file.is_file()), None)
+
+
+def _is_metric(folder: Path) -> bool:
+    file = folder / LENGTH_UNIT_FILE
+    if not file.is_file():
+        return False
+    unit = file.read_text(encoding="utf-8").strip()
+    if unit not in ("mm", "arbitrary"):
+        raise SourceError(
+            f"{unit!r} is no length unit known here; expected mm or arbitrary", file=file, field="length_unit"
+        )
+    return unit == "mm"
+
+
+def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train", "test"]]:
+    known = {image.name for image in images}
+    result: dict[str, Literal["train", "test"]] = {}
+    file = folder / "test_list.txt"
+    if not file.is_file():
+        return result
+    held_out = set(file.read_text(encoding="utf-8").split("\n")) - {""}
+    unknown = sorted(held_out - known, key=natural_key)
+    if unknown:
+        raise SourceError(
+            f"{len(unknown)} of {len(held_out)} held-out images have no pose in the model; take them out "
+            "of the list or register them",
+            file=file,
+            frame=unknown[0],
+            field="split",
+        )
+    listed = folder / "train_list.txt"
+    training = set(listed.read_text(encoding="utf-8").split("\n")) if listed.is_file() else known - held_out
+    both = sorted(held_out & training, key=natural_key)
+    if both:
+        raise SourceError(
+            f"{len(both)} images both train and evaluate, this one is the first",
+            file=file,
+            frame=both[0],
+            field="split",
+        )
+    for name in known:
+        result[name] = "test" if name in held_out else "train"
+    return result
+
+
+def _tell_about_unposed(root: Path, posed: set[str]) -> None:
+    present = {
+        file.relative_to(root).as_posix()
+        for file in root.rglob("*")
+        if file.suffix.lower() in COLOUR_SUFFIXES and file.is_file()
+    }
+    unposed = sorted(present - posed, key=natural_key)
+    if unposed and root.name in ("images", "rgb"):
+        logger.warning(
+            "%d of %d images have no pose in the COLMAP model and are left out; the first is %s",
+            len(unposed),
+            len(present),
+            unposed[0],
+        )

@@ -1,0 +1,229 @@
+"""Which pixels of an endoscope's video show tissue: the picture inside its dark frame, less burnt-in text.
+
+Everything is found from several frames of one recording together and nothing is learned: the dark frame is
+dark always, a burnt-in sign has the same edges in every frame while the scene moves under it.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+__all__ = ["Circle", "content_circle", "content_mask", "overlay_mask", "view_mask"]
+
+logger = logging.getLogger(__name__)
+
+_DARK = 14
+"""A pixel whose brightest channel stays below this belongs to the frame round the picture."""
+_MARGIN_SHARE = 0.006
+"""The picture's rim is blurred: so much of the image width is cut off all round."""
+_CIRCLE_TRIALS = 400
+_CIRCLE_TOLERANCE_SHARE = 0.006
+_CIRCLE_INLIERS = 0.75
+_FEWEST_FRAMES = 4
+_MOST_FRAMES = 32
+_LARGEST_WIDTH = 640
+_EDGE_STRENGTH = 24.0
+"""Of burnt-in text, in grey values per pixel; blurred tissue under compression stays below."""
+_MOVED_SHARE = 0.25
+"""So much of the picture must change visibly before what stays can be called burnt in."""
+_VISIBLE_CHANGE = 8.0
+_LARGEST_OVERLAY = 0.15
+
+
+@dataclass(frozen=True)
+class Circle:
+    """The rim of a round picture, in pixels with centres at +0.5.
+
+    Args:
+        center_x: may lie outside the image.
+        center_y: may lie outside the image.
+        radius_px: of the rim itself, before any margin.
+        inliers: share of rim points that lie on it.
+    """
+
+    center_x: float
+    center_y: float
+    radius_px: float
+    inliers: float
+
+    def mask(self, width: int, height: int, margin_px: float = 0.0) -> Bool[np.ndarray, "h w"]:
+        """True inside."""
+        x = np.arange(width)[None, :] + 0.5 - self.center_x
+        y = np.arange(height)[:, None] + 0.5 - self.center_y
+        return np.asarray(np.hypot(x, y) <= self.radius_px - margin_px)
+
+
+def view_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
+    """False in the dark frame round an endoscope's picture, whatever its shape.
+
+    A pixel is outside when it is dark in every frame and joined to the image border by such pixels: a dark
+    lumen in the middle stays inside.
+    """
+    import cv2
+
+    dark = (rgb.max(axis=(0, 3)) < _DARK).astype(np.uint8)
+    _, labels = cv2.connectedComponents(dark, connectivity=4)
+    border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    outside = np.isin(labels, np.setdiff1d(border, 0)) & (dark > 0)
+    return np.asarray(~outside)
+
+
+def content_circle(rgb: UInt8[np.ndarray, "f h w 3"]) -> Circle | None:
+    """The round picture of an endoscope, cut off by the image border or not.
+
+    The rim of the largest lit region is sampled row by row and column by column; a circle is fitted to it
+    by RANSAC (seeded) and least squares. Text and logos beside the picture are no part of that region.
+
+    Returns:
+        None where the rim is no circle, or the picture fills the image.
+    """
+    rim = _rim(_largest(view_mask(rgb)))
+    height, width = rgb.shape[1:3]
+    if len(rim) < 0.25 * height:
+        return None
+    tolerance = max(1.0, _CIRCLE_TOLERANCE_SHARE * width)
+    generator = np.random.default_rng(0)
+    best: np.ndarray | None = None
+    for _ in range(_CIRCLE_TRIALS):
+        found = _fitted(rim[generator.choice(len(rim), 3, replace=False)])
+        if found is None or not 0.2 * height < found[2] < 1.5 * width:
+            continue
+        on_it = np.abs(np.hypot(*(rim - found[:2]).T) - found[2]) < tolerance
+        if best is None or on_it.sum() > best.sum():
+            best = on_it
+    if best is None:
+        return None
+    found = _fitted(rim[best])
+    if found is None:
+        return None
+    share = float((np.abs(np.hypot(*(rim - found[:2]).T) - found[2]) < tolerance).mean())
+    if share < _CIRCLE_INLIERS:
+        return None
+    return Circle(float(found[0]), float(found[1]), float(found[2]), share)
+
+
+def overlay_mask(
+    rgb: UInt8[np.ndarray, "f h w 3"], inside: Bool[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Burnt-in text and signs inside the picture.
+
+    Their edges are strong in all frames (the tenth percentile over frames of the gradient is taken, so that
+    changing digits are joined by those that stay), while the scene changes. Found edges are closed and
+    dilated to whole signs.
+
+    Args:
+        rgb: frames of one recording, spread over it.
+        inside: the picture; its rim is no sign.
+
+    Returns:
+        True on overlays; false everywhere with fewer than four frames, or where too little of the picture
+        moves to tell.
+    """
+    import cv2
+
+    frames, height, width = rgb.shape[:3]
+    nothing = np.zeros((height, width), dtype=bool)
+    if frames < _FEWEST_FRAMES:
+        return nothing
+    grey = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in rgb])
+    change = np.percentile(grey, 90, axis=0) - np.percentile(grey, 10, axis=0)
+    margin = max(2, round(2 * _MARGIN_SHARE * width))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
+    # The image border is no rim.
+    padded = np.pad(inside.astype(np.uint8), margin, mode="edge")
+    core = cv2.erode(padded, kernel)[margin:-margin, margin:-margin] > 0
+    if not core.any() or (change[core] > _VISIBLE_CHANGE).mean() < _MOVED_SHARE:
+        return nothing
+    edges = np.percentile(np.stack([_gradient(image) for image in grey]), 10, axis=0)
+    strong = ((edges > _EDGE_STRENGTH) & core).astype(np.uint8)
+    gap = max(2, round(0.012 * width))
+    closed = cv2.morphologyEx(
+        strong, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_RECT, (2 * gap + 1, gap | 1))
+    )
+    found = cv2.dilate(closed, np.ones((5, 5), np.uint8)) > 0
+    if found[core].mean() > _LARGEST_OVERLAY:
+        logger.warning(
+            "%.0f %% of the picture keeps its edges in all frames: taken for a scene that stands still, "
+            "not for burnt-in text",
+            100 * found[core].mean(),
+        )
+        return nothing
+    return np.asarray(found & inside)
+
+
+def content_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
+    """True where frames show tissue: inside the round picture, or the dark frame, and not under text.
+
+    Long and large recordings are looked at through 32 frames at 640 pixels of width.
+
+    Args:
+        rgb: frames of one recording.
+    """
+    import cv2
+
+    height, width = rgb.shape[1:3]
+    if len(rgb) > _MOST_FRAMES:
+        rgb = rgb[np.round(np.linspace(0, len(rgb) - 1, _MOST_FRAMES)).astype(int)]
+    small = rgb
+    if width > _LARGEST_WIDTH:
+        size = (_LARGEST_WIDTH, round(_LARGEST_WIDTH * height / width))
+        small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in rgb])
+    circle = content_circle(small)
+    margin = max(1.0, _MARGIN_SHARE * small.shape[2])
+    inside = view_mask(small) if circle is None else circle.mask(small.shape[2], small.shape[1], margin)
+    found = inside & ~overlay_mask(small, inside)
+    if found.shape == (height, width):
+        return np.asarray(found)
+    share = cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(share > 0.999)
+
+
+def _largest(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    """The largest connected region after thin bridges are cut."""
+    import cv2
+
+    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+    if count < 2:
+        return mask
+    return np.asarray(labels == 1 + int(np.argmax(stats[1:, cv2.CC_STAT_AREA])))
+
+
+def _rim(region: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "p 2"]:
+    """First and last pixels of rows and columns, less those at the image border."""
+    height, width = region.shape
+    points = []
+    for row in np.flatnonzero(region.any(axis=1)):
+        columns = np.flatnonzero(region[row])
+        points += [(columns[0], row + 0.5), (columns[-1] + 1, row + 0.5)]
+    for column in np.flatnonzero(region.any(axis=0)):
+        rows = np.flatnonzero(region[:, column])
+        points += [(column + 0.5, rows[0]), (column + 0.5, rows[-1] + 1)]
+    found = np.array(points, dtype=np.float64).reshape(-1, 2)
+    inner = (found[:, 0] > 3) & (found[:, 0] < width - 3) & (found[:, 1] > 3) & (found[:, 1] < height - 3)
+    return np.asarray(found[inner])
+
+
+def _fitted(points: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "3"] | None:
+    """Centre and radius of the circle nearest to the points (algebraic); None where they lie on a line."""
+    mean = points.mean(axis=0)
+    x, y = (points - mean).T
+    matrix = np.column_stack([2 * x, 2 * y, np.ones_like(x)])
+    solution, _, rank, _ = np.linalg.lstsq(matrix, x * x + y * y, rcond=None)
+    square = solution[2] + solution[0] ** 2 + solution[1] ** 2
+    if rank < 3 or square <= 0:
+        return None
+    return np.array([solution[0] + mean[0], solution[1] + mean[1], np.sqrt(square)])
+
+
+def _gradient(grey: UInt8[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Length of the gradient, in grey values per pixel."""
+    import cv2
+
+    across = cv2.Scharr(grey, cv2.CV_32F, 1, 0, scale=1 / 32)
+    down = cv2.Scharr(grey, cv2.CV_32F, 0, 1, scale=1 / 32)
+    return np.asarray(np.hypot(across, down))

@@ -1,0 +1,209 @@
+"""A source looked over: what is known about it, what is wrong with it, and a picture of its frames."""
+
+from __future__ import annotations
+
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+from pydantic import BaseModel, ConfigDict
+
+from data_catalog.catalog import Source, read, resolve
+from data_catalog.formats import folder_formats
+from data_catalog.specular import saturated_mask, specular_masks
+from data_catalog.suspicions import Finding, suspicions
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
+from extrags.sequence import Sequence
+
+__all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
+
+_TILE_WIDTH = 240
+_MOST_TILES = 30
+
+
+class Inspection(BaseModel):
+    """What `data check` says about a source."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    format: str | None
+    """None where the source was not even recognised."""
+    conventions: str
+    """Axes and units the reader assumes."""
+    notes: tuple[str, ...]
+    """What reading found out, e.g. the polarity of masks and assumed intrinsics."""
+    findings: tuple[Finding, ...]
+    facts: dict[str, Any] | None
+    """Numbers of `facts`; None where the source cannot be read."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing was found."""
+        return not self.findings
+
+
+def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Inspection:
+    """Read a source and report everything that is wrong with it.
+
+    Args:
+        name_or_path: what `data_catalog.catalog.resolve` takes.
+        config: settings it is read with.
+
+    Raises:
+        UnknownSequenceError: neither a known name nor an existing path.
+        ConfigError: settings that this source cannot be read with.
+    """
+    source: Source | None = None
+    sequence: Sequence | None = None
+    conventions = ""
+    notes: tuple[str, ...] = ()
+    with _HeardWarnings() as heard:
+        try:
+            source = resolve(name_or_path)
+            kind = next((item for item in folder_formats() if item.name == source.format), None)
+            conventions = kind.conventions if kind is not None else "OpenCV camera axes, camera to world; mm"
+            if kind is not None and kind.notes is not None:
+                notes = kind.notes(Path(str(source.path)))
+            sequence = read(source, config)
+        except (UnknownSequenceError, ConfigError):
+            raise
+        except ExtragsError as error:
+            findings = [_as_finding(error)]
+    if sequence is not None and source is not None:
+        findings = suspicions(sequence, source.path or source.name)
+    return Inspection(
+        name=source.name if source is not None else str(name_or_path),
+        format=source.format if source is not None else None,
+        conventions=conventions,
+        notes=(*notes, *heard.messages),
+        findings=tuple(findings),
+        facts=None if sequence is None else facts(sequence),
+    )
+
+
+def facts(sequence: Sequence) -> dict[str, Any]:
+    """Numbers that describe a sequence, ready for JSON.
+
+    Lengths are millimetres where the sequence is metric.
+    """
+    K = sequence.K
+    inside = max(1, int(sequence.mask.sum()))
+    specular = specular_masks(sequence.rgb, sequence.mask) if sequence.specular is None else sequence.specular
+    result: dict[str, Any] = {
+        "frames": len(sequence),
+        "train": len(sequence.train),
+        "test": len(sequence.test),
+        "split": f"{sequence.split.name} (version {sequence.split.version})",
+        "recordings": 1 if sequence.recording is None else len(np.unique(sequence.recording)),
+        "width": sequence.width,
+        "height": sequence.height,
+        "fx": float(K[0, 0, 0]),
+        "fy": float(K[0, 1, 1]),
+        "cx": float(K[0, 0, 2]),
+        "cy": float(K[0, 1, 2]),
+        "intrinsics": len(np.unique(K.reshape(len(K), -1), axis=0)),
+        "field_of_view_deg": float(np.degrees(2 * np.arctan(sequence.width / 2 / K[0, 0, 0]))),
+        "length_unit": "mm" if sequence.metric else "arbitrary",
+        "has_poses": sequence.world_from_camera is not None,
+        "has_depth": sequence.depth_mm is not None,
+        "points": 0 if sequence.points is None else len(sequence.points),
+        "masked_share": float(1 - sequence.mask.mean()),
+        "specular_share": float(specular.sum() / inside),
+        "saturated_share": float((saturated_mask(sequence.rgb) & sequence.mask).sum() / inside),
+    }
+    if sequence.world_from_camera is not None:
+        centers = sequence.cameras.centers
+        result["path_length"] = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
+        result["reach"] = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    if sequence.depth_mm is not None:
+        known = sequence.depth_mm > 0
+        low, middle, high = np.percentile(sequence.depth_mm[known], [1, 50, 99]) if known.any() else (0, 0, 0)
+        result["depth_known_share"] = float((known & sequence.mask).sum() / inside)
+        result["depth"] = {"p1": float(low), "median": float(middle), "p99": float(high)}
+    if sequence.observed is not None and len(sequence.test):
+        shown = sequence.mask[sequence.test]
+        seen = sequence.observed[sequence.test] & shown
+        result["observed_share"] = float(seen.sum() / max(1, int(shown.sum())))
+    return result
+
+
+def contact_sheet(sequence: Sequence) -> UInt8[np.ndarray, "h w 3"]:
+    """Frames spread over the sequence: masked pixels blue, highlights green, held-out frames framed.
+
+    Where there is depth, it stands below each frame (near is bright).
+    """
+    import cv2
+
+    count = min(len(sequence), _MOST_TILES)
+    chosen = np.round(np.linspace(0, len(sequence) - 1, count)).astype(int)
+    specular = (
+        specular_masks(sequence.rgb[chosen], sequence.mask[chosen])
+        if sequence.specular is None
+        else sequence.specular[chosen]
+    )
+    farthest = 1.0
+    if sequence.depth_mm is not None and (sequence.depth_mm > 0).any():
+        farthest = float(np.percentile(sequence.depth_mm[sequence.depth_mm > 0], 99))
+    height = round(_TILE_WIDTH * sequence.height / sequence.width)
+    tiles = []
+    for index, shine in zip(chosen.tolist(), specular, strict=True):
+        picture = sequence.rgb[index].copy()
+        outside = ~sequence.mask[index]
+        picture[outside] = picture[outside] // 2 + np.array([0, 0, 90], dtype=np.uint8)
+        picture[shine] = (0, 255, 0)
+        parts = [picture]
+        if sequence.depth_mm is not None:
+            near = 1 - np.clip(sequence.depth_mm[index] / farthest, 0, 1)
+            grey = np.where(sequence.depth_mm[index] > 0, 40 + 215 * near, 0).astype(np.uint8)
+            parts.append(np.repeat(grey[..., None], 3, axis=2))
+        tile = np.vstack(
+            [cv2.resize(part, (_TILE_WIDTH, height), interpolation=cv2.INTER_AREA) for part in parts]
+        )
+        if index in sequence.test:
+            cv2.rectangle(tile, (1, 1), (_TILE_WIDTH - 2, tile.shape[0] - 2), (255, 210, 0), 2)
+        label = sequence.frame_name(index)
+        # Dark below light, to be read on any picture.
+        for colour, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+            cv2.putText(tile, label, (6, 16), cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, width, cv2.LINE_AA)
+        tiles.append(tile)
+    columns = min(count, max(1, round(math.sqrt(count * tiles[0].shape[0] * 1.6 / _TILE_WIDTH))))
+    blank = np.zeros_like(tiles[0])
+    tiles += [blank] * (-count % columns)
+    rows = [np.hstack(tiles[start : start + columns]) for start in range(0, len(tiles), columns)]
+    return np.asarray(np.vstack(rows), dtype=np.uint8)
+
+
+def _as_finding(error: ExtragsError) -> Finding:
+    if isinstance(error, SourceError):
+        return Finding(
+            kind="error",
+            topic="cannot be read",
+            sentence=error.problem,
+            file=error.file,
+            frame=error.frame,
+            field=error.field,
+        )
+    return Finding(kind="error", topic="cannot be read", sentence=str(error))
+
+
+class _HeardWarnings(logging.Handler):
+    """Collects what readers warn of while a source is read: assumptions a user should know."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.WARNING)
+        self.messages: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.messages.append(record.getMessage())
+
+    def __enter__(self) -> _HeardWarnings:
+        logging.getLogger("data_catalog").addHandler(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        logging.getLogger("data_catalog").removeHandler(self)

@@ -1,0 +1,249 @@
+"""Lens models of COLMAP and OpenCV, and images resampled from them to a pinhole.
+
+Names and parameters are COLMAP's; pixel centres lie at +0.5. A distorted image is resampled once, straight
+from its true model: for each pixel of the pinhole, where the lens put that ray. The pinhole keeps size and
+central resolution of the source (or gets the field of view asked for), with square pixels and a centred
+principal point; what the lens did not
+see, or saw beyond the radius where its polynomial folds back, is left out of the validity mask.
+
+Source: COLMAP's camera models (https://colmap.github.io/cameras.html); Kannala and Brandt, "A generic camera
+model and calibration method for conventional, wide-angle and fish-eye lenses", PAMI 2006 (fisheye).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from extrags.errors import SourceError
+
+__all__ = ["LENS_PARAMETERS", "Lens", "Undistortion", "sample_depth"]
+
+LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "FOV": ("fx", "fy", "cx", "cy", "omega"),
+    "SIMPLE_RADIAL_FISHEYE": ("f", "cx", "cy", "k1"),
+    "RADIAL_FISHEYE": ("f", "cx", "cy", "k1", "k2"),
+    "THIN_PRISM_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+}
+"""Every model understood here, with the names of its parameters in COLMAP's order."""
+
+_INTRINSIC_NAMES = frozenset({"f", "fx", "fy", "cx", "cy"})
+# Directions and radii in which a polynomial is searched for its fold.
+_FOLD_DIRECTIONS = 16
+_FOLD_STEPS = 2000
+# Neighbouring depths that differ by more than this share lie on different surfaces.
+_FOLD_STEP = 0.05
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How one camera maps rays to pixels.
+
+    Args:
+        model: a key of `LENS_PARAMETERS`.
+        parameters: its parameters, in that order.
+        width: image width in pixels.
+        height: image height in pixels.
+
+    Raises:
+        SourceError: an unknown model, a wrong number of parameters, or one that is not finite.
+    """
+
+    model: str
+    parameters: tuple[float, ...]
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        names = LENS_PARAMETERS.get(self.model)
+        if names is None:
+            raise SourceError(
+                f"the camera model {self.model} is not known here; known: {', '.join(LENS_PARAMETERS)}",
+                field="camera_model",
+            )
+        if len(self.parameters) != len(names):
+            raise SourceError(
+                f"{len(self.parameters)} parameters for the model {self.model}; expected {len(names)}: "
+                f"{', '.join(names)}",
+                field="camera parameters",
+            )
+        for name, value in zip(names, self.parameters, strict=True):
+            if not np.isfinite(value):
+                raise SourceError(f"{name} = {value}; expected a finite number", field="camera parameters")
+
+    def value(self, name: str) -> float:
+        """One parameter by name; 0 where the model has none of that name."""
+        names = LENS_PARAMETERS[self.model]
+        return float(self.parameters[names.index(name)]) if name in names else 0.0
+
+    @property
+    def K(self) -> Float[np.ndarray, "3 3"]:
+        """The linear part: focal lengths and principal point."""
+        one = self.value("f")
+        fx, fy = (one, one) if one else (self.value("fx"), self.value("fy"))
+        return np.array([[fx, 0, self.value("cx")], [0, fy, self.value("cy")], [0, 0, 1.0]])
+
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether the linear part is all there is."""
+        if self.model == "FOV" or self.model.endswith("FISHEYE"):
+            return False
+        names = LENS_PARAMETERS[self.model]
+        return all(
+            value == 0
+            for name, value in zip(names, self.parameters, strict=True)
+            if name not in _INTRINSIC_NAMES
+        )
+
+    def distorted(
+        self, x: Float[np.ndarray, "*s"], y: Float[np.ndarray, "*s"]
+    ) -> tuple[Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]]:
+        """Normalised coordinates after the lens.
+
+        Args:
+            x: ray direction X / Z.
+            y: ray direction Y / Z.
+        """
+        k1, k2, k3, k4 = (self.value(name) for name in ("k1", "k2", "k3", "k4"))
+        p1, p2 = self.value("p1"), self.value("p2")
+        r = np.hypot(x, y)
+        safe = np.maximum(r, 1e-12)
+        if self.model == "FOV":
+            omega = self.value("omega")
+            if abs(omega) < 1e-9:
+                return x, y
+            scale = np.where(r > 1e-9, np.arctan(2 * r * np.tan(omega / 2)) / (omega * safe), 1.0)
+            return x * scale, y * scale
+        if self.model.endswith("FISHEYE"):
+            angle = np.arctan(r)
+            turned = np.where(r > 1e-9, angle / safe, 1.0)
+            x, y = x * turned, y * turned
+        square = x * x + y * y
+        radial = 1 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
+        if self.model == "FULL_OPENCV":
+            k5, k6 = self.value("k5"), self.value("k6")
+            radial = (1 + square * (k1 + square * (k2 + square * k3))) / (
+                1 + square * (k4 + square * (k5 + square * k6))
+            )
+        return (
+            x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x) + self.value("sx1") * square,
+            y * radial + 2 * p2 * x * y + p1 * (square + 2 * y * y) + self.value("sy1") * square,
+        )
+
+    def project(
+        self, x: Float[np.ndarray, "*s"], y: Float[np.ndarray, "*s"]
+    ) -> tuple[Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]]:
+        """Pixel coordinates of rays (X / Z, Y / Z), centres at +0.5."""
+        K = self.K
+        moved_x, moved_y = self.distorted(x, y)
+        return K[0, 0] * moved_x + K[0, 2], K[1, 1] * moved_y + K[1, 2]
+
+    def fold_radius(self, up_to: float) -> float:
+        """Normalised radius X / Z from which the model maps outward rays inward; at most `up_to`."""
+        radius = np.linspace(0, up_to, _FOLD_STEPS)
+        limit = up_to
+        for turn in np.arange(_FOLD_DIRECTIONS) * (2 * np.pi / _FOLD_DIRECTIONS):
+            x, y = self.distorted(radius * np.cos(turn), radius * np.sin(turn))
+            falling = np.flatnonzero(np.diff(x * np.cos(turn) + y * np.sin(turn)) <= 0)
+            if falling.size:
+                limit = min(limit, float(radius[falling[0]]))
+        return limit
+
+
+@dataclass(frozen=True)
+class Undistortion:
+    """A plan to resample images of one lens to a pinhole of the same size.
+
+    Args:
+        K: of the pinhole.
+        u: column in the source of each pixel's ray, centres at +0.5.
+        v: row in the source.
+        valid: whether the lens saw that ray.
+    """
+
+    K: Float[np.ndarray, "3 3"]
+    u: Float[np.ndarray, "h w"]
+    v: Float[np.ndarray, "h w"]
+    valid: Bool[np.ndarray, "h w"]
+
+    @classmethod
+    def planned(cls, lens: Lens, field_of_view_deg: float | None = None) -> Undistortion:
+        """The pinhole for a lens: square pixels, centred.
+
+        Args:
+            lens: what the images were taken with.
+            field_of_view_deg: horizontal, of the pinhole; None keeps the lens's own central resolution, which
+                cuts off the outermost part of what a fisheye sees.
+        """
+        width, height = lens.width, lens.height
+        focal = float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))
+        if field_of_view_deg is not None:
+            focal = float(width / 2 / np.tan(np.radians(field_of_view_deg) / 2))
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+        x, y = np.meshgrid(
+            (np.arange(width) + 0.5 - width / 2) / focal, (np.arange(height) + 0.5 - height / 2) / focal
+        )
+        u, v = lens.project(x, y)
+        radius = np.hypot(x, y)
+        # Half a pixel inside, so that no sample reaches over the border.
+        valid = (u >= 0.5) & (u <= width - 0.5) & (v >= 0.5) & (v <= height - 0.5)
+        valid &= radius < lens.fold_radius(float(radius.max()) * 1.01)
+        return cls(K, u, v, valid)
+
+    def colour(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+        """Colours, bilinear; black where nothing was seen."""
+        import cv2
+
+        moved = cv2.remap(image, *self._maps(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        moved[~self.valid] = 0
+        return np.asarray(moved)
+
+    def mask(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+        """True where all source pixels that a sample touches are true, and the lens saw it."""
+        import cv2
+
+        moved = cv2.remap(
+            mask.astype(np.float32), *self._maps(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        return np.asarray((moved > 0.999) & self.valid)
+
+    def depth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+        """z-depth, never mixed across a fold; 0 where unknown."""
+        return np.where(self.valid, sample_depth(depth, self.u, self.v), 0).astype(np.float32)
+
+    def _maps(self) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
+        # OpenCV counts from pixel centres.
+        return (self.u - 0.5).astype(np.float32), (self.v - 0.5).astype(np.float32)
+
+
+def sample_depth(
+    depth: Float[np.ndarray, "h w"], u: Float[np.ndarray, "*s"], v: Float[np.ndarray, "*s"]
+) -> Float[np.ndarray, "*s"]:
+    """Depth at pixel coordinates (centres at +0.5).
+
+    Where the four neighbours are known and close, their inverse depth is interpolated (exact on a plane
+    seen by a pinhole); elsewhere the nearest value is taken. Coordinates outside take the border's value.
+    """
+    height, width = depth.shape
+    x = np.clip(u - 0.5, 0, width - 1)
+    y = np.clip(v - 0.5, 0, height - 1)
+    j = np.clip(np.floor(x).astype(int), 0, max(width - 2, 0))
+    i = np.clip(np.floor(y).astype(int), 0, max(height - 2, 0))
+    a, b = y - i, x - j
+    right, down = np.minimum(j + 1, width - 1), np.minimum(i + 1, height - 1)
+    corners = np.stack([depth[i, j], depth[i, right], depth[down, j], depth[down, right]]).astype(np.float64)
+    weights = np.stack([(1 - a) * (1 - b), (1 - a) * b, a * (1 - b), a * b])
+    nearest = np.take_along_axis(corners, weights.argmax(axis=0)[None], axis=0)[0]
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    one_surface = (low > 0) & (high <= low * (1 + _FOLD_STEP))
+    inverse = (weights / np.where(corners > 0, corners, 1)).sum(axis=0)
+    return np.asarray(np.where(one_surface, 1 / np.maximum(inverse, 1e-12), nearest))

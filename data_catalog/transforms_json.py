@@ -1,0 +1,404 @@
+"""Reader and writer of `transforms.json`, the format of nerfstudio and instant-ngp.
+
+Read: `transform_matrix` (camera to world, OpenGL axes: y up, z backward; turned to OpenCV's on reading and
+nothing else), `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`, `cx`, `cy`, `w`, `h`, `k1` to `k4`, `p1`,
+`p2`, `camera_model` or `is_fisheye`, each for all frames or in a frame of its own; `file_path` (its suffix
+may be missing), `mask_path` (white is tissue), `depth_file_path`; `train_filenames`, `test_filenames` and
+`val_filenames`; `ply_file_path`. Images of distorted cameras are resampled to a pinhole.
+
+Depth is z-depth; a value times `depth_unit_scale_factor` is in the unit of the poses. Where the file does not
+say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). 0 is unknown.
+
+Lengths: `length_unit` (a key of ours: `mm`, `m` or `arbitrary`) says what a pose's 1 is; without it the scale
+is arbitrary. instant-ngp's `scale`, `offset` and `aabb_scale` and nerfstudio's `applied_transform` say how a
+scene was put into a box; poses stand in the file after or before that consistently, so they change nothing.
+
+Source: https://docs.nerf.studio/quickstart/data_conventions.html.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from data_catalog.formats import FolderFormat
+from data_catalog.images import COLOUR_SUFFIXES, natural_key, read_depth
+from data_catalog.lens import LENS_PARAMETERS, Lens
+from data_catalog.posed_frames import PosedFrame, assembled, save_images
+from extrags.config import IngestConfig
+from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.sequence import Sequence
+
+__all__ = ["FORMAT", "TRANSFORMS_FILE", "write_transforms"]
+
+TRANSFORMS_FILE = "transforms.json"
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_NERFSTUDIO_DEPTH_SCALE = 1e-3
+_MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "arbitrary": 1.0}
+_FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
+
+
+def _recognises(folder: Path) -> bool:
+    return (folder / TRANSFORMS_FILE).is_file()
+
+
+def _files(folder: Path) -> list[Path]:
+    content = _load(folder / TRANSFORMS_FILE)
+    found = {folder / TRANSFORMS_FILE}
+    for entry in content["frames"]:
+        for key in _FILE_KEYS:
+            if isinstance(entry.get(key), str):
+                found.add(_with_suffix(folder / entry[key]))
+    if isinstance(content.get("ply_file_path"), str):
+        found.add(folder / content["ply_file_path"])
+    return sorted(file for file in found if file.is_file() and file.is_relative_to(folder))
+
+
+def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+    file = folder / TRANSFORMS_FILE
+    content = _load(file)
+    unit = content.get("length_unit", "arbitrary")
+    if unit not in _MM_PER_UNIT:
+        raise SourceError(
+            f"{unit!r} is no length unit known here; expected one of {', '.join(_MM_PER_UNIT)}",
+            file=file,
+            field="length_unit",
+        )
+    scale = _MM_PER_UNIT[unit]
+    entries = sorted(content["frames"], key=lambda entry: natural_key(entry["file_path"]))
+    splits = _splits(content, file)
+    folders = sorted({str(Path(entry["file_path"]).parent) for entry in entries}, key=natural_key)
+    frames = []
+    for entry in entries:
+        frame = entry["file_path"]
+        place = _with_suffix(folder / frame)
+        if not place.is_file():
+            raise SourceNotFoundError(
+                f"{TRANSFORMS_FILE} lists this frame, but there is no such file",
+                file=place,
+                frame=frame,
+                field="file_path",
+            )
+        frames.append(
+            PosedFrame(
+                name=str(Path(frame).relative_to("images")) if frame.startswith("images/") else frame,
+                file=place,
+                lens=_lens({**content, **entry}, place, file, frame),
+                world_from_camera=_pose(entry, scale, file, frame),
+                mask_file=_beside(folder, entry, "mask_path", frame),
+                depth_file=_beside(folder, entry, "depth_file_path", frame),
+                recording=folders.index(str(Path(frame).parent)),
+                split=None if splits is None else splits.get(frame, "train"),
+            )
+        )
+    points, points_rgb = _points(folder, content, file)
+
+    def depth_of(depth_file: Path, frame: str) -> Float[np.ndarray, "h w"]:
+        factor = _depth_factor(content, depth_file, file) * scale
+        return (read_depth(depth_file, frame=frame) * factor).astype(np.float32)
+
+    return assembled(
+        frames,
+        config,
+        name=name,
+        pose_file=file,
+        metric=unit != "arbitrary",
+        read_depth=depth_of,
+        points=None if points is None else points * scale,
+        points_rgb=points_rgb,
+    )
+
+
+FORMAT = FolderFormat(
+    name="transforms",
+    version=1,
+    summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in data_catalog/transforms_json.py",
+    recognises=_recognises,
+    files=_files,
+    read=_read,
+    conventions="OpenGL camera axes (y up, z backward, turned on reading), camera to world; "
+    "depth in thousandths of the pose unit unless it says otherwise",
+)
+
+
+def write_transforms(
+    sequence: Sequence,
+    folder: Path,
+    *,
+    points: Float[np.ndarray, "p 3"] | None = None,
+    points_rgb: UInt8[np.ndarray, "p 3"] | None = None,
+) -> None:
+    """Write a posed sequence as `transforms.json` with its images, masks, depth and points.
+
+    Numbers keep all their digits. Depth is written as float `.npy` in thousandths of the pose unit, which is
+    what nerfstudio expects; `length_unit` says what that unit is.
+
+    Args:
+        sequence: with poses.
+        folder: made if need be.
+        points: sparse points in world coordinates; None takes the sequence's own.
+        points_rgb: their colours.
+
+    Raises:
+        ShapeError: while the sequence has no poses.
+    """
+    cameras = sequence.cameras
+    if points is None:
+        points, points_rgb = sequence.points, sequence.points_rgb
+    names = save_images(sequence, folder)
+    masked = not sequence.mask.all()
+    frames = []
+    for index, image in enumerate(names):
+        K = cameras.K[index]
+        pose = cameras.world_from_camera[index] @ _OPENCV_FROM_OPENGL
+        entry: dict[str, Any] = {"file_path": f"images/{image}"}
+        entry |= {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        entry |= {"w": sequence.width, "h": sequence.height}
+        if masked:
+            entry["mask_path"] = f"masks/{image}.png"
+        if sequence.depth_mm is not None:
+            entry["depth_file_path"] = f"depth/{Path(image).with_suffix('.npy').as_posix()}"
+            place = folder / entry["depth_file_path"]
+            place.parent.mkdir(parents=True, exist_ok=True)
+            # In double precision, so that only the reader rounds.
+            np.save(place, sequence.depth_mm[index].astype(np.float64) / _NERFSTUDIO_DEPTH_SCALE)
+        frames.append({**entry, "transform_matrix": pose.tolist()})
+    content: dict[str, Any] = {
+        "camera_model": "PINHOLE",
+        "length_unit": "mm" if sequence.metric else "arbitrary",
+        "frames": frames,
+    }
+    for split, indices in (("train", sequence.train), ("test", sequence.test)):
+        content[f"{split}_filenames"] = [frames[int(index)]["file_path"] for index in indices]
+    content["val_filenames"] = []
+    if points is not None:
+        content["ply_file_path"] = "points.ply"
+        _write_points(folder / "points.ply", points, points_rgb)
+    (folder / TRANSFORMS_FILE).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _load(file: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise SourceError(f"not readable as JSON: {error}", file=file) from error
+    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
+        raise SourceError("expected an object with a list `frames`", file=file, field="frames")
+    if not content["frames"]:
+        raise SourceError("the list of frames is empty", file=file, field="frames")
+    seen: set[str] = set()
+    for index, entry in enumerate(content["frames"]):
+        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
+            raise SourceError(
+                "expected an object with `file_path`", file=file, frame=index, field="file_path"
+            )
+        if entry["file_path"] in seen:
+            raise SourceError(
+                "the frame is listed twice", file=file, frame=entry["file_path"], field="file_path"
+            )
+        seen.add(entry["file_path"])
+    return content
+
+
+def _with_suffix(file: Path) -> Path:
+    """The image a path means: the synthetic NeRF scenes leave `.png` out."""
+    if file.is_file() or file.suffix.lower() in COLOUR_SUFFIXES:
+        return file
+    candidates = (file.with_name(file.name + suffix) for suffix in COLOUR_SUFFIXES)
+    return next((candidate for candidate in candidates if candidate.is_file()), file)
+
+
+def _beside(folder: Path, entry: dict[str, Any], key: str, frame: str) -> Path | None:
+    if key not in entry:
+        return None
+    file = folder / str(entry[key])
+    if not file.is_file():
+        raise SourceNotFoundError("no such file", file=file, frame=frame, field=key)
+    return file
+
+
+def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[np.ndarray, "4 4"]:
+    if "transform_matrix" not in entry:
+        raise PoseError(
+            "no transform_matrix; expected 4 x 4 numbers", file=file, frame=frame, field="transform_matrix"
+        )
+    try:
+        matrix = np.asarray(entry["transform_matrix"], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise PoseError(
+            f"not a matrix of numbers: {error}", file=file, frame=frame, field="transform_matrix"
+        ) from error
+    if matrix.shape == (3, 4):
+        matrix = np.vstack([matrix, [0, 0, 0, 1.0]])
+    if matrix.shape != (4, 4):
+        raise PoseError(
+            f"found shape {matrix.shape}; expected 4 rows of 4 numbers",
+            file=file,
+            frame=frame,
+            field="transform_matrix",
+        )
+    pose = matrix @ _OPENCV_FROM_OPENGL
+    pose[:3, 3] *= scale
+    return pose
+
+
+def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
+    def number(key: str, otherwise: float | None = None) -> float:
+        if key not in values and otherwise is not None:
+            return otherwise
+        try:
+            return float(values[key])
+        except (KeyError, TypeError, ValueError) as error:
+            raise SourceError(
+                f"{key} = {values.get(key)!r}; expected a number", file=file, frame=frame, field=key
+            ) from error
+
+    if "w" in values and "h" in values:
+        width, height = int(number("w")), int(number("h"))
+    else:
+        width, height = _image_size(image)
+    if "fl_x" in values or "fl_y" in values:
+        fx = number("fl_x") if "fl_x" in values else number("fl_y")
+        fy = number("fl_y", fx)
+    elif "camera_angle_x" in values:
+        fx = width / 2 / np.tan(number("camera_angle_x") / 2)
+        fy = (
+            height / 2 / np.tan(number("camera_angle_y") / 2)
+            if "camera_angle_y" in values and "fl_y" not in values
+            else fx
+        )
+    else:
+        raise SourceError(
+            "no focal length; expected fl_x (pixels) or camera_angle_x (radians), for all frames or in each",
+            file=file,
+            frame=frame,
+            field="fl_x",
+        )
+    named = {
+        "fx": fx,
+        "fy": fy,
+        "cx": number("cx", width / 2),
+        "cy": number("cy", height / 2),
+        **{key: number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")},
+    }
+    model = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"))
+    if model in ("PINHOLE", "SIMPLE_PINHOLE") or (
+        model == "OPENCV" and not any(named[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    ):
+        model = "PINHOLE"
+    elif model in ("SIMPLE_RADIAL", "RADIAL") or (model == "OPENCV" and not (named["k3"] or named["k4"])):
+        model = "OPENCV"
+    elif model == "OPENCV":
+        # nerfstudio's OPENCV has k1 to k4 as a polynomial; COLMAP's has two, the full one puts k4 below.
+        if named["k4"]:
+            raise SourceError(
+                "k4 with camera_model OPENCV is not understood; expected OPENCV_FISHEYE or k4 = 0",
+                file=file,
+                frame=frame,
+                field="k4",
+            )
+        model = "FULL_OPENCV"
+    names = LENS_PARAMETERS.get(model)
+    if names is None or not set(names) <= set(named):
+        raise SourceError(
+            f"camera_model {model!r} is not understood; expected PINHOLE, SIMPLE_PINHOLE, SIMPLE_RADIAL, "
+            "RADIAL, OPENCV, FULL_OPENCV or OPENCV_FISHEYE",
+            file=file,
+            frame=frame,
+            field="camera_model",
+        )
+    return Lens(model, tuple(float(named[key]) for key in names), width, height)
+
+
+def _image_size(image: Path) -> tuple[int, int]:
+    from data_catalog.images import read_colour
+
+    height, width = read_colour(image, frame=image.name).shape[:2]
+    return width, height
+
+
+def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> float:
+    if "depth_unit_scale_factor" in content:
+        key = "depth_unit_scale_factor"
+    elif "integer_depth_scale" in content and depth_file.suffix.lower() != ".npy":
+        key = "integer_depth_scale"
+    else:
+        return _NERFSTUDIO_DEPTH_SCALE
+    try:
+        factor = float(content[key])
+    except (TypeError, ValueError) as error:
+        raise SourceError(f"{content[key]!r}; expected a number", file=file, field=key) from error
+    if not np.isfinite(factor) or factor <= 0:
+        raise SourceError(f"{factor:g}; expected a positive number", file=file, field=key)
+    return factor
+
+
+def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "test"]] | None:
+    """Splits by `file_path`; None where the file names none. Validation frames are held out too."""
+    held_out = [
+        name for key in ("test_filenames", "val_filenames") for name in content.get(key) or [] if name
+    ]
+    if not held_out:
+        return None
+    known = {entry["file_path"] for entry in content["frames"]}
+    training = set(content.get("train_filenames") or known - set(held_out))
+    for listed in [*held_out, *sorted(training, key=natural_key)]:
+        if listed not in known:
+            raise SourceError(
+                "the split names this frame, but `frames` does not", file=file, frame=listed, field="split"
+            )
+    both = sorted(set(held_out) & training, key=natural_key)
+    if both:
+        raise SourceError(
+            f"{len(both)} frames both train and evaluate, this one is the first",
+            file=file,
+            frame=both[0],
+            field="split",
+        )
+    result: dict[str, Literal["train", "test"]] = dict.fromkeys(held_out, "test")
+    for name in training:
+        result[name] = "train"
+    return result
+
+
+def _points(
+    folder: Path, content: dict[str, Any], file: Path
+) -> tuple[Float[np.ndarray, "p 3"] | None, UInt8[np.ndarray, "p 3"] | None]:
+    from plyfile import PlyData, PlyParseError
+
+    if "ply_file_path" not in content:
+        return None, None
+    place = folder / str(content["ply_file_path"])
+    if not place.is_file():
+        raise SourceNotFoundError("no such file", file=place, field="ply_file_path")
+    try:
+        vertices = PlyData.read(str(place))["vertex"]
+        located = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
+    except (PlyParseError, KeyError, ValueError) as error:
+        raise SourceError(f"no PLY with vertices: {error}", file=place, field="ply_file_path") from error
+    names = {item.name for item in vertices.properties}
+    if not {"red", "green", "blue"} <= names:
+        return located, None
+    coloured = np.stack([np.asarray(vertices[name]) for name in ("red", "green", "blue")], axis=1)
+    return located, coloured.astype(np.uint8)
+
+
+def _write_points(
+    file: Path, points: Float[np.ndarray, "p 3"], points_rgb: UInt8[np.ndarray, "p 3"] | None
+) -> None:
+    from plyfile import PlyData, PlyElement
+
+    kinds = [(axis, "f8") for axis in "xyz"]
+    if points_rgb is not None:
+        kinds += [(name, "u1") for name in ("red", "green", "blue")]
+    rows = np.zeros(len(points), dtype=kinds)
+    for index, axis in enumerate("xyz"):
+        rows[axis] = points[:, index]
+    if points_rgb is not None:
+        for index, colour in enumerate(("red", "green", "blue")):
+            rows[colour] = points_rgb[:, index]
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(file))

@@ -1,0 +1,24 @@
+"""The true surface of a sequence: the source's own geometry, else its true depth fused."""
+
+from __future__ import annotations
+
+from extrags.metrics.surface import TrueSurface, surface_from_depth
+from extrags.sequence import Sequence
+from extrags.surface import Mesh
+
+__all__ = ["true_surface"]
+
+
+def true_surface(sequence: Sequence) -> TrueSurface | None:
+    """What a reconstruction of the sequence is held against; None where nothing is known.
+
+    The phantom's wall is made again from the settings that the sequence carries in `truth`.
+    """
+    phantom = sequence.truth.get("phantom")
+    if phantom is not None:
+        from data_catalog.phantom.config import PhantomConfig
+        from data_catalog.phantom.geometry import build_wall
+
+        wall = build_wall(PhantomConfig.model_validate(phantom))
+        return TrueSurface(Mesh(wall.vertices, wall.triangles), "mesh")
+    return surface_from_depth(sequence)

@@ -1,0 +1,282 @@
+"""Runs compared: spread over seeds, and paired differences between methods.
+
+A run is a mapping with `method`, `profile`, `sequence`, `setting`, `seed` and `metrics` (the tree of
+`EvaluationResult`). Methods are compared in pairs only: two runs that share everything but the method. Over
+a dataset, the mean difference of each sequence is one sample: seeds of one sequence are no independent
+evidence. `PROTOCOL.md`, section 7, has the rules in words.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from collections.abc import Sequence as AbstractSequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from extrags.errors import ConfigError
+
+__all__ = ["FIGURES", "Figure", "Spread", "compare_runs", "dataset_of", "figure_of", "paired", "spread"]
+
+Run = Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """A figure of the metrics tree that runs are compared by.
+
+    Args:
+        name: dotted path in the tree.
+        higher_is_better: the direction.
+    """
+
+    name: str
+    higher_is_better: bool
+
+
+_PHOTOMETRIC = (
+    ("psnr", True),
+    ("ssim", True),
+    ("lpips_alex", False),
+    ("lpips_squeeze", False),
+    ("flip", False),
+)
+_DEPTH = (("depth_absrel", False), ("depth_rmse", False), ("depth_delta125", True), ("depth_coverage", True))
+_SURFACE = (
+    ("accuracy_mm", False),
+    ("completeness_mm", False),
+    ("precision", True),
+    ("recall", True),
+    ("fscore", True),
+)
+
+FIGURES: tuple[Figure, ...] = tuple(
+    Figure(f"{prefix}{name}", higher)
+    for prefix, names in (
+        ("", (*_PHOTOMETRIC, *_DEPTH)),
+        ("aligned.", _PHOTOMETRIC),
+        ("observed.", (*_PHOTOMETRIC, *_DEPTH)),
+        ("observed.aligned.", _PHOTOMETRIC),
+        ("unobserved.", (*_PHOTOMETRIC, *_DEPTH)),
+        ("unobserved.aligned.", _PHOTOMETRIC),
+        ("whole.", _PHOTOMETRIC),
+        ("surface.", (*_SURFACE, ("coverage", True))),
+        ("surface.unobserved.", _SURFACE),
+    )
+    for name, higher in names
+)
+"""All figures that have a direction."""
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """A sample of a figure, or of differences.
+
+    Args:
+        n: its size.
+        mean: of the sample.
+        deviation: standard deviation with n - 1; None for a single value.
+        low: lower end of the 95 % interval of the mean (Student's t); None for a single value.
+        high: its upper end.
+        smallest: of the sample.
+        largest: of the sample.
+    """
+
+    n: int
+    mean: float
+    deviation: float | None
+    low: float | None
+    high: float | None
+    smallest: float
+    largest: float
+
+
+def spread(values: AbstractSequence[float]) -> Spread:
+    """Mean, deviation and 95 % interval of a sample.
+
+    Raises:
+        ConfigError: for an empty sample.
+    """
+    if not values:
+        raise ConfigError("an empty sample has no spread")
+    sample = np.asarray(values, dtype=np.float64)
+    mean = float(sample.mean())
+    deviation = low = high = None
+    if len(sample) > 1:
+        from scipy.stats import t
+
+        deviation = float(sample.std(ddof=1))
+        reach = float(t.ppf(0.975, len(sample) - 1)) * deviation / math.sqrt(len(sample))
+        low, high = mean - reach, mean + reach
+    return Spread(len(sample), mean, deviation, low, high, float(sample.min()), float(sample.max()))
+
+
+def figure_of(metrics: Mapping[str, Any] | None, name: str) -> float | None:
+    """A figure by its dotted path; None when any part of the way is missing."""
+    node: Any = metrics
+    for part in name.split("."):
+        if not isinstance(node, Mapping):
+            return None
+        node = node.get(part)
+    return None if node is None or isinstance(node, Mapping) else float(node)
+
+
+def dataset_of(run: Run) -> str:
+    """`phantom@sparse` for the runs of `phantom/3` in the setting `sparse`."""
+    dataset = str(run["sequence"]).partition("/")[0]
+    return f"{dataset}@{run['setting']}" if run["setting"] else dataset
+
+
+def paired(runs: AbstractSequence[Run], method: str, baseline: str, name: str) -> list[tuple[Run, float]]:
+    """Differences method - baseline of runs that share all but the method.
+
+    Args:
+        runs: of both, and of others.
+        method: the method in question.
+        baseline: the method it is compared with.
+        name: of the figure.
+
+    Returns:
+        The runs of `method` that have a partner, with the difference; runs without a figure are left out.
+    """
+    others = {_identity(run): run for run in runs if run["method"] == baseline}
+    found = []
+    for run in runs:
+        partner = others.get(_identity(run)) if run["method"] == method else None
+        if partner is None:
+            continue
+        value, reference = figure_of(run["metrics"], name), figure_of(partner["metrics"], name)
+        if value is not None and reference is not None:
+            found.append((run, value - reference))
+    return found
+
+
+def compare_runs(runs: AbstractSequence[Run], baseline: str) -> dict[str, Any]:
+    """Spread and paired differences of all figures that any run has.
+
+    Args:
+        runs: the runs; failed ones (`metrics` None) are left out.
+        baseline: method the others are compared with.
+
+    Returns:
+        `{baseline, sequences, datasets, paired_sequences, paired_datasets}`: lists of rows with what they
+        are about (`sequence` and `setting`, or `dataset`; `profile`, `method`, `n_seeds` or
+        `n_sequences`) and `figures`, by name a `Spread`. Paired rows hold differences method - baseline
+        and, per figure, in how many of the `n` pairs the method is better.
+
+    Raises:
+        ConfigError: when no run is of the baseline, or a run is there twice.
+    """
+    methods = list(dict.fromkeys(str(run["method"]) for run in runs))
+    if runs and baseline not in methods:
+        raise ConfigError(f"no run of the baseline {baseline!r}; methods here: {', '.join(methods)}")
+    seen: set[tuple[Any, ...]] = set()
+    for run in runs:
+        key = (run["method"], *_identity(run))
+        if key in seen:
+            raise ConfigError(f"the run {key} is there twice")
+        seen.add(key)
+    measured = [run for run in runs if run["metrics"] is not None]
+    figures = [
+        figure
+        for figure in FIGURES
+        if any(figure_of(run["metrics"], figure.name) is not None for run in measured)
+    ]
+    rivals = [method for method in methods if method != baseline]
+    return {
+        "baseline": baseline,
+        "sequences": _grouped(measured, figures, _by_sequence),
+        "datasets": _grouped(measured, figures, _by_dataset),
+        "paired_sequences": _paired(measured, figures, rivals, baseline, _by_sequence),
+        "paired_datasets": _paired(measured, figures, rivals, baseline, _by_dataset),
+    }
+
+
+def _identity(run: Run) -> tuple[Any, ...]:
+    return (run["profile"], run["sequence"], run["setting"], run["seed"])
+
+
+def _by_sequence(run: Run) -> dict[str, Any]:
+    return {"sequence": run["sequence"], "setting": run["setting"], "profile": run["profile"]}
+
+
+def _by_dataset(run: Run) -> dict[str, Any]:
+    return {"dataset": dataset_of(run), "profile": run["profile"]}
+
+
+def _grouped(
+    runs: AbstractSequence[Run],
+    figures: AbstractSequence[Figure],
+    about: Callable[[Run], dict[str, Any]],
+) -> list[dict[str, Any]]:
+    rows = []
+    for group, members in _groups(runs, lambda run: {**about(run), "method": run["method"]}):
+        found = {}
+        for figure in figures:
+            values = [
+                (run, value)
+                for run in members
+                if (value := figure_of(run["metrics"], figure.name)) is not None
+            ]
+            sample = _sample(values, about)
+            if sample:
+                found[figure.name] = asdict(spread(sample))
+        rows.append({**group, **_sizes(members), "figures": found})
+    return rows
+
+
+def _paired(
+    runs: AbstractSequence[Run],
+    figures: AbstractSequence[Figure],
+    methods: AbstractSequence[str],
+    baseline: str,
+    about: Callable[[Run], dict[str, Any]],
+) -> list[dict[str, Any]]:
+    rows = []
+    for method in methods:
+        for group, members in _groups(runs, about):
+            found: dict[str, Any] = {}
+            partners: dict[int, Run] = {}
+            for figure in figures:
+                differences = paired(members, method, baseline, figure.name)
+                partners |= {id(run): run for run, _ in differences}
+                sample = _sample(differences, about)
+                if sample:
+                    sign = 1 if figure.higher_is_better else -1
+                    better = sum(sign * value > 0 for value in sample)
+                    found[figure.name] = {**asdict(spread(sample)), "better": better}
+            if found:
+                sizes = _sizes(list(partners.values()))
+                rows.append({**group, "method": method, "baseline": baseline, **sizes, "figures": found})
+    return rows
+
+
+def _sample(
+    values: AbstractSequence[tuple[Run, float]], about: Callable[[Run], dict[str, Any]]
+) -> list[float]:
+    """The values of a sequence's seeds; of a dataset, the mean of each sequence."""
+    if about is _by_sequence:
+        return [value for _, value in values]
+    by_sequence: dict[Any, list[float]] = {}
+    for run, value in values:
+        by_sequence.setdefault((run["sequence"], run["setting"]), []).append(value)
+    return [float(np.mean(found)) for found in by_sequence.values()]
+
+
+def _groups(
+    runs: AbstractSequence[Run], about: Callable[[Run], dict[str, Any]]
+) -> list[tuple[dict[str, Any], list[Run]]]:
+    groups: dict[tuple[Any, ...], tuple[dict[str, Any], list[Run]]] = {}
+    for run in runs:
+        row = about(run)
+        groups.setdefault(tuple(row.values()), (row, []))[1].append(run)
+    return list(groups.values())
+
+
+def _sizes(runs: AbstractSequence[Run]) -> dict[str, int]:
+    return {
+        "n_sequences": len({(run["sequence"], run["setting"]) for run in runs}),
+        "n_seeds": len({run["seed"] for run in runs}),
+    }

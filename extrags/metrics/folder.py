@@ -1,0 +1,183 @@
+"""Renders made elsewhere: a folder of images as `RenderedViews`.
+
+Images stand for the held-out frames of a sequence. They are matched by name (`b_0010.png` for the frame
+`b_0010`) where every file name is a frame's; otherwise by number: as many files as held-out frames, in the
+order of the numbers in their names, in the order of the recording.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from jaxtyping import Float
+
+from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
+from extrags.metrics.protocol import RenderedViews
+from extrags.sequence import Sequence
+
+__all__ = ["read_renders"]
+
+COLOR_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
+DEPTH_SUFFIXES = frozenset({".npy", ".png", ".tif", ".tiff"})
+_NAMED_AT_MOST = 5
+
+
+def read_renders(
+    folder: Path,
+    sequence: Sequence,
+    *,
+    depth_folder: Path | None = None,
+    depth_step_mm: float | None = None,
+) -> RenderedViews:
+    """Read renders of a sequence's held-out frames.
+
+    Args:
+        folder: images of the sequence's size, 8 bits a channel.
+        sequence: says which frames, in which order, and how large.
+        depth_folder: z-depth maps of the same frames, 0 where there is no surface: `.npy` or floating-point
+            TIFF in the unit of the sequence, or 16-bit PNG or TIFF in steps of `depth_step_mm`.
+        depth_step_mm: unit of integer depth images; not needed for floating-point ones.
+
+    Returns:
+        The renders in the order of `sequence.test`. Alpha is 1; without depth maps depth is 0, which the
+        protocol reads as unknown.
+
+    Raises:
+        SourceNotFoundError: for a folder that is not there or holds no images, and for held-out frames
+            without one; names them.
+        SourceError: for a file that cannot be read or stands for no held-out frame.
+        ShapeError: for an image of another size; names the file and both sizes.
+        NonFiniteError: for depth that holds NaN or infinity.
+        ConfigError: for integer depth without its step.
+    """
+    shape = (sequence.height, sequence.width)
+    rgb = [_color(file, shape) for file in _files_of(folder, sequence, COLOR_SUFFIXES, "image")]
+    depth = np.zeros((len(rgb), *shape), dtype=np.float32)
+    if depth_folder is not None:
+        files = _files_of(depth_folder, sequence, DEPTH_SUFFIXES, "depth map")
+        depth = np.stack([_depth(file, shape, depth_step_mm) for file in files])
+    return RenderedViews(np.stack(rgb), np.ones((len(rgb), *shape), dtype=np.float32), depth, None)
+
+
+def _files_of(folder: Path, sequence: Sequence, suffixes: frozenset[str], kind: str) -> list[Path]:
+    """One file per held-out frame, in their order."""
+    if not folder.is_dir():
+        raise SourceNotFoundError(f"there is no such folder of {kind}s", file=folder)
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.is_file())
+    if not files:
+        kinds = ", ".join(sorted(suffixes))
+        raise SourceNotFoundError(f"the folder holds no {kind} ({kinds})", file=folder)
+    wanted = {_stem(sequence.frame_name(int(frame))): int(frame) for frame in sequence.test}
+    every = {_stem(sequence.frame_name(frame)) for frame in range(len(sequence))}
+    by_stem = _by_stem(files, kind)
+    named = [stem for stem in by_stem if stem in every]
+    if named and len(named) == len(by_stem):
+        missing = [stem for stem in wanted if stem not in by_stem]
+        if missing:
+            raise SourceNotFoundError(
+                f"{len(missing)} of the {len(wanted)} held-out frames of {sequence.name} have no {kind}: "
+                f"{_some(missing)}",
+                file=folder,
+            )
+        return [by_stem[stem] for stem in wanted]
+    if any(stem in wanted for stem in named):
+        strange = [file.name for stem, file in by_stem.items() if stem not in every]
+        raise SourceError(
+            f"some {kind}s are named after frames of {sequence.name} and some are not: {_some(strange)}",
+            file=folder,
+        )
+    return _by_number(files, folder, sequence, kind, list(wanted))
+
+
+def _by_number(
+    files: list[Path], folder: Path, sequence: Sequence, kind: str, wanted: list[str]
+) -> list[Path]:
+    if len(files) != len(wanted):
+        raise SourceNotFoundError(
+            f"{len(files)} {kind}s for {len(wanted)} held-out frames of {sequence.name}, and their names are "
+            f"not those of the frames ({_some(wanted)})",
+            file=folder,
+        )
+    numbers = [re.findall(r"\d+", file.stem) for file in files]
+    bare = [file.name for file, found in zip(files, numbers, strict=True) if not found]
+    if bare:
+        raise SourceError(
+            f"a {kind} without a number in its name has no place: {_some(bare)}; name it after its frame "
+            f"({_some(wanted)})",
+            file=folder,
+        )
+    keys = [tuple(int(number) for number in found) for found in numbers]
+    if len(set(keys)) != len(keys):
+        twice = [file.name for file, key in zip(files, keys, strict=True) if keys.count(key) > 1]
+        raise SourceError(f"{kind}s with the same number: {_some(twice)}", file=folder)
+    return [file for _, file in sorted(zip(keys, files, strict=True))]
+
+
+def _by_stem(files: list[Path], kind: str) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for file in files:
+        if file.stem in found:
+            raise SourceError(f"two {kind}s of one name: {found[file.stem].name} and {file.name}", file=file)
+        found[file.stem] = file
+    return found
+
+
+def _stem(frame_name: str) -> str:
+    """Frame names may be file names or paths of the source."""
+    last = PurePosixPath(frame_name).name
+    return last.rsplit(".", 1)[0] if Path(last).suffix.lower() in COLOR_SUFFIXES else last
+
+
+def _color(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(file) as image:
+            if image.mode not in ("RGB", "RGBA", "P"):
+                raise SourceError(
+                    f"expected an 8-bit colour image, found the mode {image.mode}", file=file, field="mode"
+                )
+            levels = np.asarray(image.convert("RGB"))
+    except (UnidentifiedImageError, OSError, SyntaxError) as error:
+        raise SourceError(f"this is no image that can be read: {error}", file=file) from error
+    _check_size(file, levels.shape[:2], shape)
+    return levels.astype(np.float32) / 255
+
+
+def _depth(file: Path, shape: tuple[int, int], step_mm: float | None) -> Float[np.ndarray, "h w"]:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        if file.suffix.lower() == ".npy":
+            values = np.load(file, allow_pickle=False)
+        else:
+            with Image.open(file) as image:
+                values = np.asarray(image)
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as error:
+        raise SourceError(f"this is no depth map that can be read: {error}", file=file) from error
+    values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
+    if values.ndim != 2:
+        raise ShapeError(f"{file}: a depth map has shape {values.shape}, expected two dimensions")
+    _check_size(file, values.shape, shape)
+    if not np.issubdtype(values.dtype, np.floating):
+        if step_mm is None:
+            raise ConfigError(f"{file} holds integers; say what a step of depth is (depth step in mm)")
+        values = values * step_mm
+    if not np.isfinite(values).all():
+        raise NonFiniteError(f"{file}: depth holds NaN or infinity; 0 means that there is no surface")
+    return np.asarray(values.astype(np.float32))
+
+
+def _check_size(file: Path, found: tuple[int, ...], expected: tuple[int, int]) -> None:
+    if tuple(found) != expected:
+        raise ShapeError(
+            f"{file}: {found[1]} x {found[0]} pixels, but the held-out frames are "
+            f"{expected[1]} x {expected[0]}; renders are never resized"
+        )
+
+
+def _some(names: list[str]) -> str:
+    more = len(names) - _NAMED_AT_MOST
+    return ", ".join(names[:_NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,380 @@
+"""Errors of the reconstructed surface against the true one: accuracy, completeness, F-score, coverage.
+
+A scene of Gaussians has no mesh of its own. The protocol makes one from any scene in the same way
+(`scene_surface`): TSDF fusion of the rendered median depth, at the training and the held-out cameras, with
+fixed settings. The true surface is a mesh where the source has geometry, else the fusion of the true depth
+of all frames with the same settings (`surface_from_depth`).
+
+Both surfaces are sampled uniformly by area. A part of the true surface counts as *observed* when at least
+one training camera sees it, as *unobserved* when held-out cameras alone do; what no camera sees does not
+count. A sample of the reconstruction belongs to the part its nearest true point belongs to.
+
+Source: Knapitsch, Park, Zhou, Koltun: Tanks and Temples, ACM TOG 2017, section 4 (precision, recall,
+F-score); Seitz et al.: A Comparison and Evaluation of Multi-View Stereo Reconstruction Algorithms, CVPR
+2006 (accuracy and completeness).
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from extrags.cameras import Cameras
+from extrags.config import SurfaceConfig
+from extrags.errors import CaptureError, ConfigError
+from extrags.scene import Scene
+from extrags.sequence import Sequence
+from extrags.surface import Mesh, fuse_depth, rendered_depth
+
+__all__ = [
+    "PROTOCOL_FUSION",
+    "SurfaceErrors",
+    "SurfaceResult",
+    "TrueSurface",
+    "distance_to_surface",
+    "evaluate_surface",
+    "sample_surface",
+    "scene_surface",
+    "seen_by",
+    "surface_errors",
+    "surface_from_depth",
+]
+
+PROTOCOL_FUSION = SurfaceConfig(
+    voxel_share=1 / 96,
+    truncation_voxels=5.0,
+    min_alpha=0.5,
+    depth_quantile=0.98,
+    min_cluster_triangles=50,
+    max_width=320,
+)
+"""Every value is written down: other defaults of the surface stage must not change a figure."""
+N_SAMPLES = 30_000
+"""Samples of each surface."""
+THRESHOLD_MM = 1.0
+"""Closer than this is right: about the voxel of the fusion at 60 mm, a twentieth of a usual distance."""
+THRESHOLD_SHARE = 0.05
+"""The same where lengths are not millimetres, as a share of the median true depth of training frames."""
+_HIDDEN_SHARE = 0.005
+"""A point is hidden when something stands before it by more than this share of the way."""
+_SEED = 20_260
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceErrors:
+    """How a reconstructed surface fits a true one; None where there is nothing to take a mean of.
+
+    Args:
+        accuracy_mm: mean distance of reconstructed samples from the true surface.
+        accuracy_median_mm: the median of it, blind to floaters.
+        completeness_mm: mean distance of true samples from the reconstructed surface.
+        completeness_median_mm: the median of it, blind to holes.
+        precision: share of reconstructed samples closer than the threshold.
+        recall: share of true samples closer than the threshold.
+        fscore: harmonic mean of precision and recall.
+    """
+
+    accuracy_mm: float | None
+    accuracy_median_mm: float | None
+    completeness_mm: float | None
+    completeness_median_mm: float | None
+    precision: float | None
+    recall: float | None
+    fscore: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class TrueSurface:
+    """What the reconstruction is held against.
+
+    Args:
+        mesh: in the world of the sequence.
+        kind: `mesh` for the source's own geometry, `depth` for the fusion of its true depth.
+    """
+
+    mesh: Mesh
+    kind: Literal["mesh", "depth"]
+
+
+@dataclass(frozen=True, slots=True)
+class SurfaceResult:
+    """Surface figures of a scene.
+
+    Args:
+        observed: errors on surface that training cameras saw.
+        unobserved: errors on surface that held-out cameras alone see.
+        coverage: share of all that surface, observed or not, closer than the threshold to the
+            reconstruction.
+        observed_share: how much of it is observed.
+        threshold_mm: what counts as close.
+        kind: of the true surface.
+    """
+
+    observed: SurfaceErrors
+    unobserved: SurfaceErrors
+    coverage: float | None
+    observed_share: float
+    threshold_mm: float
+    kind: Literal["mesh", "depth"]
+
+    def to_json(self) -> dict[str, Any]:
+        """The `surface` group of the metrics: the observed figures, and `unobserved` within."""
+        return {
+            **asdict(self.observed),
+            "coverage": self.coverage,
+            "observed_share": self.observed_share,
+            "threshold_mm": self.threshold_mm,
+            "unobserved": asdict(self.unobserved),
+        }
+
+
+def scene_surface(scene: Scene, sequence: Sequence) -> Mesh | None:
+    """The surface of a scene as the protocol sees it, or None when the cameras see none.
+
+    Args:
+        scene: the reconstruction.
+        sequence: says where the training and held-out cameras are.
+    """
+    cameras = sequence.cameras[_all_frames(sequence)]
+    try:
+        return _fused(*rendered_depth(scene, cameras, PROTOCOL_FUSION))
+    except CaptureError:
+        # An empty scene is a result, not a fault of the evaluation: its recall is zero.
+        return None
+
+
+def surface_from_depth(sequence: Sequence) -> TrueSurface | None:
+    """The true surface from the true depth of all frames; None without poses, depth or surface."""
+    if sequence.depth_mm is None or sequence.world_from_camera is None:
+        return None
+    frames = _all_frames(sequence)
+    depth = np.where(sequence.mask[frames], sequence.depth_mm[frames], 0).astype(np.float32)
+    depth[~np.isfinite(depth)] = 0
+    try:
+        return TrueSurface(_fused(sequence.cameras[frames], depth), "depth")
+    except CaptureError:
+        return None
+
+
+def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: Sequence) -> SurfaceResult:
+    """Surface figures of a reconstruction, observed and unobserved parts apart.
+
+    Args:
+        mesh: of `scene_surface`, or made elsewhere in the same world; None is an empty reconstruction.
+        truth: the true surface.
+        sequence: its cameras and masks tell what is observed.
+
+    Raises:
+        ShapeError: while the poses are unknown.
+    """
+    points = sample_surface(truth.mesh, N_SAMPLES, seed=_SEED)
+    observed, unobserved = _parts(points, truth, sequence)
+    found = np.zeros((0, 3))
+    found_observed = found_unobserved = np.zeros(0, dtype=bool)
+    to_truth = np.zeros(0)
+    to_mesh = np.full(len(points), np.inf)
+    if mesh is not None and len(mesh.triangles):
+        found = sample_surface(mesh, N_SAMPLES, seed=_SEED + 1)
+        to_truth, nearest = distance_to_surface(found, truth.mesh)
+        found_observed, found_unobserved = _parts(nearest, truth, sequence)
+        to_mesh, _ = distance_to_surface(points, mesh)
+    threshold = _threshold(sequence)
+    counted = observed | unobserved
+    return SurfaceResult(
+        observed=_errors(to_truth[found_observed], to_mesh[observed], threshold),
+        unobserved=_errors(to_truth[found_unobserved], to_mesh[unobserved], threshold),
+        coverage=_share(to_mesh[counted] <= threshold),
+        observed_share=_share(observed[counted]) or 0.0,
+        threshold_mm=threshold,
+        kind=truth.kind,
+    )
+
+
+def surface_errors(
+    reconstructed: Mesh, true: Mesh, threshold_mm: float, *, n_samples: int = N_SAMPLES, seed: int = _SEED
+) -> SurfaceErrors:
+    """Errors of a whole surface against another, without any notion of what was observed.
+
+    Args:
+        reconstructed: the mesh in question.
+        true: the mesh it should be.
+        threshold_mm: closer than this is right.
+        n_samples: samples of each.
+        seed: of the samples.
+
+    Raises:
+        ConfigError: for a threshold or a number of samples that is not positive.
+    """
+    if not threshold_mm > 0:
+        raise ConfigError(f"the threshold is {threshold_mm}; expected a length above zero")
+    to_truth = to_mesh = np.zeros(0)
+    if len(reconstructed.triangles) and len(true.triangles):
+        to_truth, _ = distance_to_surface(sample_surface(reconstructed, n_samples, seed=seed + 1), true)
+        to_mesh, _ = distance_to_surface(sample_surface(true, n_samples, seed=seed), reconstructed)
+    elif len(true.triangles):
+        to_mesh = np.full(n_samples, np.inf)
+    return _errors(to_truth, to_mesh, threshold_mm)
+
+
+def sample_surface(mesh: Mesh, n_samples: int, *, seed: int) -> Float[np.ndarray, "n 3"]:
+    """Points spread evenly by area: one in each of `n_samples` equal parts of the total area.
+
+    Args:
+        mesh: with at least one triangle of some area.
+        n_samples: number of points.
+        seed: places each point in its part.
+
+    Raises:
+        ConfigError: for a mesh without area, or no samples.
+    """
+    if n_samples < 1:
+        raise ConfigError(f"{n_samples} samples of a surface; expected 1 or more")
+    corners = mesh.vertices[mesh.triangles].astype(np.float64)
+    edges = corners[:, 1:] - corners[:, :1]
+    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    total = area.sum()
+    if not total > 0:
+        raise ConfigError("a mesh without any area cannot be sampled")
+    rng = np.random.default_rng(seed)
+    place = (np.arange(n_samples) + rng.random(n_samples)) * (total / n_samples)
+    triangle = np.minimum(np.searchsorted(np.cumsum(area), place, side="right"), len(area) - 1)
+    # Square root: uniform in the triangle, not in the parallelogram's skew (Osada et al. 2002).
+    root, along = np.sqrt(rng.random(n_samples)), rng.random(n_samples)
+    weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
+    return np.asarray(np.einsum("nk,nkx->nx", weights, corners[triangle]))
+
+
+def distance_to_surface(
+    points: Float[np.ndarray, "n 3"], mesh: Mesh
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"]]:
+    """Distance of each point from the nearest triangle, and the nearest point on it."""
+    closest = _ray_scene(mesh).compute_closest_points(_tensor(points.astype(np.float32)))
+    nearest = closest["points"].numpy().astype(np.float64)
+    return np.linalg.norm(points - nearest, axis=1), nearest
+
+
+def seen_by(
+    points: Float[np.ndarray, "n 3"],
+    mesh: Mesh,
+    cameras: Cameras,
+    mask: Bool[np.ndarray, "c h w"],
+    far_mm: float,
+) -> Bool[np.ndarray, "n"]:
+    """Which points on a mesh at least one camera sees.
+
+    Args:
+        points: on the mesh.
+        mesh: what may stand in between.
+        cameras: the views.
+        mask: pixels that show tissue.
+        far_mm: z-depth beyond which nothing counts as seen.
+    """
+    scene = _ray_scene(mesh)
+    seen = np.zeros(len(points), dtype=bool)
+    for index in range(len(cameras)):
+        left = np.flatnonzero(~seen)
+        pose, K = cameras.world_from_camera[index], cameras.K[index]
+        local = (points[left] - pose[:3, 3]) @ pose[:3, :3]
+        z = np.where(local[:, 2] > 0, local[:, 2], np.inf)
+        u = K[0, 0] * local[:, 0] / z + K[0, 2]
+        v = K[1, 1] * local[:, 1] / z + K[1, 2]
+        inside = (z <= far_mm) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
+        inside[inside] = mask[index][np.floor(v[inside]).astype(int), np.floor(u[inside]).astype(int)]
+        candidates = left[inside]
+        if not candidates.size:
+            continue
+        rays = np.empty((len(candidates), 6), dtype=np.float32)
+        rays[:, :3] = pose[:3, 3]
+        rays[:, 3:] = points[candidates] - pose[:3, 3]
+        hit = scene.cast_rays(_tensor(rays))["t_hit"].numpy()
+        seen[candidates[hit >= 1 - _HIDDEN_SHARE]] = True
+    return seen
+
+
+def _fused(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"]) -> Mesh:
+    """Fusion with the protocol's settings."""
+    known = depth_mm[depth_mm > 0]
+    if known.size:
+        # Cut here and not in the fusion, which cannot do with a view that has nothing near.
+        far = np.quantile(known, PROTOCOL_FUSION.depth_quantile)
+        depth_mm = np.where(depth_mm > far, np.float32(0), depth_mm)
+    return fuse_depth(cameras, depth_mm, PROTOCOL_FUSION.model_copy(update={"depth_quantile": 1.0}))
+
+
+def _parts(
+    points: Float[np.ndarray, "n 3"], truth: TrueSurface, sequence: Sequence
+) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
+    """Which true points training cameras see, and which held-out cameras alone."""
+    far = _reach(sequence)
+
+    def by(frames: np.ndarray) -> Bool[np.ndarray, "n"]:
+        return seen_by(points, truth.mesh, sequence.cameras[frames], sequence.mask[frames], far)
+
+    observed = by(sequence.train)
+    return observed, by(sequence.test) & ~observed
+
+
+def _reach(sequence: Sequence) -> float:
+    """Farther depth is not fused, so surface seen from farther only cannot be asked for."""
+    frames = _all_frames(sequence)
+    if sequence.depth_mm is None:
+        return float("inf")
+    depth = sequence.depth_mm[frames]
+    known = depth[(depth > 0) & np.isfinite(depth) & sequence.mask[frames]]
+    return float(np.quantile(known, PROTOCOL_FUSION.depth_quantile)) if known.size else float("inf")
+
+
+def _threshold(sequence: Sequence) -> float:
+    if sequence.metric or sequence.depth_mm is None:
+        return THRESHOLD_MM
+    depth = sequence.depth_mm[sequence.train]
+    known = depth[(depth > 0) & np.isfinite(depth) & sequence.mask[sequence.train]]
+    return THRESHOLD_SHARE * float(np.median(known)) if known.size else THRESHOLD_MM
+
+
+def _errors(to_truth: np.ndarray, to_mesh: np.ndarray, threshold: float) -> SurfaceErrors:
+    precision, recall = _share(to_truth <= threshold), _share(to_mesh <= threshold)
+    fscore = None
+    if recall is not None and (precision is not None or recall == 0):
+        # Without any reconstructed sample there is no precision, yet the harmonic mean is zero.
+        total = (precision or 0.0) + recall
+        fscore = 2 * (precision or 0.0) * recall / total if total > 0 else 0.0
+    reached = to_mesh[np.isfinite(to_mesh)]
+    return SurfaceErrors(
+        accuracy_mm=_statistic(np.mean, to_truth),
+        accuracy_median_mm=_statistic(np.median, to_truth),
+        completeness_mm=_statistic(np.mean, reached),
+        completeness_median_mm=_statistic(np.median, reached),
+        precision=precision,
+        recall=recall,
+        fscore=fscore,
+    )
+
+
+def _share(flags: np.ndarray) -> float | None:
+    return float(flags.mean()) if flags.size else None
+
+
+def _statistic(of: Any, values: np.ndarray) -> float | None:
+    return float(of(values)) if values.size else None
+
+
+def _all_frames(sequence: Sequence) -> np.ndarray:
+    return np.unique(np.concatenate([sequence.train, sequence.test]))
+
+
+def _ray_scene(mesh: Mesh) -> Any:
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(_tensor(mesh.vertices.astype(np.float32)), _tensor(mesh.triangles.astype(np.uint32)))
+    return scene
+
+
+def _tensor(array: np.ndarray) -> Any:
+    import open3d as o3d
+
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array))

@@ -1,0 +1,279 @@
+"""Loss and gradients of one view straight from the native kernels, without autograd.
+
+`rasterize`, `l1_ssim_loss`, `inverse_depth_loss` and a backward pass through them do the same for any
+backend. Here nothing is recorded: the arrays that the kernels write stay while the number of Gaussians does,
+and the chain rule through exponential and sigmoid is written out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrags.errors import ShapeError
+from extrags.raster import native
+from extrags.raster.rendering import Rendering, nonfinite_error
+
+__all__ = ["DirectStep", "Target"]
+
+
+class Target:
+    """What the image of one camera is held against, as the kernels read it.
+
+    Args:
+        viewmat: camera from world, [4, 4].
+        K: intrinsics in pixels, [3, 3].
+        rgb: the colours, [H, W, 3].
+        weight: of the colours, per pixel, [H, W]; None weighs all alike.
+        depth: z-depth in world units, 0 where there is none, [H, W].
+
+    Raises:
+        ShapeError: when sizes do not fit together.
+        NonFiniteError: when the camera holds a NaN or an infinity.
+    """
+
+    def __init__(
+        self,
+        viewmat: Float[np.ndarray, "4 4"],
+        K: Float[np.ndarray, "3 3"],
+        rgb: Float[Tensor, "h w 3"],
+        *,
+        weight: Float[Tensor, "h w"] | None = None,
+        depth: Float[Tensor, "h w"] | None = None,
+    ) -> None:
+        if rgb.ndim != 3 or rgb.shape[2] != 3:
+            raise ShapeError(f"rgb has shape {tuple(rgb.shape)}, expected (H, W, 3)")
+        self.height, self.width = int(rgb.shape[0]), int(rgb.shape[1])
+        self.rgb = _plain(rgb)
+        self.weight = None if weight is None else _plain(weight)
+        self.depth = None if depth is None else _plain(depth)
+        for name, image in (("weight", self.weight), ("depth", self.depth)):
+            if image is not None and image.shape != (self.height, self.width):
+                raise ShapeError(f"{name} has shape {image.shape}, expected {(self.height, self.width)}")
+        self.viewmat = np.ascontiguousarray(viewmat, dtype=np.float32)
+        self.K = np.ascontiguousarray(K, dtype=np.float32)
+        for name, matrix in (("viewmats", self.viewmat), ("Ks", self.K)):
+            if not np.isfinite(matrix).all():
+                raise nonfinite_error(name, torch.from_numpy(matrix)[None])
+        pixels = self.height * self.width
+        total = 3 * (pixels if self.weight is None else float(self.weight.sum(dtype=np.float64)))
+        self.scale = 1 / total if total != 0 else 1.0
+
+
+def _plain(values: Tensor) -> np.ndarray:
+    return values.detach().to(torch.float32).contiguous().numpy()
+
+
+@dataclass(frozen=True)
+class _Images:
+    """Rendered images of one size and their gradients; tensors and the same memory as the kernels take it."""
+
+    tensors: dict[str, Tensor]
+    arrays: dict[str, np.ndarray]
+
+    @classmethod
+    def empty(cls, width: int, height: int) -> _Images:
+        shapes = {"rgb": 3, "v_rgb": 3, "alpha": 0, "depth": 0, "v_depth": 0}
+        tensors = {
+            name: torch.empty(1, height, width, *([channels] if channels else []))
+            for name, channels in shapes.items()
+        }
+        return cls(tensors, {name: value.numpy() for name, value in tensors.items()})
+
+
+class DirectStep:
+    """Renders, compares and carries back one view after the other, into the same arrays.
+
+    `gradients` holds the last view's gradients with respect to the parameters before activation, by name.
+    It and the renderings are overwritten by the next `run` and replaced by the next `bind`.
+
+    Args:
+        absgrad: fill `means2d.absgrad`.
+        lit: the cameras carry a light.
+    """
+
+    def __init__(self, *, absgrad: bool = False, lit: bool = False) -> None:
+        self.gradients: dict[str, Tensor] = {}
+        self.visible = torch.empty(0, dtype=torch.bool)
+        self.light_gradient = np.zeros(12, dtype=np.float32)
+        self._absgrad, self._lit = absgrad, lit
+        self._images: dict[tuple[int, int], _Images] = {}
+        self._renderings: dict[tuple[int, int], Rendering] = {}
+        self._values: dict[str, Tensor] = {}
+        self._linear: dict[str, Tensor] = {}
+        self._arguments: tuple[np.ndarray, ...] = ()
+        self._checked: tuple[tuple[str, Tensor, np.ndarray], ...] = ()
+        self._arrays: dict[str, np.ndarray | None] = {}
+        self._means2d = self._radius_px = torch.empty(0)
+
+    def bind(self, parameters: Mapping[str, Tensor]) -> None:
+        """Take the parameters to work on; they may change in place from one `run` to the next.
+
+        Args:
+            parameters: float32 on the CPU and contiguous: `means` [N, 3], `quats` [N, 4], `scales` (their
+                logarithms) [N, 3], `opacities` (logits) [N], `sh` [N, K, 3].
+        """
+        values = self._values = {name: value.detach() for name, value in parameters.items()}
+        n = len(values["means"])
+        self._linear = {name: torch.empty_like(values[name]) for name in ("scales", "opacities")}
+        rendered = {**values, **self._linear}
+        names = ("means", "quats", "scales", "opacities", "sh")
+        self._arguments = tuple(rendered[name].numpy() for name in names)
+        self._checked = tuple((name, rendered[name], rendered[name].numpy()) for name in names)
+        self.gradients = {name: torch.empty_like(values[name]) for name in names}
+        self.visible = torch.empty(n, dtype=torch.bool)
+        self._means2d, self._radius_px = torch.empty(1, n, 2), torch.empty(1, n)
+        self._means2d.grad = torch.empty(1, n, 2)
+        arrays: dict[str, np.ndarray | None] = {name: g.numpy() for name, g in self.gradients.items()}
+        arrays |= {"means2d": self._means2d[0].numpy(), "radius_px": self._radius_px[0].numpy()}
+        arrays |= {"v_means2d": self._means2d.grad[0].numpy(), "absolute": None}
+        if self._absgrad:
+            absolute = torch.empty(1, n, 2)
+            self._means2d.absgrad = absolute  # type: ignore[attr-defined]
+            arrays["absolute"] = absolute[0].numpy()
+        self._arrays = arrays
+        self._renderings = {}
+
+    def run(
+        self,
+        target: Target,
+        *,
+        sh_degree: int,
+        light: Float[np.ndarray, "12"] | None = None,
+        dssim_weight: float = 0.2,
+        loss_weight: float = 1.0,
+        depth_weight: float = 0.0,
+        depth_scale: float = 1.0,
+        near: float = 0.01,
+    ) -> float:
+        """Loss of one view; fills `gradients`, `visible`, `light_gradient` and the rendering.
+
+        Args:
+            target: what to compare with, and its camera.
+            sh_degree: use the harmonics up to this degree.
+            light: a row of `CameraLight.packed`; given exactly if the step was made `lit`.
+            dssim_weight: as in `l1_ssim_loss`.
+            loss_weight: of the whole view.
+            depth_weight: of `inverse_depth_loss`; without effect where the target has no depth.
+            depth_scale: as in `inverse_depth_loss`.
+            near: as in `rasterize`.
+
+        Raises:
+            NonFiniteError: when a parameter, activated, holds a NaN or an infinity.
+        """
+        kernels = native.compiled_kernels()
+        torch.exp(self._values["scales"], out=self._linear["scales"])
+        torch.sigmoid(self._values["opacities"], out=self._linear["opacities"])
+        self._refuse_nonfinite(kernels, light)
+        size = target.width, target.height
+        images = self._images.get(size)
+        if images is None:
+            images = self._images[size] = _Images.empty(*size)
+        image, arrays = images.arrays, self._arrays
+        means, quats, scales, opacities, sh = self._arguments
+        frame = kernels.render(
+            means,
+            quats,
+            scales,
+            opacities,
+            sh,
+            sh_degree,
+            None,
+            target.viewmat,
+            target.K,
+            None,
+            *size,
+            near,
+            image["rgb"],
+            image["alpha"],
+            image["depth"],
+            arrays["means2d"],
+            arrays["radius_px"],
+            None,
+            None,
+            None,
+            light,
+        )
+        loss: float = kernels.l1_ssim(
+            image["rgb"],
+            target.rgb,
+            target.weight,
+            image["v_rgb"],
+            target.height,
+            target.width,
+            dssim_weight,
+            loss_weight * target.scale,
+        )
+        compared = 0
+        if target.depth is not None and depth_weight > 0:
+            depth_loss, compared = kernels.inverse_depth(
+                image["depth"],
+                image["alpha"],
+                target.depth,
+                image["v_depth"],
+                depth_scale,
+                loss_weight * depth_weight,
+            )
+            loss += depth_loss
+        frame.backward(
+            means,
+            quats,
+            scales,
+            opacities,
+            sh,
+            sh_degree,
+            None,
+            image["v_rgb"],
+            None,
+            image["v_depth"] if compared else None,
+            image["depth"] if compared else None,
+            False,
+            arrays["means"],
+            arrays["quats"],
+            arrays["scales"],
+            arrays["opacities"],
+            arrays["sh"],
+            None,
+            None,
+            arrays["v_means2d"],
+            arrays["absolute"],
+            self.light_gradient if self._lit else None,
+        )
+        self._carry_activations()
+        torch.gt(self._radius_px[0], 0, out=self.visible)
+        return loss
+
+    def rendering(self, target: Target) -> Rendering:
+        """The images of the last `run`, whose target this must be, in the arrays the next one overwrites."""
+        size = target.width, target.height
+        if size not in self._renderings:
+            images = self._images[size].tensors
+            self._renderings[size] = Rendering(
+                rgb=images["rgb"],
+                alpha=images["alpha"],
+                depth=images["depth"],
+                means2d=self._means2d,
+                radius_px=self._radius_px,
+            )
+        return self._renderings[size]
+
+    def _carry_activations(self) -> None:
+        """From gradients of scales and opacities to those of their logarithms and logits."""
+        g_scales, g_opacities = self.gradients["scales"], self.gradients["opacities"]
+        torch.mul(g_scales, self._linear["scales"], out=g_scales)
+        torch.ops.aten.sigmoid_backward.grad_input(
+            g_opacities, self._linear["opacities"], grad_input=g_opacities
+        )
+
+    def _refuse_nonfinite(self, kernels: Any, light: np.ndarray | None) -> None:
+        for name, tensor, array in self._checked:
+            if array.size and kernels.first_nonfinite(array) >= 0:
+                raise nonfinite_error(name, tensor)
+        if light is not None and kernels.first_nonfinite(light) >= 0:
+            raise nonfinite_error("light", torch.from_numpy(light)[None])

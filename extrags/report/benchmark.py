@@ -1,0 +1,269 @@
+"""The page of a benchmark: methods compared over sequences and seeds, in numbers, charts and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from collections.abc import Sequence as AbstractSequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from extrags.metrics.comparison import compare_runs, figure_of
+from extrags.report.charts import method_colors, methods_chart, pairs_chart
+from extrags.report.comparison import RenderedMethod, compared_rows
+from extrags.report.encode import DataImage
+from extrags.report.page import rendered_page
+from extrags.report.wording import count, duration, lpips_networks, number
+from extrags.sequence import Sequence
+
+__all__ = ["BenchmarkInputs", "ComparedViews", "build_benchmark_report"]
+
+LARGEST_PAGE_BYTES = 5_000_000
+"""The share of the pictures; numbers and charts come on top."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Column:
+    name: str
+    label: str
+    unit: str
+    higher_is_better: bool
+    digits: int
+
+
+COLUMNS = (
+    _Column("psnr", "PSNR", "dB", True, 2),
+    _Column("aligned.psnr", "PSNR, aligned", "dB", True, 2),
+    _Column("observed.psnr", "PSNR, observed", "dB", True, 2),
+    _Column("observed.aligned.psnr", "PSNR, observed, aligned", "dB", True, 2),
+    _Column("unobserved.psnr", "PSNR, never observed", "dB", True, 2),
+    _Column("ssim", "SSIM", "", True, 3),
+    _Column("lpips_alex", "LPIPS (AlexNet)", "", False, 3),
+    _Column("lpips_squeeze", "LPIPS (SqueezeNet)", "", False, 3),
+    _Column("flip", "FLIP", "", False, 3),
+    _Column("depth_absrel", "Depth AbsRel", "", False, 3),
+    _Column("surface.accuracy_mm", "Surface accuracy", "mm", False, 2),
+    _Column("surface.completeness_mm", "Completeness", "mm", False, 2),
+    _Column("surface.fscore", "F-score", "", True, 3),
+    _Column("surface.coverage", "Coverage", "", True, 3),
+)
+"""What the tables show; the JSON has every figure."""
+PANELS = ("observed.psnr", "observed.aligned.psnr", "lpips_alex", "depth_absrel")
+
+
+@dataclass(frozen=True)
+class ComparedViews:
+    """Renders of two methods to be shown side by side.
+
+    Args:
+        sequence: with its held-out frames.
+        label: what is said of the run, e.g. `seed 0`.
+        baseline: the method it is compared with.
+        contender: the other.
+    """
+
+    sequence: Sequence
+    label: str
+    baseline: RenderedMethod
+    contender: RenderedMethod
+
+
+@dataclass(frozen=True)
+class BenchmarkInputs:
+    """Everything the page shows.
+
+    Args:
+        name: title.
+        runs: `{method, profile, sequence, setting, seed, seconds, peak_mib, metrics, error}` of each;
+            `metrics` is None for a failed run, whose `error` says why.
+        baseline: method the others are compared with.
+        methods: what each method is, in words, in the order they are shown.
+        pictures: held-out views side by side.
+        views: rows of pictures per sequence at most.
+        made: when, in words; nothing is said when empty.
+    """
+
+    name: str
+    runs: AbstractSequence[Mapping[str, Any]]
+    baseline: str
+    methods: Mapping[str, str]
+    pictures: AbstractSequence[ComparedViews] = ()
+    views: int = 4
+    made: str = field(default="")
+
+
+def build_benchmark_report(inputs: BenchmarkInputs) -> str:
+    """One self-contained HTML page.
+
+    Differences are paired: two runs that share all but the method. Intervals and means are those of
+    `extrags.metrics.comparison`.
+    """
+    comparison = compare_runs(inputs.runs, inputs.baseline)
+    measured = [run for run in inputs.runs if run["metrics"] is not None]
+    columns = [
+        column
+        for column in COLUMNS
+        if any(figure_of(run["metrics"], column.name) is not None for run in measured)
+    ]
+    images = sum(5 * min(inputs.views, len(pair.sequence.test)) for pair in inputs.pictures)
+    largest = LARGEST_PAGE_BYTES // max(images, 1)
+    return rendered_page(
+        "benchmark.html.j2",
+        name=inputs.name,
+        made=inputs.made,
+        baseline=inputs.baseline,
+        summary=_summary(comparison, inputs),
+        facts=[
+            ("Runs", count(len(inputs.runs))),
+            ("Sequences", count(len({(run["sequence"], run["setting"]) for run in inputs.runs}))),
+            ("Seeds", count(len({run["seed"] for run in inputs.runs}))),
+            ("Run time of all", duration(sum(run["seconds"] for run in inputs.runs))),
+        ],
+        methods=inputs.methods,
+        failures=[
+            (f"{_label(run)}, {run['method']}, seed {run['seed']}", run["error"] or "no reason was recorded")
+            for run in inputs.runs
+            if run["metrics"] is None
+        ],
+        columns=columns,
+        paired_datasets=_rows(comparison["paired_datasets"], columns, signed=True),
+        paired_sequences=_rows(comparison["paired_sequences"], columns, signed=True),
+        datasets=_rows(comparison["datasets"], columns),
+        sequences=_rows(comparison["sequences"], columns),
+        difference_chart=_difference_chart(comparison["paired_sequences"], columns, inputs.baseline),
+        figure_charts=_figure_charts(measured, columns, inputs),
+        pictures=[
+            (
+                f"{pair.sequence.name}, {pair.label}",
+                compared_rows(pair.sequence, (pair.baseline, pair.contender), inputs.views, largest),
+            )
+            for pair in inputs.pictures
+        ],
+        protocol={"version": None, "lpips": lpips_networks(*(run["metrics"] for run in measured))},
+    )
+
+
+def _summary(comparison: Mapping[str, Any], inputs: BenchmarkInputs) -> str:
+    said = []
+    for row in comparison["paired_datasets"]:
+        name = next((name for name in ("observed.psnr", "psnr") if name in row["figures"]), None)
+        if name is None:
+            continue
+        figure = row["figures"][name]
+        where = "observed pixels" if name.startswith("observed") else "all valid pixels"
+        interval = _interval(figure, 2)
+        said.append(
+            f"{row['method']} against {inputs.baseline} on {row['dataset']}: "
+            f"{number(figure['mean'], 2, signed=True)} dB PSNR on {where}"
+            f"{f' (95 % interval {interval})' if interval else ''}, better on {figure['better']} of "
+            f"{figure['n']} {'sequence' if figure['n'] == 1 else 'sequences'}."
+        )
+    return " ".join(said) or "No two runs share everything but the method: there is nothing to compare."
+
+
+def _rows(
+    rows: AbstractSequence[Mapping[str, Any]], columns: AbstractSequence[_Column], *, signed: bool = False
+) -> list[dict[str, Any]]:
+    return [
+        {
+            "about": row["dataset"] if "dataset" in row else _label(row),
+            "profile": row["profile"],
+            "method": row["method"],
+            "sizes": _sizes(row),
+            "cells": [_cell(row["figures"].get(column.name), column, signed) for column in columns],
+        }
+        for row in rows
+    ]
+
+
+def _cell(figure: Mapping[str, Any] | None, column: _Column, signed: bool) -> dict[str, str]:
+    if figure is None:
+        return {"value": "–", "verdict": "", "note": "", "better": ""}  # noqa: RUF001
+    value = number(figure["mean"], column.digits, signed=signed)
+    if not signed:
+        deviation = figure["deviation"]
+        return {
+            "value": value,
+            "verdict": "",
+            "note": "" if deviation is None else f"± {number(deviation, column.digits)}",
+            "better": "",
+        }
+    if round(figure["mean"], column.digits) == 0:
+        verdict = "equal"
+    else:
+        verdict = "better" if (figure["mean"] > 0) == column.higher_is_better else "worse"
+    return {
+        "value": value,
+        "verdict": verdict,
+        "note": _interval(figure, column.digits),
+        "better": f"better in {figure['better']} of {figure['n']}",
+    }
+
+
+def _interval(figure: Mapping[str, Any], digits: int) -> str:
+    if figure["low"] is None:
+        return ""
+    low, high = (number(figure[end], digits, signed=True) for end in ("low", "high"))
+    return f"{low} to {high}"
+
+
+def _sizes(row: Mapping[str, Any]) -> str:
+    parts = [f"{row['n_seeds']} seed{'s' * (row['n_seeds'] != 1)}"]
+    if "dataset" in row:
+        parts.insert(0, f"{row['n_sequences']} sequence{'s' * (row['n_sequences'] != 1)}")
+    return ", ".join(parts)
+
+
+def _difference_chart(
+    rows: AbstractSequence[Mapping[str, Any]], columns: AbstractSequence[_Column], baseline: str
+) -> tuple[DataImage, str] | None:
+    panels = [column for column in columns if column.name in PANELS]
+    if not rows or not panels:
+        return None
+    several = len({row["method"] for row in rows}) > 1
+    lines = []
+    for row in rows:
+        figures = [row["figures"].get(panel.name) for panel in panels]
+        cells = [None if found is None else (found["mean"], found["low"], found["high"]) for found in figures]
+        lines.append((f"{row['method']}, {_label(row)}" if several else _label(row), cells))
+    titles = [
+        (f"{panel.label} ({panel.unit})" if panel.unit else panel.label, panel.higher_is_better)
+        for panel in panels
+    ]
+    alt = f"Differences to {baseline} of each sequence with their 95 % intervals over the seeds"
+    return pairs_chart(titles, lines), alt
+
+
+def _figure_charts(
+    runs: AbstractSequence[Mapping[str, Any]], columns: AbstractSequence[_Column], inputs: BenchmarkInputs
+) -> list[tuple[DataImage, str]]:
+    known = {column.name: column for column in columns}
+    # Whole-mask figures only where the source cannot tell what was observed.
+    names = [name for name in PANELS[:2] if name in known] or [name for name in ("psnr",) if name in known]
+    groups = list(dict.fromkeys(_label(run) for run in runs))
+    charts = []
+    for name in names:
+        having = [run for run in runs if figure_of(run["metrics"], name) is not None]
+        title = f"{known[name].label} ({known[name].unit})"
+        chart = methods_chart(
+            groups,
+            _by_method(having, [figure_of(run["metrics"], name) or 0.0 for run in having]),
+            _by_method(having, [float(run["seconds"]) for run in having]),
+            method_colors(list(inputs.methods), inputs.baseline),
+            title,
+        )
+        alt = f"{title} on held-out views of every run, by sequence and method, and against run time"
+        charts.append((chart, alt))
+    return charts
+
+
+def _by_method(
+    runs: AbstractSequence[Mapping[str, Any]], values: AbstractSequence[float]
+) -> dict[str, dict[str, list[float]]]:
+    found: dict[str, dict[str, list[float]]] = {}
+    for run, value in zip(runs, values, strict=True):
+        found.setdefault(run["method"], {}).setdefault(_label(run), []).append(value)
+    return found
+
+
+def _label(run: Mapping[str, Any]) -> str:
+    return f"{run['sequence']}@{run['setting']}" if run["setting"] else str(run["sequence"])

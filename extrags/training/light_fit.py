@@ -1,0 +1,170 @@
+"""Learning the few numbers of the light without autograd: its row, the chain rule, Adam."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from extrags.config import LightConfig
+from extrags.illumination import NearFieldLight
+
+__all__ = ["DenseAdam", "LightFit", "learned_parameters"]
+
+COMMON = ("log_softening", "log_exponent", "spread", "cosine", "offset", "log_shoulder")
+"""Parameters all cameras share, in the order of `CameraLight.packed`; the exposure comes before them."""
+
+
+def learned_parameters(config: LightConfig) -> list[str]:
+    """Names of the global light parameters that the settings leave free."""
+    switches = {
+        "log_softening": config.falloff,
+        "log_exponent": config.falloff,
+        "spread": config.spread,
+        "cosine": config.cosine,
+        "offset": config.offset,
+        "log_shoulder": config.response,
+    }
+    return [name for name, free in switches.items() if free]
+
+
+class DenseAdam:
+    """`torch.optim.Adam` for one short array, at the cost of a few numpy calls.
+
+    Args:
+        values: stepped in place, [N].
+        learning_rate: of all entries.
+
+    Source: Kingma & Ba, Adam, ICLR 2015.
+    """
+
+    BETAS = (0.9, 0.999)
+    EPS = 1e-15
+
+    def __init__(self, values: Float[np.ndarray, "n"], learning_rate: float) -> None:
+        self.values, self.learning_rate = values, learning_rate
+        self._first, self._second = np.zeros_like(values), np.zeros_like(values)
+        self._steps = 0
+
+    def step(self, gradient: Float[np.ndarray, "n"]) -> None:
+        """One step; entries whose gradient is always zero stay what they are."""
+        beta1, beta2 = self.BETAS
+        self._steps += 1
+        self._first += (1 - beta1) * (gradient - self._first)
+        self._second *= beta2
+        self._second += (1 - beta2) * gradient * gradient
+        root = np.sqrt(self._second) / math.sqrt(1 - beta2**self._steps) + self.EPS
+        self.values -= self.learning_rate / (1 - beta1**self._steps) * self._first / root
+
+
+@dataclass(frozen=True)
+class _Slots:
+    """Where a parameter lies among the common ones."""
+
+    begin: int
+    end: int
+    logarithm: bool
+
+
+class LightFit:
+    """A near-field light while it is learned.
+
+    Args:
+        light: where to start; it is copied.
+        config: what is learned, and how fast.
+    """
+
+    def __init__(self, light: NearFieldLight, config: LightConfig) -> None:
+        self._config = config
+        self._reference_distance = light.reference_distance
+        values = light.parameters()
+        self._slots: dict[str, _Slots] = {}
+        parts = []
+        begin = 0
+        for name in COMMON:
+            part = values[name].detach().reshape(-1).float()
+            self._slots[name] = _Slots(begin, begin + len(part), name.startswith("log_"))
+            begin += len(part)
+            parts.append(part)
+        # The tensors and the arrays below are the same memory.
+        self._tensor, self._exposures = torch.cat(parts), values["log_exposure"].detach().float().clone()
+        self._common, self._log_exposure = self._tensor.numpy(), self._exposures.numpy()
+        self._logarithms = np.zeros(begin, dtype=bool)
+        self._free = np.zeros(begin, dtype=np.float32)
+        learned = learned_parameters(config)
+        for name, slots in self._slots.items():
+            self._logarithms[slots.begin : slots.end] = slots.logarithm
+            self._free[slots.begin : slots.end] = name in learned
+        self._any_free = bool(self._free.any())
+        self._row = np.zeros(12, dtype=np.float32)
+        self._row[11] = light.reference_distance
+        self._frame: int | None = None
+        self._adam = DenseAdam(self._common, config.learning_rate)
+        self._exposure_adam = DenseAdam(self._log_exposure, config.exposure_learning_rate)
+
+    @property
+    def light(self) -> NearFieldLight:
+        """The light as it is now; it changes with the next step."""
+        values = {
+            name: self._tensor[slots.begin : slots.end] if name == "offset" else self._tensor[slots.begin]
+            for name, slots in self._slots.items()
+        }
+        return NearFieldLight(
+            **values, log_exposure=self._exposures, reference_distance=self._reference_distance
+        )
+
+    def row(self, frame: int | None) -> Float[np.ndarray, "12"]:
+        """What the camera of a training frame carries; None is the mean exposure.
+
+        Returns:
+            A row of `CameraLight.packed`, overwritten by the next call.
+        """
+        self._frame = frame
+        row = self._row
+        exposures = self._log_exposure
+        row[:3] = 1 if frame is None else math.exp(float(exposures[frame]) - self._mean(exposures))
+        common = row[3:11]
+        common[:] = self._common
+        np.exp(common, out=common, where=self._logarithms)
+        return row
+
+    @staticmethod
+    def _mean(values: np.ndarray) -> float:
+        return float(np.add.reduce(values, dtype=np.float64)) / len(values)
+
+    def prior(self) -> float:
+        """The term of the loss that holds log-exposures near zero; only real frames pay it."""
+        if self._frame is None:
+            return 0.0
+        exposures = self._log_exposure
+        return self._config.exposure_prior * float(exposures @ exposures) / len(exposures)
+
+    def step(self, gradient: Float[np.ndarray, "12"]) -> None:
+        """Step what is learned.
+
+        Args:
+            gradient: of the loss without the prior, with respect to the last `row`.
+        """
+        if self._any_free:
+            self._adam.step(self.common_gradient(gradient))
+        if self._config.exposure and self._frame is not None:
+            self._exposure_adam.step(self.exposure_gradient(gradient))
+
+    def common_gradient(self, gradient: Float[np.ndarray, "12"]) -> Float[np.ndarray, "8"]:
+        """Gradient of the parameters all cameras share, in the order of a row; zero where not learned."""
+        common: np.ndarray = gradient[3:11] * self._free
+        np.multiply(common, self._row[3:11], out=common, where=self._logarithms)
+        return common
+
+    def exposure_gradient(self, gradient: Float[np.ndarray, "12"]) -> Float[np.ndarray, "f"]:
+        """Gradient of the log-exposures, that of the prior included; the last row was of a real frame."""
+        count = len(self._log_exposure)
+        carried = float(gradient[:3].sum()) * float(self._row[0])
+        # Each exposure is taken relative to the mean of all.
+        exposure: np.ndarray = (2 * self._config.exposure_prior / count) * self._log_exposure
+        exposure -= carried / count
+        exposure[self._frame] += carried
+        return exposure

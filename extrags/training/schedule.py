@@ -1,0 +1,52 @@
+"""What the optimisation of a scene goes by: rates, weights and budgets."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from extrags.config import DensifyConfig, LightConfig, OptimiserConfig
+
+__all__ = ["Schedule"]
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Everything the optimisation needs besides scene and views."""
+
+    stage: str
+    iterations: int
+    extent: float
+    optimiser: OptimiserConfig
+    light: LightConfig
+    densify: DensifyConfig
+    dssim_weight: float
+    depth_weight: float
+    depth_weight_final_share: float
+    depth_scale: float
+    sh_every: int
+    seed: int
+
+    def learning_rates(self, iteration: int) -> dict[str, float]:
+        """Rates at an iteration; positions fall log-linearly."""
+        rates = self.optimiser
+        t = iteration / max(1, self.iterations)
+        means = math.exp((1 - t) * math.log(rates.means) + t * math.log(rates.means_final))
+        return {
+            "means": means * self.extent,
+            "quats": rates.quats,
+            "scales": rates.scales,
+            "opacities": rates.opacities,
+            "sh0": rates.sh0,
+            "shN": rates.shN,
+        }
+
+    def resumed(self, *, seed: int) -> Schedule:
+        """The schedule of a scene that is already there: all harmonics from the first step."""
+        return replace(self, sh_every=1, seed=seed)
+
+    def depth_weight_at(self, iteration: int) -> float:
+        """Weight of the depth term, falling log-linearly."""
+        return self.depth_weight * float(
+            self.depth_weight_final_share ** (iteration / max(1, self.iterations))
+        )

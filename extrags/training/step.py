@@ -1,0 +1,240 @@
+"""One optimisation step: render a view, compare, carry the gradients back, move the parameters.
+
+`AutogradStep` does it with autograd on any backend and says what is meant; `NativeStep` calls the native
+kernels one after the other, into arrays that stay. Both give the same numbers to rounding.
+"""
+
+from __future__ import annotations
+
+import weakref
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from extrags.gaussians import Gaussians
+from extrags.illumination import NearFieldLight
+from extrags.raster import Rendering, SelectiveAdam, l1_ssim_loss, native_isa
+from extrags.raster.direct import DirectStep, Target
+from extrags.raster.loss import inverse_depth_loss
+from extrags.scene import Scene
+from extrags.training.density import DensityStrategy
+from extrags.training.light_fit import LightFit, learned_parameters
+from extrags.training.schedule import Schedule
+from extrags.training.views import View
+
+__all__ = ["AutogradStep", "NativeStep", "Observation", "TrainingStep", "training_step"]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What a step saw.
+
+    Args:
+        loss: all terms.
+        rendering: of the view, the gradients of its 2D means filled; good until the next step.
+        visible: Gaussians in view, [N].
+    """
+
+    loss: float
+    rendering: Rendering
+    visible: Tensor
+
+
+@runtime_checkable
+class TrainingStep(Protocol):
+    """Holds the parameters of a scene while they are optimised."""
+
+    adam: SelectiveAdam
+
+    @property
+    def light(self) -> NearFieldLight | None:
+        """The light as it is now, if the scene has one."""
+
+    def differentiate(self, view: View, iteration: int, density: DensityStrategy) -> Observation:
+        """Loss and gradients of a view; the parameters stay."""
+
+    def update(self, observation: Observation) -> None:
+        """Move the parameters along the gradients of the last `differentiate`."""
+
+
+def training_step(scene: Scene, schedule: Schedule) -> TrainingStep:
+    """The fastest implementation that can take a scene; its parameters are copied."""
+    plain = all(
+        value.dtype == torch.float32 and value.device.type == "cpu"
+        for value in scene.gaussians.parameters().values()
+    )
+    return (NativeStep if plain and native_isa() is not None else AutogradStep)(scene, schedule)
+
+
+class AutogradStep:
+    """The step as autograd and `torch.optim` do it, on any backend.
+
+    Args:
+        scene: where to start; it is copied.
+        schedule: rates and weights.
+    """
+
+    def __init__(self, scene: Scene, schedule: Schedule) -> None:
+        self._schedule = schedule
+        self.adam = SelectiveAdam(_leaves(scene.gaussians), schedule.learning_rates(0))
+        self.light, self._light_adam = _trainable_light(scene.light, schedule)
+
+    def differentiate(self, view: View, iteration: int, density: DensityStrategy) -> Observation:
+        """See `TrainingStep.differentiate`."""
+        schedule = self._schedule
+        scene = Scene(Gaussians(**self.adam.parameters), self.light)
+        exposure = None
+        if scene.light is not None:
+            exposure = scene.light.exposure(view.frame)[None]
+        rendering = scene.render(
+            view.camera,
+            exposure=exposure,
+            sh_degree=iteration // schedule.sh_every,
+            absgrad=density.needs_absgrad,
+        )
+        loss = l1_ssim_loss(rendering.rgb[0], view.rgb, dssim_weight=schedule.dssim_weight, mask=view.weight)
+        if view.depth_mm is not None and schedule.depth_weight > 0:
+            loss = loss + schedule.depth_weight_at(iteration) * inverse_depth_loss(
+                rendering.depth[0], rendering.alpha[0], view.depth_mm, scale=schedule.depth_scale
+            )
+        loss = loss * view.loss_weight
+        if scene.light is not None and view.frame is not None:
+            loss = loss + schedule.light.exposure_prior * scene.light.log_exposure.square().mean()
+        penalty = density.penalty(self.adam.parameters)
+        if penalty is not None:
+            loss = loss + penalty
+        loss.backward()
+        return Observation(float(loss.detach()), rendering, rendering.visible[0])
+
+    def update(self, observation: Observation) -> None:
+        """See `TrainingStep.update`."""
+        self.adam.step(visible=observation.visible)
+        self.adam.zero_grad()
+        if self._light_adam is not None:
+            self._light_adam.step()
+            self._light_adam.zero_grad(set_to_none=True)
+
+
+class NativeStep:
+    """The step as the native kernels do it: no graph, no new arrays while the number of Gaussians stays.
+
+    Args:
+        scene: float32 on the CPU; it is copied.
+        schedule: rates and weights.
+    """
+
+    def __init__(self, scene: Scene, schedule: Schedule) -> None:
+        self._schedule = schedule
+        self._sh_degree = scene.gaussians.sh_degree
+        self._light = None if scene.light is None else LightFit(scene.light, schedule.light)
+        self.adam = SelectiveAdam(
+            _leaves(scene.gaussians), schedule.learning_rates(0), joined={"sh": ("sh0", "shN")}
+        )
+        self._direct: DirectStep | None = None
+        self._bound: list[Tensor] = []
+        self._targets: dict[int, tuple[weakref.ref[View], Target]] = {}
+
+    @property
+    def light(self) -> NearFieldLight | None:
+        """See `TrainingStep.light`."""
+        return None if self._light is None else self._light.light
+
+    def differentiate(self, view: View, iteration: int, density: DensityStrategy) -> Observation:
+        """See `TrainingStep.differentiate`."""
+        schedule = self._schedule
+        direct = self._bound_step(density)
+        target = self._target(view)
+        loss = direct.run(
+            target,
+            sh_degree=min(iteration // schedule.sh_every, self._sh_degree),
+            light=None if self._light is None else self._light.row(view.frame),
+            dssim_weight=schedule.dssim_weight,
+            loss_weight=view.loss_weight,
+            depth_weight=schedule.depth_weight_at(iteration),
+            depth_scale=schedule.depth_scale,
+        )
+        if self._light is not None:
+            loss += self._light.prior()
+        penalty = density.penalty(self.adam.parameters)
+        if penalty is not None:
+            self._add_penalty(penalty, direct.gradients)
+            loss += float(penalty.detach())
+        return Observation(loss, direct.rendering(target), direct.visible)
+
+    def update(self, observation: Observation) -> None:
+        """See `TrainingStep.update`."""
+        if self._direct is None:
+            raise RuntimeError("update before the first differentiate")
+        self.adam.step(visible=observation.visible, gradients=self._direct.gradients)
+        if self._light is not None:
+            self._light.step(self._direct.light_gradient)
+
+    def _bound_step(self, density: DensityStrategy) -> DirectStep:
+        """The kernels' arrays, made anew where densification has replaced the parameters."""
+        if self._direct is None:
+            self._direct = DirectStep(absgrad=density.needs_absgrad, lit=self._light is not None)
+        leaves = list(self.adam.parameters.values())
+        if len(leaves) != len(self._bound) or any(
+            a is not b for a, b in zip(leaves, self._bound, strict=True)
+        ):
+            joined = {name: array.values for name, array in self.adam.joined.items()}
+            self._direct.bind({**self.adam.parameters, **joined})
+            self._bound = leaves
+        return self._direct
+
+    def _add_penalty(self, penalty: Tensor, gradients: dict[str, Tensor]) -> None:
+        """A penalty depends on the parameters alone: autograd costs little there."""
+        parameters = self.adam.parameters
+        found = torch.autograd.grad(penalty, list(parameters.values()), allow_unused=True)
+        split = {"sh0": gradients["sh"][:, :1], "shN": gradients["sh"][:, 1:]}
+        for name, gradient in zip(parameters, found, strict=True):
+            if gradient is not None:
+                (split[name] if name in split else gradients[name]).add_(gradient)
+
+    def _target(self, view: View) -> Target:
+        """What the kernels need of a view, kept as long as the view lives."""
+        key = id(view)
+        if key in self._targets:
+            return self._targets[key][1]
+        camera = view.camera
+        target = Target(
+            camera.viewmats[0].astype(np.float32),
+            camera.K[0].astype(np.float32),
+            view.rgb,
+            weight=view.weight,
+            depth=view.depth_mm if self._schedule.depth_weight > 0 else None,
+        )
+        targets = self._targets
+        # An identity may be given again once its view is gone.
+        targets[key] = (weakref.ref(view, lambda _: targets.pop(key, None)), target)
+        return target
+
+
+def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:
+    return {
+        name: value.detach().clone().contiguous().requires_grad_()
+        for name, value in gaussians.parameters().items()
+    }
+
+
+def _trainable_light(
+    light: NearFieldLight | None, schedule: Schedule
+) -> tuple[NearFieldLight | None, torch.optim.Adam | None]:
+    if light is None:
+        return None, None
+    config = schedule.light
+    values = {k: v.detach().clone() for k, v in light.parameters().items()}
+    learned = learned_parameters(config)
+    for name in learned:
+        values[name].requires_grad_()
+    if config.exposure:
+        values["log_exposure"].requires_grad_()
+    trainable = NearFieldLight(**values, reference_distance=light.reference_distance)
+    groups: list[dict[str, Any]] = [
+        {"params": [values[name] for name in learned], "lr": config.learning_rate},
+        {"params": [values["log_exposure"]], "lr": config.exposure_learning_rate},
+    ]
+    return trainable, torch.optim.Adam(groups, eps=1e-15)

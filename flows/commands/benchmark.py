@@ -1,0 +1,131 @@
+"""`benchmark` (also `bench pipeline`): methods compared over sequences and seeds."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from rich.table import Table
+
+from extrags.config import profile_config
+from extrags.errors import ConfigError
+from extrags.store import Store
+from flows.commands.common import parsed_settings, set_up_logging, store_root, write_json
+from flows.environment import prepare, without_heartbeat
+from flows.terminal import console
+
+__all__ = ["benchmark", "items", "parsed_seeds", "parsed_variants", "print_benchmark"]
+
+
+def benchmark(given: argparse.Namespace) -> int:
+    """`extrags benchmark`; exit code 1 when a run failed."""
+    terminal = sys.stderr.isatty()
+    set_up_logging(debug=given.debug, terminal=terminal)
+    root = store_root(given)
+    settings = parsed_settings(given.settings)
+    # Any: the flow wants the literal names, which are looked at below.
+    methods: Any = items(given.methods)
+    profiles: Any = items(given.profiles)
+    seeds = parsed_seeds(given.seeds)
+    variants = parsed_variants(given.variants)
+    prepare(Store(root).state, debug=given.debug)
+    from flows.benchmark import benchmark as flow
+    from flows.benchmark import check_methods
+    from flows.console import watched
+    from flows.settings import task_runner
+
+    # Prefect would say the same in a page of its own words.
+    check_methods(methods, variants, given.baseline)
+    for profile in profiles:
+        profile_config(profile)
+    with without_heartbeat(), watched(terminal=terminal):
+        found = flow.with_options(task_runner=task_runner(given.runner))(
+            sequences=given.sequences,
+            profiles=profiles,
+            methods=methods,
+            seeds=seeds,
+            settings=settings,
+            variants=variants,
+            baseline=given.baseline,
+            store=root,
+            name=given.name,
+        )
+    print_benchmark(found, to_stderr=given.json == "-")
+    write_json(found, given.json)
+    return 1 if any(case["error"] for case in found["cases"]) else 0
+
+
+def items(given: list[str]) -> list[str]:
+    """`["a,b", "c"]` to `["a", "b", "c"]`."""
+    return [item for text in given for item in text.split(",") if item]
+
+
+def parsed_seeds(given: list[str]) -> list[int]:
+    """`["0,1", "2"]` to `[0, 1, 2]`.
+
+    Raises:
+        ConfigError: for anything but whole numbers from zero, or a seed that is there twice.
+    """
+    texts = items(given)
+    for text in texts:
+        if not text.isdecimal():
+            raise ConfigError(f"--seeds {text}: expected whole numbers from 0, e.g. --seeds 0,1,2")
+    seeds = [int(text) for text in texts]
+    if not seeds or len(set(seeds)) != len(seeds):
+        raise ConfigError(f"--seeds {','.join(texts)}: expected one or more different seeds")
+    return seeds
+
+
+def parsed_variants(given: list[list[str]]) -> dict[str, dict[str, Any]]:
+    """`[["dim", "coarse", "coarse.light.exponent=1"]]` to `{"dim": {"method": ..., "coarse...": 1}}`.
+
+    Raises:
+        ConfigError: for a variant without settings, or a name that is there twice.
+    """
+    variants: dict[str, dict[str, Any]] = {}
+    for name, *rest in given:
+        bases = [text for text in rest if "=" not in text]
+        changed = parsed_settings([text for text in rest if "=" in text])
+        if "=" in name or len(bases) > 1 or not changed:
+            raise ConfigError(
+                f"--variant {' '.join([name, *rest])}: expected NAME [METHOD] SETTING=VALUE..., "
+                "e.g. no-light coarse coarse.light.enabled=false"
+            )
+        if name in variants:
+            raise ConfigError(f"--variant {name} is there twice")
+        variants[name] = {**({"method": bases[0]} if bases else {}), **changed}
+    return variants
+
+
+def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
+    """What came out: differences to the baseline, spread over seeds, failures, and where the page is."""
+    from flows.tables import DIFFERENCES, METRICS, difference_text, spread_text
+
+    out = console(error=to_stderr)
+    comparison = found["comparison"]
+    if comparison["paired_datasets"]:
+        table = _table(f"differences to {comparison['baseline']}, mean over sequences [95 % interval]")
+        for column in ("dataset", "profile", "method", "sequences", *DIFFERENCES):
+            table.add_column(column)
+        for row in comparison["paired_datasets"]:
+            about = (row["dataset"], row["profile"], row["method"], str(row["n_sequences"]))
+            table.add_row(*about, *(difference_text(name, row["figures"].get(name)) for name in DIFFERENCES))
+        out.print(table)
+    table = _table("mean ± standard deviation over seeds")
+    for column in ("sequence", "profile", "method", "seeds", *METRICS):
+        table.add_column(column)
+    for row in comparison["sequences"]:
+        name = f"{row['sequence']}@{row['setting']}" if row["setting"] else row["sequence"]
+        figures = (spread_text(metric, row["figures"].get(metric)) for metric in METRICS)
+        table.add_row(name, row["profile"], row["method"], str(row["n_seeds"]), *figures)
+    out.print(table)
+    for case in found["cases"]:
+        if case["error"]:
+            run = f"{case['sequence']} {case['method']} seed {case['seed']}"
+            out.print(f"[red]{run} failed in {case['error']}[/]")
+    out.print(f"report: {found['report']}", soft_wrap=True)
+
+
+def _table(title: str) -> Table:
+    return Table(box=None, pad_edge=False, header_style="bold", title=title, title_justify="left")

@@ -1,0 +1,106 @@
+"""benchmark-report: the page that compares methods, and its tables as files."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from extrags.store import Ref, Slot
+from tasks.evaluate import METRICS_FILE
+from tasks.report import PAGE
+from tasks.stage import stage
+
+__all__ = ["COMPARISON_FILE", "PER_VIEW_FILE", "benchmark_report"]
+
+COMPARISON_FILE = "comparison.json"
+"""Spread and paired differences: `extrags.metrics.comparison.compare_runs`."""
+PER_VIEW_FILE = "per_view.json"
+"""Every figure of every held-out view of every run."""
+
+
+# `rows` adds what the runs cost. The page shows it, but other times are no reason to build another page.
+@stage("benchmark-report", version=1, ignore=("rows",))
+def benchmark_report(
+    slot: Slot,
+    name: str,
+    baseline: str,
+    methods: dict[str, str],
+    runs: list[dict[str, Any]],
+    metrics: dict[str, Ref],
+    failures: dict[str, str],
+    pictures: list[dict[str, Any]],
+    sequences: dict[str, Ref],
+    renders: dict[str, Ref],
+    views: int,
+    rows: list[dict[str, Any]],
+) -> None:
+    """Build the page; writes `report.html`, `comparison.json` and `per_view.json`.
+
+    Args:
+        slot: where it goes.
+        name: title of the page.
+        baseline: method the others are compared with.
+        methods: what each method is, in words.
+        runs: `{method, profile, sequence, setting, seed}` of each.
+        metrics: where the metrics of a run are, by its index as text; failed runs have none.
+        failures: what went wrong, by the same index.
+        pictures: `{baseline, contender, label}`: two runs, by index as text, to be shown side by side.
+        sequences: the sequence of each run that is shown, by index.
+        renders: its renders.
+        views: rows of pictures per pair at most.
+        rows: `{seconds, peak_mib}` of each run.
+    """
+    from extrags.metrics.comparison import compare_runs
+    from extrags.metrics.protocol import RenderedViews
+    from extrags.report.benchmark import BenchmarkInputs, ComparedViews, build_benchmark_report
+    from extrags.report.comparison import RenderedMethod
+    from extrags.sequence import Sequence
+
+    found = {
+        index: json.loads((slot.open(ref) / METRICS_FILE).read_bytes()) for index, ref in metrics.items()
+    }
+    every = [
+        {
+            **run,
+            **rows[index],
+            "metrics": found[str(index)]["metrics"] if str(index) in found else None,
+            "error": failures.get(str(index), ""),
+        }
+        for index, run in enumerate(runs)
+    ]
+
+    def rendered(index: str) -> RenderedMethod:
+        return RenderedMethod(
+            str(runs[int(index)]["method"]),
+            RenderedViews.load(slot.open(renders[index]) / "renders").rgb,
+            found[index]["per_view"],
+        )
+
+    page = build_benchmark_report(
+        BenchmarkInputs(
+            name=name,
+            runs=every,
+            baseline=baseline,
+            methods=methods,
+            pictures=[
+                ComparedViews(
+                    Sequence.load(slot.open(sequences[pair["baseline"]]) / "sequence"),
+                    pair["label"],
+                    rendered(pair["baseline"]),
+                    rendered(pair["contender"]),
+                )
+                for pair in pictures
+            ],
+            views=views,
+        )
+    )
+    (slot.path / PAGE).write_text(page, encoding="utf-8")
+    comparison = compare_runs(every, baseline)
+    (slot.path / COMPARISON_FILE).write_text(json.dumps(comparison, indent=1, allow_nan=False))
+    per_view = [
+        {**run, "protocol": found[str(index)]["protocol"], "per_view": found[str(index)]["per_view"]}
+        for index, run in enumerate(runs)
+        if str(index) in found
+    ]
+    (slot.path / PER_VIEW_FILE).write_text(json.dumps(per_view, indent=1, allow_nan=False))
+    slot.counts.update(runs=len(runs), kib=round(len(page.encode()) / 1024))

@@ -1,0 +1,208 @@
+"""COLMAP in and out: exact round trips, models that open in pycolmap, lenses undone."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from data_catalog.catalog import read, resolve, source_fingerprint
+from data_catalog.colmap_files import ColmapImage, ColmapModel, read_model, write_model
+from data_catalog.colmap_model import model_folder, points_of, read_depth_map, write_colmap
+from data_catalog.lens import Lens, Undistortion
+from extrags.config import IngestConfig
+from extrags.sequence import Split
+from tests.data_catalog.layouts import carried_error_mm, same_frames
+
+# Rounding of a rotation to a quaternion and back, of an inverse and back; lengths up to some 100 mm.
+ROUNDING = 1e-12
+
+
+@pytest.fixture
+def varied(clip):
+    """Masks, two intrinsics, points and a split of its own: everything a workspace can hold."""
+    K = clip.K.copy()
+    K[5:] *= np.array([[1.1], [1.1], [1]])
+    mask = clip.mask.copy()
+    mask[:, :4] = False
+    rng = np.random.default_rng(1)
+    return replace(
+        clip,
+        K=K,
+        mask=mask,
+        split=Split("manifest", np.array([0, 1, 2, 4, 5, 6, 7, 9]), np.array([3, 8])),
+        points=rng.normal(0, 20, (50, 3)),
+        points_rgb=rng.integers(0, 256, (50, 3)).astype(np.uint8),
+    )
+
+
+@pytest.mark.parametrize("binary", [True, False])
+class TestRoundTrip:
+    def test_sequence_to_colmap_to_sequence(self, varied, tmp_path, binary) -> None:
+        write_colmap(varied, tmp_path / "scene", binary=binary)
+        back = read(tmp_path / "scene")
+        same_frames(back, varied, atol=ROUNDING)
+        np.testing.assert_array_equal(back.depth_mm, varied.depth_mm)
+        np.testing.assert_array_equal(back.points, varied.points)
+        np.testing.assert_array_equal(back.points_rgb, varied.points_rgb)
+        assert back.observed is not None
+
+    def test_colmap_to_sequence_to_colmap(self, varied, tmp_path, binary) -> None:
+        write_colmap(varied, tmp_path / "first", binary=binary)
+        write_colmap(read(tmp_path / "first"), tmp_path / "second", binary=not binary)
+        first, second = (read_model(tmp_path / name / "sparse" / "0") for name in ("first", "second"))
+        assert first.lenses == second.lenses
+        np.testing.assert_array_equal(first.points, second.points)
+        for one, other in zip(first.images, second.images, strict=True):
+            assert (one.name, one.camera) == (other.name, other.camera)
+            np.testing.assert_allclose(one.world_from_camera, other.world_from_camera, rtol=0, atol=ROUNDING)
+
+    def test_depth_carried_from_frame_to_frame(self, clip, tmp_path, binary) -> None:
+        write_colmap(clip, tmp_path / "scene", binary=binary)
+        back = read(tmp_path / "scene")
+        assert carried_error_mm(back) == pytest.approx(carried_error_mm(clip), abs=1e-6)
+        assert carried_error_mm(back) < 0.2
+
+    def test_opens_in_pycolmap(self, varied, tmp_path, binary) -> None:
+        """In a process of its own: pycolmap says what it read, and writes the model again."""
+        write_colmap(varied, tmp_path / "scene", binary=binary)
+        code = (
+            "import json, sys\n"
+            "import PIL.Image, cv2, pycolmap\n"
+            "model = pycolmap.Reconstruction(sys.argv[1])\n"
+            "found = {i.name: i.cam_from_world().inverse().matrix() for i in model.images.values()}\n"
+            "model.write(sys.argv[2])\n"
+            "counts = {'points': len(model.points3D), 'cameras': len(model.cameras)}\n"
+            "print(json.dumps({'images': {k: v.tolist() for k, v in found.items()}, **counts}))\n"
+        )
+        again = tmp_path / "again" / "sparse" / "0"
+        again.mkdir(parents=True)
+        arguments = [sys.executable, "-c", code, str(tmp_path / "scene" / "sparse" / "0"), str(again)]
+        said = json.loads(subprocess.run(arguments, capture_output=True, text=True, check=True).stdout)
+        assert (said["points"], said["cameras"]) == (50, 2)
+        for index, name in enumerate(varied.frame_names):
+            np.testing.assert_allclose(
+                said["images"][f"{name}.png"], varied.world_from_camera[index, :3], atol=ROUNDING
+            )
+        # What pycolmap writes (with rigs and frames beside it) is read here.
+        (tmp_path / "again" / "images").symlink_to(tmp_path / "scene" / "images")
+        found = read(tmp_path / "again")
+        np.testing.assert_allclose(found.cameras.world_from_camera, varied.world_from_camera, atol=ROUNDING)
+        assert found.metric is False
+
+
+class TestReading:
+    def test_a_distorted_camera_is_undone(self, clip, tmp_path) -> None:
+        """Frames seen through a lens: after reading, depth and colour are where a pinhole has them."""
+        lens = Lens("OPENCV", (60.0, 61.0, 47.0, 39.5, -0.15, 0.02, 0.001, -0.001), 96, 77)
+        plain = Undistortion.planned(Lens("PINHOLE", (1.0, 1.0, 0.0, 0.0), 96, 77))
+        assert plain.valid.any()
+        # Distort: for each pixel of the lens, the pinhole pixel its ray comes from (fixed point iteration).
+        u, v = np.meshgrid(np.arange(96) + 0.5, np.arange(77) + 0.5)
+        target = np.stack([(u - 47.0) / 60.0, (v - 39.5) / 61.0])
+        ray = target.copy()
+        for _ in range(50):
+            ray += target - np.stack(lens.distorted(*ray))
+        K = clip.K[0]
+        map_u = (K[0, 0] * ray[0] + K[0, 2] - 0.5).astype(np.float32)
+        map_v = (K[1, 1] * ray[1] + K[1, 2] - 0.5).astype(np.float32)
+        seen = (map_u >= 0) & (map_u <= 95) & (map_v >= 0) & (map_v <= 76)
+        rgb = np.stack([cv2.remap(image, map_u, map_v, cv2.INTER_LINEAR) for image in clip.rgb])
+        distorted = replace(clip, rgb=rgb, depth_mm=None, mask=np.broadcast_to(seen, clip.mask.shape).copy())
+        write_colmap(distorted, tmp_path / "scene")
+        model = read_model(tmp_path / "scene" / "sparse" / "0")
+        write_model(replace(model, lenses={1: lens}), tmp_path / "scene" / "sparse" / "0")
+        back = read(tmp_path / "scene")
+        assert back.K[0, 0, 0] == pytest.approx(np.sqrt(60 * 61))
+        assert (back.K[0, 0, 2], back.K[0, 1, 2]) == (48, 38.5)
+        # The same view by resampling the pinhole image once.
+        x, y = (u - 48) / back.K[0, 0, 0], (v - 38.5) / back.K[0, 0, 0]
+        expected = cv2.remap(
+            clip.rgb[0],
+            (K[0, 0] * x + K[0, 2] - 0.5).astype(np.float32),
+            (K[1, 1] * y + K[1, 2] - 0.5).astype(np.float32),
+            cv2.INTER_LINEAR,
+        )
+        inside = back.mask[0]
+        assert inside.mean() > 0.6
+        difference = np.abs(back.rgb[0].astype(float) - expected)[inside]
+        assert difference.mean() < 2.5
+        shifted = np.abs(np.roll(back.rgb[0], 1, axis=1).astype(float) - expected)[inside]
+        assert difference.mean() < 0.5 * shifted.mean()
+
+    def test_the_largest_model_is_read(self, clip, tmp_path) -> None:
+        write_colmap(clip, tmp_path / "scene")
+        model = read_model(tmp_path / "scene" / "sparse" / "0")
+        write_model(model, tmp_path / "scene" / "sparse" / "1")
+        write_model(replace(model, images=model.images[:2]), tmp_path / "scene" / "sparse" / "0")
+        found = model_folder(tmp_path / "scene")
+        assert found is not None
+        assert found.name == "1"
+        assert len(read(tmp_path / "scene")) == 10
+
+    def test_images_without_pose_are_left_out_and_said(self, clip, tmp_path, caplog) -> None:
+        write_colmap(clip, tmp_path / "scene")
+        folder = tmp_path / "scene" / "sparse" / "0"
+        model = read_model(folder)
+        write_model(replace(model, images=model.images[:7]), folder)
+        for name in ("train", "test"):
+            (tmp_path / "scene" / f"{name}_list.txt").unlink()
+        assert len(read(tmp_path / "scene", IngestConfig(holdout_every=3))) == 7
+        assert "3 of 10 images have no pose in the COLMAP model" in caplog.text
+        assert "0007.png" in caplog.text
+
+    def test_recordings_are_folders(self, clip, tmp_path) -> None:
+        two = replace(clip, recording=np.repeat([0, 1], 5))
+        write_colmap(two, tmp_path / "scene")
+        assert (tmp_path / "scene" / "images" / "recording_1" / "0007.png").is_file()
+        back = read(tmp_path / "scene")
+        assert back.recording.tolist() == [0] * 5 + [1] * 5
+        assert back.frame_names == clip.frame_names
+
+    def test_observations_are_kept(self, tmp_path) -> None:
+        """Tracks of the files agree with the observations of the images, both ways."""
+        rng = np.random.default_rng(0)
+        images = [
+            ColmapImage(f"{k}.png", 1, np.eye(4), rng.uniform(0, 50, (6, 2)), np.array([k, -1, 2, 3, -1, 4]))
+            for k in range(2)
+        ]
+        lens = Lens("SIMPLE_PINHOLE", (50.0, 30.0, 20.0), 60, 40)
+        model = ColmapModel({1: lens}, images, rng.normal(size=(5, 3)), np.zeros((5, 3), np.uint8))
+        for binary in (True, False):
+            write_model(model, tmp_path / str(binary), binary=binary)
+            back = read_model(tmp_path / str(binary))
+            for one, other in zip(model.images, back.images, strict=True):
+                np.testing.assert_array_equal(one.observed_px, other.observed_px)
+                np.testing.assert_array_equal(one.observed_point, other.observed_point)
+
+    def test_fingerprint_is_the_content(self, clip, tmp_path) -> None:
+        for name in ("one", "two"):
+            write_colmap(clip, tmp_path / name)
+        first, second = source_fingerprint(tmp_path / "one"), source_fingerprint(tmp_path / "two")
+        assert first == second
+        assert resolve(tmp_path / "one").format == "colmap"
+        (tmp_path / "two" / "length_unit.txt").write_text("arbitrary")
+        assert source_fingerprint(tmp_path / "two") != first
+        assert read(tmp_path / "two").metric is False
+
+
+class TestPoints:
+    def test_depth_gives_points_where_there_are_none(self, clip) -> None:
+        points, colours = points_of(clip, at_most=500)
+        assert 200 < len(points) <= 700
+        assert colours.shape == points.shape
+        viewmat = clip.cameras.viewmats[1]
+        assert ((points @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2] > 0).mean() > 0.5
+
+    def test_neither_points_nor_depth(self, clip) -> None:
+        assert points_of(replace(clip, depth_mm=None)) is None
+
+    def test_depth_map_file(self, tmp_path) -> None:
+        file = tmp_path / "a.geometric.bin"
+        file.write_bytes(b"3&2&1&" + np.arange(6, dtype="<f4").tobytes())
+        np.testing.assert_array_equal(read_depth_map(file), np.arange(6, dtype=np.float32).reshape(2, 3))

@@ -1,0 +1,134 @@
+"""The round picture, the dark frame and burnt-in text."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_catalog.content import Circle, content_circle, content_mask, overlay_mask, view_mask
+
+
+def rim(x: float, y: float, radius: float) -> Circle:
+    return Circle(float(x), float(y), float(radius), 1.0)
+
+
+def moving_scene(frames: int, width: int = 320, height: int = 180, speed: int = 7) -> np.ndarray:
+    """A textured picture that slides under the image."""
+    rng = np.random.default_rng(0)
+    small = rng.integers(60, 190, (height // 6, (width + speed * frames) // 6 + 2, 3)).astype(np.uint8)
+    large = cv2.resize(small, None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)
+    return np.stack([large[:height, k * speed : k * speed + width] for k in range(frames)])
+
+
+def in_a_circle(scene: np.ndarray, circle: Circle) -> np.ndarray:
+    inside = circle.mask(scene.shape[2], scene.shape[1])
+    noise = np.random.default_rng(1).integers(0, 8, scene.shape)
+    return np.where(inside[None, ..., None], scene, noise).astype(np.uint8)
+
+
+def signed(scene: np.ndarray) -> np.ndarray:
+    for k, image in enumerate(scene):
+        cv2.putText(image, "PATIENT 14", (70, 150), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (255, 255, 255), 1)
+        cv2.putText(image, f"{k % 10}", (190, 150), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (80, 255, 80), 1)
+    return scene
+
+
+class TestCircle:
+    @pytest.mark.parametrize(
+        "circle",
+        [
+            rim(160, 90, 80),
+            rim(150.3, 95.7, 110),
+            rim(200, 60, 140),
+            rim(100, 90, 70),
+        ],
+        ids=["whole", "cut above and below", "cut on three sides", "left"],
+    )
+    def test_found_to_a_pixel(self, circle) -> None:
+        found = content_circle(in_a_circle(moving_scene(6), circle))
+        assert found is not None
+        assert abs(found.center_x - circle.center_x) < 1.5
+        assert abs(found.center_y - circle.center_y) < 1.5
+        assert abs(found.radius_px - circle.radius_px) < 1.5
+
+    def test_a_dark_side_does_not_move_it(self) -> None:
+        """Half the picture is unlit in every frame: the lit rim still tells the circle."""
+        circle = rim(160, 90, 84)
+        scene = in_a_circle(moving_scene(6), circle)
+        scene[:, 110:, 60:110] = 4
+        found = content_circle(scene)
+        assert found is not None
+        assert abs(found.radius_px - 84) < 2
+
+    @pytest.mark.parametrize("shape", ["full", "rectangle"])
+    def test_no_circle_where_there_is_none(self, shape) -> None:
+        scene = moving_scene(6)
+        if shape == "rectangle":
+            scene[:, :20] = scene[:, -20:] = 3
+            scene[:, :, :40] = scene[:, :, -40:] = 3
+        assert content_circle(scene) is None
+        np.testing.assert_array_equal(content_mask(scene), view_mask(scene))
+
+    def test_real_pictures(self, shared_data) -> None:
+        """Laparoscopes of 15 operations: text and logos beside the picture stay outside."""
+        files = sorted((shared_data / "laparoscopy_frames_40").glob("*.jpg"))[::4]
+        for file in files:
+            image = np.array(Image.open(file).resize((640, 360), Image.Resampling.BOX))
+            found = content_circle(image[None])
+            assert found is not None, file.name
+            assert 225 < found.radius_px < 330
+            inside = found.mask(640, 360)
+            assert image[~inside].max(axis=-1).mean() < 12
+            assert not inside[:, :8].any()
+
+
+class TestOverlay:
+    def test_text_over_a_moving_scene(self) -> None:
+        scene = moving_scene(12)
+        plain = scene.copy()
+        found = overlay_mask(signed(scene), np.ones(scene.shape[1:3], bool))
+        letters = (scene != plain).any(axis=-1)
+        always = letters.all(axis=0)
+        assert found[always].mean() > 0.97
+        assert found.sum() < 5 * always.sum()
+        assert not overlay_mask(plain, np.ones(scene.shape[1:3], bool)).any()
+
+    def test_a_scene_that_stands_still_has_no_text(self) -> None:
+        scene = np.repeat(moving_scene(1), 10, axis=0)
+        assert not overlay_mask(signed(scene), np.ones(scene.shape[1:3], bool)).any()
+
+    def test_too_few_frames_tell_nothing(self) -> None:
+        scene = signed(moving_scene(3))
+        assert not overlay_mask(scene, np.ones(scene.shape[1:3], bool)).any()
+
+    def test_real_text(self, shared_data) -> None:
+        """Gas flow and pressure in the lower left corner, over forty frames of fifteen operations."""
+        files = sorted((shared_data / "laparoscopy_frames_40").glob("*.jpg"))
+        frames = np.stack(
+            [np.array(Image.open(file).resize((640, 360), Image.Resampling.BOX)) for file in files]
+        )
+        found = overlay_mask(frames, np.ones((360, 640), bool))
+        rows, columns = np.nonzero(found[:355])
+        assert found[325:352, 40:110].mean() > 0.3
+        assert columns.max() < 140
+        assert rows.min() > 320
+
+
+def test_everything_together() -> None:
+    circle = rim(160, 90, 84)
+    scene = signed(in_a_circle(moving_scene(40), circle))
+    mask = content_mask(scene)
+    expected = circle.mask(320, 180, 2.0)
+    assert not mask[~circle.mask(320, 180)].any()
+    assert (expected & ~mask).mean() < 0.08
+    assert not mask[144:148, 120:160].all()
+
+
+def test_large_frames_are_looked_at_small() -> None:
+    circle = rim(640, 360, 330)
+    scene = in_a_circle(moving_scene(4, 1280, 720), circle)
+    mask = content_mask(scene)
+    assert mask.shape == (720, 1280)
+    assert (mask != circle.mask(1280, 720, 8.0)).mean() < 0.01

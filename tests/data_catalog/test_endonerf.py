@@ -1,0 +1,71 @@
+"""EndoNeRF's layout: LLFF axes, and masks of either polarity."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from data_catalog.catalog import read, resolve
+from data_catalog.endonerf import mask_polarity, polarity_of_images
+from data_catalog.inspection import inspect
+from extrags.errors import SourceError
+from tests.data_catalog.layouts import carried_error_mm, with_tool, write_endonerf
+
+
+def test_poses_come_back(clip, tmp_path) -> None:
+    write_endonerf(clip, tmp_path)
+    assert resolve(tmp_path).format == "endonerf"
+    back = read(tmp_path)
+    assert back.metric
+    np.testing.assert_allclose(back.cameras.world_from_camera, clip.cameras.world_from_camera, atol=1e-12)
+    np.testing.assert_allclose(back.K, clip.K, atol=1e-12)
+    np.testing.assert_array_equal(back.rgb, clip.rgb)
+
+
+def test_depth_carried_from_frame_to_frame(clip, tmp_path) -> None:
+    """Depth is stored in whole millimetres here, which bounds how well it can agree."""
+    write_endonerf(clip, tmp_path)
+    rounded = replace(clip, depth_mm=np.round(clip.depth_mm))
+    assert carried_error_mm(read(tmp_path)) == pytest.approx(carried_error_mm(rounded), abs=1e-4)
+    assert carried_error_mm(read(tmp_path)) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("white_is_tissue", "folder"), [(False, "masks"), (True, "masks"), (True, "gt_masks")]
+)
+def test_polarity_is_found_and_stated(clip, tmp_path, caplog, white_is_tissue, folder) -> None:
+    sequence, tool = with_tool(clip)
+    write_endonerf(sequence, tmp_path, tool != white_is_tissue, mask_folder=folder)
+    with caplog.at_level(logging.INFO):
+        back = read(tmp_path)
+    np.testing.assert_array_equal(back.mask, ~tool)
+    stated = "white is tissue, by colour" if white_is_tissue else "white is tool, by colour"
+    assert stated in caplog.text
+    assert stated in mask_polarity(tmp_path).because
+    assert any(stated in note for note in inspect(tmp_path).notes)
+
+
+def test_grey_tissue_is_told_by_area() -> None:
+    rgb = np.full((2, 20, 20, 3), 110, np.uint8)
+    white = np.zeros((2, 20, 20), bool)
+    white[:, :4] = True
+    assert polarity_of_images(rgb, white).white_is_tissue is False
+    assert polarity_of_images(rgb, ~white).white_is_tissue is True
+    assert "by area" in polarity_of_images(rgb, white).because
+
+
+def test_one_value_throughout_is_tissue() -> None:
+    rgb = np.full((2, 20, 20, 3), 110, np.uint8)
+    assert polarity_of_images(rgb, np.zeros((2, 20, 20), bool)).white_is_tissue is False
+    assert polarity_of_images(rgb, np.ones((2, 20, 20), bool)).white_is_tissue is True
+
+
+def test_masks_that_tell_nothing_are_refused() -> None:
+    rgb = np.full((2, 20, 20, 3), 110, np.uint8)
+    white = np.zeros((2, 20, 20), bool)
+    white[:, :10] = True
+    with pytest.raises(SourceError, match="cannot be told"):
+        polarity_of_images(rgb, white)

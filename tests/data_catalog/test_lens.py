@@ -1,0 +1,118 @@
+"""Lens models against COLMAP's own, and resampling against images computed ray by ray."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import PIL.Image  # noqa: F401  (the same)
+import pytest
+
+from data_catalog.lens import LENS_PARAMETERS, Lens, Undistortion, sample_depth
+from extrags.errors import SourceError
+
+WIDTH, HEIGHT = 160, 128
+DISTORTION = {
+    "k1": -0.12, "k2": 0.03, "k3": 0.004, "k4": -0.002, "k5": 0.01, "k6": 0.002,
+    "p1": 0.003, "p2": -0.002, "sx1": 0.002, "sy1": -0.003, "omega": 0.8,
+}  # fmt: skip
+
+
+def lens_of(model: str) -> Lens:
+    linear = {"f": 110.0, "fx": 110.0, "fy": 113.0, "cx": 83.5, "cy": 61.0}
+    values = {**linear, **DISTORTION}
+    return Lens(model, tuple(values[name] for name in LENS_PARAMETERS[model]), WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("model", LENS_PARAMETERS)
+def test_projection_is_colmaps(model) -> None:
+    import pycolmap
+
+    lens = lens_of(model)
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=list(lens.parameters))
+    rays = np.random.default_rng(0).uniform(-0.7, 0.7, (200, 2))
+    u, v = lens.project(rays[:, 0], rays[:, 1])
+    expected = camera.img_from_cam(np.column_stack([rays, np.ones(200)]))
+    np.testing.assert_allclose(np.column_stack([u, v]), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", ["OPENCV", "OPENCV_FISHEYE", "FOV", "SIMPLE_RADIAL"])
+def test_resampling_error_is_below_a_tenth_of_a_pixel(model) -> None:
+    """An image whose colour says its ray: what is read off after resampling is the ray of another pixel."""
+    import pycolmap
+
+    lens = lens_of(model)
+    camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=list(lens.parameters))
+    pixels = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), axis=-1).reshape(-1, 2)
+    rays = camera.cam_from_img(pixels).reshape(HEIGHT, WIDTH, 2)
+    plan = Undistortion.planned(lens)
+    assert plan.K[0, 0] == plan.K[1, 1]
+    assert (plan.K[0, 2], plan.K[1, 2]) == (WIDTH / 2, HEIGHT / 2)
+    assert plan.valid.mean() > 0.75
+    x = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / plan.K[0, 0]
+    y = (np.arange(HEIGHT) + 0.5 - HEIGHT / 2) / plan.K[1, 1]
+    for axis, expected in enumerate(np.meshgrid(x, y)):
+        # Eight bits would round more than is asked for: resample the numbers themselves.
+        moved = cv2.remap(rays[..., axis].astype(np.float32), *plan._maps(), cv2.INTER_LINEAR)
+        error_px = np.abs(moved - expected)[plan.valid] * plan.K[0, 0]
+        assert error_px.max() < 0.1
+
+
+def test_a_plane_keeps_its_depth() -> None:
+    """z-depth of a slanted plane seen through a lens, resampled to the pinhole."""
+    import pycolmap
+
+    lens = lens_of("OPENCV")
+    camera = pycolmap.Camera(model="OPENCV", width=WIDTH, height=HEIGHT, params=list(lens.parameters))
+    pixels = np.stack(np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5), axis=-1).reshape(-1, 2)
+    rays = camera.cam_from_img(pixels).reshape(HEIGHT, WIDTH, 2)
+
+    def plane(x, y):
+        return 30 / (1 + 0.3 * x - 0.2 * y)
+
+    plan = Undistortion.planned(lens)
+    found = plan.depth(plane(rays[..., 0], rays[..., 1]).astype(np.float32))
+    x = (np.arange(WIDTH) + 0.5 - WIDTH / 2)[None] / plan.K[0, 0]
+    y = (np.arange(HEIGHT) + 0.5 - HEIGHT / 2)[:, None] / plan.K[1, 1]
+    error = np.abs(found - plane(x, y))[plan.valid]
+    assert error.max() < 0.02
+    assert (found[~plan.valid] == 0).all()
+
+
+def test_depth_is_not_mixed_across_a_fold() -> None:
+    depth = np.full((20, 20), 10, np.float32)
+    depth[:, 10:] = 30
+    depth[3, 3] = 0
+    u, v = np.meshgrid(np.linspace(0.5, 19.5, 77), np.linspace(0.5, 19.5, 55))
+    values = sample_depth(depth, u, v)
+    distance = np.abs(values[..., None] - np.array([0, 10, 30])).min(axis=-1)
+    assert distance.max() < 1e-9
+
+
+def test_a_polynomial_that_folds_back_is_cut_off() -> None:
+    folding = Lens("SIMPLE_RADIAL", (60.0, 80.0, 64.0, -0.25), WIDTH, HEIGHT)
+    # r (1 - 0.25 r^2) falls from r = sqrt(4 / 3) on.
+    assert folding.fold_radius(3.0) == pytest.approx(np.sqrt(4 / 3), abs=0.01)
+    plan = Undistortion.planned(folding)
+    x = (np.arange(WIDTH) + 0.5 - 80) / 60
+    y = (np.arange(HEIGHT) + 0.5 - 64) / 60
+    assert not plan.valid[np.hypot(x[None], y[:, None]) > np.sqrt(4 / 3) + 0.01].any()
+
+
+def test_pinholes_are_told_from_lenses() -> None:
+    assert lens_of("PINHOLE").is_pinhole
+    assert Lens("OPENCV", (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 4, 4).is_pinhole
+    assert not lens_of("OPENCV").is_pinhole
+    assert not Lens("OPENCV_FISHEYE", (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 4, 4).is_pinhole
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters", "message"),
+    [
+        ("EQUIRECTANGULAR", (1.0,), "the camera model EQUIRECTANGULAR is not known"),
+        ("PINHOLE", (1.0, 1.0, 2.0), "3 parameters for the model PINHOLE; expected 4: fx, fy, cx, cy"),
+        ("PINHOLE", (1.0, float("nan"), 2.0, 2.0), "fy = nan; expected a finite number"),
+    ],
+)
+def test_impossible_lenses(model, parameters, message) -> None:
+    with pytest.raises(SourceError, match=message):
+        Lens(model, parameters, 4, 4)

@@ -1,0 +1,165 @@
+"""`transforms.json` in and out."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_catalog.catalog import read, resolve
+from data_catalog.transforms_json import write_transforms
+from extrags.config import IngestConfig
+from extrags.sequence import Split
+from tests.data_catalog.layouts import carried_error_mm, same_frames
+
+ROUNDING = 1e-12
+
+
+@pytest.fixture
+def folder(clip, tmp_path):
+    write_transforms(clip, tmp_path / "scene")
+    return tmp_path / "scene"
+
+
+@pytest.fixture
+def edit(folder):
+    def change(how) -> None:
+        file = folder / "transforms.json"
+        content = json.loads(file.read_text())
+        how(content)
+        file.write_text(json.dumps(content))
+
+    return change
+
+
+class TestRoundTrip:
+    def test_sequence_to_file_to_sequence(self, clip, tmp_path) -> None:
+        mask = clip.mask.copy()
+        mask[:, :, :6] = False
+        rng = np.random.default_rng(0)
+        given = replace(
+            clip,
+            mask=mask,
+            points=rng.normal(0, 10, (30, 3)),
+            points_rgb=rng.integers(0, 255, (30, 3)).astype(np.uint8),
+            split=Split("manifest", np.arange(2, 10), np.array([0, 1])),
+        )
+        write_transforms(given, tmp_path / "scene")
+        back = read(tmp_path / "scene")
+        same_frames(back, given, atol=ROUNDING)
+        np.testing.assert_allclose(back.depth_mm, given.depth_mm, rtol=1e-6)
+        np.testing.assert_array_equal(back.points, given.points)
+        np.testing.assert_array_equal(back.points_rgb, given.points_rgb)
+
+    def test_file_to_sequence_to_file(self, folder, tmp_path) -> None:
+        write_transforms(read(folder), tmp_path / "again")
+        first, second = (
+            json.loads((place / "transforms.json").read_text()) for place in (folder, tmp_path / "again")
+        )
+        assert [entry["file_path"] for entry in first["frames"]] == [
+            entry["file_path"] for entry in second["frames"]
+        ]
+        for one, other in zip(first["frames"], second["frames"], strict=True):
+            np.testing.assert_allclose(
+                one["transform_matrix"], other["transform_matrix"], rtol=0, atol=ROUNDING
+            )
+            for key in ("fl_x", "fl_y", "cx", "cy", "w", "h"):
+                assert one[key] == other[key]
+        assert first["test_filenames"] == second["test_filenames"]
+
+    def test_depth_carried_from_frame_to_frame(self, clip, folder) -> None:
+        back = read(folder)
+        assert carried_error_mm(back) == pytest.approx(carried_error_mm(clip), abs=1e-4)
+        assert carried_error_mm(back) < 0.2
+
+    def test_arbitrary_scale_stays_arbitrary(self, clip, tmp_path) -> None:
+        write_transforms(replace(clip, metric=False, depth_mm=None), tmp_path / "scene")
+        assert read(tmp_path / "scene").metric is False
+
+
+class TestReading:
+    def test_recognised(self, folder) -> None:
+        assert resolve(folder).format == "transforms"
+
+    def test_axes_are_opengl(self, folder) -> None:
+        """A camera that looks along -z of its matrix looks along +z here."""
+        content = json.loads((folder / "transforms.json").read_text())
+        matrix = np.array(content["frames"][2]["transform_matrix"])
+        pose = read(folder).cameras.world_from_camera[2]
+        np.testing.assert_allclose(pose[:3, 2], -matrix[:3, 2], atol=1e-12)
+        np.testing.assert_allclose(pose[:3, 1], -matrix[:3, 1], atol=1e-12)
+        np.testing.assert_allclose(pose[:3, 0], matrix[:3, 0], atol=1e-12)
+
+    def test_metres_and_millimetre_depth_as_nerfstudio_has_them(self, clip, folder, edit) -> None:
+        def metres(content) -> None:
+            content["length_unit"] = "m"
+            for index, entry in enumerate(content["frames"]):
+                matrix = np.array(entry["transform_matrix"])
+                matrix[:3, 3] /= 1000
+                entry["transform_matrix"] = matrix.tolist()
+                entry["depth_file_path"] = f"depth/{index:04d}.png"
+                millimetres = np.round(clip.depth_mm[index]).astype(np.uint16)
+                Image.fromarray(millimetres).save(folder / entry["depth_file_path"])
+
+        edit(metres)
+        back = read(folder)
+        assert back.metric
+        np.testing.assert_allclose(back.cameras.world_from_camera, clip.cameras.world_from_camera, atol=1e-9)
+        assert np.abs(back.depth_mm - clip.depth_mm).max() <= 0.5 + 1e-3
+
+    def test_integer_depth_scale_of_instant_ngp(self, clip, folder, edit) -> None:
+        def coded(content) -> None:
+            content["integer_depth_scale"] = 100 / 65535
+            for index, entry in enumerate(content["frames"]):
+                entry["depth_file_path"] = f"depth/{index:04d}.png"
+                codes = np.clip(np.round(clip.depth_mm[index] / 100 * 65535), 0, 65535).astype(np.uint16)
+                Image.fromarray(codes).save(folder / entry["depth_file_path"])
+
+        edit(coded)
+        assert np.abs(read(folder).depth_mm - np.minimum(clip.depth_mm, 100)).max() < 2e-3
+
+    def test_intrinsics_for_all_frames_and_from_an_angle(self, folder, edit) -> None:
+        def shared(content) -> None:
+            for entry in content["frames"]:
+                for key in ("fl_x", "fl_y", "cx", "cy", "w", "h", "depth_file_path"):
+                    entry.pop(key)
+            content["camera_angle_x"] = np.pi / 2
+            content.pop("camera_model")
+
+        edit(shared)
+        np.testing.assert_allclose(read(folder).K[4], [[48, 0, 48], [0, 48, 38.5], [0, 0, 1]], atol=1e-9)
+
+    @pytest.mark.parametrize("keys", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+    def test_fisheye(self, folder, edit, keys) -> None:
+        def fisheye(content) -> None:
+            content.pop("camera_model")
+            content.update(k1=0.15, k2=0.001, **keys)
+            for entry in content["frames"]:
+                entry.pop("depth_file_path")
+
+        edit(fisheye)
+        back = read(folder)
+        # At the lens's central resolution a pinhole sees less than a fisheye: nothing is missing.
+        assert back.mask.all()
+        assert (back.K[0, 0, 2], back.K[0, 1, 2]) == (48, 38.5)
+        wide = read(folder, IngestConfig(field_of_view_deg=140.0))
+        assert wide.K[0, 0, 0] == pytest.approx(48 / np.tan(np.radians(70)))
+        assert wide.mask[0, 38, 48]
+        assert not wide.mask[0, 0, 0]
+
+    def test_paths_without_suffix(self, folder, edit) -> None:
+        def strip(content) -> None:
+            for key in ("train_filenames", "test_filenames"):
+                content[key] = [name.removesuffix(".png") for name in content[key]]
+            for entry in content["frames"]:
+                entry["file_path"] = entry["file_path"].removesuffix(".png")
+
+        edit(strip)
+        assert read(folder).test.tolist() == [0]
+
+    def test_validation_frames_are_held_out_too(self, folder, edit) -> None:
+        edit(lambda content: content.update(val_filenames=["images/0005.png"], train_filenames=[]))
+        assert read(folder).test.tolist() == [0, 5]

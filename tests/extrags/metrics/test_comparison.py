@@ -1,0 +1,128 @@
+"""Spread and paired differences against scipy, and what counts as one sample."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from extrags.errors import ConfigError
+from extrags.metrics.comparison import FIGURES, compare_runs, dataset_of, figure_of, paired, spread
+
+
+def run(method: str, sequence: str, seed: int, psnr: float | None, **more: Any) -> dict[str, Any]:
+    metrics = {
+        "psnr": psnr,
+        "lpips_alex": None if psnr is None else 1 - psnr / 40,
+        "observed": {"psnr": psnr},
+    }
+    found = {
+        "method": method,
+        "profile": "quick",
+        "sequence": sequence,
+        "setting": "sparse",
+        "seed": seed,
+        "metrics": metrics,
+    }
+    return found | more
+
+
+def both(sequence: str, seed: int, psnr: float, gain: float) -> list[dict[str, Any]]:
+    return [run("3dgs", sequence, seed, psnr), run("coarse", sequence, seed, psnr + gain)]
+
+
+class TestSpread:
+    def test_agrees_with_scipy(self) -> None:
+        values = list(np.random.default_rng(0).normal(20, 2, 7))
+        found = spread(values)
+        expected = stats.ttest_1samp(values, 0).confidence_interval(0.95)
+        assert found.mean == pytest.approx(np.mean(values))
+        assert found.deviation == pytest.approx(stats.tstd(values))
+        assert (found.low, found.high) == pytest.approx((expected.low, expected.high))
+        assert (found.n, found.smallest, found.largest) == (7, min(values), max(values))
+
+    def test_one_value_has_no_deviation(self) -> None:
+        found = spread([3.0])
+        assert (found.mean, found.deviation, found.low, found.high) == (3.0, None, None, None)
+
+    def test_nothing_has_no_spread(self) -> None:
+        with pytest.raises(ConfigError, match="empty sample"):
+            spread([])
+
+
+class TestPaired:
+    def test_is_the_paired_t_test(self) -> None:
+        rng = np.random.default_rng(1)
+        first, gains = rng.normal(20, 3, 6), rng.normal(1, 0.5, 6)
+        runs = [item for seed in range(6) for item in both("phantom/0", seed, first[seed], gains[seed])]
+        (row,) = compare_runs(runs, "3dgs")["paired_sequences"]
+        figure = row["figures"]["psnr"]
+        expected = stats.ttest_rel(first + gains, first).confidence_interval(0.95)
+        assert (figure["low"], figure["high"]) == pytest.approx((expected.low, expected.high))
+        assert figure["n"] == row["n_seeds"] == 6
+        assert figure["better"] == (gains > 0).sum()
+
+    def test_pairs_share_everything_but_the_method(self) -> None:
+        runs = [
+            run("3dgs", "phantom/0", 0, 10.0),
+            run("3dgs", "phantom/0", 1, 20.0),
+            run("3dgs", "phantom/0", 2, 90.0, setting="distanced"),
+            run("coarse", "phantom/0", 0, 11.0),
+            run("coarse", "phantom/0", 1, 22.0),
+            run("coarse", "phantom/0", 2, 30.0),
+            run("coarse", "phantom/0", 0, 99.0, profile="balanced"),
+        ]
+        assert [value for _, value in paired(runs, "coarse", "3dgs", "psnr")] == pytest.approx([1.0, 2.0])
+
+    def test_better_knows_the_direction(self) -> None:
+        runs = [item for seed, gain in enumerate((1.0, 2.0, -1.0)) for item in both("a/b", seed, 20.0, gain)]
+        (row,) = compare_runs(runs, "3dgs")["paired_sequences"]
+        assert row["figures"]["psnr"]["better"] == 2
+        assert row["figures"]["lpips_alex"]["better"] == 2
+        assert row["figures"]["lpips_alex"]["mean"] == pytest.approx(-row["figures"]["psnr"]["mean"] / 40)
+
+    def test_sequences_are_the_sample_of_a_dataset(self) -> None:
+        """Ten seeds of one sequence must not outvote the one seed of another."""
+        runs = [item for seed in range(10) for item in both("phantom/0", seed, 20.0, 3.0)]
+        runs += both("phantom/1", 0, 20.0, 1.0)
+        runs += both("sinus/hopkins", 0, 20.0, 5.0)
+        rows = {row["dataset"]: row for row in compare_runs(runs, "3dgs")["paired_datasets"]}
+        figure = rows["phantom@sparse"]["figures"]["psnr"]
+        assert (figure["mean"], figure["n"], figure["better"]) == (pytest.approx(2.0), 2, 2)
+        assert rows["phantom@sparse"]["n_seeds"] == 10
+        assert rows["sinus@sparse"]["figures"]["psnr"]["mean"] == pytest.approx(5.0)
+
+
+class TestTables:
+    def test_spread_of_each_method(self) -> None:
+        runs = [item for seed in range(3) for item in both("phantom/0", seed, 20.0 + seed, 1.0)]
+        comparison = compare_runs(runs, "3dgs")
+        rows = {row["method"]: row for row in comparison["sequences"]}
+        assert rows["3dgs"]["figures"]["psnr"]["mean"] == pytest.approx(21.0)
+        assert rows["coarse"]["figures"]["observed.psnr"]["deviation"] == pytest.approx(1.0)
+        assert "depth_absrel" not in rows["coarse"]["figures"]
+        json.dumps(comparison, allow_nan=False)
+
+    def test_failed_runs_are_left_out(self) -> None:
+        runs = [*both("phantom/0", 0, 20.0, 1.0), run("coarse", "phantom/1", 0, None)]
+        runs.append(run("3dgs", "phantom/1", 0, 10.0) | {"metrics": None})
+        comparison = compare_runs(runs, "3dgs")
+        assert [row["sequence"] for row in comparison["paired_sequences"]] == ["phantom/0"]
+
+    def test_what_makes_no_sense_is_refused(self) -> None:
+        runs = both("phantom/0", 0, 20.0, 1.0)
+        with pytest.raises(ConfigError, match="no run of the baseline 'extrags'; methods here: 3dgs, coarse"):
+            compare_runs(runs, "extrags")
+        with pytest.raises(ConfigError, match="there twice"):
+            compare_runs([*runs, runs[0]], "3dgs")
+
+    def test_names(self) -> None:
+        assert dataset_of(run("a", "phantom/3", 0, 1.0)) == "phantom@sparse"
+        assert dataset_of(run("a", "phantom/3", 0, 1.0, setting=None)) == "phantom"
+        assert figure_of({"a": {"b": 2}}, "a.b") == 2.0
+        assert figure_of({"a": {"b": None}}, "a.b") is None
+        assert figure_of(None, "a") is None
+        assert len({figure.name for figure in FIGURES}) == len(FIGURES)

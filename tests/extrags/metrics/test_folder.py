@@ -1,0 +1,154 @@
+"""Renders made elsewhere: matched to frames, measured as our own, refused by file and reason."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
+from extrags.metrics.folder import read_renders
+from extrags.metrics.protocol import RenderedViews, evaluate_views
+from extrags.sequence import Sequence, Split
+
+FRAMES, HEIGHT, WIDTH = 5, 24, 32
+TEST = np.array([3, 1, 4])
+LEVELS = np.random.default_rng(0).integers(0, 256, (FRAMES, HEIGHT, WIDTH, 3), dtype=np.uint8)
+
+
+@pytest.fixture
+def sequence() -> Sequence:
+    return Sequence(
+        name="made/up",
+        rgb=LEVELS,
+        K=np.tile(np.eye(3), (FRAMES, 1, 1)),
+        mask=np.ones((FRAMES, HEIGHT, WIDTH), dtype=bool),
+        split=Split("here", np.array([0, 2]), TEST),
+        depth_mm=np.full((FRAMES, HEIGHT, WIDTH), 20.0, dtype=np.float32),
+        frame_names=tuple(f"b_{index:04d}" for index in range(FRAMES)),
+    )
+
+
+def write(folder: Path, images: dict[str, np.ndarray]) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, image in images.items():
+        Image.fromarray(image).save(folder / name)
+    return folder
+
+
+def test_names_decide_whatever_the_order(sequence: Sequence, tmp_path: Path) -> None:
+    folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in range(FRAMES)})
+    renders = read_renders(folder, sequence)
+    np.testing.assert_array_equal(np.rint(renders.rgb * 255), LEVELS[TEST])
+    assert evaluate_views(renders, sequence, TEST, None).metrics["psnr"] == 100
+    assert renders.n_gaussians is None
+
+
+def test_frames_named_like_files(sequence: Sequence, tmp_path: Path) -> None:
+    named = replace(sequence, frame_names=tuple(f"rgb/b_{index:04d}.png" for index in range(FRAMES)))
+    folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in TEST})
+    np.testing.assert_array_equal(np.rint(read_renders(folder, named).rgb * 255), LEVELS[TEST])
+
+
+def test_else_numbers_decide_and_nine_comes_before_ten(sequence: Sequence, tmp_path: Path) -> None:
+    folder = write(
+        tmp_path / "renders",
+        {"view9.png": LEVELS[3], "view10.png": LEVELS[1], "view100.png": LEVELS[4]},
+    )
+    np.testing.assert_array_equal(np.rint(read_renders(folder, sequence).rgb * 255), LEVELS[TEST])
+
+
+def test_the_same_figures_as_our_own_renders(sequence: Sequence, tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    rgb = (LEVELS[TEST] / 255 + rng.normal(0, 0.1, (3, HEIGHT, WIDTH, 3))).astype(np.float32)
+    depth = rng.uniform(18, 25, (3, HEIGHT, WIDTH)).astype(np.float32)
+    own = RenderedViews(rgb, np.ones_like(depth), depth, 9)
+    levels = np.rint(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+    folder = write(tmp_path / "renders", {f"{index}.png": image for index, image in enumerate(levels)})
+    (tmp_path / "depth").mkdir()
+    for index, image in enumerate(depth):
+        np.save(tmp_path / "depth" / f"{index}.npy", image)
+    there = read_renders(folder, sequence, depth_folder=tmp_path / "depth")
+    ours = evaluate_views(own, sequence, TEST, None)
+    theirs = evaluate_views(there, sequence, TEST, None)
+    assert theirs.per_view == ours.per_view
+    assert theirs.metrics == ours.metrics | {"n_gaussians": None}
+    assert theirs.reasons["n_gaussians"] == "the renders were made elsewhere"
+
+
+def test_without_depth_there_are_no_depth_figures(sequence: Sequence, tmp_path: Path) -> None:
+    folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
+    result = evaluate_views(read_renders(folder, sequence), sequence, TEST, None)
+    assert result.metrics["depth_absrel"] is None
+    assert result.metrics["psnr"] is not None
+
+
+def test_integer_depth_needs_its_step(sequence: Sequence, tmp_path: Path) -> None:
+    folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
+    steps = np.full((HEIGHT, WIDTH), 2200, dtype=np.uint16)
+    depth = write(tmp_path / "depth", {f"{index}.png": steps for index in range(3)})
+    with pytest.raises(ConfigError, match="holds integers"):
+        read_renders(folder, sequence, depth_folder=depth)
+    renders = read_renders(folder, sequence, depth_folder=depth, depth_step_mm=0.01)
+    np.testing.assert_allclose(renders.depth_mm, 22.0, rtol=1e-6)
+
+
+class TestRefused:
+    def test_no_folder(self, sequence: Sequence, tmp_path: Path) -> None:
+        with pytest.raises(SourceNotFoundError, match="no such folder"):
+            read_renders(tmp_path / "nowhere", sequence)
+        with pytest.raises(SourceNotFoundError, match="holds no image"):
+            read_renders(write(tmp_path / "empty", {}), sequence)
+
+    def test_missing_frames_are_named(self, sequence: Sequence, tmp_path: Path) -> None:
+        folder = write(tmp_path / "renders", {"b_0001.png": LEVELS[1]})
+        with pytest.raises(SourceNotFoundError, match=r"2 of the 3 held-out frames .*: b_0003, b_0004"):
+            read_renders(folder, sequence)
+
+    def test_strangers_among_frames(self, sequence: Sequence, tmp_path: Path) -> None:
+        folder = write(tmp_path / "renders", {"b_0001.png": LEVELS[1], "b_0077.png": LEVELS[2]})
+        with pytest.raises(SourceError, match=r"some are not: b_0077\.png"):
+            read_renders(folder, sequence)
+
+    def test_another_count(self, sequence: Sequence, tmp_path: Path) -> None:
+        folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[0] for index in range(4)})
+        with pytest.raises(SourceNotFoundError, match="4 images for 3 held-out frames"):
+            read_renders(folder, sequence)
+
+    def test_no_number_or_the_same(self, sequence: Sequence, tmp_path: Path) -> None:
+        first = write(tmp_path / "first", {f"{name}.png": LEVELS[0] for name in ("a", "b1", "c2")})
+        with pytest.raises(SourceError, match=r"without a number .*: a\.png"):
+            read_renders(first, sequence)
+        second = write(tmp_path / "second", {f"{name}.png": LEVELS[0] for name in ("a1", "b1", "c2")})
+        with pytest.raises(SourceError, match=r"same number: a1\.png, b1\.png"):
+            read_renders(second, sequence)
+
+    def test_another_size_names_the_file(self, sequence: Sequence, tmp_path: Path) -> None:
+        images = {f"{index}.png": LEVELS[index] for index in range(3)} | {"1.png": LEVELS[1, :20]}
+        with pytest.raises(ShapeError, match=r"1\.png: 32 x 20 pixels, but .* 32 x 24"):
+            read_renders(write(tmp_path / "renders", images), sequence)
+
+    def test_no_colours_or_no_image(self, sequence: Sequence, tmp_path: Path) -> None:
+        images = {f"{index}.png": LEVELS[index] for index in range(3)}
+        folder = write(tmp_path / "renders", images | {"2.png": LEVELS[2, ..., 0]})
+        with pytest.raises(SourceError, match="8-bit colour image, found the mode L") as refused:
+            read_renders(folder, sequence)
+        assert refused.value.file == str(folder / "2.png")
+        (folder / "2.png").write_bytes(b"no image")
+        with pytest.raises(SourceError, match="no image that can be read"):
+            read_renders(folder, sequence)
+
+    def test_bad_depth(self, sequence: Sequence, tmp_path: Path) -> None:
+        folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
+        depth = tmp_path / "depth"
+        depth.mkdir()
+        for index in range(3):
+            np.save(depth / f"{index}.npy", np.full((HEIGHT, WIDTH), np.nan, dtype=np.float32))
+        with pytest.raises(NonFiniteError, match=r"0\.npy"):
+            read_renders(folder, sequence, depth_folder=depth)
+        np.save(depth / "0.npy", np.ones((3, HEIGHT, WIDTH), dtype=np.float32))
+        with pytest.raises(ShapeError, match="expected two dimensions"):
+            read_renders(folder, sequence, depth_folder=depth)

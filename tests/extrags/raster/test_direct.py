@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.errors import NonFiniteError, ShapeError
+from extrags.raster import l1_ssim_loss, native, rasterize, set_num_threads
+from extrags.raster.direct import DirectStep, Target
+from extrags.raster.loss import inverse_depth_loss
+from tests.extrags.raster.scenes import relative_l2
+
+NAMES = ("means", "quats", "scales", "opacities", "sh")
+
+
+def _parameters(n: int = 300, coefficients: int = 4) -> dict[str, torch.Tensor]:
+    generator = torch.Generator().manual_seed(5)
+    means = torch.randn(n, 3, generator=generator)
+    means[:, 2] = 4 + means[:, 2].abs()
+    return {
+        "means": means,
+        "quats": torch.randn(n, 4, generator=generator),
+        "scales": torch.randn(n, 3, generator=generator) * 0.4 - 1.5,
+        "opacities": torch.randn(n, generator=generator),
+        "sh": torch.randn(n, coefficients, 3, generator=generator) * 0.3,
+    }
+
+
+def _target(width: int = 61, height: int = 43) -> Target:
+    generator = torch.Generator().manual_seed(6)
+    K = np.array([[50.0, 0, width / 2], [0, 50.0, height / 2], [0, 0, 1]])
+    depth = 3 + 3 * torch.rand(height, width, generator=generator)
+    depth[:5] = 0
+    weight = torch.rand(height, width, generator=generator)
+    weight[:, :4] = 0
+    rgb = torch.rand(height, width, 3, generator=generator)
+    return Target(np.eye(4), K, rgb, weight=weight, depth=depth)
+
+
+def _autograd(
+    parameters: dict[str, torch.Tensor], target: Target, degree: int, absgrad: bool
+) -> tuple[float, dict[str, torch.Tensor], torch.Tensor]:
+    leaves = {k: v.clone().requires_grad_() for k, v in parameters.items()}
+    rendering = rasterize(
+        leaves["means"], leaves["quats"], leaves["scales"].exp(), leaves["opacities"].sigmoid(), leaves["sh"],
+        torch.from_numpy(target.viewmat)[None], torch.from_numpy(target.K)[None], target.width, target.height,
+        sh_degree=degree, absgrad=absgrad,
+    )  # fmt: skip
+    assert target.weight is not None
+    assert target.depth is not None
+    loss = l1_ssim_loss(
+        rendering.rgb[0], torch.from_numpy(target.rgb), dssim_weight=0.3, mask=torch.from_numpy(target.weight)
+    )
+    depth = torch.from_numpy(target.depth)
+    loss = loss + 0.2 * inverse_depth_loss(rendering.depth[0], rendering.alpha[0], depth, scale=4.0)
+    (0.7 * loss).backward()
+    found = {k: v.grad for k, v in leaves.items() if v.grad is not None}
+    means2d = rendering.means2d
+    moved = means2d.absgrad if absgrad else means2d.grad  # type: ignore[attr-defined]
+    return 0.7 * float(loss.detach()), found, moved
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_equals_autograd(degree: int, absgrad: bool, isa: str) -> None:
+    parameters, target = _parameters(), _target()
+    expected_loss, expected, moved = _autograd(parameters, target, degree, absgrad)
+    direct = DirectStep(absgrad=absgrad)
+    direct.bind(parameters)
+    # Stale numbers of an earlier step must not come through.
+    for gradient in direct.gradients.values():
+        gradient.fill_(float("nan"))
+    weights = {"dssim_weight": 0.3, "loss_weight": 0.7, "depth_weight": 0.2, "depth_scale": 4.0}
+    loss = direct.run(target, sh_degree=degree, **weights)
+    assert loss == pytest.approx(expected_loss, rel=1e-6)
+    for name in NAMES:
+        assert relative_l2(direct.gradients[name], expected[name].double()) < 1e-5, name
+    means2d = direct.rendering(target).means2d
+    own = means2d.absgrad if absgrad else means2d.grad  # type: ignore[attr-defined]
+    assert relative_l2(own, moved.double()) < 1e-5
+    assert torch.equal(direct.visible, direct.rendering(target).visible[0])
+
+
+def test_arrays_stay_while_the_number_of_gaussians_does() -> None:
+    parameters = _parameters()
+    direct = DirectStep()
+    direct.bind(parameters)
+    addresses = []
+    for _ in range(2):
+        direct.run(_target(), sh_degree=1)
+        addresses.append([g.data_ptr() for g in direct.gradients.values()])
+    assert addresses[0] == addresses[1]
+
+
+def test_parameters_may_change_in_place() -> None:
+    parameters, target = _parameters(), _target()
+    direct = DirectStep()
+    direct.bind(parameters)
+    before = direct.run(target, sh_degree=1)
+    parameters["scales"] -= 0.5
+    after = direct.run(target, sh_degree=1)
+    fresh = DirectStep()
+    fresh.bind(parameters)
+    assert after != before
+    assert fresh.run(target, sh_degree=1) == after
+
+
+def test_views_of_several_sizes_take_turns() -> None:
+    parameters = _parameters()
+    direct = DirectStep()
+    direct.bind(parameters)
+    small, large = _target(30, 20), _target()
+    first = direct.run(small, sh_degree=1)
+    direct.run(large, sh_degree=1)
+    assert direct.rendering(large).rgb.shape == (1, 43, 61, 3)
+    assert direct.run(small, sh_degree=1) == first
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nonfinite_parameters_are_named(name: str) -> None:
+    parameters = _parameters()
+    parameters[name][3] = float("nan")
+    direct = DirectStep()
+    direct.bind(parameters)
+    with pytest.raises(NonFiniteError, match=rf"{name}\[3"):
+        direct.run(_target(), sh_degree=0)
+
+
+def test_targets_are_checked(unchecked: None) -> None:
+    rgb, eye = torch.zeros(4, 5, 3), np.eye(3)
+    with pytest.raises(ShapeError, match="rgb has shape"):
+        Target(np.eye(4), eye, rgb[0])
+    with pytest.raises(ShapeError, match="weight has shape"):
+        Target(np.eye(4), eye, rgb, weight=torch.zeros(5, 4))
+    with pytest.raises(NonFiniteError, match="Ks"):
+        Target(np.eye(4), eye * np.nan, rgb)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (37, 53), (150, 131)])
+def test_inverse_depth_kernel(shape: tuple[int, int], isa: str, threads: None) -> None:
+    generator = torch.Generator().manual_seed(1)
+    depth = (10 * torch.rand(shape, generator=generator)).requires_grad_()
+    alpha, target = torch.rand(shape, generator=generator), 10 * torch.rand(shape, generator=generator) - 1
+    with torch.no_grad():
+        depth[0, 0], alpha[0, 0], target[0, 0] = 3.0, 0.9, 4.0
+        depth[-1, -1], target[-1, -1] = (3.0, 4.0) if shape == (1, 1) else (0.0, 5.0)
+    expected = inverse_depth_loss(depth, alpha, target, scale=5.0)
+    (0.3 * expected).backward()
+    arrays = [value.detach().numpy() for value in (depth, alpha, target)]
+    results = []
+    for count in (1, 3):
+        set_num_threads(count)
+        gradient = np.full(shape, np.nan, dtype=np.float32)
+        loss, compared = native.compiled_kernels().inverse_depth(*arrays, gradient, 5.0, 0.3)
+        results.append((loss, gradient))
+        assert compared == int(((target > 0) & (alpha > 0.5) & (depth > 5e-3)).sum())
+        assert loss == pytest.approx(0.3 * float(expected.detach()), rel=1e-6)
+        assert relative_l2(torch.from_numpy(gradient), depth.grad.double()) < 1e-6  # type: ignore[union-attr]
+    assert results[0][0] == results[1][0]
+    assert np.array_equal(results[0][1], results[1][1])
+
+
+def test_inverse_depth_with_nothing_to_compare(isa: str) -> None:
+    depth, gradient = np.ones((4, 4), dtype=np.float32), np.full((4, 4), np.nan, dtype=np.float32)
+    zero = np.zeros_like(depth)
+    loss, compared = native.compiled_kernels().inverse_depth(depth, depth, zero, gradient, 1.0, 1.0)
+    assert (loss, compared) == (0.0, 0)
+    assert not gradient.any()
+    leaf = torch.ones(1, 4, 4, requires_grad=True)
+    nothing = inverse_depth_loss(leaf, leaf.detach(), torch.zeros(1, 4, 4), scale=1.0)
+    nothing.backward()
+    assert float(nothing.detach()) == 0
+    assert leaf.grad is not None
+    assert not leaf.grad.any()

@@ -1,0 +1,154 @@
+"""The page of a benchmark: paired numbers, charts, pictures of two methods, failures."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from extrags.errors import ConfigError, ShapeError
+from extrags.report.benchmark import BenchmarkInputs, ComparedViews, build_benchmark_report
+from extrags.report.charts import method_colors
+from extrags.report.comparison import RenderedMethod, compared_rows
+from extrags.sequence import Sequence
+
+from .conftest import TEST, metrics_of
+from .pages import Page, decoded
+
+METHODS = {"3dgs": "plain 3D Gaussian Splatting", "coarse": "the light-aware coarse scene"}
+
+
+def run(method: str, sequence: str, seed: int, psnr: float) -> dict[str, Any]:
+    surface = {"accuracy_mm": 1 / psnr, "fscore": psnr / 40, "unobserved": {}}
+    return {
+        "method": method,
+        "profile": "quick",
+        "sequence": sequence,
+        "setting": "sparse",
+        "seed": seed,
+        "seconds": 30.0 + psnr,
+        "peak_mib": 500.0,
+        "metrics": metrics_of(psnr) | {"surface": surface},
+        "error": "",
+    }
+
+
+def runs_of(gains: dict[str, float], seeds: int = 3) -> list[dict[str, Any]]:
+    return [
+        run(method, sequence, seed, 20.0 + seed / 4 + gain * (method == "coarse"))
+        for sequence, gain in gains.items()
+        for seed in range(seeds)
+        for method in METHODS
+    ]
+
+
+@pytest.fixture(scope="module")
+def compared(sequence: Sequence) -> ComparedViews:
+    truth = sequence.rgb[TEST].astype(np.float32) / 255
+    waves = np.sin(np.arange(truth.size).reshape(truth.shape) / 7)
+    views = {
+        name: RenderedMethod(
+            name,
+            np.clip(truth + size * waves, 0, 1),
+            [{"frame": int(frame)} | metrics_of(20 + 5 * (name == "coarse")) for frame in TEST],
+        )
+        for name, size in (("3dgs", 0.2), ("coarse", 0.05))
+    }
+    return ComparedViews(sequence, "seed 0", views["3dgs"], views["coarse"])
+
+
+@pytest.fixture(scope="module")
+def inputs(compared: ComparedViews) -> BenchmarkInputs:
+    gains = {"phantom/0": 4.0, "phantom/1": 3.0}
+    return BenchmarkInputs("light", runs_of(gains), "3dgs", METHODS, [compared], views=2)
+
+
+@pytest.fixture(scope="module")
+def html(inputs: BenchmarkInputs) -> str:
+    return build_benchmark_report(inputs)
+
+
+def test_says_what_was_gained(html: str) -> None:
+    text = Page(html).text
+    assert "coarse against 3dgs on phantom@sparse: +3.50 dB PSNR on observed pixels" in text
+    assert "better on 2 of 2 sequences" in text
+    # t(0.975, 1) * 0.7071 / sqrt(2) = 6.35
+    assert "−2.85 to +9.85" in text  # noqa: RUF001
+    assert "better in 3 of 3" in text
+    assert "Surface accuracy" in text
+    assert "3dgs (baseline)" in text
+
+
+def test_is_one_file_and_the_same_twice(inputs: BenchmarkInputs, html: str) -> None:
+    page = Page(html)
+    assert page.loads
+    assert all(load.startswith("data:image/") for load in page.loads)
+    assert build_benchmark_report(inputs) == html
+    assert len(html.encode()) < 6_000_000
+    for image in page.images:
+        assert image["alt"]
+        content = decoded(str(image["src"]))
+        if isinstance(content, str):
+            assert content.count("<path") > 10
+
+
+def test_pictures_stand_side_by_side(html: str) -> None:
+    alts = [str(image["alt"]) for image in Page(html).images]
+    for wanted in ("3dgs render", "coarse render", "Truth as recorded", "error of 3dgs", "error of coarse"):
+        assert sum(wanted in alt for alt in alts) == 2, wanted
+
+
+def test_errors_share_a_scale_and_show_the_better(compared: ComparedViews) -> None:
+    table = compared_rows(compared.sequence, (compared.baseline, compared.contender), 1, 100_000)
+    (row,) = table.rows
+    assert [cell.label for cell in row.cells] == ["3dgs", "coarse", "Truth", "Error, 3dgs", "Error, coarse"]
+    worse, better = (np.asarray(decoded(cell.image.uri).convert("L")) for cell in row.cells[3:])  # type: ignore[union-attr]
+    assert worse.mean() > 2 * better.mean()
+    assert "PSNR 20.00 → 25.00 dB" in row.note
+    assert table.outlined
+    assert (table.shown, table.total) == (1, len(TEST))
+    short = replace(compared.baseline, rgb=compared.baseline.rgb[:2])
+    with pytest.raises(ShapeError, match="renders of 3dgs have shape"):
+        compared_rows(compared.sequence, (short, compared.contender), 1, 100_000)
+
+
+def test_failures_and_what_is_missing_are_said() -> None:
+    runs = runs_of({"phantom/0": 1.0}, seeds=1)
+    runs[1] |= {"metrics": None, "error": "coarse: not finite any more at iteration 3"}
+    text = Page(build_benchmark_report(BenchmarkInputs("bad", runs, "3dgs", METHODS))).text
+    assert "not finite any more at iteration 3" in text
+    assert "phantom/0@sparse, coarse, seed 0" in text
+    assert "there is nothing to compare" in text
+    assert "No renders of two methods" in text
+
+
+def test_a_single_seed_has_no_interval() -> None:
+    html = build_benchmark_report(
+        BenchmarkInputs("one", runs_of({"phantom/0": 2.0}, seeds=1), "3dgs", METHODS)
+    )
+    text = Page(html).text
+    assert "+2.00 dB PSNR on observed pixels, better on 1 of 1 sequence." in text
+    assert "interval" not in text.split("Methods")[0]
+
+
+def test_sources_that_tell_nothing_of_what_was_observed() -> None:
+    runs = runs_of({"sinus/hopkins": 1.0})
+    for item in runs:
+        for name in ("observed", "unobserved", "surface"):
+            del item["metrics"][name]
+    text = Page(build_benchmark_report(BenchmarkInputs("sinus", runs, "3dgs", METHODS))).text
+    assert "+1.00 dB PSNR on all valid pixels" in text
+    assert "Surface accuracy" not in text.split("How the numbers")[0]
+
+
+def test_a_baseline_that_was_not_run_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no run of the baseline"):
+        build_benchmark_report(BenchmarkInputs("x", runs_of({"phantom/0": 1.0}), "extrags", METHODS))
+
+
+def test_colours_of_methods() -> None:
+    colors = method_colors(["a", "base", "b"], "base")
+    assert list(colors) == ["base", "a", "b"]
+    assert len(set(colors.values())) == 3

@@ -1,0 +1,93 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.config import LightConfig
+from extrags.illumination import NearFieldLight
+from extrags.training.light_fit import DenseAdam, LightFit
+
+EVERYTHING = LightConfig(offset=True)
+
+
+def _light() -> NearFieldLight:
+    generator = torch.Generator().manual_seed(2)
+    values = {k: v.clone() for k, v in NearFieldLight.initial(5, 12.0, EVERYTHING).parameters().items()}
+    values["log_exposure"] = 0.2 * torch.randn(5, generator=generator)
+    values["offset"] = 0.1 * torch.randn(3, generator=generator)
+    return NearFieldLight(**values, reference_distance=12.0)
+
+
+def _gradient() -> np.ndarray:
+    return np.random.default_rng(4).normal(size=12).astype(np.float32)
+
+
+@pytest.mark.parametrize("frame", [None, 0, 3])
+def test_row_is_what_the_light_packs(frame: int | None) -> None:
+    light = _light()
+    expected = light.of_cameras(light.exposure(frame)[None]).packed()[0].numpy()
+    np.testing.assert_allclose(LightFit(light, EVERYTHING).row(frame), expected, rtol=1e-6)
+
+
+def test_gradients_are_those_of_autograd() -> None:
+    light, gradient = _light(), _gradient()
+    values = {k: v.requires_grad_() for k, v in light.parameters().items()}
+    fit = LightFit(light, EVERYTHING)
+    fit.row(3)
+    row = light.of_cameras(light.exposure(3)[None]).packed()[0]
+    prior = EVERYTHING.exposure_prior * light.log_exposure.square().mean()
+    (row @ torch.from_numpy(gradient) + prior).backward()
+    assert fit.prior() == pytest.approx(float(prior.detach()), rel=1e-6)
+    names = ("log_softening", "log_exponent", "spread", "cosine", "offset", "log_shoulder")
+    expected = np.concatenate([values[name].grad.reshape(-1).numpy() for name in names])  # type: ignore[union-attr]
+    np.testing.assert_allclose(fit.common_gradient(gradient), expected, rtol=1e-5)
+    exposure = values["log_exposure"].grad
+    assert exposure is not None
+    np.testing.assert_allclose(fit.exposure_gradient(gradient), exposure.numpy(), rtol=1e-5, atol=1e-7)
+
+
+def test_what_is_not_learned_stays() -> None:
+    config = LightConfig(falloff=False, response=False, exposure=False)
+    light = NearFieldLight.initial(4, 10.0, config)
+    fit = LightFit(light, config)
+    for _ in range(3):
+        fit.row(1)
+        fit.step(_gradient())
+    after = fit.light.parameters()
+    for name, value in light.parameters().items():
+        moved = name in ("spread", "cosine")
+        assert torch.equal(after[name], value) != moved, name
+
+
+def test_a_virtual_view_teaches_no_exposure() -> None:
+    fit = LightFit(_light(), EVERYTHING)
+    fit.row(None)
+    assert fit.prior() == 0
+    before = fit.light.detached()
+    fit.step(_gradient())
+    assert torch.equal(fit.light.log_exposure, before.log_exposure)
+    assert not torch.equal(fit.light.spread, before.spread)
+
+
+def test_the_light_given_is_copied() -> None:
+    light = _light()
+    before = light.detached()
+    fit = LightFit(light, EVERYTHING)
+    fit.row(2)
+    fit.step(_gradient())
+    for name, value in before.parameters().items():
+        assert torch.equal(light.parameters()[name], value)
+
+
+def test_dense_adam_is_that_of_torch() -> None:
+    generator = np.random.default_rng(0)
+    values = generator.normal(size=7).astype(np.float32)
+    leaf = torch.from_numpy(values.copy()).requires_grad_()
+    own, expected = DenseAdam(values, 0.01), torch.optim.Adam([leaf], lr=0.01, eps=1e-15)
+    for _ in range(60):
+        gradient = generator.normal(size=7).astype(np.float32)
+        leaf.grad = torch.from_numpy(gradient)
+        own.step(gradient)
+        expected.step()
+    np.testing.assert_allclose(values, leaf.detach().numpy(), rtol=1e-5, atol=1e-6)

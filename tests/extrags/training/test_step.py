@@ -1,0 +1,266 @@
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.config import CoarseConfig, DensifyConfig, LightConfig
+from extrags.errors import DivergedError, NonFiniteError
+from extrags.gaussians import Gaussians
+from extrags.raster import native, set_num_threads
+from extrags.scene import Scene
+from extrags.sequence import Sequence
+from extrags.training.optimise import optimise
+from extrags.training.reconstruction import coarse_schedule
+from extrags.training.schedule import Schedule
+from extrags.training.step import AutogradStep, NativeStep, TrainingStep, training_step
+from extrags.training.strategies import density_strategy
+from extrags.training.views import View, real_views
+from tests.extrags.training.conftest import tube_gaussians, tube_light
+
+pytestmark = pytest.mark.skipif(native.native_isa() is None, reason="the native kernels are not built")
+
+MakeStep = Callable[[Scene, Schedule], TrainingStep]
+
+
+@pytest.fixture
+def threads() -> Iterator[None]:
+    before = native.num_threads()
+    yield
+    native.set_num_threads(before)
+
+
+def _scene(sh_degree: int = 1, *, lit: bool = True) -> Scene:
+    """The tube, shaken: no gradient is zero."""
+    generator = torch.Generator().manual_seed(1)
+    tube = tube_gaussians()
+
+    def noise(value: torch.Tensor, size: float) -> torch.Tensor:
+        return value + size * torch.randn(value.shape, generator=generator)
+
+    n, higher = len(tube), (sh_degree + 1) ** 2 - 1
+    shaken = Gaussians(
+        means=noise(tube.means, 0.1),
+        quats=noise(tube.quats, 0.05),
+        scales=noise(tube.scales, 0.1),
+        opacities=noise(tube.opacities, 0.5),
+        sh0=noise(tube.sh0, 0.05),
+        shN=noise(torch.zeros(n, higher, 3), 0.05),
+    )
+    light = tube_light()
+    light = replace(light, log_exposure=0.1 * torch.randn(6, generator=generator))
+    return Scene(shaken, light if lit else None)
+
+
+def _schedule(iterations: int = 30, **changes: object) -> Schedule:
+    config = CoarseConfig(
+        iterations=iterations, densify=DensifyConfig(enabled=False), light=LightConfig(offset=True)
+    )
+    return replace(coarse_schedule(config, 20.0, 15.0, "coarse", iterations=iterations), **changes)  # type: ignore[arg-type]
+
+
+def _relative(found: torch.Tensor, expected: torch.Tensor) -> float:
+    return float((found.double() - expected.double()).norm() / expected.double().norm().clamp_min(1e-30))
+
+
+def _virtual(view: View) -> View:
+    return replace(view, depth_mm=None, frame=None, loss_weight=0.3)
+
+
+def _weighted(view: View) -> View:
+    weight = torch.rand(view.weight.shape, generator=torch.Generator().manual_seed(2))
+    return replace(view, weight=weight)
+
+
+SETTINGS: dict[str, DensifyConfig] = {
+    "none": DensifyConfig(enabled=False),
+    "absgrad": DensifyConfig(absgrad=True),
+    "mcmc": DensifyConfig(strategy="mcmc"),
+}
+
+
+class TestOneStep:
+    @pytest.mark.parametrize("lit", [True, False])
+    @pytest.mark.parametrize("change", [_weighted, _virtual])
+    @pytest.mark.parametrize("setting", SETTINGS)
+    def test_loss_and_gradients_are_those_of_autograd(
+        self, tube_sequence: Sequence, setting: str, change: Callable[[View], View], lit: bool
+    ) -> None:
+        view = change(real_views(tube_sequence, tube_sequence.train)[1])
+        schedule = _schedule(densify=SETTINGS[setting], sh_every=5)
+        scene = _scene(lit=lit)
+        native_step, expected = NativeStep(scene, schedule), AutogradStep(scene, schedule)
+        density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
+        iteration = 7
+        own = native_step.differentiate(view, iteration, density)
+        other = expected.differentiate(view, iteration, density)
+        assert own.loss == pytest.approx(other.loss, rel=1e-6)
+        assert native_step._direct is not None
+        gradients = dict(native_step._direct.gradients)
+        gradients |= {"sh0": gradients["sh"][:, :1], "shN": gradients["sh"][:, 1:]}
+        for name, value in expected.adam.parameters.items():
+            assert value.grad is not None
+            assert _relative(gradients[name], value.grad) < 1e-5, name
+        assert torch.equal(own.visible, other.visible)
+        assert torch.equal(own.rendering.radius_px, other.rendering.radius_px)
+        assert _relative(own.rendering.rgb, other.rendering.rgb.detach()) < 1e-6
+        name = "absgrad" if setting == "absgrad" else "grad"
+        moved, expected_moved = getattr(own.rendering.means2d, name), getattr(other.rendering.means2d, name)
+        assert _relative(moved, expected_moved) < 1e-5
+        if lit:
+            assert native_step._light is not None
+            assert expected.light is not None
+            row = native_step._direct.light_gradient
+            common = native_step._light.common_gradient(row)
+            names = ("log_softening", "log_exponent", "spread", "cosine", "offset", "log_shoulder")
+            flat = [expected.light.parameters()[name].grad for name in names]
+            joined = torch.cat([value.reshape(-1) for value in flat if value is not None])
+            assert _relative(torch.from_numpy(common), joined) < 1e-5
+            if view.frame is not None:
+                exposure = torch.from_numpy(native_step._light.exposure_gradient(row))
+                assert expected.light.log_exposure.grad is not None
+                assert _relative(exposure, expected.light.log_exposure.grad) < 1e-5
+
+    @pytest.mark.parametrize("degree", [0, 1, 3])
+    def test_parameters_after_a_step_are_the_same(self, tube_sequence: Sequence, degree: int) -> None:
+        view = real_views(tube_sequence, tube_sequence.train)[0]
+        schedule = _schedule(sh_every=1)
+        scene = _scene(degree)
+        density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
+        steps = [NativeStep(scene, schedule), AutogradStep(scene, schedule)]
+        for step in steps:
+            step.update(step.differentiate(view, 3, density))
+        own, other = (step.adam.parameters for step in steps)
+        start = scene.gaussians.parameters()
+        for name, value in other.items():
+            if value.numel():
+                moved, expected = own[name].detach() - start[name], value.detach() - start[name]
+                # A first Adam step is the sign of the gradient: a few that are nearly zero may differ.
+                assert _relative(moved, expected) < 0.02, name
+                assert float(expected.abs().max()) > 0
+        for name, value in steps[1].light.parameters().items():  # type: ignore[union-attr]
+            torch.testing.assert_close(
+                steps[0].light.parameters()[name], value.detach(), rtol=1e-4, atol=1e-6
+            )  # type: ignore[union-attr]
+
+    def test_depth_weight_zero_leaves_depth_alone(self, tube_sequence: Sequence) -> None:
+        view = real_views(tube_sequence, tube_sequence.train)[0]
+        schedule = _schedule(depth_weight=0.0)
+        density = density_strategy(schedule.densify, 20.0, 30, 900, seed=0)
+        losses = [
+            NativeStep(_scene(), schedule).differentiate(v, 0, density).loss
+            for v in (view, replace(view, depth_mm=None))
+        ]
+        assert losses[0] == losses[1]
+
+
+def _train(
+    sequence: Sequence, make_step: MakeStep, densify: DensifyConfig, iterations: int = 30
+) -> tuple[Scene, list[dict[str, float]]]:
+    views = real_views(sequence, sequence.train)
+    mixed = [*views, _virtual(views[0])]
+    schedule = _schedule(iterations, densify=densify, sh_every=8)
+    result = optimise(_scene(), lambda i: mixed[i % len(mixed)], schedule, make_step=make_step)
+    return result.scene, result.history
+
+
+DENSIFYING = DensifyConfig(
+    start_share=0.1, stop_share=1.0, every=10, gradient_threshold=1e-4, max_gaussians=1200
+)
+
+
+class TestManySteps:
+    def test_stays_close_to_autograd_through_densification(self, tube_sequence: Sequence) -> None:
+        own, own_history = _train(tube_sequence, NativeStep, DENSIFYING)
+        other, history = _train(tube_sequence, AutogradStep, DENSIFYING)
+        assert history[-1]["n_gaussians"] > 900
+        # Thresholds may fall differently for a Gaussian or two.
+        assert own_history[-1]["n_gaussians"] == pytest.approx(history[-1]["n_gaussians"], abs=10)
+        assert own_history[-1]["loss"] == pytest.approx(history[-1]["loss"], rel=1e-2)
+        assert own_history[-1]["psnr"] == pytest.approx(history[-1]["psnr"], abs=0.1)
+        for name, value in other.light.parameters().items():  # type: ignore[union-attr]
+            torch.testing.assert_close(own.light.parameters()[name], value, rtol=1e-2, atol=1e-3)  # type: ignore[union-attr]
+
+    def test_mcmc_stays_close_too(self, tube_sequence: Sequence) -> None:
+        densify = DENSIFYING.model_copy(update={"strategy": "mcmc"})
+        _, own = _train(tube_sequence, NativeStep, densify)
+        _, other = _train(tube_sequence, AutogradStep, densify)
+        assert own[-1]["n_gaussians"] == other[-1]["n_gaussians"] > 900
+        assert own[-1]["loss"] == pytest.approx(other[-1]["loss"], rel=1e-2)
+
+    @pytest.mark.parametrize("strategy", ["default", "mcmc"])
+    def test_same_bits_on_any_number_of_threads(
+        self, tube_sequence: Sequence, strategy: str, threads: None
+    ) -> None:
+        densify = DENSIFYING.model_copy(update={"strategy": strategy})
+        results = []
+        for count in (1, 2, 8):
+            set_num_threads(count)
+            results.append(_train(tube_sequence, NativeStep, densify)[0])
+        for other in results[1:]:
+            for name, value in results[0].gaussians.parameters().items():
+                assert torch.equal(value, other.gaussians.parameters()[name]), name
+            for name, value in results[0].light.parameters().items():  # type: ignore[union-attr]
+                assert torch.equal(value, other.light.parameters()[name]), name  # type: ignore[union-attr]
+
+
+class TestNativeStep:
+    def test_the_scene_given_is_copied(self, tube_sequence: Sequence) -> None:
+        scene = _scene()
+        before = scene.detached()
+        view = real_views(tube_sequence, tube_sequence.train)[0]
+        optimise(scene, lambda _: view, _schedule(3), make_step=NativeStep)
+        for name, value in before.gaussians.parameters().items():
+            assert torch.equal(scene.gaussians.parameters()[name], value), name
+        for name, value in before.light.parameters().items():  # type: ignore[union-attr]
+            assert torch.equal(scene.light.parameters()[name], value), name  # type: ignore[union-attr]
+
+    def test_views_that_are_gone_are_forgotten(self, tube_sequence: Sequence) -> None:
+        schedule = _schedule()
+        step = NativeStep(_scene(), schedule)
+        density = density_strategy(schedule.densify, 20.0, 30, 900, seed=0)
+        views = real_views(tube_sequence, tube_sequence.train)
+        for view in views:
+            step.differentiate(view, 0, density)
+        assert len(step._targets) == len(views)
+        del views, view
+        gc.collect()
+        assert not step._targets
+
+    def test_nonfinite_parameters_are_refused(self, tube_sequence: Sequence) -> None:
+        scene = _scene()
+        scene.gaussians.shN[5, 1, 2] = float("inf")
+        view = real_views(tube_sequence, tube_sequence.train)[0]
+        with pytest.raises(NonFiniteError, match=r"sh\[5, 2, 2\] is inf"):
+            optimise(scene, lambda _: view, _schedule(2), make_step=NativeStep)
+
+    def test_chosen_where_it_can_work(self) -> None:
+        scene = _scene()
+        wide = Gaussians(**{k: v.double() for k, v in scene.gaussians.parameters().items()})
+        assert isinstance(training_step(scene, _schedule()), NativeStep)
+        assert isinstance(training_step(Scene(wide), _schedule()), AutogradStep)
+
+
+@pytest.mark.parametrize("make_step", [NativeStep, AutogradStep])
+def test_torch_threads_are_put_back(tube_sequence: Sequence, make_step: MakeStep) -> None:
+    view = real_views(tube_sequence, tube_sequence.train)[0]
+    poisoned = replace(view, rgb=torch.full_like(view.rgb, np.nan))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    seen: list[int] = []
+
+    def draw(iteration: int) -> View:
+        seen.append(torch.get_num_threads())
+        return poisoned if iteration == 2 else view
+
+    try:
+        with pytest.raises(DivergedError, match="iteration 2"):
+            optimise(_scene(), draw, _schedule(5), make_step=make_step)
+        assert torch.get_num_threads() == 2
+        assert seen == [1, 1, 1]
+    finally:
+        torch.set_num_threads(before)

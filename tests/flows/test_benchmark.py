@@ -1,0 +1,158 @@
+"""The benchmark flow: methods, variants and seeds on the tiny sequence, compared in pairs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prefect.artifacts import Artifact
+
+from extrags.errors import ConfigError
+from flows.benchmark import benchmark, check_methods, summary_of
+from flows.outcome import SequenceOutcome
+from flows.tables import difference_text, spread_text
+from tests.flows.tiny import SEQUENCE, TINY
+
+NO_LIGHT = {"no-light": {"coarse.light.enabled": False}}
+
+
+@pytest.fixture(scope="module")
+def found(finished: tuple[str, SequenceOutcome], prefect_server: None) -> dict[str, Any]:
+    store, _ = finished
+    result: dict[str, Any] = benchmark(
+        sequences=[SEQUENCE],
+        profiles=["quick"],
+        methods=["3dgs", "coarse"],
+        variants=NO_LIGHT,
+        seeds=[0, 1],
+        settings={**TINY, "ingest.max_frames": 10, "coarse.iterations": 60},
+        store=store,
+        name="tiny methods",
+    )
+    return result
+
+
+class TestRuns:
+    def test_a_case_for_each_combination(self, found: dict[str, Any]) -> None:
+        assert {"processor", "cores", "threads", "versions", "commit"} <= set(found["machine"])
+        identities = [(case["method"], case["seed"]) for case in found["cases"]]
+        assert identities == [(method, seed) for seed in (0, 1) for method in ("3dgs", "coarse", "no-light")]
+        case = found["cases"][0]
+        assert (case["sequence"], case["setting"], case["error"]) == ("phantom/0", "sparse", "")
+        assert case["seconds"] > 0
+        assert case["peak_mib"] > 50
+        assert len({case["metrics"]["psnr"] for case in found["cases"]}) == len(found["cases"])
+        json.dumps(found, allow_nan=False)
+
+    def test_the_baseline_has_no_light_and_three_degrees(
+        self, found: dict[str, Any], finished: tuple[str, SequenceOutcome]
+    ) -> None:
+        from extrags.scene import Scene
+        from extrags.store import Store
+
+        scenes = {}
+        for manifest in Store(finished[0]).ls("coarse"):
+            config = manifest.config["config"]
+            if config["iterations"] == 60 and config["seed"] == 0:
+                scene = Scene.load(Path(finished[0]) / "artefacts" / manifest.key / "scene")
+                scenes[(config["light"]["enabled"], config["sh_degree"])] = scene
+        assert set(scenes) == {(True, 0), (False, 0), (False, 3)}
+        assert scenes[False, 3].light is None
+        assert scenes[False, 3].gaussians.sh_degree == 3
+
+    def test_figures_of_every_view_are_there(self, found: dict[str, Any]) -> None:
+        case = found["cases"][0]
+        evaluation = json.loads(Path(case["evaluation"]).read_text())
+        assert evaluation["metrics"] == case["metrics"]
+        per_view = json.loads((Path(found["report"]).parent / "per_view.json").read_text())
+        assert per_view[0]["per_view"] == evaluation["per_view"]
+        assert [run["method"] for run in per_view[:2]] == ["3dgs", "coarse"]
+        assert case["metrics"]["surface"]["threshold_mm"] == 1.0
+        assert evaluation["true_surface"] == "mesh"
+
+    def test_methods_are_compared_in_pairs(self, found: dict[str, Any]) -> None:
+        comparison = found["comparison"]
+        assert comparison["baseline"] == "3dgs"
+        rows = {row["method"]: row for row in comparison["paired_sequences"]}
+        assert set(rows) == {"coarse", "no-light"}
+        psnr = {(case["method"], case["seed"]): case["metrics"]["psnr"] for case in found["cases"]}
+        expected = sum(psnr["coarse", seed] - psnr["3dgs", seed] for seed in (0, 1)) / 2
+        assert rows["coarse"]["figures"]["psnr"]["mean"] == pytest.approx(expected)
+        assert rows["coarse"]["figures"]["psnr"]["n"] == 2
+        stored = json.loads((Path(found["report"]).parent / "comparison.json").read_text())
+        assert stored == comparison
+
+    def test_page_and_artifact(self, found: dict[str, Any]) -> None:
+        page = Path(found["report"]).read_text()
+        assert "no-light" in page
+        assert "Truth as recorded" in page
+        artifact: Any = Artifact.get("benchmark-tiny-methods")
+        assert "## Differences to 3dgs" in artifact.data
+        assert "| phantom/0 | sparse | quick | coarse | 2 |" in artifact.data
+
+
+@pytest.mark.usefixtures("prefect_server")
+class TestAgain:
+    def test_what_is_there_is_taken_and_a_failure_stops_nothing(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        store, first = finished
+        (tmp_path / "empty").mkdir()
+        found = benchmark(
+            sequences=[str(tmp_path / "empty"), SEQUENCE],
+            methods=["coarse", "extrags"],
+            settings=TINY,
+            store=store,
+        )
+        broken, fine = found["cases"][:2], {case["method"]: case for case in found["cases"][2:]}
+        assert [case["metrics"] for case in broken] == [None, None]
+        assert all("ingest: " in case["error"] for case in broken)
+        assert fine["coarse"]["metrics"] == first.metrics["coarse"]
+        assert fine["extrags"]["metrics"] == first.metrics["final"]
+        assert fine["extrags"]["seconds"] > fine["coarse"]["seconds"] > 0
+        assert "the folder is empty" in Path(found["report"]).read_text()
+
+    def test_a_wrong_setting_stops_it_at_once(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match=r"did you mean coarse\.iterations"):
+            benchmark(
+                sequences=[SEQUENCE],
+                variants={"x": {"coarse.iteration": 1}},
+                store=str(tmp_path / "store"),
+            )
+
+
+class TestNames:
+    def test_the_baseline_is_3dgs_else_the_first(self) -> None:
+        assert check_methods(["coarse", "3dgs"], {}) == "3dgs"
+        assert check_methods(["coarse", "extrags"], {}) == "coarse"
+        assert check_methods(["coarse"], NO_LIGHT, "no-light") == "no-light"
+
+    @pytest.mark.parametrize(
+        ("methods", "variants", "baseline", "message"),
+        [
+            (["nerf"], {}, None, "no method 'nerf'"),
+            (["coarse", "coarse"], {}, None, "named twice"),
+            (["coarse"], {}, "3dgs", "'3dgs' is not among the methods: coarse"),
+            (["coarse"], {"3dgs": {}}, None, "cannot have a method's name: 3dgs"),
+            (["coarse"], {"x": {"method": "nerf"}}, None, "variant x: no method 'nerf'"),
+        ],
+    )
+    def test_wrong_names(
+        self, methods: list[str], variants: dict[str, Any], baseline: str | None, message: str
+    ) -> None:
+        with pytest.raises(ConfigError, match=message):
+            check_methods(methods, variants, baseline)
+
+    def test_variants_say_what_they_are(self) -> None:
+        assert summary_of("no-light", NO_LIGHT) == "coarse with coarse.light.enabled = False"
+        assert "plain 3D Gaussian Splatting" in summary_of("3dgs", NO_LIGHT)
+
+    def test_texts(self) -> None:
+        figure = {"mean": 1.5, "low": 0.25, "high": 2.75, "deviation": 0.5}
+        assert difference_text("observed.psnr", figure) == "+1.50 [+0.25, +2.75]"
+        assert difference_text("ssim", {**figure, "low": None}) == "+1.5000"
+        assert spread_text("psnr", figure) == "1.50 ± 0.50"
+        assert spread_text("psnr", {**figure, "deviation": None}) == "1.50"
+        assert spread_text("psnr", None) == difference_text("psnr", None) == "–"  # noqa: RUF001

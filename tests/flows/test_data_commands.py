@@ -1,0 +1,154 @@
+"""`data list|show|check` and `export --to colmap|transforms` as a user runs them."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_catalog.catalog import read
+from data_catalog.colmap_model import write_colmap
+from data_catalog.phantom.config import PhantomConfig
+from data_catalog.phantom.recording import record
+from flows.cli import main
+
+SMALL = ["--set", "ingest.width=48", "--set", "ingest.max_frames=8"]
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A folder with two recordings, depth and poses: quicker to read than a phantom is to render."""
+    config = PhantomConfig(
+        scene=5, width=64, height=51, train_every=25, test_frames=4, shadows=False, supersample=1
+    )
+    folder = tmp_path_factory.mktemp("scene") / "colon"
+    write_colmap(record(config, "phantom/5"), folder)
+    return str(folder)
+
+
+@pytest.fixture(autouse=True)
+def untouched_environment() -> Iterator[None]:
+    """The command sets up Prefect through the environment; put it back."""
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+class TestList:
+    def test_everything_with_what_is_known(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "list"]) == 0
+        said = capsys.readouterr().out
+        assert "phantom/0@sparse" in said
+        assert "sinus/hopkins" in said
+        assert "of them can be read here" in said
+
+    def test_filters(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "list", "phantom", "--here", "--json", "-"]) == 0
+        listed = json.loads(capsys.readouterr().out)
+        assert listed
+        assert all(item["name"].startswith("phantom/") and item["available"] for item in listed)
+        assert main(["data", "list", "s*/*", "--json", "-"]) == 0
+        assert {item["name"] for item in json.loads(capsys.readouterr().out)} >= {
+            "sinus/hopkins",
+            "simcol3d/s1",
+        }
+
+
+class TestShow:
+    def test_measured_and_pictured(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        picture = tmp_path / "sheet.png"
+        arguments = ["data", "show", "phantom/5@sparse", *SMALL, "--picture", str(picture), "--json", "-"]
+        assert main(arguments) == 0
+        shown = json.loads(capsys.readouterr().out)
+        assert shown["frames"] == 48
+        assert shown["measured"]["frames"] == 8
+        assert shown["measured"]["has_depth"] is True
+        assert np.array(Image.open(picture)).shape[2] == 3
+
+    def test_a_folder_as_a_table(self, scene: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "show", scene]) == 0
+        said = capsys.readouterr().out
+        assert "specular_share" in said
+        assert "colmap" in said
+
+    def test_without_the_data(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setattr("data_catalog.catalog._data_roots", lambda: [tmp_path])
+        assert main(["data", "show", "sinus/hopkins", "--json", "-"]) == 0
+        shown = json.loads(capsys.readouterr().out)
+        assert shown["available"] is False
+        assert shown["measured"] is None
+        assert main(["data", "show", "sinus/hopkins", "--picture", str(tmp_path / "x.png")]) == 1
+        assert "EXTRAGS_DATA" in capsys.readouterr().err
+
+
+class TestCheck:
+    def test_right_and_wrong(self, scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "check", scene]) == 0
+        assert "nothing is wrong" in capsys.readouterr().out
+        (tmp_path / "empty").mkdir()
+        assert main(["data", "check", scene, str(tmp_path / "empty")]) == 1
+        said = capsys.readouterr().out
+        assert "nothing is wrong" in said
+        assert "the folder is empty" in said
+
+    def test_as_json(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        (tmp_path / "poses.json").write_text("{")
+        assert main(["data", "check", str(tmp_path), "--json", "-"]) == 1
+        (found,) = json.loads(capsys.readouterr().out)
+        assert found["ok"] is False
+        (finding,) = found["findings"]
+        assert finding["kind"] == "error"
+        assert finding["file"].endswith("poses.json")
+        assert "not readable as JSON" in finding["sentence"]
+
+    def test_unknown_name_is_wrong_usage(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["data", "check", "phantm/1@sparse"]) == 2
+        assert "Did you mean" in capsys.readouterr().err
+
+
+class TestExport:
+    @pytest.mark.parametrize("to", ["colmap", "colmap-text", "transforms"])
+    def test_what_is_written_is_read_back(
+        self, to: str, scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        target = tmp_path / "scene"
+        assert main(["export", scene, "--to", to, "--out", str(target)]) == 0
+        given, back = read(scene), read(target)
+        assert f"{len(given)} frames with poses" in capsys.readouterr().out
+        assert back.frame_names == given.frame_names
+        np.testing.assert_array_equal(back.rgb, given.rgb)
+        np.testing.assert_array_equal(back.test, given.test)
+        np.testing.assert_array_equal(back.recording, given.recording)
+        np.testing.assert_allclose(back.world_from_camera, given.world_from_camera, atol=1e-12)
+        assert back.metric
+        assert back.points is not None
+        assert len(back.points) > 500
+        assert main(["data", "check", str(target)]) == 0
+
+    def test_nothing_is_written_over(
+        self, scene: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (tmp_path / "precious.txt").write_text("x")
+        assert main(["export", scene, "--to", "colmap", "--out", str(tmp_path)]) == 2
+        assert "is not an empty folder" in capsys.readouterr().err
+        assert [file.name for file in tmp_path.iterdir()] == ["precious.txt"]
+
+    def test_a_source_without_poses_needs_its_run(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        rng = np.random.default_rng(0)
+        folder = tmp_path / "frames"
+        folder.mkdir()
+        for k in range(3):
+            Image.fromarray(rng.integers(30, 220, (40, 48, 3)).astype(np.uint8)).save(folder / f"{k}.png")
+        arguments = ["export", str(folder), "--to", "colmap", "--out", str(tmp_path / "scene")]
+        assert main([*arguments, "--store", str(tmp_path / "store")]) == 1
+        assert "run it first" in capsys.readouterr().err
