@@ -1,10 +1,12 @@
-"""What the light model is worth: `python tests/benchmarks/bench_light.py ablation|distance|uniform --json -`.
+"""What the light model is worth: `python tests/benchmarks/bench_light.py ablation|distance|uniform|cost`.
 
 * `ablation`: the coarse model with one part left out at a time, on held-out views of another recording.
 * `distance`: brightness of the same surface from half and from double the distance it was trained at, and the
   recovered light beside the true one. Needs the phantom, whose generator photographs any pose.
 * `uniform`: matt objects under uniform light, seen from outside; what the model costs where there is no such
   light.
+* `cost`: a training iteration with and without the light, in turns in one process, processor time of one
+  thread.
 """
 
 from __future__ import annotations
@@ -25,10 +27,11 @@ from data_catalog.phantom.imaging import recording_sensor
 from data_catalog.phantom.recording import Phantom
 from extrags.cameras import Cameras, look_at, pixel_rays
 from extrags.config import CoarseConfig, IngestConfig, profile_config
+from extrags.illumination import NearFieldLight
 from extrags.metrics.exposure import align_exposure
 from extrags.metrics.image import mean_of_known, psnr, ssim
-from extrags.raster import set_num_threads
-from extrags.raster.bench import machine
+from extrags.raster import SelectiveAdam, l1_ssim_loss, rasterize, set_num_threads
+from extrags.raster.bench import STANDARD_SIZES, bench_scene, machine
 from extrags.scene import Scene
 from extrags.sequence import Sequence, Split
 from extrags.training import reconstruct
@@ -219,6 +222,51 @@ def uniform(profile: str, seeds: list[int]) -> list[dict[str, Any]]:
     return cases
 
 
+def cost(rounds: int = 40) -> list[dict[str, Any]]:
+    cases = []
+    for size in STANDARD_SIZES:
+        scene = bench_scene(size)
+        target = scene.pop("target")
+        leaves = {k: v.requires_grad_() for k, v in scene.items() if k not in ("viewmats", "Ks")}
+        adam = SelectiveAdam(leaves, dict.fromkeys(leaves, 1e-9))
+        light = NearFieldLight.initial(1, 2.0)
+        spent: dict[str, list[float]] = {"with": [], "without": []}
+        for _ in range(rounds):
+            for label, times in spent.items():
+                carried = None
+                started = time.process_time()
+                if label == "with":
+                    learned = {k: v.requires_grad_() for k, v in light.detached().parameters().items()}
+                    carried = NearFieldLight(**learned, reference_distance=2.0).of_cameras(torch.ones(1))
+                shown = rasterize(
+                    leaves["means"],
+                    leaves["quats"],
+                    leaves["scales"],
+                    leaves["opacities"],
+                    leaves["sh"],
+                    scene["viewmats"],
+                    scene["Ks"],
+                    size.width,
+                    size.height,
+                    light=carried,
+                )
+                l1_ssim_loss(shown.rgb, target).backward()
+                adam.step(visible=shown.visible[0])
+                adam.zero_grad()
+                times.append(1e3 * (time.process_time() - started))
+        medians = {label: float(np.median(times[3:])) for label, times in spent.items()}
+        cases.append(
+            {
+                "width": size.width,
+                "height": size.height,
+                "n_gaussians": size.n_gaussians,
+                "cpu_ms": medians,
+                "share": medians["with"] / medians["without"] - 1,
+            }
+        )
+    return cases
+
+
 def block_world(*, width: int = 160, height: int = 128, views: int = 48) -> Sequence:
     """Painted blocks on a plate under uniform light, photographed from a dome; every 8th view is held out."""
     import open3d as o3d
@@ -272,7 +320,7 @@ def block_world(*, width: int = 160, height: int = 128, views: int = 48) -> Sequ
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("what", choices=("ablation", "distance", "uniform"))
+    parser.add_argument("what", choices=("ablation", "distance", "uniform", "cost"))
     parser.add_argument("--sequences", nargs="+", default=[f"phantom/{k}@sparse" for k in range(5)])
     parser.add_argument("--variants", nargs="+", default=list(VARIANTS), choices=list(VARIANTS))
     parser.add_argument("--profile", default="quick")
@@ -285,8 +333,10 @@ def main() -> int:
         cases = ablation(chosen.sequences, chosen.variants, chosen.profile, chosen.seeds)
     elif chosen.what == "distance":
         cases = distance(chosen.sequences, chosen.profile, chosen.seeds)
-    else:
+    elif chosen.what == "uniform":
         cases = uniform(chosen.profile, chosen.seeds)
+    else:
+        cases = cost()
     text = json.dumps({"machine": machine(), "cases": cases}, indent=1)
     if chosen.json == "-":
         sys.stdout.write(text + "\n")
