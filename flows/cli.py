@@ -375,7 +375,8 @@ _KERNELS: dict[str, Any] = {
   --size 160x128,320x256 --gaussians 10000,30000 --threads 1 2 --json -
   --quick --peers torch,reference
 
-peers: torch (batched tiles, float32), reference (the specification, float64), gsplat (CUDA).
+peers: direct (the kernels as training uses them, without autograd; train only), torch (batched tiles,
+float32), reference (the specification, float64), gsplat (CUDA).
 A size goes with the number of Gaussians at the same place in the list.""",
 }
 
@@ -394,7 +395,7 @@ def _add_kernel_cases(made: argparse.ArgumentParser, *, with_error: bool) -> Non
         "--peers",
         metavar="PEER",
         **many,
-        help="what to run beside the native kernels (default: torch; native: nothing)",
+        help="what to run beside the native kernels (default: torch, and direct for train; native: nothing)",
     )
     made.add_argument("--threads", metavar="N", **many, help="numbers of threads to measure (default: 1 2)")
     made.add_argument("--rounds", type=int, default=20, metavar="N", help="timed rounds (default: 20)")

@@ -186,6 +186,8 @@ def _bench(
 ) -> dict[str, Any]:
     entrants = ["native", *(peer for peer in dict.fromkeys(peers) if peer != "native")]
     check_peers(entrants)
+    if "direct" in entrants and not training:
+        raise ConfigError("peer direct is a training iteration: extrags bench train")
     smallest = min([rounds, *threads, *(min(size.width, size.height, size.n_gaussians) for size in sizes)])
     if smallest < 1:
         raise ConfigError(f"sizes, numbers of Gaussians, threads and rounds start at 1, got {smallest}")
@@ -237,11 +239,14 @@ def _bench_size(
             "peak_mib": peaks[peer, count],
         }
         use_threads(peer, count)
-        if exact is not None:
+        # The direct step runs the same kernels; its gradients are held against autograd's in the tests.
+        if exact is not None and peer != "direct":
             case["error"] = errors(gradients(peer, scene), exact)
+        measured = case["cpu_ms" if count == 1 else "ms"]["iteration"]
+        if peer == "direct":
+            case["roofline"] = roofline(size.n_gaussians, part_times(scene)[1], count, measured)
         if peer == "native" and training:
             case["parts_ms"], entries = part_times(scene)
-            measured = case["cpu_ms" if count == 1 else "ms"]["iteration"]
             case["roofline"] = roofline(size.n_gaussians, entries, count, measured)
         cases.append(case)
     own = {case["threads"]: case["cpu_ms"]["iteration"] for case in cases if case["backend"] == "native"}

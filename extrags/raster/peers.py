@@ -13,6 +13,7 @@ from torch import Tensor
 from extrags.errors import ConfigError
 from extrags.raster import native
 from extrags.raster.adam import SelectiveAdam
+from extrags.raster.direct import DirectStep, Target
 from extrags.raster.dispatch import Backend, available_backends, rasterize
 from extrags.raster.loss import l1_ssim_loss
 from extrags.raster.rendering import Rendering
@@ -36,6 +37,7 @@ __all__ = [
 
 PEERS: dict[str, str] = {
     "native": "the compiled kernels",
+    "direct": "the compiled kernels without autograd, as training uses them; training only",
     "torch": "batched 8x8 tiles in float32 torch, depthwise SSIM, fused Adam",
     "reference": "the specification in float64 torch",
     "gsplat": "gsplat's CUDA kernels",
@@ -56,8 +58,8 @@ def check_peers(peers: list[str]) -> None:
     unknown = [peer for peer in peers if peer not in PEERS]
     if unknown:
         raise ConfigError(f"unknown peers {', '.join(unknown)}; expected {', '.join(PEERS)}")
-    if "native" in peers and native.native_isa() is None:
-        raise ConfigError("peer native needs the compiled kernels: pip install extrags")
+    if {"native", "direct"} & set(peers) and native.native_isa() is None:
+        raise ConfigError("peers native and direct need the compiled kernels: pip install extrags")
     if "gsplat" in peers and "gsplat" not in available_backends():
         raise ConfigError("peer gsplat needs a CUDA device and the package gsplat")
 
@@ -66,7 +68,7 @@ def use_threads(backend: str, count: int) -> None:
     """Let a backend use so many threads."""
     # Beside the native kernels torch has only small arrays to handle: its threads, which wait for each other
     # at barriers, would cost more than they bring.
-    torch.set_num_threads(1 if backend == "native" else count)
+    torch.set_num_threads(1 if backend in ("native", "direct") else count)
     if native.native_isa() is not None:
         native.set_num_threads(count)
 
@@ -85,19 +87,29 @@ class Contestant:
         values = _placed(backend, scene)
         self.target = values["target"]
         self.cameras = {name: values[name] for name in ("viewmats", "Ks")}
+        if backend == "direct":
+            values["scales"], values["opacities"] = values["scales"].log(), values["opacities"].logit()
         self.parameters = {k: v.requires_grad_() for k, v in values.items() if k not in NOT_LEARNED}
         # Rates so small that the scene stays what it is, round after round
         rate = 1e-9
         self.adam: SelectiveAdam | torch.optim.Adam
-        if backend in ("native", "gsplat"):
+        if backend in ("native", "direct", "gsplat"):
             self.adam = SelectiveAdam(self.parameters, dict.fromkeys(self.parameters, rate))
         else:
             self.adam = torch.optim.Adam(list(self.parameters.values()), lr=rate, eps=1e-15, fused=True)
+        if backend == "direct":
+            viewmat, K = (self.cameras[name][0].numpy() for name in ("viewmats", "Ks"))
+            self.view = Target(viewmat, K, self.target[0])
+            self.direct = DirectStep()
+            self.direct.bind(self.parameters)
         self._wall: list[dict[str, float]] = []
         self._cpu: list[dict[str, float]] = []
 
     def iteration(self) -> None:
         """Render, compare, carry back, step; the times are kept."""
+        if self.backend == "direct":
+            self._direct_iteration()
+            return
         marks = [self._now()]
         rgb, visible = self._render()
         marks.append(self._now())
@@ -117,6 +129,17 @@ class Contestant:
         for kind, record in enumerate((self._wall, self._cpu)):
             steps = {name: marks[i + 1][kind] - marks[i][kind] for i, name in enumerate(names)}
             record.append({**steps, "iteration": marks[-1][kind] - marks[0][kind]})
+
+    def _direct_iteration(self) -> None:
+        marks = [self._now()]
+        self.direct.run(self.view, sh_degree=3)
+        marks.append(self._now())
+        if isinstance(self.adam, SelectiveAdam):
+            self.adam.step(self.direct.visible, self.direct.gradients)
+        marks.append(self._now())
+        for kind, record in enumerate((self._wall, self._cpu)):
+            start, carried, end = (mark[kind] for mark in marks)
+            record.append({"gradients": carried - start, "adam": end - carried, "iteration": end - start})
 
     def _render(self) -> tuple[Tensor, Tensor | None]:
         scene = {**self.parameters, **self.cameras}

@@ -46,7 +46,8 @@ def _kernels(given: argparse.Namespace, *, training: bool) -> int:
     _let_waiting_threads_sleep()
     sizes = _sizes(given)
     threads = [_number("--threads", text) for text in _items(given.threads or ["1", "2"])]
-    peers = _items(given.peers if given.peers is not None else ["torch"])
+    usual = ["direct", "torch"] if training else ["torch"]
+    peers = _items(usual if given.peers is None else given.peers)
     from extrags.raster.bench import BenchSize, bench_raster, bench_train
 
     found = (bench_train if training else bench_raster)(
@@ -107,7 +108,7 @@ def _print_kernels(cases: list[dict[str, Any]]) -> None:
     for case in cases:
         low, high = case["spread_ms"]
         row = [f"{case['width']}x{case['height']}", case["n_gaussians"], case["backend"], case["threads"]]
-        row += [case["ms"][name] for name in ("forward", "backward", "iteration")]
+        row += [case["ms"].get(name) for name in ("forward", "backward", "iteration")]
         row += [
             f"{low:.4g} - {high:.4g}",
             case["cpu_ms"]["iteration"],
@@ -115,14 +116,16 @@ def _print_kernels(cases: list[dict[str, Any]]) -> None:
             case["peak_mib"],
         ]
         if with_error:
-            row += [case["error"]["image"], max(case["error"]["grads"].values())]
+            error = case.get("error")
+            row += [None, None] if error is None else [error["image"], max(error["grads"].values())]
         rows.append(row)
     _print([*header, *(("image error", "worst gradient") if with_error else ())], rows)
     for case in cases:
         if "roofline" in case:
-            parts = ", ".join(f"{name} {value:.3g}" for name, value in case["parts_ms"].items())
+            parts = ", ".join(f"{name} {value:.3g}" for name, value in case.get("parts_ms", {}).items())
             console().print(
-                f"{case['width']}x{case['height']}, {case['threads']} threads: {parts} ms; floor "
+                f"{case['width']}x{case['height']}, {case['backend']}, {case['threads']} threads: "
+                f"{f'{parts} ms; ' if parts else ''}floor "
                 f"{case['roofline']['floor_ms']:.3g} ms, {case['roofline']['share']:.0%} of the time taken",
                 soft_wrap=True,
             )
