@@ -292,7 +292,7 @@ class TestBench:
         assert main(["bench", "train", *self.SMALL, "--peers", "native"]) == 0
         said = capsys.readouterr().out
         assert "x native" in said
-        assert "32x20, 1 threads: project" in said
+        assert "32x20, native, 1 threads: project" in said
         assert "worst gradient" not in said
         assert main(["bench", "train", *self.SMALL, "--peers", "native", "--error"]) == 0
         assert "worst gradient" in capsys.readouterr().out

@@ -80,7 +80,7 @@ def test_the_scene_is_what_it_is() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"peers": ["warp"]}, "unknown peers warp; expected native, torch"),
+        ({"peers": ["warp"]}, "unknown peers warp; expected native, direct, torch"),
         ({"rounds": 0}, "start at 1, got 0"),
         ({"threads": [0]}, "start at 1, got 0"),
         ({"sizes": [BenchSize(16, 0, 10)]}, "start at 1, got 0"),
