@@ -12,11 +12,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from data_catalog.ray_casting import RayCaster
 from extrags.cameras import Cameras, compose, pixel_rays
 from extrags.errors import SourceError, SourceNotFoundError
 
@@ -24,8 +24,6 @@ __all__ = ["Alignment", "CoverageMesh", "Surface", "align", "read_coverage_mesh"
 
 # Vertices are written with three decimals; a residual beyond this is another mesh or another order.
 _LARGEST_RESIDUAL_MM = 0.2
-# Between two points of one mesh, both float32: a first hit this near to the end of the way is its end.
-_SEEN_TOLERANCE_MM = 0.05
 _OBSERVED, _UNOBSERVED = 1, 2
 
 
@@ -166,30 +164,21 @@ def align(
 
 
 class Surface:
-    """A coverage mesh as a target for rays (Open3D's ray casting, embree).
+    """A coverage mesh as a target for rays.
 
     Args:
         mesh: in the world of the cameras asked about.
     """
 
     def __init__(self, mesh: CoverageMesh) -> None:
-        import open3d as o3d
-
-        self._tensor = o3d.core.Tensor.from_numpy
-        self._scene: Any = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(
-            self._tensor(mesh.vertices.astype(np.float32)), self._tensor(mesh.triangles.astype(np.uint32))
-        )
+        self._rays = RayCaster(mesh.vertices, mesh.triangles)
 
     def cast(
         self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "*s 3"]
     ) -> tuple[Float[np.ndarray, "*s"], Int[np.ndarray, "*s"]]:
         """First hits: the distance in lengths of each ray, infinite for a miss, and the face."""
-        packed = np.empty((*rays.shape[:-1], 6), dtype=np.float32)
-        packed[..., :3] = origin
-        packed[..., 3:] = rays
-        found = self._scene.cast_rays(self._tensor(packed))
-        return found["t_hit"].numpy(), found["primitive_ids"].numpy().astype(np.int64)
+        hits = self._rays.cast(origin, rays)
+        return hits.distance, hits.triangle
 
     def z_depth(self, camera: Cameras) -> tuple[Float[np.ndarray, "h w"], Int[np.ndarray, "h w"]]:
         """z-depth at a pinhole's pixel centres, infinite for a miss, and the face."""
@@ -222,32 +211,5 @@ class Surface:
             met = np.isfinite(depth)
             rays = pixel_rays(cameras[int(index)])[0][met]
             points = cameras.centers[index] + rays * depth[met][:, None].astype(np.float64)
-            observed[index][met] = self._seen(points, cameras[train], mask[train])
+            observed[index][met] = self._rays.seen_by(points, cameras[train], mask[train])
         return observed
-
-    def _seen(
-        self, points: Float[np.ndarray, "p 3"], cameras: Cameras, mask: Bool[np.ndarray, "c h w"]
-    ) -> Bool[np.ndarray, "p"]:
-        seen = np.zeros(len(points), dtype=bool)
-        if not len(points):
-            return seen
-        # The nearest cameras see most; only what they leave is cast again.
-        distance = np.linalg.norm(cameras.centers - np.median(points, axis=0), axis=1)
-        for index in np.argsort(distance, kind="stable"):
-            left = np.flatnonzero(~seen)
-            pose, K = cameras.world_from_camera[index], cameras.K[index]
-            local = (points[left] - pose[:3, 3]) @ pose[:3, :3]
-            z = np.maximum(local[:, 2], 1e-9)
-            column = np.floor(K[0, 0] * local[:, 0] / z + K[0, 2])
-            row = np.floor(K[1, 1] * local[:, 1] / z + K[1, 2])
-            inside = (local[:, 2] > 0) & (column >= 0) & (column < cameras.width)
-            inside &= (row >= 0) & (row < cameras.height)
-            inside[inside] = mask[index][row[inside].astype(int), column[inside].astype(int)]
-            candidates = left[inside]
-            if not candidates.size:
-                continue
-            toward = points[candidates] - pose[:3, 3]
-            length = np.linalg.norm(toward, axis=1)
-            hit, _ = self.cast(pose[:3, 3], toward / length[:, None])
-            seen[candidates[hit >= length - _SEEN_TOLERANCE_MM]] = True
-        return seen

@@ -16,8 +16,8 @@ from data_catalog.phantom.appearance import Texture, bilinear, paint
 from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig, stream
 from data_catalog.phantom.geometry import Wall, build_wall
 from data_catalog.phantom.imaging import LightPair, Sensor, recording_sensor
-from data_catalog.phantom.rays import RayCaster
 from data_catalog.phantom.trajectories import camera_path
+from data_catalog.ray_casting import RayCaster
 from extrags.cameras import Cameras, pixel_rays
 from extrags.events import Progress, emit
 from extrags.sequence import Sequence, Split
@@ -41,7 +41,7 @@ class Phantom:
         self.wall: Wall = build_wall(config)
         self.texture: Texture = paint(config, self.wall)
         self.light = LightPair()
-        self.rays = RayCaster(self.wall)
+        self.rays = RayCaster(self.wall.vertices, self.wall.triangles)
         self._shape_grid = np.concatenate([self.wall.normals, self.wall.along], axis=2, dtype=np.float32)
 
     def intrinsics(self, width: int, height: int) -> Float[np.ndarray, "3 3"]:

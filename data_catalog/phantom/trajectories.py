@@ -28,7 +28,7 @@ from jaxtyping import Float
 
 from data_catalog.phantom.config import PhantomConfig, Setting, stream
 from data_catalog.phantom.geometry import Wall
-from data_catalog.phantom.rays import RayCaster
+from data_catalog.ray_casting import RayCaster
 from extrags.cameras import compose, look_at, rotation_about
 
 __all__ = ["MIN_CLEARANCE_MM", "PathStyle", "camera_path", "path_style"]

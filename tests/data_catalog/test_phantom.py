@@ -7,9 +7,9 @@ import pytest
 from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.geometry import build_wall
 from data_catalog.phantom.imaging import recording_sensor
-from data_catalog.phantom.rays import RayCaster
 from data_catalog.phantom.recording import Phantom, record
 from data_catalog.phantom.trajectories import MIN_CLEARANCE_MM, camera_path
+from data_catalog.ray_casting import RayCaster
 from data_catalog.visibility import observed_from_depth
 from extrags.cameras import Cameras, invert_poses, pixel_rays
 from extrags.sequence import Sequence
@@ -54,7 +54,7 @@ class TestGroundTruth:
         assert sparse.depth_mm is not None
         rays = pixel_rays(sparse.cameras[25])[0]
         points = sparse.cameras.centers[25] + rays * sparse.depth_mm[25][..., None]
-        assert RayCaster(wall).clearance_mm(points.reshape(-1, 3)).max() < 0.01
+        assert RayCaster(wall.vertices, wall.triangles).clearance_mm(points.reshape(-1, 3)).max() < 0.01
 
     def test_observed_agrees_with_a_depth_test(self, sparse: Sequence, distanced: Sequence) -> None:
         """Occlusion rays and training depth maps are two ways to the same answer, but for pixel borders."""
@@ -133,7 +133,7 @@ class TestRecordings:
         for setting in ("sparse", "distanced"):
             config = PhantomConfig(scene=scene, setting=setting)
             wall = build_wall(config)
-            rays = RayCaster(wall)
+            rays = RayCaster(wall.vertices, wall.triangles)
             for recording in ("a", "b"):
                 poses = camera_path(config, wall, rays, recording, np.linspace(0, 1, 100))
                 assert rays.clearance_mm(poses[:, :3, 3]).min() > MIN_CLEARANCE_MM

@@ -1,4 +1,4 @@
-"""Rays against the phantom's wall, by Open3D's ray-casting scene (embree)."""
+"""Rays against a known surface, by Open3D's ray-casting scene (embree)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from data_catalog.phantom.geometry import Wall
 from extrags.cameras import Cameras
 
 __all__ = ["Hits", "RayCaster"]
@@ -35,18 +34,21 @@ class Hits:
 
 
 class RayCaster:
-    """The wall as a target for rays.
+    """A triangle mesh as a target for rays.
 
     Args:
-        wall: the anatomy.
+        vertices: in world units.
+        triangles: indices of vertices.
     """
 
-    def __init__(self, wall: Wall) -> None:
+    def __init__(self, vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]) -> None:
         import open3d as o3d
 
         self._tensor = o3d.core.Tensor.from_numpy
         self._scene: Any = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(self._tensor(wall.vertices), self._tensor(wall.triangles.astype(np.uint32)))
+        self._scene.add_triangles(
+            self._tensor(vertices.astype(np.float32)), self._tensor(triangles.astype(np.uint32))
+        )
 
     def cast(self, origin: Float[np.ndarray, "3"], rays: Float[np.ndarray, "*s 3"]) -> Hits:
         """First hits of rays from one point; distances count in lengths of each ray."""
@@ -60,19 +62,30 @@ class RayCaster:
     def reaches(
         self, origin: Float[np.ndarray, "3"], offsets: Float[np.ndarray, "n 3"]
     ) -> Bool[np.ndarray, "n"]:
-        """Which wall points, given as offsets from the origin, have nothing before them."""
+        """Which points of the surface, given as offsets from the origin, have nothing before them."""
         blocked = self._scene.test_occlusions(
             self._tensor(_packed(origin, offsets)), tnear=0.0, tfar=_NEARLY_THERE
         )
         return np.asarray(~blocked.numpy())
 
     def clearance_mm(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Distance to the nearest wall."""
+        """Distance to the surface."""
         distance = self._scene.compute_distance(self._tensor(points.astype(np.float32)))
         return np.asarray(distance.numpy())
 
-    def seen_by(self, points: Float[np.ndarray, "p 3"], cameras: Cameras) -> Bool[np.ndarray, "p"]:
-        """Which wall points at least one camera sees: inside its image, and nothing before them."""
+    def seen_by(
+        self,
+        points: Float[np.ndarray, "p 3"],
+        cameras: Cameras,
+        mask: Bool[np.ndarray, "c h w"] | None = None,
+    ) -> Bool[np.ndarray, "p"]:
+        """Which points of the surface at least one camera sees, with nothing before them.
+
+        Args:
+            points: on the surface.
+            cameras: who looks.
+            mask: their valid pixels; None is all of the image.
+        """
         seen = np.zeros(len(points), dtype=bool)
         if not len(points):
             return seen
@@ -83,9 +96,12 @@ class RayCaster:
             pose, K = cameras.world_from_camera[index], cameras.K[index]
             local = (points[left] - pose[:3, 3]) @ pose[:3, :3]
             z = np.maximum(local[:, 2], 1e-9)
-            u = K[0, 0] * local[:, 0] / z + K[0, 2]
-            v = K[1, 1] * local[:, 1] / z + K[1, 2]
-            inside = (local[:, 2] > 0) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
+            column = np.floor(K[0, 0] * local[:, 0] / z + K[0, 2])
+            row = np.floor(K[1, 1] * local[:, 1] / z + K[1, 2])
+            inside = (local[:, 2] > 0) & (column >= 0) & (column < cameras.width)
+            inside &= (row >= 0) & (row < cameras.height)
+            if mask is not None:
+                inside[inside] = mask[index][row[inside].astype(int), column[inside].astype(int)]
             candidates = left[inside]
             if candidates.size:
                 toward = points[candidates] - pose[:3, 3]
