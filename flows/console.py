@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -114,7 +115,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     for outcome in run.sequences:
         for row in outcome.stages:
             if row.state == "failed":
-                out.print(f"[red]{outcome.name} failed in {row.stage}:[/] {row.reason}")
+                out.print(f"[red]{outcome.name} failed in {row.stage}:[/] {escape(row.reason)}")
         if outcome.report:
             out.print(f"report: {outcome.report}", soft_wrap=True)
     if run.report and len(run.sequences) > 1:
@@ -138,7 +139,7 @@ def print_plan(outcome: SequenceOutcome) -> None:
     for line in plan["decisions"]:
         budget = ", ".join(f"{name} {value}" for name, value in line["budget"].items())
         runs = "[green]yes[/]" if line["run"] else "no"
-        table.add_row(line["stage"], runs, budget, line["reason"])
+        table.add_row(line["stage"], runs, budget, escape(line["reason"]))
     out.print(table)
     figures = ", ".join(f"{name} {value:.4g}" for name, value in plan["measurements"].items())
     out.print(f"[dim]measured: {figures}[/]")

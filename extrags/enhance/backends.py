@@ -9,6 +9,8 @@ from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.enhance.classical import ClassicalEnhancer
 from extrags.enhance.embedded import EmbeddedEnhancer
 from extrags.enhance.pairs import make_pairs
+from extrags.enhance.pretrained.checkpoint import CheckpointEnhancer
+from extrags.enhance.pretrained.enhancer import ADAPTERS, PretrainedEnhancer
 from extrags.enhance.protocol import Enhancer
 from extrags.enhance.references import ReferenceViews
 from extrags.errors import WeightsError
@@ -19,7 +21,7 @@ __all__ = ["load_enhancer", "train_enhancer"]
 
 
 def train_enhancer(scene: Scene, sequence: Sequence, config: EnhanceConfig, coarse: CoarseConfig) -> Enhancer:
-    """The restorer of a scene: trained on the scene's own pairs, or the classical one if that is asked for.
+    """The restorer of a scene: trained on the scene's own pairs, or prepared where nothing is trained.
 
     Args:
         scene: the coarse scene, trained on `sequence.train`.
@@ -30,9 +32,16 @@ def train_enhancer(scene: Scene, sequence: Sequence, config: EnhanceConfig, coar
     Raises:
         CaptureError: with too few training frames for the embedded backend.
         DivergedError: when a reconstruction or the training does not stay finite.
+        WeightsError: when a pretrained model is not there; says how to get it.
+        MissingDependencyError: when a pretrained backend lacks a package.
+        ConfigError: when its settings do not fit.
     """
     if config.backend == "classical":
         return ClassicalEnhancer()
+    if config.backend == CheckpointEnhancer.name:
+        return CheckpointEnhancer.prepare(scene, sequence, config)
+    if config.backend in ADAPTERS:
+        return PretrainedEnhancer.prepare(scene, sequence, config)
     pairs = make_pairs(scene, sequence, config, coarse)
     transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
     return EmbeddedEnhancer.train(pairs, transfer, config)
@@ -52,4 +61,9 @@ def load_enhancer(path: Path) -> Enhancer:
         return ClassicalEnhancer()
     if backend == EmbeddedEnhancer.name:
         return EmbeddedEnhancer.load(path)
-    raise WeightsError(f"{description}: unknown backend {backend!r}; known: classical, embedded")
+    if backend == CheckpointEnhancer.name:
+        return CheckpointEnhancer.load(path)
+    if backend in ADAPTERS:
+        return PretrainedEnhancer.load(path)
+    known = ["classical", "embedded", *sorted(ADAPTERS), CheckpointEnhancer.name]
+    raise WeightsError(f"{description}: unknown backend {backend!r}; known: {', '.join(known)}")

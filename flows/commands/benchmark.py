@@ -6,6 +6,7 @@ import argparse
 import sys
 from typing import Any
 
+from rich.markup import escape
 from rich.table import Table
 
 from extrags.config import profile_config
@@ -123,7 +124,7 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
     for case in found["cases"]:
         if case["error"]:
             run = f"{case['sequence']} {case['method']} seed {case['seed']}"
-            out.print(f"[red]{run} failed in {case['error']}[/]")
+            out.print(f"[red]{escape(run)} failed in {escape(case['error'])}[/]")
     out.print(f"report: {found['report']}", soft_wrap=True)
 
 
