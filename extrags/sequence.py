@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, cast
 
 import numpy as np
 import zarr
@@ -14,7 +14,11 @@ from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["Sequence", "Split"]
+__all__ = ["PoseSource", "Sequence", "Split"]
+
+PoseSource = Literal["given", "estimated", "aligned", "refined"]
+"""given: by the source; estimated: by COLMAP; aligned: by colour and depth; refined: corrected by the
+reconstruction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +62,7 @@ class Sequence:
         truth: further ground truth of simulated sources, as JSON (light, exposure, ...).
         specular: true on specular highlights, [F, H, W]; they carry no weight in training, but count in the
             evaluation of held-out frames like any other pixel. None where they were not looked for.
+        pose_source: where the poses come from; the reconstruction may refine those that were estimated.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -78,6 +83,7 @@ class Sequence:
     points_rgb: UInt8[np.ndarray, "p 3"] | None = None
     truth: dict[str, Any] = field(default_factory=dict)
     specular: Bool[np.ndarray, "f h w"] | None = None
+    pose_source: PoseSource = "given"
 
     def __post_init__(self) -> None:
         frames, height, width = self.rgb.shape[:3]
@@ -133,9 +139,11 @@ class Sequence:
         """Name of a frame for messages."""
         return self.frame_names[index] if self.frame_names else f"{index:04d}"
 
-    def with_poses(self, world_from_camera: Float[np.ndarray, "f 4 4"]) -> Sequence:
+    def with_poses(
+        self, world_from_camera: Float[np.ndarray, "f 4 4"], source: PoseSource = "given"
+    ) -> Sequence:
         """The same sequence with poses."""
-        return replace(self, world_from_camera=world_from_camera)
+        return replace(self, world_from_camera=world_from_camera, pose_source=source)
 
     def training_part(self) -> Sequence:
         """The training frames alone, with nothing that tells of the others.
@@ -190,6 +198,9 @@ class Sequence:
                 "truth": self.truth,
             }
         )
+        # Only where it says something: what was written before the field existed keeps its digest.
+        if self.pose_source != "given":
+            group.attrs["pose_source"] = self.pose_source
 
     @classmethod
     def load(cls, path: Path) -> Sequence:
@@ -225,5 +236,6 @@ class Sequence:
             frame_names=tuple(names),
             metric=bool(attributes["metric"]),
             truth=truth,
+            pose_source=cast("PoseSource", attributes.get("pose_source", "given")),
             **optional,
         )

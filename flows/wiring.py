@@ -17,7 +17,7 @@ from flows.outcome import SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner
 from flows.settings import STAGES
 from tasks.assess import PLAN, assess, plan
-from tasks.coarse import coarse
+from tasks.coarse import coarse, refined_frames
 from tasks.enhance import assemble, restore, train
 from tasks.evaluate import measure, render
 from tasks.explore import NEXT, branch, explore, merge, start
@@ -141,12 +141,13 @@ class SequenceRun:
             self.refs["ingest"] = self.refs["sequence"] = self._one(row, Call(ingest, inputs))
 
     def _poses(self) -> None:
-        if self._manifest("sequence").counts["has_poses"]:
+        if self._manifest("sequence").counts["has_poses"] and not self.config.poses.replace_given:
             self._skip("poses", "the source has poses")
             return
         with self._stage("poses") as row:
             inputs = {"sequence": self.refs["sequence"], "config": self.config.poses}
             self.refs["poses"] = self.refs["sequence"] = self._one(row, Call(poses, inputs))
+            row.reason = str(self._manifest("poses").counts["summary"])
 
     def _coarse(self) -> None:
         with self._stage("coarse") as row:
@@ -157,6 +158,15 @@ class SequenceRun:
             self.refs["training"] = part.ref
             inputs = {"sequence": self.refs["training"], "config": self.config.coarse}
             self.refs["coarse"] = self._one(row, Call(coarse, inputs))
+            if self._manifest("coarse").counts.get("refined_poses"):
+                # The scene belongs to the corrected poses: all that follows takes those.
+                inputs = {"sequence": self.refs["sequence"], "coarse": self.refs["coarse"]}
+                (whole,) = self.runner.run([Call(refined_frames, inputs)], self.outcome.name)
+                call = Call(training_frames, {"sequence": whole.ref})
+                (part,) = self.runner.run([call], self.outcome.name)
+                self.refs["sequence"], self.refs["training"] = whole.ref, part.ref
+                counts = self._manifest("coarse").counts
+                row.reason = f"poses refined, by {counts['refined_mean_turn_deg']:.2f} degrees on average"
 
     def _assess(self) -> None:
         with self._stage("assess") as row:

@@ -1,8 +1,19 @@
-"""Camera poses by COLMAP: mapping on training frames, registration of held-out ones, metric scale."""
+"""Camera poses: by COLMAP or by colour and depth, from training frames; held-out frames afterwards."""
 
 from __future__ import annotations
 
+from extrags.poses.account import errors_against_given
 from extrags.poses.estimate import PoseEstimate, estimate_poses, with_estimated_poses
+from extrags.poses.rgbd import RgbdAlignment, align_by_depth
 from extrags.poses.scale import DepthScale, depth_scale
 
-__all__ = ["DepthScale", "PoseEstimate", "depth_scale", "estimate_poses", "with_estimated_poses"]
+__all__ = [
+    "DepthScale",
+    "PoseEstimate",
+    "RgbdAlignment",
+    "align_by_depth",
+    "depth_scale",
+    "errors_against_given",
+    "estimate_poses",
+    "with_estimated_poses",
+]

@@ -83,7 +83,7 @@ def run_colmap(folder: Path, job: PoseJob) -> PoseJobResult:
     _extract(pycolmap, folder, job, job.train, told)
     _match(pycolmap, folder, pairs, seed, told)
     with _opened(pycolmap, database_path) as database:
-        account |= _match_account(database, job.train, pairs)
+        account |= _match_account(pycolmap, database, job.train, pairs)
 
     # The first pair of a model counts once, and further models count images again: told steps are
     # held below what the map is given, and set to it at its end.
@@ -188,21 +188,59 @@ def _match(pycolmap: Any, folder: Path, pairs: list[Pair], seed: int, told: _Tol
             told.step(len(part))
 
 
-def _match_account(database: Any, frames: np.ndarray, pairs: list[Pair]) -> dict[str, Any]:
+def _match_account(pycolmap: Any, database: Any, frames: np.ndarray, pairs: list[Pair]) -> dict[str, Any]:
     ids = {int(frame): database.read_image_with_name(_name(int(frame))).image_id for frame in frames}
-    features = [database.num_keypoints_for_image(number) for number in ids.values()]
-    inliers = [
-        len(database.read_two_view_geometry(ids[i], ids[j]).inlier_matches)
+    features = {frame: int(database.num_keypoints_for_image(number)) for frame, number in ids.items()}
+    inliers = {
+        (i, j): len(database.read_two_view_geometry(ids[i], ids[j]).inlier_matches)
         if database.exists_two_view_geometry(ids[i], ids[j])
         else 0
         for i, j in pairs
-    ]
-    verified = [count for count in inliers if count > 0]
-    return {
-        "features_median": float(np.median(features)),
-        "pairs_verified": len(verified),
-        "inliers_median": float(np.median(verified)) if verified else 0.0,
     }
+    verified = sorted((pair for pair, count in inliers.items() if count > 0), key=lambda p: (-inliers[p], p))
+    best, partners = dict.fromkeys(ids, 0), dict.fromkeys(ids, 0)
+    for (i, j), count in inliers.items():
+        best[i], best[j] = max(best[i], count), max(best[j], count)
+        partners[i] += int(count > 0)
+        partners[j] += int(count > 0)
+    angles, turn_only = _parallax(pycolmap, database, ids, verified[:_PAIRS_PER_CALL])
+    return {
+        "features_median": float(np.median(list(features.values()))),
+        "features_fewest": min(features.values()),
+        "pairs_verified": len(verified),
+        "inliers_median": float(np.median([inliers[pair] for pair in verified])) if verified else 0.0,
+        "pairs_examined": len(angles),
+        "pair_angle_deg": float(np.median(angles)) if angles else 0.0,
+        "pairs_turn_only": turn_only,
+        "frames": {
+            str(frame): {
+                "features": features[frame],
+                "best_pair_inliers": best[frame],
+                "verified_pairs": partners[frame],
+            }
+            for frame in ids
+        },
+    }
+
+
+def _parallax(
+    pycolmap: Any, database: Any, ids: dict[int, int], pairs: list[Pair]
+) -> tuple[list[float], int]:
+    """Angle between the rays of the matched points of each pair, and how many pairs only turn."""
+    angles, turn_only = [], 0
+    kinds = pycolmap.TwoViewGeometryConfiguration
+    for pair in pairs:
+        images = [database.read_image_with_name(_name(frame)) for frame in pair]
+        cameras = [database.read_camera(image.camera_id) for image in images]
+        keypoints = [database.read_keypoints(image.image_id)[:, :2].astype(np.float64) for image in images]
+        geometry = database.read_two_view_geometry(ids[pair[0]], ids[pair[1]])
+        found = pycolmap.estimate_two_view_geometry_pose(
+            cameras[0], keypoints[0], cameras[1], keypoints[1], geometry
+        )
+        turns = geometry.config in (kinds.PANORAMIC, kinds.PLANAR_OR_PANORAMIC)
+        turn_only += int(turns)
+        angles.append(float(np.degrees(geometry.tri_angle)) if found and not turns else 0.0)
+    return angles, turn_only
 
 
 def _mapping_options(pycolmap: Any, settings: dict[str, Any]) -> Any:

@@ -10,7 +10,7 @@ import sys
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -19,7 +19,9 @@ from extrags.cameras import as_rotation
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
+from extrags.poses.account import colmap_account, failure_message, frames_without_pose
 from extrags.poses.job import PoseJob, PoseJobResult
+from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import depth_scale
 from extrags.sequence import Sequence, Split
 
@@ -31,35 +33,56 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """What COLMAP found.
+    """Poses that were found.
 
     Args:
+        method: how: by COLMAP, or by alignment of colour and depth.
         world_from_camera: [F, 4, 4], float64, NaN for frames that did not register.
         registered: true for frames with a pose, [F].
-        points: triangulated points, [P, 3], float32, in the unit of the poses.
+        points: of the surface, [P, 3], float32, in the unit of the poses.
         points_rgb: their colours, [P, 3].
-        mean_reprojection_px: over the observations in training frames.
+        mean_reprojection_px: over the observations in training frames; None without such.
         metric: true when the unit is the millimetre, from known depth.
         account: counts of features, matches and registrations, ready for JSON.
     """
 
+    method: Literal["colmap", "rgbd"]
     world_from_camera: Float[np.ndarray, "f 4 4"]
     registered: Bool[np.ndarray, "f"]
     points: Float[np.ndarray, "p 3"]
     points_rgb: UInt8[np.ndarray, "p 3"]
-    mean_reprojection_px: float
+    mean_reprojection_px: float | None
     metric: bool
     account: dict[str, Any]
 
+    @property
+    def summary(self) -> str:
+        """One line for plans and logs."""
+        found = self.account
+        by = "COLMAP" if self.method == "colmap" else "colour and depth"
+        why = ""
+        if "colmap" in found:
+            failed = found["colmap"]
+            why = f" (COLMAP registered only {failed['registered_train']})"
+        return (
+            f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
+            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames"
+        )
+
 
 def estimate_poses(sequence: Sequence, config: PosesConfig) -> PoseEstimate:
-    """Reconstruct the cameras of a sequence with COLMAP.
+    """Find the cameras of a sequence: by COLMAP, and where that fails, by colour and depth.
 
-    SIFT inside the validity mask, known intrinsics held fixed, incremental mapping on the training
-    frames alone; the largest model counts. Held-out frames are registered afterwards against the
-    finished map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the
-    millimetre (`extrags.poses.depth_scale`). COLMAP runs in a process of its own. Same input and seed
-    give the same poses, bit by bit, on one machine.
+    *COLMAP*: SIFT inside the validity mask, known intrinsics held fixed, incremental mapping on the training
+    frames alone; the largest model counts. Held-out frames are registered afterwards against the finished
+    map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the millimetre
+    (`extrags.poses.depth_scale`). COLMAP runs in a process of its own.
+
+    *Colour and depth* (`extrags.poses.rgbd`): where the sequence has depth and COLMAP registers too few
+    training frames, unless `config.fallback` says `never`; or from the start if it says `rgbd`. Again
+    training frames first, held-out ones against what these made.
+
+    Same input and seed give the same poses, bit by bit, on one machine.
 
     Args:
         sequence: frames with intrinsics; poses it may have are not looked at.
@@ -79,32 +102,46 @@ def estimate_poses(sequence: Sequence, config: PosesConfig) -> PoseEstimate:
             f"{sequence.name}: poses need at least {FEWEST_TRAINING_FRAMES} training frames, "
             f"found {len(sequence.train)}"
         )
-    frames = len(sequence)
-    recording = np.zeros(frames, dtype=np.int64) if sequence.recording is None else sequence.recording
-    result = _run(
-        PoseJob(
-            rgb=sequence.rgb,
-            mask=sequence.mask,
-            K=sequence.K,
-            recording=recording,
-            train=np.asarray(sequence.train, dtype=np.int64),
-            test=np.asarray(sequence.test, dtype=np.int64),
-            settings=config.model_dump(),
-        ),
-        sequence.name,
-    )
+    if config.fallback == "rgbd":
+        return _by_depth(sequence, config, None)
+    result = _run(_job(sequence, config), sequence.name)
     registered = np.isfinite(result.world_from_camera).all((1, 2))
-    account = _account(sequence, result, registered)
-    _check_share(sequence, registered, account, config)
-    for kind in ("train", "test"):
-        if account[f"unregistered_{kind}"]:
-            _LOG.warning(
-                "%s: no pose for %s frames %s",
-                sequence.name,
-                "training" if kind == "train" else "held-out",
-                ", ".join(account[f"unregistered_{kind}"]),
-            )
-    poses, points = _cleaned(result, registered), result.points
+    account = colmap_account(sequence, result, registered)
+    if _enough(account, config):
+        _warn_of_missing(sequence, account)
+        return _from_colmap(sequence, result, registered, account)
+    if config.fallback == "never":
+        instead = "Alignment by colour and depth is switched off (poses.fallback)."
+    elif sequence.depth_mm is None:
+        instead = "The source has no depth that frames could be aligned by instead."
+    else:
+        _LOG.warning(
+            "%s: COLMAP registered %d of %d training frames; aligning by colour and depth instead",
+            sequence.name,
+            account["registered_train"],
+            account["n_train"],
+        )
+        return _by_depth(sequence, config, account)
+    raise CaptureError(failure_message(sequence.name, account, config.min_registered_share, instead=instead))
+
+
+def _job(sequence: Sequence, config: PosesConfig) -> PoseJob:
+    recording = sequence.recording
+    return PoseJob(
+        rgb=sequence.rgb,
+        mask=sequence.mask,
+        K=sequence.K,
+        recording=np.zeros(len(sequence), dtype=np.int64) if recording is None else recording,
+        train=np.asarray(sequence.train, dtype=np.int64),
+        test=np.asarray(sequence.test, dtype=np.int64),
+        settings=config.model_dump(),
+    )
+
+
+def _from_colmap(
+    sequence: Sequence, result: PoseJobResult, registered: np.ndarray, account: dict[str, Any]
+) -> PoseEstimate:
+    poses, points = _cleaned(result.world_from_camera, registered), result.points
     scale = None
     if sequence.depth_mm is not None and sequence.metric:
         scale = depth_scale(
@@ -121,12 +158,50 @@ def estimate_poses(sequence: Sequence, config: PosesConfig) -> PoseEstimate:
         points = points * scale.mm_per_unit
         account["scale"] = asdict(scale)
     return PoseEstimate(
+        method="colmap",
         world_from_camera=poses,
         registered=registered,
         points=points.astype(np.float32),
         points_rgb=result.points_rgb,
         mean_reprojection_px=float(account["mean_reprojection_px"]),
         metric=scale is not None,
+        account=account,
+    )
+
+
+def _by_depth(sequence: Sequence, config: PosesConfig, failed: dict[str, Any] | None) -> PoseEstimate:
+    """By colour and depth; `failed` is COLMAP's account, if it was asked first."""
+    found = align_by_depth(sequence, config)
+    registered = np.isfinite(found.world_from_camera).all((1, 2))
+    account = found.account | frames_without_pose(sequence, registered)
+    if failed is not None:
+        account["colmap"] = failed
+    if not _enough(account, config):
+        message = (
+            f"{sequence.name}: alignment by colour and depth placed {account['registered_train']} of "
+            f"{account['n_train']} training frames, expected at least {config.min_registered_share:.0%}. "
+            f"Without a pose: {', '.join(account['unregistered_train'])}; of these without depth: "
+            f"{', '.join(account['without_depth']) or 'none'}. Give frames nearer together, or less "
+            "noisy depth"
+        )
+        if failed is not None:
+            because = failure_message(
+                sequence.name,
+                failed,
+                config.min_registered_share,
+                instead="Alignment by depth failed as well.",
+            )
+            message = f"{because} {message}"
+        raise CaptureError(message)
+    _warn_of_missing(sequence, account)
+    return PoseEstimate(
+        method="rgbd",
+        world_from_camera=_cleaned(found.world_from_camera, registered),
+        registered=registered,
+        points=found.points.astype(np.float32),
+        points_rgb=found.points_rgb,
+        mean_reprojection_px=None,
+        metric=sequence.metric,
         account=account,
     )
 
@@ -168,6 +243,7 @@ def with_estimated_poses(sequence: Sequence, estimate: PoseEstimate) -> Sequence
         metric=estimate.metric,
         points=estimate.points,
         points_rgb=estimate.points_rgb,
+        pose_source="estimated" if estimate.method == "colmap" else "aligned",
     )
 
 
@@ -205,40 +281,25 @@ def _run(job: PoseJob, name: str) -> PoseJobResult:
         return PoseJobResult.load(folder)
 
 
-def _cleaned(result: PoseJobResult, registered: np.ndarray) -> np.ndarray:
+def _cleaned(found: np.ndarray, registered: np.ndarray) -> np.ndarray:
     """Poses with rotations orthonormal to rounding."""
-    poses = result.world_from_camera.copy()
+    poses = found.copy()
     for frame in np.flatnonzero(registered):
         poses[frame, :3, :3] = as_rotation(poses[frame, :3, :3], frame=int(frame))
     return poses
 
 
-def _account(sequence: Sequence, result: PoseJobResult, registered: np.ndarray) -> dict[str, Any]:
-    account = dict(result.account)
-    account.setdefault("mean_reprojection_px", 0.0)
-    for kind, frames in (("train", sequence.train), ("test", sequence.test)):
-        account[f"registered_{kind}"] = int(registered[frames].sum())
-        account[f"unregistered_{kind}"] = [
-            sequence.frame_name(int(frame)) for frame in frames if not registered[frame]
-        ]
-    account["registrations"] = {
-        sequence.frame_name(int(frame)): counts for frame, counts in account["registrations"].items()
-    }
-    return account
+def _enough(account: dict[str, Any], config: PosesConfig) -> bool:
+    share = account["registered_train"] / account["n_train"]
+    return bool(account["registered_train"] > 0 and share >= config.min_registered_share)
 
 
-def _check_share(
-    sequence: Sequence, registered: np.ndarray, account: dict[str, Any], config: PosesConfig
-) -> None:
-    share = float(registered[sequence.train].mean())
-    if share >= config.min_registered_share and account["registered_train"] > 0:
-        return
-    raise CaptureError(
-        f"{sequence.name}: COLMAP found poses for {account['registered_train']} of {account['n_train']} "
-        f"training frames ({share:.0%}), expected at least {config.min_registered_share:.0%}. "
-        f"Features per frame (median): {account['features_median']:.0f}; pairs matched: {account['pairs']}, "
-        f"verified: {account['pairs_verified']}, inliers per verified pair (median): "
-        f"{account['inliers_median']:.0f}; frames per model: {account['model_sizes'] or 'none'}. "
-        "Few features ask for a lower poses.peak_threshold or larger images, few inliers for frames nearer "
-        "together, good pairs without a model for more sideways motion or a lower poses.min_tri_angle_deg"
-    )
+def _warn_of_missing(sequence: Sequence, account: dict[str, Any]) -> None:
+    for kind in ("train", "test"):
+        if account[f"unregistered_{kind}"]:
+            _LOG.warning(
+                "%s: no pose for %s frames %s",
+                sequence.name,
+                "training" if kind == "train" else "held-out",
+                ", ".join(account[f"unregistered_{kind}"]),
+            )

@@ -102,6 +102,7 @@ class DirectStep:
         self.gradients: dict[str, Tensor] = {}
         self.visible = torch.empty(0, dtype=torch.bool)
         self.light_gradient = np.zeros(12, dtype=np.float32)
+        self.viewmat_gradient = np.zeros((4, 4), dtype=np.float32)
         self._absgrad, self._lit = absgrad, lit
         self._images: dict[tuple[int, int], _Images] = {}
         self._renderings: dict[tuple[int, int], Rendering] = {}
@@ -151,6 +152,7 @@ class DirectStep:
         depth_weight: float = 0.0,
         depth_scale: float = 1.0,
         near: float = 0.01,
+        pose: bool = False,
     ) -> float:
         """Loss of one view; fills `gradients`, `visible`, `light_gradient` and the rendering.
 
@@ -163,6 +165,7 @@ class DirectStep:
             depth_weight: of `inverse_depth_loss`; without effect where the target has no depth.
             depth_scale: as in `inverse_depth_loss`.
             near: as in `rasterize`.
+            pose: fill `viewmat_gradient` too.
 
         Raises:
             NonFiniteError: when a parameter, activated, holds a NaN or an infinity.
@@ -240,7 +243,7 @@ class DirectStep:
             arrays["opacities"],
             arrays["sh"],
             None,
-            None,
+            self.viewmat_gradient if pose else None,
             arrays["v_means2d"],
             arrays["absolute"],
             self.light_gradient if self._lit else None,

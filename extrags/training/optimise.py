@@ -15,6 +15,7 @@ from extrags.errors import DivergedError
 from extrags.events import Progress, emit
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
+from extrags.training.pose_refinement import PoseRefinement, RefinedPoses
 from extrags.training.schedule import Schedule
 from extrags.training.step import Observation, TrainingStep, training_step
 from extrags.training.strategies import density_strategy
@@ -36,10 +37,12 @@ class TrainingResult:
         scene: without gradient history.
         history: every 50 iterations `{iteration, loss, psnr, n_gaussians}`; the PSNR is of the view just
             drawn, inside its weights.
+        refined: corrected poses of the training frames, where they were refined; the scene belongs to these.
     """
 
     scene: Scene
     history: list[dict[str, float]]
+    refined: RefinedPoses | None = None
 
 
 def optimise(
@@ -48,6 +51,7 @@ def optimise(
     schedule: Schedule,
     *,
     make_step: Callable[[Scene, Schedule], TrainingStep] = training_step,
+    poses: PoseRefinement | None = None,
 ) -> TrainingResult:
     """Fit a scene to views, one per iteration.
 
@@ -56,6 +60,7 @@ def optimise(
         draw: gives the view of an iteration.
         schedule: rates, weights and budgets.
         make_step: which implementation of a step; default: the fastest that can take the scene.
+        poses: corrects the poses of real views on the way.
 
     Raises:
         DivergedError: when loss or parameters stop being finite; names iteration and parameter group.
@@ -71,11 +76,15 @@ def optimise(
         for iteration in range(schedule.iterations):
             view = draw(iteration)
             adam.learning_rates = schedule.learning_rates(iteration)
-            observation = step.differentiate(view, iteration, density)
+            frame = view.frame if poses is not None and poses.active(iteration) else None
+            viewmat = None if poses is None or frame is None else poses.viewmat(frame)
+            observation = step.differentiate(view, iteration, density, viewmat)
             if not math.isfinite(observation.loss):
                 raise DivergedError(_account(schedule, iteration, adam.parameters), last_good)
             step.update(observation)
             density.step(adam, observation.rendering, iteration)
+            if poses is not None and frame is not None and observation.viewmat_gradient is not None:
+                poses.step(frame, observation.viewmat_gradient, iteration)
             if iteration % HISTORY_EVERY == 0 or iteration == schedule.iterations - 1:
                 entry = {
                     "iteration": float(iteration),
@@ -89,7 +98,8 @@ def optimise(
                     last_good = Scene(Gaussians(**adam.parameters), step.light).detached()
     if not _finite(adam.parameters):
         raise DivergedError(_account(schedule, schedule.iterations, adam.parameters), last_good)
-    return TrainingResult(Scene(Gaussians(**adam.parameters), step.light).detached(), history)
+    found = Scene(Gaussians(**adam.parameters), step.light).detached()
+    return TrainingResult(found, history, None if poses is None else poses.refined())
 
 
 @contextmanager

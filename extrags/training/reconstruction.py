@@ -11,11 +11,12 @@ from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
 from extrags.sequence import Sequence
 from extrags.training.optimise import TrainingResult, optimise
+from extrags.training.pose_refinement import PoseRefinement
 from extrags.training.schedule import Schedule
 from extrags.training.starting import median_depth, starting_gaussians
 from extrags.training.views import epochs, real_views
 
-__all__ = ["coarse_schedule", "reconstruct", "scene_extent"]
+__all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent"]
 
 
 def reconstruct(
@@ -36,6 +37,10 @@ def reconstruct(
     Raises:
         CaptureError: with fewer than one frame, or nothing to start from.
         DivergedError: when the optimisation does not stay finite.
+
+    Returns:
+        The scene; where poses were refined (`refines_poses`), `refined` holds those of `frames`, and the
+        scene belongs to them (`extrags.training.pose_refinement.with_refined_poses`).
 
     Source: 3DGS loss (paper equation 2) inside the mask, with inverse depth where it is known.
     """
@@ -58,7 +63,21 @@ def reconstruct(
     views = real_views(sequence, chosen)
     order = epochs(len(views), np.random.default_rng(config.seed))
     schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
-    return optimise(Scene(gaussians, light), lambda _: views[next(order)], schedule)
+    poses = None
+    if refines_poses(sequence, config):
+        settings = config.pose_refinement
+        poses = PoseRefinement(sequence.cameras[chosen], settings, depth, config.iterations)
+    return optimise(Scene(gaussians, light), lambda _: views[next(order)], schedule, poses=poses)
+
+
+def refines_poses(sequence: Sequence, config: CoarseConfig) -> bool:
+    """Whether `reconstruct` corrects poses: as the settings say; for `auto`, those that COLMAP estimated.
+
+    Poses are refined once: those that came out of a reconstruction are left as they are.
+    """
+    if sequence.pose_source == "refined":
+        return False
+    return sequence.pose_source == "estimated" if config.refine_poses == "auto" else config.refine_poses
 
 
 def coarse_schedule(

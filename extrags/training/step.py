@@ -16,7 +16,7 @@ from torch import Tensor
 
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
-from extrags.raster import Rendering, SelectiveAdam, l1_ssim_loss, native_isa
+from extrags.raster import Rendering, SelectiveAdam, l1_ssim_loss, native_isa, rasterize
 from extrags.raster.direct import DirectStep, Target
 from extrags.raster.loss import inverse_depth_loss
 from extrags.scene import Scene
@@ -36,11 +36,13 @@ class Observation:
         loss: all terms.
         rendering: of the view, the gradients of its 2D means filled; good until the next step.
         visible: Gaussians in view, [N].
+        viewmat_gradient: where a pose was given, [4, 4]; good until the next step.
     """
 
     loss: float
     rendering: Rendering
     visible: Tensor
+    viewmat_gradient: np.ndarray | None = None
 
 
 @runtime_checkable
@@ -53,8 +55,17 @@ class TrainingStep(Protocol):
     def light(self) -> NearFieldLight | None:
         """The light as it is now, if the scene has one."""
 
-    def differentiate(self, view: View, iteration: int, density: DensityStrategy) -> Observation:
-        """Loss and gradients of a view; the parameters stay."""
+    def differentiate(
+        self, view: View, iteration: int, density: DensityStrategy, viewmat: np.ndarray | None = None
+    ) -> Observation:
+        """Loss and gradients of a view; the parameters stay.
+
+        Args:
+            view: what to match.
+            iteration: sets weights and degree.
+            density: says what it needs to know, and may add a penalty.
+            viewmat: camera from world instead of the view's own, [4, 4]; its gradient is asked for.
+        """
 
     def update(self, observation: Observation) -> None:
         """Move the parameters along the gradients of the last `differentiate`."""
@@ -82,18 +93,18 @@ class AutogradStep:
         self.adam = SelectiveAdam(_leaves(scene.gaussians), schedule.learning_rates(0))
         self.light, self._light_adam = _trainable_light(scene.light, schedule)
 
-    def differentiate(self, view: View, iteration: int, density: DensityStrategy) -> Observation:
+    def differentiate(
+        self, view: View, iteration: int, density: DensityStrategy, viewmat: np.ndarray | None = None
+    ) -> Observation:
         """See `TrainingStep.differentiate`."""
         schedule = self._schedule
         scene = Scene(Gaussians(**self.adam.parameters), self.light)
         exposure = None
         if scene.light is not None:
             exposure = scene.light.exposure(view.frame)[None]
-        rendering = scene.render(
-            view.camera,
-            exposure=exposure,
-            sh_degree=iteration // schedule.sh_every,
-            absgrad=density.needs_absgrad,
+        pose = None if viewmat is None else torch.from_numpy(viewmat.astype(np.float32)).requires_grad_()
+        rendering = _rendered(
+            scene, view, exposure, pose, iteration // schedule.sh_every, absgrad=density.needs_absgrad
         )
         loss = l1_ssim_loss(rendering.rgb[0], view.rgb, dssim_weight=schedule.dssim_weight, mask=view.weight)
         if view.depth_mm is not None and schedule.depth_weight > 0:
@@ -107,7 +118,8 @@ class AutogradStep:
         if penalty is not None:
             loss = loss + penalty
         loss.backward()
-        return Observation(float(loss.detach()), rendering, rendering.visible[0])
+        gradient = None if pose is None or pose.grad is None else pose.grad.numpy()
+        return Observation(float(loss.detach()), rendering, rendering.visible[0], gradient)
 
     def update(self, observation: Observation) -> None:
         """See `TrainingStep.update`."""
@@ -142,11 +154,15 @@ class NativeStep:
         """See `TrainingStep.light`."""
         return None if self._light is None else self._light.light
 
-    def differentiate(self, view: View, iteration: int, density: DensityStrategy) -> Observation:
+    def differentiate(
+        self, view: View, iteration: int, density: DensityStrategy, viewmat: np.ndarray | None = None
+    ) -> Observation:
         """See `TrainingStep.differentiate`."""
         schedule = self._schedule
         direct = self._bound_step(density)
         target = self._target(view)
+        if viewmat is not None:
+            target.viewmat[...] = viewmat
         loss = direct.run(
             target,
             sh_degree=min(iteration // schedule.sh_every, self._sh_degree),
@@ -155,6 +171,7 @@ class NativeStep:
             loss_weight=view.loss_weight,
             depth_weight=schedule.depth_weight_at(iteration),
             depth_scale=schedule.depth_scale,
+            pose=viewmat is not None,
         )
         if self._light is not None:
             loss += self._light.prior()
@@ -162,7 +179,8 @@ class NativeStep:
         if penalty is not None:
             self._add_penalty(penalty, direct.gradients)
             loss += float(penalty.detach())
-        return Observation(loss, direct.rendering(target), direct.visible)
+        gradient = None if viewmat is None else direct.viewmat_gradient
+        return Observation(loss, direct.rendering(target), direct.visible, gradient)
 
     def update(self, observation: Observation) -> None:
         """See `TrainingStep.update`."""
@@ -211,6 +229,38 @@ class NativeStep:
         # An identity may be given again once its view is gone.
         targets[key] = (weakref.ref(view, lambda _: targets.pop(key, None)), target)
         return target
+
+
+def _rendered(
+    scene: Scene,
+    view: View,
+    exposure: Tensor | None,
+    viewmat: Tensor | None,
+    sh_degree: int,
+    *,
+    absgrad: bool,
+) -> Rendering:
+    """The view; from another pose, that gradients reach, where one is given."""
+    if viewmat is None:
+        return scene.render(view.camera, exposure=exposure, sh_degree=sh_degree, absgrad=absgrad)
+    gaussians = scene.gaussians
+    light = None
+    if scene.light is not None:
+        light = scene.light.of_cameras(torch.ones(1) if exposure is None else exposure)
+    return rasterize(
+        gaussians.means,
+        gaussians.quats,
+        gaussians.scales.exp(),
+        gaussians.opacities.sigmoid(),
+        gaussians.sh,
+        viewmat[None],
+        torch.from_numpy(view.camera.K.astype(np.float32)),
+        view.camera.width,
+        view.camera.height,
+        sh_degree=min(sh_degree, gaussians.sh_degree),
+        light=light,
+        absgrad=absgrad,
+    )
 
 
 def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:

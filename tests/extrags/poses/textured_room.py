@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
@@ -36,6 +38,24 @@ def room_sequence(n_frames: int, *, width: int = 240, height: int = 180, holdout
         depth_mm=depth.astype(np.float32),
         frame_names=tuple(f"arc-{frame}" for frame in frames),
     )
+
+
+def turning_room(n_frames: int) -> Sequence:
+    """All from one place, held out none: good matches, no parallax."""
+    room = room_sequence(n_frames, width=200, height=150)
+    turn = np.linspace(-0.35, 0.35, n_frames)
+    center = np.array([1.0, -1.0, -6.0])
+    poses = np.stack(
+        [
+            look_at(
+                center, center + np.array([np.sin(a), 0.3 * np.sin(2 * a), np.cos(a)]), np.array([0, -1.0, 0])
+            )
+            for a in turn
+        ]
+    )
+    rgb, depth = render_room(Cameras(room.K, poses, room.width, room.height))
+    split = Split("all", np.arange(n_frames), np.arange(0))
+    return replace(room, rgb=rgb, depth_mm=depth.astype(np.float32), world_from_camera=poses, split=split)
 
 
 def render_room(cameras: Cameras) -> tuple[np.ndarray, np.ndarray]:

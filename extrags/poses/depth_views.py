@@ -1,0 +1,148 @@
+"""Frames with depth as the alignment reads them: points, normals and textures that no light changes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.ndimage import binary_erosion, gaussian_filter
+
+from extrags.sequence import Sequence
+
+__all__ = ["LEVELS", "DepthView", "depth_view"]
+
+LEVELS = (6.0, 3.0, 1.5, 0.7)
+"""Blur of the textures from coarse to fine, in pixels of the working size."""
+NEIGHBOURHOOD_PX = 12.0
+"""Textures are taken against the mean and spread of so wide a neighbourhood: the lamp rides on the scope,
+so brightness belongs to the view and not to the tissue."""
+LEAST_SPREAD = 0.02
+"""Spread of the logarithm below which there is only noise."""
+SATURATED = 250
+EDGE_SHARE = 0.05
+"""A step in depth larger than this share of it is an edge, where points mix two surfaces."""
+SAMPLES = 3000
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """One frame at the working size.
+
+    Args:
+        K: intrinsics of the working size, [3, 3].
+        points: in camera axes, in the unit of the depth, [h, w, 3]; meaningless where not `valid`.
+        normals: unit, towards the camera, [h, w, 3]; zero where unknown.
+        valid: depth is known, [h, w].
+        texture: per level two channels (luminance, redness) and their derivatives along x and y,
+            [levels, h, w, 2, 3]; zero where not `textured`.
+        textured: colours say something, [h, w].
+        samples: flat indices of pixels spread evenly over those with depth and normal, [s].
+        median_depth: of the valid pixels.
+    """
+
+    K: Float[np.ndarray, "3 3"]
+    points: Float[np.ndarray, "h w 3"]
+    normals: Float[np.ndarray, "h w 3"]
+    valid: Bool[np.ndarray, "h w"]
+    texture: Float[np.ndarray, "levels h w 2 3"]
+    textured: Bool[np.ndarray, "h w"]
+    samples: np.ndarray
+    median_depth: float
+
+
+def depth_view(sequence: Sequence, frame: int, max_width: int) -> DepthView | None:
+    """Prepare a frame; None where it has too little depth to be aligned.
+
+    The size is divided by a whole number: depth is picked, never mixed across a fold; colours are averaged.
+
+    Args:
+        sequence: with depth.
+        frame: which.
+        max_width: of the working size, in pixels.
+    """
+    if sequence.depth_mm is None:
+        return None
+    step = -(-sequence.width // max_width)
+    height, width = sequence.height // step, sequence.width // step
+    middle = step // 2
+    picked = np.s_[middle : height * step : step, middle : width * step : step]
+    K = sequence.K[frame].astype(np.float64, copy=True)
+    K[:2, 2] = (K[:2, 2] - middle - 0.5) / step + 0.5
+    K[0, 0] /= step
+    K[1, 1] /= step
+    depth = sequence.depth_mm[frame][picked].astype(np.float64)
+    valid = sequence.mask[frame][picked] & np.isfinite(depth) & (depth > 0)
+    depth = np.where(valid, depth, 0)
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+    points = depth[..., None] * rays
+    normals = _normals(points, depth, valid)
+    usable = np.flatnonzero(valid & (np.abs(normals).sum(-1) > 0))
+    if len(usable) < SAMPLES // 20:
+        return None
+    spread = np.unique(np.linspace(0, len(usable) - 1, min(SAMPLES, len(usable))).round().astype(np.int64))
+    blocks = sequence.rgb[frame][: height * step, : width * step]
+    colour = blocks.reshape(height, step, width, step, 3).mean(axis=(1, 3))
+    told = sequence.mask[frame] & (sequence.rgb[frame].max(-1) < SATURATED)
+    if sequence.specular is not None:
+        told &= ~sequence.specular[frame]
+    # A block with one bad pixel is bad: highlights move with the scope.
+    told = told[: height * step, : width * step].reshape(height, step, width, step).all(axis=(1, 3))
+    texture, textured = _textures(colour, told)
+    return DepthView(
+        K, points, normals, valid, texture, textured, usable[spread], float(np.median(depth[valid]))
+    )
+
+
+def _normals(points: np.ndarray, depth: np.ndarray, valid: np.ndarray) -> np.ndarray:
+    """From central differences; zero at edges of folds and of the mask."""
+    normals = np.zeros_like(points)
+    inner = np.s_[1:-1, 1:-1]
+    along_x = points[1:-1, 2:] - points[1:-1, :-2]
+    along_y = points[2:, 1:-1] - points[:-2, 1:-1]
+    whole = valid[inner] & valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1]
+    # A slanted wall changes fast but evenly: what tells an edge is the second difference.
+    for behind, ahead in (
+        (depth[1:-1, :-2], depth[1:-1, 2:]),
+        (depth[:-2, 1:-1], depth[2:, 1:-1]),
+    ):
+        whole &= np.abs(behind + ahead - 2 * depth[inner]) < EDGE_SHARE * depth[inner]
+    across = np.cross(along_y, along_x)
+    length = np.linalg.norm(across, axis=-1, keepdims=True)
+    facing = np.sign((across * -points[inner]).sum(-1, keepdims=True))
+    unit = facing * across / np.where(length > 0, length, 1)
+    normals[inner] = np.where(whole[..., None] & (length > 0), unit, 0)
+    return normals
+
+
+def _textures(
+    colour: UInt8[np.ndarray, "h w 3"] | np.ndarray, told: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    channels = np.log(colour.astype(np.float64) + 4)
+    luminance = channels.mean(-1)
+    redness = channels[..., 0] - channels[..., 1]
+    weight = told.astype(np.float64)
+    # Near the edge of the mask the neighbourhood is lopsided.
+    textured = binary_erosion(told, iterations=2)
+    levels = []
+    for sigma in LEVELS:
+        flat = np.stack([_against_neighbourhood(c, weight, sigma) for c in (luminance, redness)], axis=-1)
+        flat = np.where(told[..., None], flat, 0)
+        along_y, along_x = np.gradient(flat, axis=(0, 1))
+        levels.append(np.stack([flat, along_x, along_y], axis=-1))
+    return np.stack(levels), textured
+
+
+def _against_neighbourhood(channel: np.ndarray, weight: np.ndarray, sigma: float) -> np.ndarray:
+    """Blurred by sigma, minus the local mean, over the local spread; pixels without weight are left out."""
+
+    def smooth(values: np.ndarray, width: float) -> np.ndarray:
+        total = gaussian_filter(weight, width)
+        return np.asarray(gaussian_filter(values * weight, width) / np.maximum(total, 1e-6))
+
+    wide = max(NEIGHBOURHOOD_PX, 3 * sigma)
+    mean = smooth(channel, wide)
+    fine = smooth(channel, sigma) - mean
+    spread = np.sqrt(smooth(fine**2, wide))
+    return np.asarray(np.clip(fine / np.maximum(spread, LEAST_SPREAD), -3, 3))

@@ -1,0 +1,198 @@
+"""Small corrections of the training frames' poses, learned together with the Gaussians.
+
+A frame's rotation and centre are corrected apart: `R = exp(turn) R0`, `c = c0 + shift`, both in world axes.
+Corrections that move, turn or scale all frames together are no corrections at all, since the Gaussians would
+just follow; they are taken out after every step (the gauge). So the frame of the world stays where it was.
+Held-out frames are never looked at; `with_refined_poses` lets them go along with the training frames beside
+them, since they were registered in the same map and share its bends.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from extrags.cameras import Cameras, invert_poses
+from extrags.config import PoseRefinementConfig
+from extrags.errors import ShapeError
+from extrags.sequence import Sequence
+from extrags.training.starting import median_depth
+
+__all__ = ["PoseRefinement", "RefinedPoses", "with_refined_poses"]
+
+PRIOR_TURN_RAD = math.radians(1.0)
+PRIOR_SHIFT_SHARE = 0.01
+BETAS = (0.9, 0.99)
+"""A frame is drawn once in an epoch: its own Adam must not remember longer than that lasts."""
+EPSILON = 1e-15
+NEIGHBOURHOOD = 0.3
+"""Training frames within about this many median depths, or radians, of a held-out frame take it along."""
+
+
+@dataclass(frozen=True)
+class RefinedPoses:
+    """Poses after refinement.
+
+    Args:
+        world_from_camera: of the frames trained on, [M, 4, 4].
+        mean_shift: mean length of the corrections of the centres, in world units.
+        mean_turn_deg: mean angle of the corrections of the rotations.
+    """
+
+    world_from_camera: Float[np.ndarray, "m 4 4"]
+    mean_shift: float
+    mean_turn_deg: float
+
+
+class PoseRefinement:
+    """Holds the corrections of all training frames and moves one of them along its gradient.
+
+    Args:
+        cameras: training frames as they were given, in the order of `View.frame`.
+        config: rates and prior.
+        depth: median depth of the scene: the length a turn of one radian is compared with.
+        iterations: of the whole optimisation.
+    """
+
+    def __init__(self, cameras: Cameras, config: PoseRefinementConfig, depth: float, iterations: int) -> None:
+        self._config, self._depth, self._iterations = config, depth, iterations
+        self._start = int(config.start_share * iterations)
+        self._given = cameras.world_from_camera.astype(np.float64)
+        count = len(cameras)
+        # Turns in radians and shifts in depths: one rate serves both.
+        self._x = np.zeros((count, 6))
+        self._mean, self._square = np.zeros((count, 6)), np.zeros((count, 6))
+        self._steps = np.zeros(count, dtype=np.int64)
+        self._gauge = _gauge(cameras.centers / depth)
+
+    def active(self, iteration: int) -> bool:
+        """Whether poses move at an iteration; before, the Gaussians settle on the given ones."""
+        return iteration >= self._start
+
+    def viewmat(self, frame: int) -> Float[np.ndarray, "4 4"]:
+        """Camera from world of a training frame as it stands now, float64."""
+        return np.asarray(invert_poses(self._corrected(np.array([frame])))[0])
+
+    def step(self, frame: int, viewmat_gradient: Float[np.ndarray, "4 4"], iteration: int) -> None:
+        """Move the pose of the frame just drawn.
+
+        Args:
+            frame: position among the training frames.
+            viewmat_gradient: of the loss with respect to what `viewmat` gave.
+            iteration: sets the learning rate.
+        """
+        config = self._config
+        scale = np.repeat([PRIOR_TURN_RAD, PRIOR_SHIFT_SHARE], 3)
+        gradient = self.gradient(frame, viewmat_gradient)
+        gradient += 2 * config.prior * self._x[frame] / scale**2 / 6
+        self._steps[frame] += 1
+        first, second = BETAS
+        self._mean[frame] += (1 - first) * (gradient - self._mean[frame])
+        # One size of step for the three turns, and one for the shifts: their directions are arbitrary.
+        size = np.repeat((gradient**2).reshape(2, 3).mean(1), 3)
+        self._square[frame] += (1 - second) * (size - self._square[frame])
+        done = int(self._steps[frame])
+        mean = self._mean[frame] / (1 - first**done)
+        square = self._square[frame] / (1 - second**done)
+        self._x[frame] -= self._rate(iteration) * mean / (np.sqrt(square) + EPSILON)
+        self._x -= (self._gauge @ (self._gauge.T @ self._x.reshape(-1))).reshape(-1, 6)
+
+    def gradient(self, frame: int, viewmat_gradient: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
+        """From the view matrix to turn (radians) and shift (depths) of a frame."""
+        given = np.asarray(viewmat_gradient, dtype=np.float64)
+        pose = self._corrected(np.array([frame]))[0]
+        rotation, centre = pose[:3, :3], pose[:3, 3]
+        # With V = [R^T | -R^T c] and R -> exp(w) R, c -> c + t at w = t = 0.
+        turned = rotation @ given[:3, :3]
+        pushed = rotation @ given[:3, 3]
+        vee = np.array(
+            [turned[2, 1] - turned[1, 2], turned[0, 2] - turned[2, 0], turned[1, 0] - turned[0, 1]]
+        )
+        turn = np.cross(centre, pushed) - vee
+        # exp(x + dx) = exp(J dx) exp(x).
+        turn = _left_jacobian(self._x[frame, :3]).T @ turn
+        return np.concatenate([turn, -pushed * self._depth])
+
+    def refined(self) -> RefinedPoses:
+        """All poses as they stand now."""
+        return RefinedPoses(
+            world_from_camera=self._corrected(np.arange(len(self._x))),
+            mean_shift=float(np.linalg.norm(self._x[:, 3:], axis=1).mean() * self._depth),
+            mean_turn_deg=float(np.degrees(np.linalg.norm(self._x[:, :3], axis=1)).mean()),
+        )
+
+    def _corrected(self, frames: np.ndarray) -> np.ndarray:
+        poses = self._given[frames].copy()
+        x = self._x[frames]
+        poses[:, :3, :3] = Rotation.from_rotvec(x[:, :3]).as_matrix() @ poses[:, :3, :3]
+        poses[:, :3, 3] += x[:, 3:] * self._depth
+        return np.asarray(poses)
+
+    def _rate(self, iteration: int) -> float:
+        share = (iteration - self._start) / max(1, self._iterations - self._start)
+        first, last = self._config.learning_rate, self._config.learning_rate_final
+        return math.exp((1 - share) * math.log(first) + share * math.log(last))
+
+
+def with_refined_poses(sequence: Sequence, refined: Float[np.ndarray, "m 4 4"]) -> Sequence:
+    """The sequence with refined poses of its training frames; held-out frames go along with their neighbours.
+
+    The correction of a held-out frame is the mean of the training frames' corrections, weighted by how near
+    they stand and how alike they look. Its image has no part in that.
+
+    Args:
+        sequence: whose training frames, in order, were refined.
+        refined: their new poses.
+
+    Raises:
+        ShapeError: when there are not as many poses as training frames.
+    """
+    train, given = sequence.train, sequence.cameras.world_from_camera
+    if len(refined) != len(train):
+        raise ShapeError(f"{sequence.name}: {len(refined)} refined poses for {len(train)} training frames")
+    poses = given.copy()
+    poses[train] = refined
+    before = given[train]
+    turns = Rotation.from_matrix(refined[:, :3, :3] @ np.swapaxes(before[:, :3, :3], 1, 2)).as_rotvec()
+    shifts = refined[:, :3, 3] - before[:, :3, 3]
+    unit = median_depth(sequence, train)
+    for frame in sequence.test:
+        apart = np.linalg.norm(before[:, :3, 3] - given[frame, :3, 3], axis=1) / unit
+        angle = np.arccos(np.clip(before[:, :3, 2] @ given[frame, :3, 2], -1, 1))
+        distance = apart**2 + angle**2
+        weight = np.exp(-(distance - distance.min()) / (2 * NEIGHBOURHOOD**2))
+        weight /= weight.sum()
+        poses[frame, :3, :3] = Rotation.from_rotvec(weight @ turns).as_matrix() @ given[frame, :3, :3]
+        poses[frame, :3, 3] += weight @ shifts
+    return sequence.with_poses(poses, "refined")
+
+
+def _gauge(centres: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of the corrections that only move, turn or scale the whole, [6 m, 7 or fewer]."""
+    count = len(centres)
+    arm = centres - centres.mean(axis=0)
+    basis = np.zeros((count, 6, 7))
+    for axis in range(3):
+        unit = np.eye(3)[axis]
+        basis[:, 3:, axis] = unit
+        basis[:, :3, 3 + axis] = unit
+        basis[:, 3:, 3 + axis] = np.cross(unit, arm)
+    basis[:, 3:, 6] = arm
+    u, singular, _ = np.linalg.svd(basis.reshape(6 * count, 7), full_matrices=False)
+    return np.asarray(u[:, singular > 1e-9 * singular[0]])
+
+
+def _left_jacobian(turn: np.ndarray) -> np.ndarray:
+    """Of the exponential map of rotations."""
+    angle = float(np.linalg.norm(turn))
+    x, y, z = turn
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    if angle < 1e-6:
+        return np.asarray(np.eye(3) + cross / 2)
+    first = (1 - math.cos(angle)) / angle**2
+    second = (angle - math.sin(angle)) / angle**3
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))

@@ -1,0 +1,194 @@
+"""Poses from colour and depth, against the exact ones."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from extrags.config import PosesConfig
+from extrags.errors import CaptureError
+from extrags.events import Event, Progress, subscribed
+from extrags.poses import RgbdAlignment, align_by_depth, errors_against_given
+from extrags.poses.alignment import Posed, agreement, align, pair_equations
+from extrags.poses.depth_views import depth_view
+from extrags.poses.landmarks import Landmarks, landmarks, match_landmarks, relative_pose
+from extrags.sequence import Sequence, Split
+from tests.extrags.poses.textured_room import HALF_SIZE_MM, room_sequence
+
+CONFIG = PosesConfig(rgbd_width=100)
+
+
+@pytest.fixture(scope="module")
+def sequence() -> Sequence:
+    """Seven training frames with noisy depth, two held out, of which the last shows nothing but noise."""
+    room = room_sequence(9, width=200, height=150)
+    assert room.depth_mm is not None
+    rng = np.random.default_rng(0)
+    depth = (room.depth_mm * rng.normal(1, 0.005, room.depth_mm.shape)).astype(np.float32)
+    rgb = room.rgb.copy()
+    rgb[8] = rng.integers(0, 255, rgb.shape[1:])
+    depth[8] = rng.uniform(5, 30, depth.shape[1:])
+    # The lamp rides on the scope: each frame has a brightness of its own.
+    gain = np.linspace(0.7, 1.1, 9)[:, None, None, None]
+    rgb = np.clip(rgb * gain, 0, 249).astype(np.uint8)
+    split = Split("seven", np.array([0, 1, 2, 4, 5, 6, 7]), np.array([3, 8]))
+    return replace(room, rgb=rgb, depth_mm=depth, split=split)
+
+
+@pytest.fixture(scope="module")
+def found(sequence: Sequence) -> tuple[RgbdAlignment, list[Event]]:
+    events: list[Event] = []
+    with subscribed(events.append):
+        alignment = align_by_depth(sequence, CONFIG)
+    return alignment, events
+
+
+def test_poses_are_metric_and_right(sequence: Sequence, found: tuple[RgbdAlignment, list[Event]]) -> None:
+    poses = found[0].world_from_camera
+    assert np.flatnonzero(np.isfinite(poses).all((1, 2))).tolist() == list(range(8))
+    np.testing.assert_array_equal(poses[0], np.eye(4))
+    errors = errors_against_given(sequence, poses, metric=True)
+    # The path is 12 mm wide, pixels at the wall are 0.3 mm wide.
+    assert errors["train"]["ate_rmse"] < 0.1
+    assert errors["test"]["ate_rmse"] < 0.1
+    assert errors["train"]["rotation_mean_deg"] < 1.0
+    assert errors["train"]["rpe_translation_rmse"] < 0.1
+
+
+def test_points_lie_on_the_walls(sequence: Sequence, found: tuple[RgbdAlignment, list[Event]]) -> None:
+    assert sequence.world_from_camera is not None
+    first = sequence.world_from_camera[0]
+    points = found[0].points @ first[:3, :3].T + first[:3, 3]
+    off_wall = np.abs(np.abs(points) - HALF_SIZE_MM).min(1)
+    assert len(points) > 2000
+    assert float(np.median(off_wall)) < 0.2
+    assert found[0].points_rgb.std() > 5
+
+
+def test_progress_and_account(sequence: Sequence, found: tuple[RgbdAlignment, list[Event]]) -> None:
+    alignment, events = found
+    steps = [event for event in events if isinstance(event, Progress)]
+    assert [step.done for step in steps] == sorted(step.done for step in steps)
+    assert steps[-1].done == steps[-1].total
+    assert steps[-1].values["registered"] == 8
+    assert alignment.account["frames"]["arc-3"]["placed"]
+    assert not alignment.account["frames"].get("arc-8", {"placed": False})["placed"]
+    assert 0 < alignment.account["surface_residual_mm"] < 0.3
+    json.dumps(alignment.account, allow_nan=False)
+
+
+def test_same_bits_and_nothing_of_held_out_frames_in_the_model(
+    sequence: Sequence, found: tuple[RgbdAlignment, list[Event]]
+) -> None:
+    rgb = sequence.rgb.copy()
+    rgb[3] = 0
+    alone = replace(sequence, rgb=rgb, split=replace(sequence.split, test=np.array([3])))
+    again = align_by_depth(alone, CONFIG)
+    train = sequence.train
+    np.testing.assert_array_equal(again.world_from_camera[train], found[0].world_from_camera[train])
+    np.testing.assert_array_equal(again.points, found[0].points)
+
+
+def test_without_texture_the_shape_may_do(sequence: Sequence) -> None:
+    """A room seen into its corners is known by its walls alone."""
+    room = room_sequence(5, width=200, height=150, holdout_every=9)
+    found = align_by_depth(replace(room, rgb=np.full_like(room.rgb, 128)), CONFIG)
+    errors = errors_against_given(room, found.world_from_camera, metric=True)
+    assert errors["train"]["frames"] == 5
+    assert errors["train"]["ate_rmse"] < 0.2
+
+
+def test_depth_is_needed(sequence: Sequence) -> None:
+    with pytest.raises(CaptureError, match="needs depth, and there is none"):
+        align_by_depth(replace(sequence, depth_mm=None), CONFIG)
+    assert sequence.depth_mm is not None
+    empty = np.zeros_like(sequence.depth_mm)
+    with pytest.raises(CaptureError, match="none of 7 training frames has enough depth"):
+        align_by_depth(replace(sequence, depth_mm=empty), CONFIG)
+
+
+def test_a_frame_without_depth_is_named(sequence: Sequence) -> None:
+    assert sequence.depth_mm is not None
+    depth = sequence.depth_mm.copy()
+    depth[4] = 0
+    part = replace(
+        sequence, depth_mm=depth, split=Split("part", np.array([0, 1, 2, 4, 5]), np.array([], dtype=np.int64))
+    )
+    found = align_by_depth(part, CONFIG)
+    assert found.account["without_depth"] == ["arc-4"]
+    assert np.isfinite(found.world_from_camera).all((1, 2))[[0, 1, 2, 4, 5]].tolist() == [
+        True, True, True, False, True,
+    ]  # fmt: skip
+
+
+class TestAlign:
+    def test_from_a_rough_guess(self, sequence: Sequence) -> None:
+        assert sequence.world_from_camera is not None
+        truth = sequence.world_from_camera
+        first, second = (depth_view(sequence, frame, 100) for frame in (0, 2))
+        assert first is not None
+        assert second is not None
+        start = truth[2].copy()
+        start[:3, 3] += [0.8, -0.6, 0.5]
+        pose = align(second, start, [Posed(first, truth[0])])
+        assert np.linalg.norm(pose[:3, 3] - truth[2][:3, 3]) < 0.15
+        right = agreement(Posed(second, truth[2]), [Posed(first, truth[0])])
+        wrong = agreement(Posed(second, start), [Posed(first, truth[0])])
+        assert right.surface > 0.9
+        assert right.texture > 0.5
+        assert right.score > wrong.score + 0.3
+
+    def test_nothing_in_common_changes_nothing(self, sequence: Sequence) -> None:
+        assert sequence.world_from_camera is not None
+        view = depth_view(sequence, 0, 100)
+        assert view is not None
+        away = sequence.world_from_camera[0].copy()
+        away[:3, 3] += 500.0
+        reference = Posed(view, sequence.world_from_camera[0])
+        np.testing.assert_array_equal(align(view, away, [reference]), away)
+        assert pair_equations(Posed(view, away), reference, 0, away[:3, 3]).count == 0
+        assert agreement(Posed(view, away), [reference]).score == 0.0
+
+    def test_size_and_normals(self, sequence: Sequence) -> None:
+        view = depth_view(sequence, 0, 70)
+        assert view is not None
+        # 200 / 3: sizes are divided by whole numbers.
+        assert view.valid.shape == (50, 66)
+        assert sequence.depth_mm is not None
+        assert view.points[20, 30, 2] == sequence.depth_mm[0, 61, 91]
+        u = view.K[0, 0] * view.points[20, 30, 0] / view.points[20, 30, 2] + view.K[0, 2]
+        assert u == pytest.approx(30.5)
+        known = np.abs(view.normals).sum(-1) > 0
+        assert (view.normals * view.points).sum(-1)[known].max() < 0
+
+
+class TestLandmarks:
+    def test_relative_pose(self, sequence: Sequence) -> None:
+        assert sequence.world_from_camera is not None
+        truth = np.linalg.inv(sequence.world_from_camera[0]) @ sequence.world_from_camera[2]
+        between, support = relative_pose(landmarks(sequence, 2), landmarks(sequence, 0), seed=0)
+        assert between is not None
+        assert support > 30
+        assert np.linalg.norm(between[:3, 3] - truth[:3, 3]) < 0.3
+
+    def test_a_third_of_wrong_matches(self) -> None:
+        rng = np.random.default_rng(1)
+        points = rng.uniform((-5, -5, 10), (5, 5, 20), (60, 3))
+        names = np.eye(128, dtype=np.float32)[rng.permutation(128)[:60]]
+        shift = np.array([2.0, -1.0, 0.5])
+        wrong = rng.permutation(60)[:20]
+        there = points + shift
+        there[wrong] = rng.uniform((-5, -5, 10), (5, 5, 20), (20, 3))
+        between, support = relative_pose(Landmarks(points, names), Landmarks(there, names), seed=0)
+        assert between is not None
+        np.testing.assert_allclose(between[:3, 3], shift, atol=0.05)
+        assert 38 <= support <= 45
+
+    def test_no_landmarks(self, sequence: Sequence) -> None:
+        none = landmarks(replace(sequence, rgb=np.full_like(sequence.rgb, 90)), 0)
+        assert len(none.points) == 0
+        assert len(match_landmarks(none, none)) == 0
+        assert relative_pose(none, landmarks(sequence, 0), seed=0) == (None, 0)

@@ -1,0 +1,247 @@
+"""Corrections of poses: gradients, gauge, and poses that were knocked out of place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from extrags.config import CoarseConfig, DensifyConfig, PoseRefinementConfig
+from extrags.errors import ShapeError
+from extrags.metrics.pose import absolute_trajectory_error
+from extrags.scene import Scene
+from extrags.sequence import Sequence
+from extrags.training import TrainingResult, reconstruct
+from extrags.training.density import DensityStrategy
+from extrags.training.pose_refinement import PoseRefinement, _gauge, with_refined_poses
+from extrags.training.reconstruction import coarse_schedule, refines_poses
+from extrags.training.step import AutogradStep, NativeStep, TrainingStep
+from extrags.training.strategies import density_strategy
+from extrags.training.views import View, real_views
+from tests.extrags.poses.textured_room import room_sequence
+from tests.extrags.training.conftest import tube_cameras, tube_gaussians, tube_light
+
+DEPTH_MM = 20.0
+QUIET = DensifyConfig(enabled=False)
+CONFIG = CoarseConfig(iterations=10)
+
+
+def knocked(poses: np.ndarray, seed: int, *, shift_mm: float, turn_deg: float) -> np.ndarray:
+    """Each pose shifted and turned by about so much, in directions of its own, the whole staying in place."""
+    off = np.random.default_rng(seed).normal(size=(len(poses), 6)) / np.sqrt(3)
+    off *= np.repeat([np.radians(turn_deg), shift_mm / DEPTH_MM], 3)
+    if len(poses) > 1:
+        whole = _gauge(poses[:, :3, 3] / DEPTH_MM)
+        off -= (whole @ (whole.T @ off.reshape(-1))).reshape(-1, 6)
+    result = poses.copy()
+    result[:, :3, :3] = Rotation.from_rotvec(off[:, :3]).as_matrix() @ poses[:, :3, :3]
+    result[:, :3, 3] += DEPTH_MM * off[:, 3:]
+    return result
+
+
+def refinement(n: int = 6, **settings: float) -> PoseRefinement:
+    return PoseRefinement(
+        tube_cameras(n), PoseRefinementConfig(start_share=0.0, **settings), DEPTH_MM, iterations=100
+    )
+
+
+def density() -> DensityStrategy:
+    return density_strategy(QUIET, 20.0, 10, 900, seed=0)
+
+
+def loss_from(step: TrainingStep, view: View, pose: np.ndarray) -> tuple[float, np.ndarray]:
+    observation = step.differentiate(view, 0, density(), np.linalg.inv(pose))
+    assert observation.viewmat_gradient is not None
+    return observation.loss, observation.viewmat_gradient.copy()
+
+
+@pytest.fixture
+def step_and_view(tube_sequence: Sequence) -> tuple[Scene, View]:
+    """The true scene, seen in training frame 1."""
+    light = tube_light()
+    scene = Scene(tube_gaussians(), replace(light, log_exposure=torch.zeros(4)))
+    return scene, real_views(tube_sequence, tube_sequence.train)[1]
+
+
+@pytest.mark.parametrize("kind", [AutogradStep, NativeStep])
+def test_gradient_of_turn_and_shift_against_differences(
+    step_and_view: tuple[Scene, View], tube_sequence: Sequence, kind: type[AutogradStep | NativeStep]
+) -> None:
+    scene, view = step_and_view
+    step = kind(scene, coarse_schedule(CONFIG, 20.0, DEPTH_MM, "coarse"))
+    cameras = tube_sequence.cameras[tube_sequence.train]
+    poses = PoseRefinement(cameras, PoseRefinementConfig(), DEPTH_MM, 100)
+    # Away from zero, where the order of turns matters.
+    start = np.array([0.02, -0.03, 0.01, 0.01, 0.02, -0.015])
+    poses._x[1] = start
+    _, gradient = loss_from(step, view, np.linalg.inv(poses.viewmat(1)))
+    analytic = poses.gradient(1, gradient)
+    numeric = np.zeros(6)
+    for axis in range(6):
+        sides = []
+        for sign in (1, -1):
+            poses._x[1] = start + sign * 2e-3 * np.eye(6)[axis]
+            sides.append(loss_from(step, view, np.linalg.inv(poses.viewmat(1)))[0])
+        numeric[axis] = (sides[0] - sides[1]) / 4e-3
+    # The image is made of edges: differences over a finite step are rough.
+    np.testing.assert_allclose(analytic, numeric, atol=0.12 * np.abs(numeric).max())
+    assert np.corrcoef(analytic, numeric)[0, 1] > 0.98
+
+
+def test_both_steps_give_the_same_gradient(step_and_view: tuple[Scene, View]) -> None:
+    scene, view = step_and_view
+    schedule = coarse_schedule(CONFIG, 20.0, DEPTH_MM, "coarse")
+    pose = knocked(view.camera.world_from_camera, 0, shift_mm=0.3, turn_deg=0.5)[0]
+    found = [loss_from(kind(scene, schedule), view, pose)[1] for kind in (AutogradStep, NativeStep)]
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-3, atol=1e-4 * np.abs(found[0]).max())
+
+
+def shift_gradient(poses: PoseRefinement, frame: int, push: float) -> np.ndarray:
+    """Of a loss that grows with the world x of a camera's centre, whatever its axes, and with no turn."""
+    camera_from_world = poses.viewmat(frame)
+    centre = np.linalg.inv(camera_from_world)[:3, 3]
+    pushed = np.array([-push, 0.0, 0.0])
+    x, y, z = np.cross(centre, pushed) / 2
+    gradient = np.zeros((4, 4))
+    gradient[:3, :3] = camera_from_world[:3, :3] @ np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    gradient[:3, 3] = camera_from_world[:3, :3] @ pushed
+    return gradient
+
+
+def test_a_shift_is_no_turn() -> None:
+    poses = refinement()
+    np.testing.assert_allclose(
+        poses.gradient(2, shift_gradient(poses, 2, 0.5)), [0, 0, 0, 0.5 * DEPTH_MM, 0, 0], atol=1e-12
+    )
+
+
+def test_the_path_as_a_whole_stays() -> None:
+    """A gradient that pushes every frame alike moves none."""
+    poses = refinement(prior=0.0)
+    for _ in range(30):
+        for frame in range(6):
+            poses.step(frame, shift_gradient(poses, frame, 1.0), 0)
+    alike = poses.refined()
+    free = refinement(prior=0.0)
+    for _ in range(30):
+        for frame in range(6):
+            free.step(frame, shift_gradient(free, frame, 1.0 if frame % 2 else -1.0), 0)
+    assert free.refined().mean_shift > 0.2
+    assert alike.mean_shift < 0.1 * free.refined().mean_shift
+    # No shift, turn or scale of the whole is left in either.
+    shifts = free.refined().world_from_camera[:, :3, 3] - tube_cameras().centers
+    np.testing.assert_allclose(shifts.mean(0), 0, atol=1e-9)
+    arm = tube_cameras().centers - tube_cameras().centers.mean(0)
+    assert abs(float((shifts * arm).sum())) < 1e-9
+
+
+def test_the_prior_draws_back() -> None:
+    poses = refinement(prior=1.0, learning_rate=4e-3)
+    poses._x[:, 3] = np.array([0.05, -0.05, 0.05, -0.05, 0.05, -0.05])
+    before = poses.refined().mean_shift
+    for iteration in range(60):
+        poses.step(iteration % 6, np.zeros((4, 4)), iteration)
+    assert poses.refined().mean_shift < 0.8 * before
+
+
+@pytest.fixture(scope="module")
+def exact() -> Sequence:
+    return room_sequence(8, width=100, height=76)
+
+
+@pytest.fixture(scope="module")
+def knocked_room(exact: Sequence) -> Sequence:
+    """Training frames 0.6 mm and 1 degree off; the held-out ones are exact."""
+    assert exact.world_from_camera is not None
+    poses = exact.world_from_camera.copy()
+    poses[exact.train] = knocked(poses[exact.train], 1, shift_mm=0.6, turn_deg=1.0)
+    return replace(exact, world_from_camera=poses, pose_source="estimated")
+
+
+def reconstruction(sequence: Sequence, *, refine: bool) -> TrainingResult:
+    settings = PoseRefinementConfig(learning_rate=2e-3, prior=0.0)
+    return reconstruct(
+        sequence,
+        CoarseConfig(
+            iterations=700, max_points=1500, densify=QUIET, refine_poses=refine, pose_refinement=settings
+        ),
+    )
+
+
+@pytest.fixture(scope="module")
+def refined(knocked_room: Sequence) -> TrainingResult:
+    return reconstruction(knocked_room, refine=True)
+
+
+def test_knocked_poses_come_back(exact: Sequence, knocked_room: Sequence, refined: TrainingResult) -> None:
+    assert exact.world_from_camera is not None
+    assert knocked_room.world_from_camera is not None
+    assert refined.refined is not None
+    train = exact.train
+    truth = exact.world_from_camera[train]
+    # Without any alignment: the whole was not moved, and must not have been.
+    before = absolute_trajectory_error(knocked_room.world_from_camera[train], truth, "none")
+    after = absolute_trajectory_error(refined.refined.world_from_camera, truth, "none")
+    assert after.rmse < 0.5 * before.rmse
+    assert after.rotation_mean_deg < 0.5 * before.rotation_mean_deg
+    assert 0.2 < refined.refined.mean_shift < 0.8
+
+
+def test_held_out_views_gain(exact: Sequence, knocked_room: Sequence, refined: TrainingResult) -> None:
+    plain = reconstruction(knocked_room, refine=False)
+    assert plain.refined is None
+
+    def psnr(result: TrainingResult) -> float:
+        with torch.no_grad():
+            rgb = result.scene.render(exact.cameras[exact.test]).rgb
+        target = torch.from_numpy(exact.rgb[exact.test].astype(np.float32) / 255)
+        return float(-10 * (rgb - target).square().mean().log10())
+
+    assert psnr(refined) > psnr(plain) + 0.3
+    assert refined.history[-1]["psnr"] > plain.history[-1]["psnr"] + 0.5
+
+
+def test_same_input_same_bits(knocked_room: Sequence) -> None:
+    config = CoarseConfig(iterations=40, max_points=300, refine_poses=True)
+    first, second = (reconstruct(knocked_room, config).refined for _ in range(2))
+    assert first is not None
+    assert second is not None
+    np.testing.assert_array_equal(first.world_from_camera, second.world_from_camera)
+    assert first.mean_turn_deg > 0
+
+
+def test_which_poses_are_refined(tube_sequence: Sequence) -> None:
+    estimated = replace(tube_sequence, pose_source="estimated")
+    done = replace(tube_sequence, pose_source="refined")
+    on, off = CoarseConfig(refine_poses=True), CoarseConfig(refine_poses=False)
+    auto = CoarseConfig(refine_poses="auto")
+    assert not refines_poses(tube_sequence, auto)
+    assert refines_poses(estimated, auto)
+    assert not refines_poses(replace(tube_sequence, pose_source="aligned"), auto)
+    assert not refines_poses(estimated, CoarseConfig())
+    assert refines_poses(tube_sequence, on)
+    assert not refines_poses(estimated, off)
+    assert not refines_poses(done, on)
+
+
+def test_held_out_frames_go_along(exact: Sequence) -> None:
+    """A bend of the path: what stands beside a training frame moves as it does."""
+    assert exact.world_from_camera is not None
+    train, poses = exact.train, exact.world_from_camera
+    bend = np.linspace(0, 1, len(exact))[:, None] ** 2 * np.array([0.0, 0.4, 0.0])
+    refined = poses[train].copy()
+    refined[:, :3, 3] += bend[train]
+    bent = with_refined_poses(exact, refined)
+    assert bent.pose_source == "refined"
+    assert bent.world_from_camera is not None
+    np.testing.assert_array_equal(bent.world_from_camera[train], refined)
+    moved = (bent.world_from_camera - poses)[exact.test, :3, 3]
+    # Between training frames, and beyond the last of them.
+    np.testing.assert_allclose(moved[0], bend[exact.test[0]], atol=0.04)
+    assert bend[exact.train].max() > moved[1, 1] > 0.15
+    np.testing.assert_allclose(bent.world_from_camera[:, :3, :3], poses[:, :3, :3], atol=1e-12)
+    with pytest.raises(ShapeError, match="3 refined poses for 6 training frames"):
+        with_refined_poses(exact, refined[:3])

@@ -1,0 +1,99 @@
+"""The poses stage, and what the coarse stage does with poses that were estimated."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from extrags.config import CoarseConfig, PosesConfig
+from extrags.sequence import Sequence
+from extrags.store import Ref, Slot, Store
+from tasks.coarse import coarse, refined_frames
+from tasks.ingest import training_frames
+from tasks.poses import poses
+from tasks.stage import stage
+from tests.extrags.poses.textured_room import room_sequence
+
+
+@stage("poses-test-source", version=1)
+def room(slot: Slot) -> None:
+    """A sequence with exact poses; its depth is known, so no COLMAP is needed."""
+    room_sequence(7, width=120, height=90, holdout_every=4).save(slot.path / "sequence")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> str:
+    return str(tmp_path_factory.mktemp("store"))
+
+
+@pytest.fixture(scope="module")
+def posed(store: str) -> Ref:
+    return poses.fn(store=store, sequence=room.fn(store=store), config=PosesConfig(fallback="rgbd"))
+
+
+@pytest.fixture(scope="module")
+def training(store: str, posed: Ref) -> Ref:
+    return training_frames.fn(store=store, sequence=posed)
+
+
+def read(store: str, ref: Ref) -> Sequence:
+    return Sequence.load(Store(store).open(ref) / "sequence")
+
+
+def test_the_method_stands_in_counts_and_account(store: str, posed: Ref) -> None:
+    counts = Store(store).manifest(posed).counts
+    assert counts["method"] == "rgbd"
+    assert counts["summary"] == "by colour and depth: 6 of 6 training frames, 1 of 1 held-out frames"
+    assert counts["dropped"] == 0
+    account = json.loads((Store(store).open(posed) / "poses.json").read_bytes())
+    assert account["against_given"]["train"]["ate_rmse"] < 0.1
+    assert account["against_given"]["test"]["frames"] == 1
+    sequence = read(store, posed)
+    assert sequence.pose_source == "aligned"
+    assert sequence.world_from_camera is not None
+    np.testing.assert_array_equal(sequence.world_from_camera[0], np.eye(4))
+
+
+def test_refined_poses_are_kept_and_held_out_frames_go_along(store: str, posed: Ref, training: Ref) -> None:
+    config = CoarseConfig(iterations=40, max_points=300, refine_poses=True)
+    done = coarse.fn(store=store, sequence=training, config=config)
+    counts = Store(store).manifest(done).counts
+    assert counts["refined_poses"] == 1
+    assert isinstance(counts["refined_mean_shift"], float)
+    assert counts["refined_mean_shift"] > 0
+    whole = refined_frames.fn(store=store, sequence=posed, coarse=done)
+    assert Store(store).manifest(whole).counts["test"] == 1
+    before = read(store, training)
+    after = read(store, training_frames.fn(store=store, sequence=whole))
+    assert after.pose_source == "refined"
+    assert before.world_from_camera is not None
+    assert after.world_from_camera is not None
+    shift = np.linalg.norm((after.world_from_camera - before.world_from_camera)[:, :3, 3], axis=1)
+    assert shift.mean() == pytest.approx(counts["refined_mean_shift"])
+    np.testing.assert_array_equal(after.rgb, before.rgb)
+    held_out, kept = read(store, whole), read(store, posed)
+    assert held_out.world_from_camera is not None
+    assert kept.world_from_camera is not None
+    moved = np.linalg.norm((held_out.world_from_camera - kept.world_from_camera)[kept.test, :3, 3], axis=1)
+    assert 0 < moved.max() < shift.max()
+
+
+def test_given_poses_are_left_alone(store: str) -> None:
+    trusted = training_frames.fn(store=store, sequence=room.fn(store=store))
+    done = coarse.fn(store=store, sequence=trusted, config=CoarseConfig(iterations=5, max_points=300))
+    assert Store(store).manifest(done).counts["refined_poses"] == 0
+    assert not (Store(store).open(done) / "sequence").exists()
+
+
+def test_where_poses_come_from_is_kept_on_disk(tmp_path: Path) -> None:
+    sequence = room_sequence(4, width=40, height=30)
+    sequence.save(tmp_path / "given")
+    assert Sequence.load(tmp_path / "given").pose_source == "given"
+    assert "pose_source" not in (tmp_path / "given" / "zarr.json").read_text()
+    replace(sequence, pose_source="refined").save(tmp_path / "refined")
+    assert Sequence.load(tmp_path / "refined").pose_source == "refined"
+    assert Sequence.load(tmp_path / "refined").training_part().pose_source == "refined"
