@@ -46,6 +46,10 @@ THREE_DGS_SHARED = frozenset(
         "densify.grow_scale2d",  # of a rule that is switched off
         "densify.prune_scale2d",
         "densify.noise",  # of the other strategy
+        "pose_refinement.learning_rate",  # switched off
+        "pose_refinement.learning_rate_final",
+        "pose_refinement.prior",
+        "pose_refinement.start_share",
         "densify.opacity_penalty",
         "densify.scale_penalty",
     }
@@ -94,6 +98,7 @@ def three_dgs(config: PipelineConfig) -> dict[str, Any]:
         "coarse.densify.prune_opacity": 0.005,
         "coarse.densify.split_scale_share": 0.01,
         "coarse.light.enabled": False,
+        "coarse.refine_poses": False,
     }
 
 
