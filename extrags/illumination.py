@@ -18,7 +18,14 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrags.config import LightConfig
-from extrags.raster.light import SPREAD_MIN, CameraLight, developed, light_gain, undeveloped
+from extrags.raster.light import (
+    COSINE_SOFTENING,
+    SPREAD_MIN,
+    CameraLight,
+    developed,
+    light_gain,
+    undeveloped,
+)
 from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["NearFieldLight"]
@@ -133,18 +140,28 @@ class NearFieldLight:
         return torch.from_numpy(np.exp(result).astype(np.float32))
 
     def falloff(
-        self, distance: Float[Tensor, "*b"], axis_cosine: Float[Tensor, "*b"] | None = None
+        self,
+        distance: Float[Tensor, "*b"],
+        axis_cosine: Float[Tensor, "*b"] | None = None,
+        facing_cosine: Float[Tensor, "*b"] | None = None,
     ) -> Float[Tensor, "*b"]:
-        """The factor on the albedo of surfaces that face the lens, of a lamp at the lens.
+        """The factor on the albedo of surfaces under a lamp at the lens.
 
         Args:
             distance: from the lens, in world units.
             axis_cosine: cosine between the ray and the optical axis; None is on the axis.
+            facing_cosine: cosine between the ray and the surface's normal, of either sign; None takes all
+                surfaces to face the lens.
         """
         softening = self.log_softening.exp()
         relative = (distance / self.reference_distance) ** 2
         gain = ((1 + softening) / (relative + softening)) ** self.log_exponent.exp()
-        return gain if axis_cosine is None else gain * axis_cosine.clamp_min(SPREAD_MIN) ** self.spread
+        if axis_cosine is not None:
+            gain = gain * axis_cosine.clamp_min(SPREAD_MIN) ** self.spread
+        if facing_cosine is not None:
+            facing = (facing_cosine.square() + COSINE_SOFTENING) / (1 + COSINE_SOFTENING)
+            gain = gain * facing ** (0.5 * self.cosine)
+        return gain
 
     def gain(
         self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None = None

@@ -14,6 +14,7 @@ from extrags.errors import ConfigError
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
 from flows.pages import benchmark_page
+from flows.preflight import check_before
 from flows.runners import PrefectRunner, Runner
 from flows.sequence import artifact_key, open_store
 from flows.settings import DEFAULT_STORE, ProfileName
@@ -77,6 +78,7 @@ def benchmark(
 
     Raises:
         ConfigError: for an unknown method or baseline, or a setting that is wrong.
+        ExtragsError: when a model, weights or a package that the settings name is not there.
     """
     baseline = check_methods(methods, variants or {}, baseline)
     open_store(store)
@@ -84,8 +86,9 @@ def benchmark(
     wanted = [*methods, *(variants or {})]
     for method in wanted:
         for profile in profiles:
-            # Wrong settings concern all runs: say so before the first hour.
-            _config_of(method, profile, settings, variants or {}, 0)
+            # Wrong settings and missing models concern all runs: say so before the first hour.
+            config = _config_of(method, profile, settings, variants or {}, 0)
+            check_before(config, "evaluate", METHODS[_variant(method, variants or {})[0]].leave_out)
     found = [
         run_method(method, sequence, profile, seed, settings, store, runner, variants=variants)
         for sequence in sequences

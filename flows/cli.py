@@ -52,6 +52,7 @@ def parser() -> argparse.ArgumentParser:
     _add_evaluate(verbs)
     _add_benchmark(verbs)
     _add_bench(verbs)
+    _add_pretrain(verbs)
     return root
 
 
@@ -407,11 +408,49 @@ def _add_kernel_cases(made: argparse.ArgumentParser, *, with_error: bool) -> Non
     )
 
 
+def _add_pretrain(verbs: Any) -> None:
+    made = _verb(
+        verbs,
+        "pretrain",
+        "pretrain.pretrain",
+        "make the restorer's weights anew from procedural scenes",
+        description="Make practice scenes (colons that are never evaluated), reconstruct them, and train the "
+        "restorer on views far off their paths. This is how the weights of the package were made; hours on "
+        "two cores. Practice scenes that are in the folder already are taken from there.",
+    )
+    made.add_argument("--out", required=True, metavar="FOLDER", help="where the weights go")
+    made.add_argument(
+        "--scenes-folder",
+        default=".extrags/practice",
+        metavar="FOLDER",
+        help="where practice scenes are kept, 40 MB each (default: %(default)s)",
+    )
+    made.add_argument("--scenes", type=int, metavar="N", help="practice scenes (default: 108)")
+    made.add_argument("--kept-back", type=int, metavar="N", help="how many of them only judge (default: 8)")
+    made.add_argument("--iterations", type=int, metavar="N", help="optimisation steps (default: 20000)")
+    made.add_argument("--batch", type=int, metavar="N", help="crops per step (default: 4)")
+    made.add_argument("--seed", type=int, metavar="N", help="of the training (default: 0)")
+    made.add_argument("--threads", type=int, metavar="N", help="threads of the training (default: all)")
+    made.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="scenes made at once (default: %(default)s)"
+    )
+    made.add_argument(
+        "--without-perceptual",
+        action="store_true",
+        help="train without the perceptual distance, whose weights (LPIPS, SqueezeNet) must be had",
+    )
+    made.add_argument(
+        "--deterministic", action="store_true", help="a plain regression: the baseline of the diffusion"
+    )
+
+
 def _add_bench(verbs: Any) -> None:
     bench = verbs.add_parser(
         "bench", help="benchmarks", description="Measure speed and error of the parts or of the whole."
     )
-    inner = bench.add_subparsers(dest="what", metavar="raster|train|stability|pipeline", required=True)
+    inner = bench.add_subparsers(
+        dest="what", metavar="raster|train|stability|enhance|pipeline", required=True
+    )
     for name, summary, with_error in (
         ("raster", "time and error of the rasteriser, forward and backward", True),
         ("train", "time of a whole training iteration: render, loss, backward, Adam", False),
@@ -432,6 +471,7 @@ def _add_bench(verbs: Any) -> None:
         "--threads", type=int, default=1, metavar="N", help="threads of the kernels (default: 1)"
     )
     _add_json(made)
+    _add_bench_enhance(inner)
     made = _verb(
         inner,
         "pipeline",
@@ -441,6 +481,46 @@ def _add_bench(verbs: Any) -> None:
         "taken from there with the time it took when it was made.",
     )
     _add_benchmark_runs(made)
+
+
+def _add_bench_enhance(inner: Any) -> None:
+    made = _verb(
+        inner,
+        "enhance",
+        "bench.enhance",
+        "restorers beside each other on held-out views of sequences",
+        description="Reconstruct each sequence, restore its held-out views with every method, and compare "
+        "with what they really look like: whole, well seen, holes, observed and unobserved.",
+    )
+    made.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    made.add_argument(
+        "--methods",
+        nargs="+",
+        default=["none", "classical", "embedded"],
+        metavar="METHOD",
+        help="none, classical, embedded (as the settings say), embedded-1, embedded-4 (steps), scratch "
+        "(without pretrained weights), zero-shot (without training on the scene), deterministic (a plain "
+        "regression), each also with /no-references behind it (default: none classical embedded)",
+    )
+    made.add_argument(
+        "--profile",
+        choices=("quick", "balanced", "paper"),
+        default="quick",
+        help="named settings (default: quick)",
+    )
+    made.add_argument(
+        "--set",
+        dest="settings",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help="override one setting, e.g. enhance.samples=4; repeatable",
+    )
+    made.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")
+    made.add_argument(
+        "--figure", metavar="FILE.png", help="draw predicted against true error (the calibration)"
+    )
+    _add_json(made)
 
 
 if __name__ == "__main__":

@@ -12,9 +12,10 @@ from prefect.artifacts import create_markdown_artifact
 from prefect.client.schemas.objects import State
 from pydantic import Field
 
-from flows.methods import MethodName, method_config, profile_label, refuse_pinned
+from flows.methods import METHODS, MethodName, method_config, profile_label, refuse_pinned
 from flows.outcome import DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
+from flows.preflight import check_before
 from flows.runners import PrefectRunner
 from flows.sequence import artifact_key, open_store, reconstruct_sequence
 from flows.settings import DEFAULT_STORE, ProfileName, StageName, task_runner
@@ -46,10 +47,11 @@ def reconstruct_dataset(
     Returns:
         One outcome per sequence, in the order given; failures among them. The summary is an artifact.
     """
-    # Wrong settings and a store that cannot be written concern all sequences: say so once, at once.
+    # Wrong settings, missing models and a store that cannot be written concern all sequences: say so once.
     refuse_pinned(method, settings or {})
-    method_config(method, profile, settings, seed)
+    config = method_config(method, profile, settings, seed)
     open_store(store)
+    check_before(config, until, METHODS[method].leave_out)
     one = reconstruct_sequence.with_options(task_runner=task_runner(runner))
 
     def reconstruct(sequence: str) -> SequenceOutcome:

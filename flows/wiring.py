@@ -28,7 +28,7 @@ from tasks.poses import poses
 from tasks.progress import StageProgress, notify
 from tasks.report import report
 from tasks.surface import surface
-from tasks.weights import Weights, lpips_weights
+from tasks.weights import Weights, lpips_weights, restorer_digest
 
 __all__ = ["SequenceRun", "run_sequence"]
 
@@ -224,7 +224,12 @@ class SequenceRun:
                 self._turn_to_skip(row, "exploration found no view that adds anything")
                 return
             settings = self.config.enhance
-            inputs = {**self._scene_inputs(), "config": settings, "coarse": self.config.coarse}
+            inputs = {
+                **self._scene_inputs(),
+                "config": settings,
+                "coarse": self.config.coarse,
+                "model_digest": restorer_digest(settings),
+            }
             self.refs["restorer"] = self._one(row, Call(train, inputs))
             weights = self._weights()
             shared = {

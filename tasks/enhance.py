@@ -3,20 +3,34 @@
 from __future__ import annotations
 
 from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.errors import WeightsError
 from extrags.store import Ref, Slot
 from tasks.stage import stage
-from tasks.weights import Weights
+from tasks.weights import Weights, restorer_digest
 
 __all__ = ["assemble", "restore", "train"]
 
 
+# The model's digest is in the key: with another model in the same place, this is another restorer.
 @stage("enhance-train", version=2)
-def train(slot: Slot, scene: Ref, sequence: Ref, config: EnhanceConfig, coarse: CoarseConfig) -> None:
-    """Train the scene's restorer on pairs it makes itself; writes `restorer/`."""
+def train(
+    slot: Slot,
+    scene: Ref,
+    sequence: Ref,
+    config: EnhanceConfig,
+    coarse: CoarseConfig,
+    model_digest: str | None,
+) -> None:
+    """Train the scene's restorer on its own pairs, or prepare a pretrained one; writes `restorer/`."""
     from extrags.enhance.backends import train_enhancer
     from extrags.scene import Scene
     from extrags.sequence import Sequence
 
+    if restorer_digest(config) != model_digest:
+        raise WeightsError(
+            f"the model of enhance.backend={config.backend} is not the one this run began with: it changed "
+            "meanwhile, or this worker sees other files; run again"
+        )
     enhancer = train_enhancer(
         Scene.load(slot.open(scene) / "scene"),
         Sequence.load(slot.open(sequence) / "sequence"),

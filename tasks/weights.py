@@ -1,4 +1,4 @@
-"""LPIPS weights as part of cache keys: by their content, or as absent."""
+"""Weights as part of cache keys: by their content, or as absent."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from extrags.config import EvaluateConfig
+from extrags.config import EnhanceConfig, EvaluateConfig
 from extrags.errors import WeightsError
 
-__all__ = ["Weights", "lpips_weights"]
+__all__ = ["Weights", "lpips_weights", "restorer_digest"]
 
 
 class Weights(BaseModel):
@@ -40,3 +40,14 @@ def lpips_weights(config: EvaluateConfig) -> Weights:
         return Weights(net=config.lpips_net, reason=str(error))
     digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
     return Weights(net=config.lpips_net, path=str(path), digest=digest)
+
+
+def restorer_digest(config: EnhanceConfig) -> str | None:
+    """Digest of the pretrained model that a scene's restorer starts from; None where there is none.
+
+    Raises:
+        ExtragsError: when it is not there; says how to get it.
+    """
+    from extrags.enhance.preconditions import model_digest
+
+    return model_digest(config)

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from data_catalog.phantom.config import PhantomConfig, stream
 from data_catalog.phantom.geometry import GRID_STEP_MM, Wall
+from data_catalog.phantom.variation import vary
 
 __all__ = ["TEXEL_MM", "Texture", "paint"]
 
@@ -91,6 +92,7 @@ def paint(config: PhantomConfig, wall: Wall) -> Texture:
     import cv2
 
     rng = stream(config.scene, "mucosa")
+    variation = vary(config)
     rows = (wall.points.shape[0] - 1) * TEXELS_PER_CELL
     columns = wall.points.shape[1] * TEXELS_PER_CELL
     shape = (rows, columns)
@@ -100,24 +102,28 @@ def paint(config: PhantomConfig, wall: Wall) -> Texture:
     blotches = _noise(rng, shape, 22.0) + 0.6 * _noise(rng, shape, 9.0)
     mottling = _noise(rng, shape, 3.5) + 0.7 * _noise(rng, shape, 1.6)
     grain = _noise(rng, shape, 0.55)
-    paleness = np.clip(0.42 + 0.16 * blotches + 0.07 * mottling + 0.25 * crest, 0, 1)[..., None]
+    mottled = variation.mottling
+    middle = 0.42 + variation.paleness
+    paleness = np.clip(middle + 0.16 * mottled * blotches + 0.07 * mottled * mottling + 0.25 * crest, 0, 1)
+    paleness = paleness[..., None]
     albedo = (1 - paleness) * np.array(_MUCOSA_RED, np.float32) + paleness * np.array(
         _MUCOSA_PALE, np.float32
     )
-    albedo *= (1 + 0.05 * mottling + 0.03 * grain)[..., None]
+    albedo *= (1 + 0.05 * mottled * mottling + 0.03 * grain)[..., None]
+    albedo *= np.array(variation.tint, np.float32)
     albedo *= 1 + bump[..., None] * (np.array(_POLYP_TINT, np.float32) - 1)
 
     coarse, fine = _vessels(config, shape)
     # Vessels shine through less where the wall is lifted into a fold or a polyp.
     cover = (1 - 0.45 * crest) * (1 - 0.7 * bump)
-    density = np.clip((0.80 * coarse + 0.55 * fine * (1 - coarse)) * cover, 0, 1)
+    density = np.clip((0.80 * coarse + 0.55 * fine * (1 - coarse)) * cover * variation.vessels, 0, 1)
     density = density * np.clip(0.85 + 0.25 * _noise(rng, shape, 7.0), 0.3, 1)
     albedo *= 1 + density[..., None] * (np.array(_VESSEL_TINT, np.float32) - 1)
     albedo = np.clip(albedo, 0.02, 0.95)
 
     # Relief in mm: soft bumps, fine pits, and vessels slightly raised. It bends normals only.
     relief = 0.055 * _noise(rng, shape, 2.6) + 0.020 * _noise(rng, shape, 1.0) + 0.004 * grain
-    relief = relief + 0.03 * coarse
+    relief = variation.relief * (relief + 0.03 * coarse)
     relief = cv2.GaussianBlur(_wrapped(relief.astype(np.float32), 8), (0, 0), 0.8)[8:-8, 8:-8]
     slope_u = np.gradient(relief, TEXEL_MM, axis=0)
     slope_x = (np.roll(relief, -1, axis=1) - np.roll(relief, 1, axis=1)) / (2 * TEXEL_MM)

@@ -14,7 +14,7 @@ Setting = Literal["sparse", "distanced"]
 GENERATOR_VERSION = 1
 """Raised by hand whenever the same settings give other pixels; part of every cache key."""
 
-_STREAMS = ("shape", "vessels", "mucosa", "exposure", "noise", "trajectory")
+_STREAMS = ("shape", "vessels", "mucosa", "exposure", "noise", "trajectory", "variation")
 
 
 class PhantomConfig(BaseModel):
@@ -49,6 +49,12 @@ class PhantomConfig(BaseModel):
     )
     noise: bool = Field(True, description="shot and read noise of the sensor")
     speculars: bool = Field(True, description="glints of the wet mucosa")
+    variation: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="how far anatomy, mucosa, lamps and sensor leave the standard colon; to train on many",
+    )
     shadows: bool = Field(True, description="shadows of folds, from each of the two lights")
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from data_catalog.phantom.config import PhantomConfig, stream
+from data_catalog.phantom.variation import Variation, vary
 
 __all__ = ["CenterLine", "Polyp", "Wall", "build_wall"]
 
@@ -124,8 +125,9 @@ class Wall:
 def build_wall(config: PhantomConfig) -> Wall:
     """The anatomy of a scene; depends on its index and the number of polyps only."""
     rng = stream(config.scene, "shape")
-    center_line = _center_line(rng)
-    radius = float(rng.uniform(16.5, 19.5))
+    variation = vary(config)
+    center_line = _center_line(rng, variation.curvature)
+    radius = float(rng.uniform(16.5, 19.5)) * variation.radius
     cap = radius * np.pi / 2
     rows = int(np.ceil((TUBE_LENGTH_MM + 2 * cap) / GRID_STEP_MM)) + 1
     columns = int(np.ceil(2 * np.pi * radius / GRID_STEP_MM))
@@ -139,10 +141,10 @@ def build_wall(config: PhantomConfig) -> Wall:
     profile = radius * np.cos(past) * np.cos(before)
     profile[[0, -1]] = 0.0
 
-    scale, crest, shift, folds = _folds(rng, arc, theta, radius)
+    scale, crest, shift, folds = _folds(rng, arc, theta, radius, variation)
     taeniae = rng.uniform(0, 2 * np.pi)
     scale = scale * (1 + 0.035 * np.cos(3 * (theta[None, :] - taeniae)))
-    scale = scale * _slow_variation(rng, u, theta)
+    scale = scale * (1 + variation.roughness * (_slow_variation(rng, u, theta) - 1))
 
     frame = center_line.frame(arc)
     across = (
@@ -166,14 +168,14 @@ def build_wall(config: PhantomConfig) -> Wall:
     )
 
 
-def _center_line(rng: np.random.Generator) -> CenterLine:
+def _center_line(rng: np.random.Generator, curving: float) -> CenterLine:
     arc = np.arange(-_BEYOND_MM, TUBE_LENGTH_MM + _BEYOND_MM + 1e-9, _CENTER_STEP_MM)
     # Two slow waves of curvature across each axis; a radius of curvature above 65 mm keeps the
     # wall (radius below 22 mm) far from folding over itself.
     curvature = np.zeros((2, arc.size))
     for axis in range(2):
         for wavelength in (230.0, 120.0):
-            amplitude = rng.uniform(0.35, 1.0) / 150
+            amplitude = curving * rng.uniform(0.35, 1.0) / 150
             curvature[axis] += amplitude * np.sin(2 * np.pi * arc / wavelength + rng.uniform(0, 2 * np.pi))
     frame = np.eye(3)
     point = np.zeros(3)
@@ -198,6 +200,7 @@ def _folds(
     arc: Float[np.ndarray, "u"],
     theta: Float[np.ndarray, "t"],
     radius: float,
+    variation: Variation,
 ) -> tuple[Float[np.ndarray, "u t"], Float[np.ndarray, "u t"], Float[np.ndarray, "u t"], list[float]]:
     """Radius factor, crest mask and lean of the haustral folds."""
     inward = np.zeros((arc.size, theta.size))
@@ -207,7 +210,7 @@ def _folds(
     side = rng.uniform(0, 2 * np.pi)
     while position < TUBE_LENGTH_MM - 4:
         centers.append(float(position))
-        height = rng.uniform(5.0, 8.0)
+        height = rng.uniform(5.0, 8.0) * variation.fold_height
         width = rng.uniform(1.6, 2.4)
         # Semilunar: deep on one side, gone on the other.
         facing = 0.5 + 0.5 * np.cos(theta - side)
@@ -222,7 +225,7 @@ def _folds(
         strength = (height * extent * ripple)[None, :] * ridge
         inward = np.maximum(inward, strength)
         shift += rng.uniform(-0.25, 0.25) * strength
-        position += rng.uniform(13, 20)
+        position += rng.uniform(13, 20) * variation.fold_spacing
         side += rng.uniform(0.55, 1.0) * np.pi
     crest = np.clip(inward / 6.0, 0, 1)
     pouch = 0.06 * (1 - crest)

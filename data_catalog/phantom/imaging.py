@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.phantom.config import PhantomConfig, stream
+from data_catalog.phantom.variation import Variation, vary
 
 __all__ = ["LightPair", "Sensor", "recording_sensor"]
 
@@ -42,6 +43,20 @@ class LightPair:
     """At normal incidence, of a water film."""
     specular_roughness: float = 0.13
     """alpha of GGX."""
+
+    @classmethod
+    def of(cls, variation: Variation) -> LightPair:
+        """The lamps of a scene."""
+        standard = cls()
+        factor = variation.lamp_offset
+        return cls(
+            tuple((factor * x, factor * y, factor * z) for x, y, z in standard.offsets_mm),
+            (standard.intensities[0], variation.lamp_balance),
+            variation.lamp_exponent,
+            variation.around,
+            standard.specular_reflectance * variation.specular,
+            variation.specular_roughness,
+        )
 
     def radiance(
         self,
@@ -171,11 +186,14 @@ def recording_sensor(config: PhantomConfig, recording: int, scene_gain: float) -
     rng = stream(config.scene, "exposure", recording)
     factor = 1 + config.exposure_spread * rng.uniform(-1, 1)
     balance = 1 + config.white_balance_spread * rng.uniform(-1, 1, 3)
+    variation = vary(config)
     return Sensor(
-        scene_gain * factor,
+        scene_gain * factor * variation.brightness,
         (float(balance[0]), float(balance[1]), float(balance[2])),
         config.exposure_drift,
         config.noise,
+        vignetting=variation.vignetting,
+        gamma=variation.gamma,
     )
 
 

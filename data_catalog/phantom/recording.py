@@ -17,6 +17,7 @@ from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig, stream
 from data_catalog.phantom.geometry import Wall, build_wall
 from data_catalog.phantom.imaging import LightPair, Sensor, recording_sensor
 from data_catalog.phantom.trajectories import camera_path
+from data_catalog.phantom.variation import vary
 from data_catalog.ray_casting import RayCaster
 from extrags.cameras import Cameras, pixel_rays
 from extrags.events import Progress, emit
@@ -40,7 +41,7 @@ class Phantom:
         self.config = config
         self.wall: Wall = build_wall(config)
         self.texture: Texture = paint(config, self.wall)
-        self.light = LightPair()
+        self.light = LightPair.of(vary(config))
         self.rays = RayCaster(self.wall.vertices, self.wall.triangles)
         self._shape_grid = np.concatenate([self.wall.normals, self.wall.along], axis=2, dtype=np.float32)
 

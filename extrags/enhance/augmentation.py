@@ -16,7 +16,7 @@ from extrags.enhance.pairs import Pairs
 from extrags.enhance.references import LightTransfer
 from extrags.errors import ConfigError
 
-__all__ = ["CropSampler", "cut_out", "drop_references"]
+__all__ = ["CropSampler", "MixedSampler", "cut_out", "drop_references"]
 
 PASTED_HOLES = 0.5
 """Probability of another pair's holes."""
@@ -65,21 +65,22 @@ class CropSampler:
     def draw(self) -> Batch:
         """The next batch."""
         crops = [self._crop(self._next()) for _ in range(self._batch)]
-        layers, clean, weight = (torch.cat(part) for part in zip(*crops, strict=True))
-        return Batch(condition(Layers(layers), self._transfer), clean, weight)
+        layers, clean, weight, depth = (torch.cat(part) for part in zip(*crops, strict=True))
+        return Batch(condition(Layers(layers), self._transfer), clean, weight, depth)
 
     def _next(self) -> int:
         if not self._order:
             self._order = self._generator.permutation(len(self._pairs)).tolist()
         return self._order.pop()
 
-    def _crop(self, index: int) -> tuple[Tensor, Tensor, Tensor]:
+    def _crop(self, index: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         generator, pairs = self._generator, self._pairs
         top, left = self._corner()
         window = (..., slice(top, top + self._side), slice(left, left + self._side))
         layers = Layers(pairs.layers.data[index : index + 1][window].clone())
         clean = pairs.target[index : index + 1][window]
         weight = pairs.weight[index : index + 1][window]
+        depth = pairs.depth_mm[index : index + 1][window]
         layers, clean = self._relit(layers, clean)
         if generator.random() < PASTED_HOLES:
             other = int(generator.integers(len(pairs)))
@@ -93,9 +94,9 @@ class CropSampler:
             layers = cut_out(layers, self._half_plane(), unseen=True)
         if generator.random() < REFERENCE_DROPOUT:
             layers = drop_references(layers)
-        everything = _turned(torch.cat([layers.data, clean, weight], dim=1), generator)
-        channels = layers.data.shape[1]
-        return everything[:, :channels], everything[:, channels : channels + 3], everything[:, -1:]
+        everything = _turned(torch.cat([layers.data, clean, weight, depth], dim=1), generator)
+        data, clean, weight, depth = everything.split((layers.data.shape[1], 3, 1, 1), dim=1)
+        return data, clean, weight, depth
 
     def _corner(self) -> tuple[int, int]:
         height, width = self._pairs.target.shape[-2:]
@@ -119,6 +120,26 @@ class CropSampler:
         across = math.cos(angle) * steps[None, :] + math.sin(angle) * steps[:, None]
         softness = self._generator.uniform(0.5, 3)
         return torch.sigmoid((offset - across) / softness)[None, None]
+
+
+class MixedSampler:
+    """Batches whose crops come from many scenes, each with its own light.
+
+    Args:
+        samplers: one per scene; each gives one crop at a time.
+        batch: crops per batch.
+        seed: of which scene is drawn.
+    """
+
+    def __init__(self, samplers: list[CropSampler], *, batch: int, seed: int) -> None:
+        self._samplers = samplers
+        self._batch = batch
+        self._generator = np.random.default_rng([seed, 6])
+
+    def draw(self) -> Batch:
+        """The next batch."""
+        chosen = self._generator.integers(len(self._samplers), size=self._batch)
+        return Batch.concatenated([self._samplers[int(scene)].draw() for scene in chosen])
 
 
 def cut_out(layers: Layers, kept: Float[Tensor, "1 1 h w"], *, unseen: bool) -> Layers:

@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
+import torch
+
 from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.enhance.classical import ClassicalEnhancer
 from extrags.enhance.embedded import EmbeddedEnhancer
+from extrags.enhance.gamut import Gamut
 from extrags.enhance.pairs import make_pairs
 from extrags.enhance.pretrained.checkpoint import CheckpointEnhancer
 from extrags.enhance.pretrained.enhancer import ADAPTERS, PretrainedEnhancer
 from extrags.enhance.protocol import Enhancer
 from extrags.enhance.references import ReferenceViews
-from extrags.errors import WeightsError
+from extrags.enhance.weights import find_weights
+from extrags.errors import ConfigError, WeightsError
 from extrags.scene import Scene
 from extrags.sequence import Sequence
 
@@ -42,9 +47,24 @@ def train_enhancer(scene: Scene, sequence: Sequence, config: EnhanceConfig, coar
         return CheckpointEnhancer.prepare(scene, sequence, config)
     if config.backend in ADAPTERS:
         return PretrainedEnhancer.prepare(scene, sequence, config)
+    weights = find_weights(config.pretrained_weights)
+    start = None if weights is None else EmbeddedEnhancer.load(weights)
+    if config.train_iterations == 0:
+        if start is None:
+            raise ConfigError(
+                "enhance.train_iterations is 0 and enhance.pretrained_weights is none: nothing would restore"
+            )
+        return start.with_settings(config, scene_gamut(sequence))
     pairs = make_pairs(scene, sequence, config, coarse)
     transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
-    return EmbeddedEnhancer.train(pairs, transfer, config)
+    return EmbeddedEnhancer.train(pairs, transfer, config, start)
+
+
+def scene_gamut(sequence: Sequence) -> Gamut:
+    """Hues of the training frames' valid tissue."""
+    images = torch.from_numpy(sequence.rgb[sequence.train].astype(np.float32) / 255).permute(0, 3, 1, 2)
+    weight = torch.from_numpy(sequence.mask[sequence.train].astype(np.float32))[:, None]
+    return Gamut.of_images(images, weight)
 
 
 def load_enhancer(path: Path) -> Enhancer:

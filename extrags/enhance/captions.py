@@ -31,7 +31,7 @@ from extrags.errors import ConfigError, ExtragsError, SourceError, SourceNotFoun
 from extrags.events import MetricRecorded, emit
 from extrags.sequence import Sequence
 
-__all__ = ["CACHE_VARIABLE", "KEY_VARIABLE", "URL_VARIABLE", "Caption", "caption_of"]
+__all__ = ["CACHE_VARIABLE", "KEY_VARIABLE", "URL_VARIABLE", "Caption", "caption_of", "check_source"]
 
 URL_VARIABLE = "EXTRAGS_CAPTION_URL"
 KEY_VARIABLE = "EXTRAGS_CAPTION_KEY"
@@ -92,21 +92,46 @@ def caption_of(sequence: Sequence, config: CaptionConfig) -> Caption:
         SourceError: when it has no text for this scene, or the endpoint's answer has none.
         ExtragsError: when the endpoint refuses, or does not answer after all tries.
     """
-    if config.source == "constant":
-        return Caption(config.text, "constant")
-    if config.source == "file":
-        return Caption(_from_file(sequence.name, config), "file")
-    return _from_endpoint(sequence, config)
+    file = check_source(config)
+    if file is not None:
+        return Caption(_from_file(sequence.name, file), "file")
+    if config.source == "endpoint":
+        return _from_endpoint(sequence, config)
+    return Caption(config.text, "constant")
 
 
-def _from_file(name: str, config: CaptionConfig) -> str:
-    import yaml
+def check_source(config: CaptionConfig) -> Path | None:
+    """Look whether settings and environment have what the source of captions needs; nothing is asked.
 
+    Returns:
+        The file of texts, where they come from one.
+
+    Raises:
+        ConfigError: when something is not set.
+        SourceNotFoundError: when the file of texts is not there.
+    """
+    if config.source == "endpoint":
+        url = os.environ.get(URL_VARIABLE, "")
+        if urlsplit(url).scheme not in ("http", "https"):
+            raise ConfigError(
+                f"enhance.caption.source=endpoint needs the server's address in {URL_VARIABLE}, e.g. "
+                f"https://host/v1 (found {url!r}), and its key, if it wants one, in {KEY_VARIABLE}"
+            )
+        if not config.model:
+            raise ConfigError("enhance.caption.source=endpoint needs enhance.caption.model")
+    if config.source != "file":
+        return None
     if config.file is None:
         raise ConfigError("enhance.caption.source=file needs enhance.caption.file")
     file = Path(config.file).expanduser()
     if not file.is_file():
         raise SourceNotFoundError("no such file; expected {name of the sequence: text}", file=file)
+    return file
+
+
+def _from_file(name: str, file: Path) -> str:
+    import yaml
+
     try:
         texts = yaml.safe_load(file.read_text(encoding="utf-8"))
     except yaml.YAMLError as error:
@@ -122,13 +147,6 @@ def _from_file(name: str, config: CaptionConfig) -> str:
 
 def _from_endpoint(sequence: Sequence, config: CaptionConfig) -> Caption:
     url, key = os.environ.get(URL_VARIABLE, ""), os.environ.get(KEY_VARIABLE, "")
-    if urlsplit(url).scheme not in ("http", "https"):
-        raise ConfigError(
-            f"enhance.caption.source=endpoint needs the server's address in {URL_VARIABLE}, e.g. "
-            f"https://host/v1 (found {url!r}), and its key, if it wants one, in {KEY_VARIABLE}"
-        )
-    if not config.model:
-        raise ConfigError("enhance.caption.source=endpoint needs enhance.caption.model")
     images = [_png(sequence.rgb[frame], config.frame_width) for frame in _chosen(sequence, config.frames)]
     question = _question(images, config)
     file = _cache_folder() / f"{_digest(url, question)}.json"

@@ -187,8 +187,10 @@ def _pseudo_observation(
 ) -> PseudoObservations:
     rendered = _image(clip.layers.get("rendered").clamp(0, 1))
     target, uncertainty = keep_known(rendered, restoration.rgb, _plane(clip.layers.get("uncertainty")))
-    with torch.no_grad():
-        depth = condition(clip.layers, clip.transfer).depth_mm
+    depth = restoration.depth_mm
+    if depth is None:
+        with torch.no_grad():
+            depth = _plane(condition(clip.layers, clip.transfer).depth_mm)
     provenance = {**restoration.provenance, "pixel_confidence": measure.name}
     if measure.reason:
         provenance["pixel_confidence_reason"] = measure.reason
@@ -198,7 +200,7 @@ def _pseudo_observation(
         restored=restoration.rgb,
         target=target,
         alpha=_plane(clip.layers.get("alpha")),
-        depth_mm=_plane(depth),
+        depth_mm=depth,
         uncertainty=uncertainty,
         pixel_confidence=pixel_confidence(rendered, target, measure),
         image_confidence=clip.image_confidence,

@@ -46,7 +46,7 @@ _SLICES = {
     "ray_length": slice(16, 17),
 }
 LAYER_CHANNELS = 17
-CONDITION_CHANNELS = 19
+CONDITION_CHANNELS = 20
 
 COLOR_CENTER = 0.35
 COLOR_SCALE = 0.45
@@ -110,7 +110,7 @@ class Conditioning:
     """Network input and starting image of V views.
 
     Args:
-        channels: [V, 19, H, W].
+        channels: [V, 20, H, W].
         base: blend of real views where they see the surface, else the rendering, holes filled; in
             [0, 1], [V, 3, H, W].
         depth_mm: z-depth without gaps, [V, 1, H, W].
@@ -285,6 +285,7 @@ def condition(layers: Layers, transfer: LightTransfer) -> Conditioning:
             _normalised(layers.get("blend")) * weight,
             weight,
             layers.get("log_ratio"),
+            falloff.log(),
             _normalised(base),
         ],
         dim=1,

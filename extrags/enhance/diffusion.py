@@ -23,18 +23,34 @@ from extrags.enhance.network import SIZE_MULTIPLE, RestorationNetwork
 from extrags.errors import DivergedError
 from extrags.events import Progress, emit
 from extrags.metrics.image import ssim_map
+from extrags.metrics.lpips import Lpips
 
-__all__ = ["Batch", "TrainingSettings", "restoration_loss", "sample", "train_network"]
+__all__ = [
+    "Batch",
+    "Predicted",
+    "Sampled",
+    "TrainingSettings",
+    "restoration_loss",
+    "sample",
+    "train_network",
+]
 
 PURE_NOISE_SHARE = 0.7
 """Share of training samples at t = 1 exactly: they alone make the one-step result."""
 TIME_LOGIT_MEAN = 0.3
 TIME_LOGIT_DEVIATION = 1.2
 STRUCTURE_WEIGHT = 0.1
+PERCEPTUAL_WEIGHT = 0.15
+DEPTH_WEIGHT = 0.1
+DOUBT_WEIGHT = 0.02
 CHARBONNIER_EPS = 1e-3
+DEPTH_LIMIT = 1.5
+"""Log-depths are corrected by no more than this; larger errors count no more either."""
+TYPICAL_ERROR = 0.05
+LOG_ERROR_LIMIT = 4.0
+"""The expected error starts at the typical one and stays within e to this power of it."""
 WARM_UP = 30
 GRADIENT_LIMIT = 1.0
-EMA_DECAY = 0.995
 REPORT_EVERY = 10
 
 
@@ -43,14 +59,31 @@ class Batch:
     """Crops to learn from.
 
     Args:
-        conditioning: network input and base image.
+        conditioning: network input, base image and completed depth.
         clean: what the view really looked like, in [0, 1], [N, 3, H, W].
         weight: of each pixel's error, [N, 1, H, W].
+        depth_mm: true z-depth, 0 where unknown, [N, 1, H, W].
     """
 
     conditioning: Conditioning
     clean: Float[Tensor, "n 3 h w"]
     weight: Float[Tensor, "n 1 h w"]
+    depth_mm: Float[Tensor, "n 1 h w"]
+
+    @staticmethod
+    def concatenated(parts: list[Batch]) -> Batch:
+        """Join crops of the same size."""
+        conditionings = [part.conditioning for part in parts]
+        return Batch(
+            Conditioning(
+                torch.cat([part.channels for part in conditionings]),
+                torch.cat([part.base for part in conditionings]),
+                torch.cat([part.depth_mm for part in conditionings]),
+            ),
+            torch.cat([part.clean for part in parts]),
+            torch.cat([part.weight for part in parts]),
+            torch.cat([part.depth_mm for part in parts]),
+        )
 
 
 @dataclass(frozen=True)
@@ -61,11 +94,47 @@ class TrainingSettings:
         iterations: steps.
         learning_rate: the peak, after the warm-up.
         half_precision: convolutions in bfloat16.
+        perceptual: a perceptual distance that counts beside the pixels' errors; None without.
+        deterministic: no noise, one step only: the same network as a plain regression.
+        ema_decay: memory of the running mean of the weights.
     """
 
     iterations: int
     learning_rate: float
     half_precision: bool
+    perceptual: Lpips | None = None
+    deterministic: bool = False
+    ema_decay: float = 0.995
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """The network's answer.
+
+    Args:
+        rgb: clean colours, about [0, 1], [N, 3, H, W].
+        log_depth: of the true z-depth, in the logarithm of millimetres, [N, 1, H, W].
+        log_error: logarithm of the expected absolute error of a pixel's colours, [N, 1, H, W].
+    """
+
+    rgb: Float[Tensor, "n 3 h w"]
+    log_depth: Float[Tensor, "n 1 h w"]
+    log_error: Float[Tensor, "n 1 h w"]
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Restored views.
+
+    Args:
+        rgb: in [0, 1], [N, 3, H, W].
+        depth_mm: z-depth without gaps, [N, 1, H, W].
+        error: expected absolute error of a pixel's colours, as the network has learned it, [N, 1, H, W].
+    """
+
+    rgb: Float[Tensor, "n 3 h w"]
+    depth_mm: Float[Tensor, "n 1 h w"]
+    error: Float[Tensor, "n 1 h w"]
 
 
 def train_network(
@@ -99,7 +168,7 @@ def train_network(
         for group in optimiser.param_groups:
             group["lr"] = settings.learning_rate * _rate(iteration, settings.iterations)
         batch = draw()
-        loss = _diffusion_loss(network, batch, generator, half_precision=settings.half_precision)
+        loss = _diffusion_loss(network, batch, generator, settings)
         value = float(loss.detach())
         if not math.isfinite(value):
             raise DivergedError(
@@ -109,7 +178,7 @@ def train_network(
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_LIMIT)
         optimiser.step()
-        decay = min(EMA_DECAY, (1 + iteration) / (10 + iteration))
+        decay = min(settings.ema_decay, (1 + iteration) / (10 + iteration))
         with torch.no_grad():
             for name, current in network.state_dict().items():
                 mean[name].lerp_(current, 1 - decay)
@@ -130,30 +199,58 @@ def _rate(iteration: int, iterations: int) -> float:
 
 
 def _diffusion_loss(
-    network: RestorationNetwork, batch: Batch, generator: torch.Generator, *, half_precision: bool
+    network: RestorationNetwork, batch: Batch, generator: torch.Generator, settings: TrainingSettings
 ) -> Tensor:
     count = len(batch.clean)
     clean = (batch.clean - COLOR_CENTER) / COLOR_SCALE
     logits = TIME_LOGIT_MEAN + TIME_LOGIT_DEVIATION * torch.randn(count, generator=generator)
     pure = torch.rand(count, generator=generator) < PURE_NOISE_SHARE
-    time = torch.where(pure, torch.ones(()), logits.sigmoid())
     noise = torch.randn(clean.shape, generator=generator)
+    if settings.deterministic:
+        pure, noise = torch.ones_like(pure), torch.zeros_like(noise)
+    time = torch.where(pure, torch.ones(()), logits.sigmoid())
     mix = time[:, None, None, None]
     noisy = (1 - mix) * clean + mix * noise
-    predicted = _predict(network, batch.conditioning, noisy, time, half_precision=half_precision)
-    return restoration_loss(predicted * COLOR_SCALE + COLOR_CENTER, batch.clean, batch.weight)
+    predicted = _predict(network, batch.conditioning, noisy, time, half_precision=settings.half_precision)
+    return restoration_loss(predicted, batch, settings.perceptual)
 
 
 def restoration_loss(
-    predicted: Float[Tensor, "n 3 h w"], clean: Float[Tensor, "n 3 h w"], weight: Float[Tensor, "n 1 h w"]
+    predicted: Predicted, batch: Batch, perceptual: Lpips | None = None
 ) -> Float[Tensor, ""]:
-    """Charbonnier on normalised colours plus a tenth of 1 - SSIM, both averaged over weighted pixels."""
+    r"""What a prediction costs, averaged over weighted pixels.
+
+    Charbonnier on normalised colours, a tenth of 1 - SSIM, the absolute error of the log-depth, and for
+    the expected error :math:`b` of a pixel with error :math:`e` the negative log-likelihood
+    :math:`e / b + \log b` of Laplace; :math:`e` is taken as it is, so that the colours do not follow their
+    own doubts. With `perceptual` its distance is added.
+
+    Args:
+        predicted: the network's answer.
+        batch: the truth.
+        perceptual: a perceptual distance, or None.
+
+    Source: for the expected error, Kendall and Gal: What Uncertainties Do We Need in Bayesian Deep
+    Learning for Computer Vision?, NeurIPS 2017, equation 5 with a Laplace likelihood.
+    """
+    weight, clean = batch.weight, batch.clean
     total = weight.sum().clamp_min(1e-6)
-    difference = (predicted - clean) / COLOR_SCALE
+    difference = (predicted.rgb - clean) / COLOR_SCALE
     charbonnier = ((difference.square() + CHARBONNIER_EPS**2).sqrt().mean(dim=1, keepdim=True) * weight).sum()
-    similarity = ssim_map(predicted.permute(0, 2, 3, 1), clean.permute(0, 2, 3, 1))
+    similarity = ssim_map(predicted.rgb.permute(0, 2, 3, 1), clean.permute(0, 2, 3, 1))
     structure = ((1 - similarity) * weight[:, 0]).sum()
-    return (charbonnier + STRUCTURE_WEIGHT * structure) / total
+    known = (batch.depth_mm > 0).to(weight)
+    depth = (predicted.log_depth - batch.depth_mm.clamp_min(1e-6).log()).abs().clamp(max=DEPTH_LIMIT) * known
+    error = (predicted.rgb.detach() - clean).abs().mean(dim=1, keepdim=True)
+    doubt = ((error * (-predicted.log_error).exp() + predicted.log_error) * weight).sum()
+    loss: Tensor = (charbonnier + STRUCTURE_WEIGHT * structure + DOUBT_WEIGHT * doubt) / total
+    loss = loss + DEPTH_WEIGHT * depth.sum() / known.sum().clamp_min(1e-6)
+    if perceptual is not None:
+        # Where nothing is known of the truth, nothing shall differ from it.
+        shown = (weight * predicted.rgb + (1 - weight) * clean).clamp(0, 1)
+        distance = perceptual.distance(shown.permute(0, 2, 3, 1), clean.permute(0, 2, 3, 1))
+        loss = loss + PERCEPTUAL_WEIGHT * distance.mean()
+    return loss
 
 
 def sample(
@@ -163,8 +260,8 @@ def sample(
     *,
     steps: int,
     half_precision: bool,
-) -> Float[Tensor, "n 3 h w"]:
-    """Restore images in a fixed number of steps.
+) -> Sampled:
+    """Restore views in a fixed number of steps.
 
     Args:
         network: trained.
@@ -172,9 +269,6 @@ def sample(
         noise: where the path starts; the same noise gives the same image.
         steps: 1 is a regression, more draw texture.
         half_precision: convolutions in bfloat16.
-
-    Returns:
-        Colours in [0, 1].
     """
     height, width = conditioning.base.shape[-2:]
     padding = (0, -width % SIZE_MULTIPLE, 0, -height % SIZE_MULTIPLE)
@@ -186,15 +280,21 @@ def sample(
         padded(conditioning.channels), padded(conditioning.base), padded(conditioning.depth_mm)
     )
     state = padded(noise)
-    clean = state
+    answers: list[Predicted] = []
     with torch.no_grad():
         for step in range(steps):
             now, then = 1 - step / steps, 1 - (step + 1) / steps
             time = torch.full((len(state),), now)
-            clean = _predict(network, whole, state, time, half_precision=half_precision)
+            answers.append(_predict(network, whole, state, time, half_precision=half_precision))
             # The noise implied by the prediction, at the next point of the path.
+            clean = (answers[-1].rgb - COLOR_CENTER) / COLOR_SCALE
             state = (then / now) * state + (1 - then / now) * clean
-    return (clean[..., :height, :width] * COLOR_SCALE + COLOR_CENTER).clamp(0, 1)
+    # Later steps take their own texture for evidence: only the first one knows what is not known.
+    return Sampled(
+        answers[-1].rgb[..., :height, :width].clamp(0, 1),
+        answers[0].log_depth[..., :height, :width].exp(),
+        answers[0].log_error[..., :height, :width].exp(),
+    )
 
 
 def _predict(
@@ -204,7 +304,12 @@ def _predict(
     time: Tensor,
     *,
     half_precision: bool,
-) -> Tensor:
+) -> Predicted:
     with torch.autocast("cpu", torch.bfloat16, enabled=half_precision):
-        residual: Tensor = network(conditioning.channels, noisy, time)
-    return (conditioning.base - COLOR_CENTER) / COLOR_SCALE + residual.float()
+        answer: Tensor = network(conditioning.channels, noisy, time)
+    color, depth, error = answer.float().split((3, 1, 1), dim=1)
+    return Predicted(
+        conditioning.base + COLOR_SCALE * color,
+        conditioning.depth_mm.clamp_min(1e-6).log() + depth.clamp(-DEPTH_LIMIT, DEPTH_LIMIT),
+        math.log(TYPICAL_ERROR) + error.clamp(-LOG_ERROR_LIMIT, LOG_ERROR_LIMIT),
+    )

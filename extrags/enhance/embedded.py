@@ -1,9 +1,11 @@
-"""The default restorer: a conditional diffusion that the pipeline trains on its own pairs."""
+"""The default restorer: a conditional diffusion that has practised before, and may learn from a scene."""
 
 from __future__ import annotations
 
+import copy
 import json
-from dataclasses import dataclass, replace
+import math
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +16,9 @@ from torch import Tensor
 
 from extrags.config import EnhanceConfig
 from extrags.enhance.augmentation import CropSampler
+from extrags.enhance.calibration import Calibration, cell_means
 from extrags.enhance.conditioning import CONDITION_CHANNELS, Layers, condition
-from extrags.enhance.diffusion import TrainingSettings, sample, train_network
+from extrags.enhance.diffusion import Sampled, TrainingSettings, sample, train_network
 from extrags.enhance.gamut import Gamut
 from extrags.enhance.network import RestorationNetwork, build_network
 from extrags.enhance.pairs import Pairs
@@ -27,11 +30,13 @@ from extrags.metrics.image import psnr_per_image, ssim_map
 
 __all__ = ["EmbeddedEnhancer", "has_fast_half_precision", "validation_scores"]
 
-FORMAT = 1
+FORMAT = 2
 """Raised when a saved restorer cannot be read by newer code."""
 CANDIDATE_STEPS = (1, 4)
 """More steps never gained on held-out pairs; which of these does differs from scene to scene."""
 VIEWS_AT_ONCE = 4
+LEAST_GAIN_DB = 0.1
+"""Training on a scene must gain so much on pairs kept back; less is chance."""
 
 
 def has_fast_half_precision() -> bool:
@@ -46,11 +51,13 @@ class EmbeddedEnhancer:
     Args:
         network: in evaluation mode.
         steps: of the sampler.
-        samples: drawn per view and averaged; more than one also gives a deviation.
+        samples: drawn per view and averaged; their spread adds to the expected error.
         seed: of the noise, together with the clip's index.
         half_precision: convolutions in bfloat16.
         gamut: hues of the scene's real frames, bounds of the restored ones.
         record: how it was trained and what it reached on validation pairs.
+        calibration: from the error the network expects to the one it makes.
+        deterministic: trained as a plain regression: no noise, one step.
     """
 
     network: RestorationNetwork
@@ -60,46 +67,143 @@ class EmbeddedEnhancer:
     half_precision: bool
     gamut: Gamut
     record: dict[str, Any]
+    calibration: Calibration = field(default_factory=Calibration)
+    deterministic: bool = False
 
     name = "embedded"
 
     @classmethod
-    def train(cls, pairs: Pairs, transfer: LightTransfer, config: EnhanceConfig) -> EmbeddedEnhancer:
-        """Train on pairs, then choose the number of steps on the pairs kept back.
+    def train(
+        cls,
+        pairs: Pairs,
+        transfer: LightTransfer,
+        config: EnhanceConfig,
+        start: EmbeddedEnhancer | None = None,
+        *,
+        deterministic: bool = False,
+    ) -> EmbeddedEnhancer:
+        """Train on a scene's pairs, and keep what the pairs kept back show to be better.
 
-        The same pairs and settings give the same weights, for one number of threads.
+        With `start`, its network is trained on; where that does not help on the pairs kept back, the
+        network stays as it came. The same pairs and settings give the same weights, for one number of
+        threads.
 
         Args:
             pairs: what the pipeline made.
             transfer: how brightness changes with distance in this scene.
             config: budget, widths and seed.
+            start: a restorer that has practised on other scenes.
+            deterministic: train a plain regression instead of a diffusion.
 
         Raises:
             ConfigError: when nothing is left to train on, or the images are too small.
             DivergedError: when the loss stops being finite.
         """
-        half = _half_precision(config)
         generator = torch.Generator().manual_seed(config.seed)
-        network = build_network(CONDITION_CHANNELS, config.channels, generator)
-        sampler = CropSampler(pairs, transfer, batch=config.batch, crop_px=config.crop, seed=config.seed)
-        settings = TrainingSettings(config.train_iterations, config.learning_rate, half)
-        network, history = train_network(network, sampler.draw, settings, generator)
-        candidates = CANDIDATE_STEPS if config.steps == "auto" else (config.steps,)
         chosen = pairs.subset(np.flatnonzero(~pairs.validation))
         gamut = Gamut.of_images(chosen.target, chosen.weight)
-        untested = cls(network, candidates[0], config.samples, config.seed, half, gamut, {})
-        scores = validation_scores(untested, pairs, transfer, candidates)
-        steps = max(candidates, key=lambda count: scores[f"embedded_{count}"]["psnr"])
+        if start is None:
+            network = build_network(CONDITION_CHANNELS, config.channels, generator)
+            rate = config.learning_rate
+            base = cls(network, 1, 1, config.seed, False, gamut, {}, deterministic=deterministic)
+        else:
+            base = start
+            rate = config.scene_learning_rate
+            deterministic = start.deterministic
+        base = base.with_settings(config, gamut)
+        candidates = base.candidate_steps(config)
+        before = {} if start is None else validation_scores(base, pairs, transfer, candidates)
+        trained = replace(base, network=copy.deepcopy(base.network))
+        sampler = CropSampler(pairs, transfer, batch=config.batch, crop_px=config.crop, seed=config.seed)
+        settings = TrainingSettings(
+            config.train_iterations, rate, base.half_precision, deterministic=deterministic
+        )
+        _, history = train_network(trained.network, sampler.draw, settings, generator)
+        after = validation_scores(trained, pairs, transfer, candidates)
+        scores = {**after, **{f"untrained_{name}": value for name, value in _embedded_only(before).items()}}
+        gain = _best(after, candidates)[1] - (_best(before, candidates)[1] if before else -math.inf)
+        helped = gain > LEAST_GAIN_DB
+        kept = trained if helped else base
+        steps = _best(after if helped else before, candidates)[0]
         for method, values in scores.items():
             emit(MetricRecorded("enhance", f"validation_psnr_{method}", values["psnr"]))
         record = {
+            **base.record,
             "training_pairs": int((~pairs.validation).sum()),
             "validation_pairs": int(pairs.validation.sum()),
             "iterations": config.train_iterations,
             "history": history,
             "validation": scores,
+            "scene_training_kept": helped,
         }
-        return replace(untested, steps=steps, record=record)
+        kept = replace(kept, steps=steps, record=record)
+        return kept.calibrated(pairs, transfer)
+
+    @classmethod
+    def practised(cls, path: Path, config: EnhanceConfig, gamut: Gamut) -> EmbeddedEnhancer:
+        """A restorer from weights that practised on other scenes, with the settings of this one.
+
+        Args:
+            path: folder or file as `load` takes it.
+            config: sampler settings.
+            gamut: hues of this scene.
+
+        Raises:
+            WeightsError: as `load`.
+        """
+        return cls.load(path).with_settings(config, gamut)
+
+    def with_settings(self, config: EnhanceConfig, gamut: Gamut) -> EmbeddedEnhancer:
+        """The same network under a scene's settings."""
+        steps = self.steps if config.steps == "auto" else config.steps
+        return replace(
+            self,
+            steps=1 if self.deterministic else steps,
+            samples=1 if self.deterministic else config.samples,
+            seed=config.seed,
+            half_precision=_half_precision(config),
+            gamut=gamut,
+        )
+
+    def candidate_steps(self, config: EnhanceConfig) -> tuple[int, ...]:
+        """Numbers of steps to choose from."""
+        if self.deterministic:
+            return (1,)
+        return CANDIDATE_STEPS if config.steps == "auto" else (config.steps,)
+
+    def calibrated(self, pairs: Pairs, transfer: LightTransfer) -> EmbeddedEnhancer:
+        """With the curve that the pairs kept back show; the present one where they are too few.
+
+        Args:
+            pairs: all pairs.
+            transfer: how brightness changes with distance.
+        """
+        kept = _kept_back(pairs)
+        if kept is None:
+            return self
+        calibration = Calibration.fitted(*self.cell_errors(kept, transfer))
+        return replace(self, calibration=calibration) if calibration.predicted else self
+
+    def cell_errors(
+        self, pairs: Pairs, transfer: LightTransfer
+    ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+        """Expected (not calibrated) and true absolute errors of cells that are mostly valid.
+
+        Args:
+            pairs: with the truth.
+            transfer: how brightness changes with distance.
+        """
+        size = (int(pairs.target.shape[-2]), int(pairs.target.shape[-1]))
+        expected, true = [], []
+        for view in range(len(pairs)):
+            noise = self._noise(size, view, 0)
+            restored = self.restored_layers(pairs.layers[view], transfer, noise, steps=self.steps)
+            weight = pairs.weight[view : view + 1]
+            error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
+            predicted, share = cell_means(restored.error, weight)
+            expected.append(predicted[share > 0.5])
+            true.append(cell_means(error, weight)[0][share > 0.5])
+        return np.concatenate(expected), np.concatenate(true)
 
     def restore(self, clip: Clip) -> Restoration:
         """Restore all views of a clip.
@@ -109,14 +213,18 @@ class EmbeddedEnhancer:
         size = (clip.cameras.height, clip.cameras.width)
         draws = []
         for index in range(self.samples):
-            noise = _noise(size, self.seed, clip.index, index)
+            noise = self._noise(size, clip.index, index)
             draws.append(self.restored_layers(clip.layers, clip.transfer, noise, steps=self.steps))
-        stacked = torch.stack(draws)
-        deviation = None
-        if self.samples > 1:
-            deviation = stacked.std(dim=0, correction=0).mean(dim=1).numpy()
-        rgb = stacked.mean(dim=0).permute(0, 2, 3, 1).contiguous().numpy()
-        return Restoration(rgb, deviation, self.provenance)
+        colors = torch.stack([draw.rgb for draw in draws])
+        spread = colors.std(dim=0, correction=0).mean(dim=1, keepdim=True)
+        error = torch.stack([draw.error for draw in draws]).mean(dim=0)
+        expected = torch.hypot(error, spread)[:, 0].contiguous().numpy()
+        return Restoration(
+            colors.mean(dim=0).permute(0, 2, 3, 1).contiguous().numpy(),
+            self.calibration.applied(expected),
+            self.provenance,
+            draws[0].depth_mm[:, 0].contiguous().numpy(),
+        )
 
     def restored_layers(
         self,
@@ -125,7 +233,7 @@ class EmbeddedEnhancer:
         noise: Float[Tensor, "1 3 h w"],
         *,
         steps: int,
-    ) -> Float[Tensor, "t 3 h w"]:
+    ) -> Sampled:
         """One sample of each view.
 
         Args:
@@ -133,9 +241,6 @@ class EmbeddedEnhancer:
             transfer: how brightness changes with distance.
             noise: shared by all views.
             steps: of the sampler.
-
-        Returns:
-            In [0, 1].
         """
         parts = []
         # In small groups: the working set of a whole clip would not stay in the cache, and peaks add up.
@@ -146,8 +251,17 @@ class EmbeddedEnhancer:
             restored = sample(
                 self.network, conditioning, start, steps=steps, half_precision=self.half_precision
             )
-            parts.append(self.gamut.bounded(restored))
-        return torch.cat(parts)
+            parts.append(replace(restored, rgb=self.gamut.bounded(restored.rgb)))
+        return Sampled(
+            torch.cat([part.rgb for part in parts]),
+            torch.cat([part.depth_mm for part in parts]),
+            torch.cat([part.error for part in parts]),
+        )
+
+    def _noise(self, size: tuple[int, int], clip: int, index: int) -> Float[Tensor, "1 3 h w"]:
+        if self.deterministic:
+            return torch.zeros(1, 3, *size)
+        return _noise(size, self.seed, clip, index)
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -159,14 +273,23 @@ class EmbeddedEnhancer:
             "seed": self.seed,
             "precision": "bfloat16" if self.half_precision else "float32",
             "validation": self.record.get("validation", {}),
+            "scene_training_kept": self.record.get("scene_training_kept"),
         }
 
-    def save(self, path: Path) -> None:
-        """Write `restorer.safetensors` and `restorer.json`."""
+    def save(self, path: Path, *, half: bool = False) -> None:
+        """Write `restorer.safetensors` and `restorer.json`.
+
+        Args:
+            path: a folder.
+            half: weights in float16: half the size, for shipping.
+        """
         from safetensors.torch import save_file
 
         path.mkdir(parents=True, exist_ok=True)
-        weights = {name: value.contiguous() for name, value in self.network.state_dict().items()}
+        weights = {
+            name: (value.half() if half else value).contiguous()
+            for name, value in self.network.state_dict().items()
+        }
         save_file(weights, str(path / "restorer.safetensors"))
         description = {
             "backend": self.name,
@@ -178,6 +301,8 @@ class EmbeddedEnhancer:
             "seed": self.seed,
             "half_precision": self.half_precision,
             "gamut": self.gamut.as_dict(),
+            "calibration": self.calibration.as_dict(),
+            "deterministic": self.deterministic,
             "record": self.record,
         }
         (path / "restorer.json").write_text(json.dumps(description, indent=2) + "\n")
@@ -186,12 +311,16 @@ class EmbeddedEnhancer:
     def load(cls, path: Path) -> EmbeddedEnhancer:
         """Read what `save` wrote.
 
+        Args:
+            path: the folder, or its .safetensors file with the .json beside it.
+
         Raises:
             WeightsError: when a file is missing, or does not fit this version.
         """
         from safetensors.torch import load_file
 
-        weights_file, description_file = path / "restorer.safetensors", path / "restorer.json"
+        weights_file = path / "restorer.safetensors" if path.suffix != ".safetensors" else path
+        description_file = weights_file.with_suffix(".json")
         for file in (weights_file, description_file):
             if not file.exists():
                 raise WeightsError(f"{file}: no such file; train the restorer first (stage enhance)")
@@ -205,7 +334,9 @@ class EmbeddedEnhancer:
         first, second, third = description["widths"]
         network = build_network(CONDITION_CHANNELS, (first, second, third), torch.Generator())
         try:
-            network.load_state_dict(load_file(str(weights_file)))
+            network.load_state_dict(
+                {name: value.float() for name, value in load_file(str(weights_file)).items()}
+            )
         except RuntimeError as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return cls(
@@ -216,6 +347,8 @@ class EmbeddedEnhancer:
             bool(description["half_precision"]),
             Gamut(**description["gamut"]),
             description["record"],
+            Calibration(**{k: tuple(v) for k, v in description["calibration"].items()}),
+            bool(description["deterministic"]),
         )
 
 
@@ -237,12 +370,7 @@ def validation_scores(
         Of `none` (the rendering), `classical` (blend and fill) and `embedded_N`: `{psnr, ssim}`, and
         `psnr_hole` where a validation pair has pixels of alpha below one half.
     """
-    chosen = np.flatnonzero(pairs.validation & ~pairs.cheap)
-    if len(chosen) == 0:
-        chosen = np.flatnonzero(pairs.validation)
-    if len(chosen) == 0:
-        chosen = np.arange(len(pairs))
-    kept = pairs.subset(chosen)
+    kept = _kept_back(pairs) or pairs
     with torch.no_grad():
         conditioning = condition(kept.layers, transfer)
     size = (int(kept.target.shape[-2]), int(kept.target.shape[-1]))
@@ -250,12 +378,30 @@ def validation_scores(
     for steps in candidates:
         parts = [
             enhancer.restored_layers(
-                kept.layers[view], transfer, _noise(size, enhancer.seed, view, 0), steps=steps
-            )
+                kept.layers[view], transfer, enhancer._noise(size, view, 0), steps=steps
+            ).rgb
             for view in range(len(kept))
         ]
         images[f"embedded_{steps}"] = torch.cat(parts)
     return {name: _score(image, kept) for name, image in images.items()}
+
+
+def _kept_back(pairs: Pairs) -> Pairs | None:
+    """Validation pairs; the leave-out ones alone where there are any. None where nothing was kept back."""
+    chosen = np.flatnonzero(pairs.validation & ~pairs.cheap)
+    if len(chosen) == 0:
+        chosen = np.flatnonzero(pairs.validation)
+    return pairs.subset(chosen) if len(chosen) else None
+
+
+def _embedded_only(scores: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
+    return {name: value for name, value in scores.items() if name.startswith("embedded_")}
+
+
+def _best(scores: dict[str, dict[str, float]], candidates: tuple[int, ...]) -> tuple[int, float]:
+    """The best number of steps and its PSNR."""
+    steps = max(candidates, key=lambda count: scores[f"embedded_{count}"]["psnr"])
+    return steps, scores[f"embedded_{steps}"]["psnr"]
 
 
 def _score(image: Float[Tensor, "n 3 h w"], pairs: Pairs) -> dict[str, float]:

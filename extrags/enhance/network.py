@@ -1,4 +1,7 @@
-"""The restorer's network: a small conditional U-Net that predicts the clean image.
+"""The restorer's network: a small conditional U-Net that predicts the clean view.
+
+It answers with a residual to the base image, a residual to the logarithm of the completed depth, and the
+logarithm of how wrong it expects its colours to be.
 
 Two-by-two pixel blocks become channels at the entrance (full resolution costs most and says least),
 group normalisation and SiLU, the diffusion time by feature-wise scale and shift, attention at the
@@ -15,12 +18,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["SIZE_MULTIPLE", "RestorationNetwork", "build_network"]
+__all__ = ["OUTPUT_CHANNELS", "SIZE_MULTIPLE", "RestorationNetwork", "build_network"]
 
 UNSHUFFLE = 2
 TIME_FEATURES = 64
 TIME_WIDTH = 128
 NORM_GROUPS = 8
+OUTPUT_CHANNELS = 5
+"""Colour residual (3), residual of the log-depth (1), logarithm of the expected error (1)."""
 SIZE_MULTIPLE = UNSHUFFLE * 4
 """Image sides must be multiples of this: one unshuffling, two halvings."""
 
@@ -69,7 +74,7 @@ class SelfAttention(nn.Module):
 
 
 class RestorationNetwork(nn.Module):
-    """Residual to the base image from conditioning, noisy image and time.
+    """Residuals to base image and depth, and the expected error, from conditioning, noisy image and time.
 
     Args:
         condition_channels: channels of the conditioning.
@@ -99,15 +104,15 @@ class RestorationNetwork(nn.Module):
         self.up_fine = ResidualBlock(2 * fine, fine)
         self.up_last = ResidualBlock(2 * fine, fine)
         self.norm = nn.GroupNorm(NORM_GROUPS, fine)
-        self.exit = nn.Conv2d(fine, 3 * blocks, 3, padding=1)
+        self.exit = nn.Conv2d(fine, OUTPUT_CHANNELS * blocks, 3, padding=1)
 
     def forward(
         self,
         condition: Float[Tensor, "n c h w"],
         noisy: Float[Tensor, "n 3 h w"],
         time: Float[Tensor, "n"],
-    ) -> Float[Tensor, "n 3 h w"]:
-        """What to add to the base image, in the normalised colour space of `noisy`."""
+    ) -> Float[Tensor, "n 5 h w"]:
+        """What to add to the base image in the normalised colours of `noisy`, to log-depth, and log-error."""
         embedded = self.time(_sinusoids(time))
         packed = functional.pixel_unshuffle(torch.cat([condition, noisy], dim=1), UNSHUFFLE)
         entered = self.entrance(packed.contiguous(memory_format=torch.channels_last))

@@ -29,7 +29,7 @@ from extrags.training.reconstruction import coarse_schedule, scene_extent
 from extrags.training.starting import median_depth, starting_gaussians
 from extrags.training.views import epochs, real_views
 
-__all__ = ["Pairs", "cheap_pairs", "fold_pairs", "leave_out_folds", "make_pairs"]
+__all__ = ["Pairs", "cheap_pairs", "fold_pairs", "leave_out_folds", "make_pairs", "pair_views"]
 
 MIN_FRAMES = 4
 """With fewer training frames there is nothing to leave out."""
@@ -49,6 +49,7 @@ class Pairs:
         layers: of the degraded views, [P].
         target: the real image, in [0, 1], [P, 3, H, W].
         weight: 1 where the target is valid tissue and not saturated, [P, 1, H, W].
+        depth_mm: true z-depth, 0 where unknown, [P, 1, H, W].
         frame: frame of the sequence, [P].
         cheap: which pairs come from unoptimised or torn Gaussians, [P].
         validation: which pairs are kept back from the training, [P].
@@ -57,6 +58,7 @@ class Pairs:
     layers: Layers
     target: Float[Tensor, "p 3 h w"]
     weight: Float[Tensor, "p 1 h w"]
+    depth_mm: Float[Tensor, "p 1 h w"]
     frame: Int[np.ndarray, "p"]
     cheap: Bool[np.ndarray, "p"]
     validation: Bool[np.ndarray, "p"]
@@ -71,6 +73,7 @@ class Pairs:
             self.layers[chosen],
             self.target[index],
             self.weight[index],
+            self.depth_mm[index],
             self.frame[chosen],
             self.cheap[chosen],
             self.validation[chosen],
@@ -89,6 +92,7 @@ class Pairs:
             Layers(torch.cat([part.layers.data for part in parts])),
             torch.cat([part.target for part in parts]),
             torch.cat([part.weight for part in parts]),
+            torch.cat([part.depth_mm for part in parts]),
             np.concatenate([part.frame for part in parts]),
             np.concatenate([part.cheap for part in parts]),
             np.concatenate([part.validation for part in parts]),
@@ -166,7 +170,7 @@ def fold_pairs(
         observation = observe_views(
             degraded, views, sequence.cameras[left], count=config.references, exposure=gain
         )
-        parts.append(_paired(sequence, observation.layers, left, cheap=degraded is torn))
+        parts.append(pair_views(sequence, observation.layers, left, cheap=degraded is torn))
     return Pairs.concatenated(parts)
 
 
@@ -276,7 +280,7 @@ def cheap_pairs(scene: Scene, sequence: Sequence, config: EnhanceConfig) -> Pair
         observation = observe_views(
             crude, views, sequence.cameras[train[targets]], count=config.references, exposure=gain
         )
-        parts.append(_paired(sequence, observation.layers, train[targets], cheap=True))
+        parts.append(pair_views(sequence, observation.layers, train[targets], cheap=True))
         remaining -= count
     return Pairs.concatenated(parts)
 
@@ -320,17 +324,22 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
     return Gaussians.from_points(points[keep], colors[keep].clip(0, None), radius[keep], opacity=opacity)
 
 
-def _paired(sequence: Sequence, layers: Layers, frames: Int[np.ndarray, "m"], *, cheap: bool) -> Pairs:
+def pair_views(sequence: Sequence, layers: Layers, frames: Int[np.ndarray, "m"], *, cheap: bool) -> Pairs:
+    """Layers of frames with what the frames really show; every fifth training frame validates."""
     rgb = sequence.rgb[frames]
     valid = sequence.mask[frames] & (rgb.max(axis=-1) < SATURATED)
     if sequence.specular is not None:
         valid &= ~sequence.specular[frames]
+    depth = np.zeros(valid.shape, dtype=np.float32)
+    if sequence.depth_mm is not None:
+        depth = np.where(sequence.mask[frames], sequence.depth_mm[frames], 0).astype(np.float32)
     train = np.asarray(sequence.train, dtype=np.int64)
     position = np.searchsorted(np.sort(train), frames)
     return Pairs(
         layers,
         torch.from_numpy(rgb.astype(np.float32) / 255).permute(0, 3, 1, 2).contiguous(),
         torch.from_numpy(valid.astype(np.float32))[:, None],
+        torch.from_numpy(depth)[:, None],
         frames,
         np.full(len(frames), cheap),
         position % VALIDATION_EVERY == VALIDATION_EVERY // 2,

@@ -56,14 +56,17 @@ class Restoration:
 
     Args:
         rgb: in [0, 1], [T, H, W, 3].
-        deviation: standard deviation over samples, mean of the channels, or None for a single sample,
-            [T, H, W].
+        deviation: expected absolute error of a pixel, mean of the channels, or None where the restorer
+            has no idea of it, [T, H, W].
         provenance: backend, steps, seed, ...; ready for JSON.
+        depth_mm: z-depth without gaps, where the restorer completes it better than smooth filling does,
+            or None, [T, H, W].
     """
 
     rgb: Float[np.ndarray, "t h w 3"]
     deviation: Float[np.ndarray, "t h w"] | None
     provenance: dict[str, Any] = field(default_factory=dict)
+    depth_mm: Float[np.ndarray, "t h w"] | None = None
 
 
 @runtime_checkable

@@ -43,15 +43,22 @@ class LightTransfer:
     exponent: float
     scale_mm: float
 
-    def falloff(self, distance: Float[Tensor, "*b"], axis_cosine: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Brightness relative to that at the reference distance, on the axis.
+    def falloff(
+        self,
+        distance: Float[Tensor, "*b"],
+        axis_cosine: Float[Tensor, "*b"],
+        facing_cosine: Float[Tensor, "*b"] | None = None,
+    ) -> Float[Tensor, "*b"]:
+        """Brightness relative to that of a surface at the reference distance, on the axis, facing the lens.
 
         Args:
             distance: from the lens, in world units.
             axis_cosine: cosine between the ray and the optical axis; counts with `light` only.
+            facing_cosine: cosine between the ray and the surface's normal; counts with `light` only. None
+                takes every surface to face the lens.
         """
         if self.light is not None:
-            return self.light.falloff(distance, axis_cosine)
+            return self.light.falloff(distance, axis_cosine, facing_cosine)
         return (distance / self.scale_mm) ** -self.exponent
 
     def signal(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:

@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from extrags.cameras import Cameras, pixel_rays
 from extrags.enhance.references import LightTransfer, ReferenceViews
+from extrags.metrics.filters import filter_separable, gaussian_weights
 
 __all__ = ["Warped", "covisibility", "fit_falloff_exponent", "warp_references"]
 
@@ -35,6 +36,9 @@ HIGHLIGHT_STEP = 0.12
 BRIGHTNESS_LIMIT = 8.0
 """Larger brightness ratios amplify noise more than they inform."""
 EXPONENT_RANGE = (0.0, 3.0)
+NORMAL_SIGMA_PX = 1.5
+NORMAL_RADIUS_PX = 4
+"""Depth is smoothed so much before normals are taken from it."""
 
 
 @dataclass(frozen=True)
@@ -69,16 +73,18 @@ class _Seen:
     quality: Float[Tensor, "k p"]
     distance: Float[Tensor, "k p"]
     axis_cosine: Float[Tensor, "k p"]
+    facing_cosine: Float[Tensor, "k p"]
 
 
 @dataclass(frozen=True)
 class _Surface:
-    """World points of a view's pixels, with distance, ray and angle to the axis as seen from its lens."""
+    """World points of a view's pixels with their normals, and how the lens sees them."""
 
     points: Float[Tensor, "p 3"]
     distance: Float[Tensor, "p"]
     direction: Float[Tensor, "p 3"]
     axis_cosine: Float[Tensor, "p"]
+    normal: Float[Tensor, "p 3"]
 
 
 def warp_references(
@@ -138,8 +144,9 @@ def _warp_one(
     here = _surface(camera, depth_mm, 1)
     seen = _look_up(references, chosen, here)
     transfer = references.transfer
-    ratio = transfer.falloff(here.distance, here.axis_cosine)[None] / transfer.falloff(
-        seen.distance, seen.axis_cosine
+    facing = (here.normal * here.direction).sum(dim=-1)
+    ratio = transfer.falloff(here.distance, here.axis_cosine, facing)[None] / transfer.falloff(
+        seen.distance, seen.axis_cosine, seen.facing_cosine
     )
     ratio = ratio * (gain / references.exposure[chosen])[:, None]
     ratio = ratio.clamp(1 / BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
@@ -176,7 +183,34 @@ def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> 
     distance = offsets.norm(dim=-1).clamp_min(1e-9)
     center = torch.from_numpy(camera.centers[0].astype(np.float32))
     cosine = 1 / rays.norm(dim=-1).reshape(-1)
-    return _Surface(center + offsets, distance, offsets / distance[:, None], cosine)
+    normal = surface_normals(cameras_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
+    return _Surface(center + offsets, distance, offsets / distance[:, None], cosine, normal)
+
+
+def surface_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]) -> Float[Tensor, "h w 3"]:
+    """Unit normals of the surface that a depth map without gaps describes, in the rays' frame.
+
+    Differences over a few pixels: what a lamp shades is the wall, not the roughness of a rendered depth.
+
+    Args:
+        rays: of each pixel, at unit z-depth.
+        depth_mm: z-depth.
+    """
+    window = gaussian_weights(NORMAL_SIGMA_PX, NORMAL_RADIUS_PX)
+    smooth = 1 / filter_separable(1 / depth_mm[None].clamp_min(1e-9), window, window)[0, 0]
+    points = rays * smooth[..., None]
+    along = points.roll(-1, 1) - points.roll(1, 1)
+    down = points.roll(-1, 0) - points.roll(1, 0)
+    along[:, 0], along[:, -1] = along[:, 1], along[:, -2]
+    down[0], down[-1] = down[1], down[-2]
+    normal = torch.linalg.cross(along, down)
+    unit: Tensor = normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-20)
+    return unit
+
+
+def cameras_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
+    """Rays of a single camera in the world's frame, at unit z-depth."""
+    return torch.from_numpy(pixel_rays(camera)[0].astype(np.float32))
 
 
 def _look_up(
@@ -214,7 +248,8 @@ def _look_up(
         -(seen_from / surface.distance).log().abs() / DISTANCE_TOLERANCE
         - (torch.arccos(cosine) / ANGLE_TOLERANCE_RAD).square()
     )
-    return _Seen(sampled[:, :3], weight, quality, seen_from, z / seen_from)
+    facing = (away / seen_from[..., None] * surface.normal).sum(dim=-1)
+    return _Seen(sampled[:, :3], weight, quality, seen_from, z / seen_from, facing)
 
 
 def fit_falloff_exponent(references: ReferenceViews, *, pairs: int = 24) -> float:

@@ -8,33 +8,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import UInt8
 
 from extrags.errors import ShapeError
-from extrags.report.encode import (
-    OUTSIDE_RGB,
-    as_uint8,
-    color_bar,
-    color_mapped,
-    fitted_image,
-    outlined,
-)
-from extrags.report.views import (
-    ERROR_COLORMAP,
-    SCALE_QUANTILE,
-    UNSEEN_RGB,
-    ColorScale,
-    ImageCell,
-    ImageRow,
-    ImageTable,
-    evenly_spaced,
-)
+from extrags.report.encode import as_uint8
+from extrags.report.image_table import ImageTable, Judged, evenly_spaced, judged_table
 from extrags.report.wording import metric_of, number
 from extrags.sequence import Sequence
 
 __all__ = ["RenderedMethod", "compared_rows"]
-
-LEAST_SCALE_END = 0.05
 
 
 @dataclass(frozen=True)
@@ -78,54 +59,9 @@ def compared_rows(
             )
     chosen = evenly_spaced(len(sequence.test), views)
     frames = sequence.test[chosen]
-    truth, masks = sequence.rgb[frames], sequence.mask[frames]
-    unseen = np.zeros_like(masks) if sequence.observed is None else ~sequence.observed[frames] & masks
-    images = [as_uint8(method.rgb[chosen]) for method in methods]
-    errors = [np.abs(image.astype(np.float64) - truth).mean(-1) / 255 for image in images]
-    counted = np.concatenate([error[masks] for error in errors])
-    high = LEAST_SCALE_END
-    if counted.size:
-        high = max(high, float(np.ceil(np.quantile(counted, SCALE_QUANTILE) * 20 - 1e-9) / 20))
-
-    rows = []
-    for place, frame in enumerate(map(int, frames)):
-        name, mask = sequence.frame_name(frame), masks[place]
-        shown = [(method.name, image[place], "render") for method, image in zip(methods, images, strict=True)]
-        cells = [
-            ImageCell(
-                fitted_image(_inside(image, mask), largest_bytes), label, f"Frame {name}, {label} {kind}"
-            )
-            for label, image, kind in [*shown, ("Truth", truth[place], "as recorded")]
-        ]
-        for method, error in zip(methods, errors, strict=True):
-            colored = color_mapped(error[place], 0, high, colormap=ERROR_COLORMAP, valid=mask)
-            mean = float(error[place][mask].mean()) if mask.any() else 0.0
-            cells.append(
-                ImageCell(
-                    fitted_image(outlined(colored, unseen[place], UNSEEN_RGB), largest_bytes),
-                    f"Error, {method.name}",
-                    f"Frame {name}, error of {method.name}, mean {mean:.3f}",
-                )
-            )
-        rows.append(ImageRow(f"Frame {name}", _note(methods, int(chosen[place])), tuple(cells)))
-    scale = ColorScale(
-        color_bar(ERROR_COLORMAP),
-        "0",
-        f"≥ {high:.2f}",
-        "mean absolute difference of red, green, blue in [0, 1]",
-    )
-    return ImageTable(
-        tuple(rows),
-        (scale,),
-        len(rows),
-        len(sequence.test),
-        outlined=bool(unseen.any()),
-        masked=not bool(masks.all()),
-    )
-
-
-def _inside(image: UInt8[np.ndarray, "h w 3"], mask: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
-    return np.where(mask[..., None], image, np.array(OUTSIDE_RGB, dtype=np.uint8))
+    judged = [Judged(method.name, method.name, as_uint8(method.rgb[chosen])) for method in methods]
+    notes = [_note(methods, int(place)) for place in chosen]
+    return judged_table(sequence, frames, judged, notes, len(sequence.test), largest_bytes)
 
 
 def _note(methods: tuple[RenderedMethod, RenderedMethod], index: int) -> str:

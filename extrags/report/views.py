@@ -2,79 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float
 
-from extrags.report.encode import (
-    OUTSIDE_RGB,
-    DataImage,
-    as_uint8,
-    color_bar,
-    color_mapped,
-    fitted_image,
-    outlined,
+from extrags.report.encode import as_uint8, color_bar, color_mapped, fitted_image
+from extrags.report.image_table import (
+    ERROR_COLORMAP,
+    SCALE_QUANTILE,
+    ColorScale,
+    ImageCell,
+    ImageRow,
+    ImageTable,
+    Judged,
+    error_scale,
+    evenly_spaced,
+    image_cell,
+    judged_table,
+    scale_end,
 )
 from extrags.report.inputs import PseudoLike, RendersLike, ReportInputs
 from extrags.report.wording import METRICS, metric_of, number
 from extrags.sequence import Sequence
 
-__all__ = ["ColorScale", "ImageCell", "ImageRow", "ImageTable", "depth_rows", "held_out_rows", "virtual_rows"]
+__all__ = ["depth_rows", "held_out_rows", "virtual_rows"]
 
-ERROR_COLORMAP = "magma"
 DEPTH_COLORMAP = "viridis"
 UNCERTAINTY_COLORMAP = "cividis"
-UNSEEN_RGB = (90, 220, 235)
-"""Outline of surface no training frame saw: a cyan that magma does not hold."""
-SCALE_QUANTILE = 0.98
-"""The colour scale ends here, so that holes and highlights do not flatten everything else."""
 SURFACE_ALPHA = 0.5
 CHANGED_LEVELS = 8
 """A pixel counts as changed when a channel differs by more than this, of 255."""
-
-
-@dataclass(frozen=True, slots=True)
-class ImageCell:
-    """One image of a row."""
-
-    image: DataImage
-    label: str
-    alt: str
-
-
-@dataclass(frozen=True, slots=True)
-class ImageRow:
-    """Images of one view, side by side."""
-
-    title: str
-    note: str
-    cells: tuple[ImageCell, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class ColorScale:
-    """What the colours of a map mean."""
-
-    bar: DataImage
-    low: str
-    high: str
-    label: str
-
-
-@dataclass(frozen=True, slots=True)
-class ImageTable:
-    """Rows of images that share their colour scales."""
-
-    rows: tuple[ImageRow, ...]
-    scales: tuple[ColorScale, ...]
-    shown: int
-    total: int
-    outlined: bool = False
-    """Whether unseen surface is outlined somewhere."""
-    masked: bool = False
-    """Whether pixels outside a mask are greyed out somewhere."""
 
 
 def held_out_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> ImageTable:
@@ -88,44 +46,11 @@ def held_out_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> Image
     sequence = inputs.sequence
     chosen = evenly_spaced(len(inputs.frames), views)
     frames = inputs.frames[chosen]
-    truth, masks = sequence.rgb[frames], sequence.mask[frames]
-    unseen = np.zeros_like(masks)
-    if sequence.observed is not None:
-        # The array says nothing about frames that are not held out.
-        unseen = ~sequence.observed[frames] & masks & np.isin(frames, sequence.test)[:, None, None]
-    images = {kind: as_uint8(renders.rgb[chosen]) for kind, renders in _renders(inputs)}
-    errors = {kind: np.abs(image.astype(np.float64) - truth).mean(-1) / 255 for kind, image in images.items()}
-    high = _scale_end([error[masks] for error in errors.values()], 0.05)
-
-    rows = []
-    for place, frame in enumerate(map(int, frames)):
-        name, mask = sequence.frame_name(frame), masks[place]
-        cells = [
-            _image_cell(image[place], mask, kind.capitalize(), f"Frame {name}, {kind} render", largest_bytes)
-            for kind, image in images.items()
-        ]
-        cells.append(_image_cell(truth[place], mask, "Truth", f"Frame {name} as recorded", largest_bytes))
-        for kind, error in errors.items():
-            shown = color_mapped(error[place], 0, high, colormap=ERROR_COLORMAP, valid=mask)
-            shown = outlined(shown, unseen[place], UNSEEN_RGB)
-            mean = float(error[place][mask].mean()) if mask.any() else 0.0
-            alt = f"Frame {name}, error of the {kind} render, mean {mean:.3f}"
-            cells.append(ImageCell(fitted_image(shown, largest_bytes), f"Error, {kind}", alt))
-        rows.append(ImageRow(f"Frame {name}", _view_note(inputs, int(chosen[place])), tuple(cells)))
-    scale = ColorScale(
-        color_bar(ERROR_COLORMAP),
-        "0",
-        f"≥ {high:.2f}",
-        "mean absolute difference of red, green, blue in [0, 1]",
-    )
-    return ImageTable(
-        tuple(rows),
-        (scale,),
-        len(rows),
-        len(inputs.frames),
-        outlined=bool(unseen.any()),
-        masked=not bool(masks.all()),
-    )
+    judged = [
+        Judged(kind, kind.capitalize(), as_uint8(renders.rgb[chosen])) for kind, renders in _renders(inputs)
+    ]
+    notes = [_view_note(inputs, int(place)) for place in chosen]
+    return judged_table(sequence, frames, judged, notes, len(inputs.frames), largest_bytes)
 
 
 def depth_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> ImageTable | None:
@@ -155,7 +80,7 @@ def depth_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> ImageTab
         kind: np.where(known & (depth > 0), np.abs(depth - truth) / np.where(known, truth, 1), np.nan)
         for kind, depth in depths.items()
     }
-    high = _scale_end([error[np.isfinite(error)] for error in errors.values()], 0.05)
+    high = scale_end([error[np.isfinite(error)] for error in errors.values()])
 
     rows = []
     for place, frame in enumerate(map(int, frames)):
@@ -174,7 +99,7 @@ def depth_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> ImageTab
     unit = "mm" if sequence.metric else "units of the scene"
     scales = (
         ColorScale(color_bar(DEPTH_COLORMAP), f"≤ {near:.3g}", f"≥ {far:.3g}", f"z-depth in {unit}"),
-        ColorScale(color_bar(ERROR_COLORMAP), "0", f"≥ {high:.2f}", "relative error of the depth"),
+        error_scale(high, "relative error of the depth"),
     )
     return ImageTable(tuple(rows), scales, len(rows), len(inputs.frames))
 
@@ -200,19 +125,19 @@ def virtual_rows(pseudo: PseudoLike, sequence: Sequence, views: int, largest_byt
         uncertainty = color_mapped(u, 0, 1, colormap=UNCERTAINTY_COLORMAP)
         name = sequence.frame_name(reference)
         cells = (
-            _image_cell(
+            image_cell(
                 sequence.rgb[reference],
                 None,
                 f"Reference, frame {name}",
                 f"Reference frame {name}",
                 largest_bytes,
             ),
-            _image_cell(before, None, "Rendered", f"Coarse render of {where}", largest_bytes),
-            _image_cell(
+            image_cell(before, None, "Rendered", f"Coarse render of {where}", largest_bytes),
+            image_cell(
                 as_uint8(pseudo.restored[index]), None, "Restored", f"Restored {where}", largest_bytes
             ),
-            _image_cell(after, None, "Used for training", f"Pseudo-observation of {where}", largest_bytes),
-            _image_cell(
+            image_cell(after, None, "Used for training", f"Pseudo-observation of {where}", largest_bytes),
+            image_cell(
                 uncertainty,
                 None,
                 "Uncertainty",
@@ -229,43 +154,16 @@ def virtual_rows(pseudo: PseudoLike, sequence: Sequence, views: int, largest_byt
     return ImageTable(tuple(rows), (scale,), len(rows), total)
 
 
-def evenly_spaced(total: int, wanted: int) -> Int[np.ndarray, "w"]:
-    """The middles of equal parts of a list: never picked by how good they look."""
-    wanted = min(wanted, total)
-    return np.floor((np.arange(wanted) + 0.5) * total / max(1, wanted)).astype(np.int64)
-
-
 def _renders(inputs: ReportInputs) -> list[tuple[str, RendersLike]]:
     """The scenes that were rendered, by name."""
     pairs = (("coarse", inputs.coarse), ("final", inputs.final))
     return [(kind, renders) for kind, renders in pairs if renders is not None]
 
 
-def _image_cell(
-    image: UInt8[np.ndarray, "h w 3"],
-    mask: np.ndarray | None,
-    label: str,
-    alt: str,
-    largest_bytes: int,
-) -> ImageCell:
-    if mask is not None and not mask.all():
-        image = np.where(mask[..., None], image, np.array(OUTSIDE_RGB, dtype=np.uint8))
-    return ImageCell(fitted_image(image, largest_bytes), label, alt)
-
-
 def _surface_depth(renders: RendersLike, chosen: np.ndarray) -> Float[np.ndarray, "n h w"]:
     """Depth where the render holds a surface, 0 elsewhere."""
     depth, alpha = (np.asarray(part[chosen], dtype=np.float64) for part in (renders.depth_mm, renders.alpha))
     return np.where((alpha >= SURFACE_ALPHA) & np.isfinite(depth), depth, 0.0)
-
-
-def _scale_end(parts: list[np.ndarray], least: float) -> float:
-    """Where a colour scale ends: a high quantile of all maps that share it, rounded up."""
-    values = np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
-    if not values.size:
-        return least
-    end = max(least, float(np.quantile(values, SCALE_QUANTILE)))
-    return float(np.ceil(end * 20 - 1e-9) / 20)
 
 
 def _view_note(inputs: ReportInputs, index: int) -> str:

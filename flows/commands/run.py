@@ -17,6 +17,7 @@ from flows.commands.common import parsed_settings, set_up_logging, store_root, w
 from flows.environment import prepare, without_heartbeat
 from flows.methods import METHODS, method_config, profile_label, refuse_pinned
 from flows.outcome import DatasetOutcome
+from flows.preflight import check_before
 from flows.settings import STAGES, StageName
 
 __all__ = ["execute", "plan", "report", "run"]
@@ -110,6 +111,8 @@ def execute(
         ConfigError: for wrong settings.
         UnknownSequenceError: for a name that is not in the catalogue.
         StoreError: for a store that cannot be written.
+        WeightsError: when a model or weights that the settings name are not there.
+        MissingDependencyError: when a package that the settings need is not there.
     """
     terminal = sys.stderr.isatty()
     set_up_logging(debug=given.debug, terminal=terminal)
@@ -122,6 +125,8 @@ def execute(
         found = _from_store(sequences, config, root, given.profile, given.method, until)
         if found is not None:
             return found
+    # The flow looks as well; here it is said without waiting for a server.
+    check_before(config, until, METHODS[given.method].leave_out)
     from flows.console import watched
     from flows.dataset import reconstruct_dataset
 

@@ -87,7 +87,7 @@ class TestRuns:
     def test_page_and_artifact(self, found: dict[str, Any]) -> None:
         page = Path(found["report"]).read_text()
         assert "no-light" in page
-        assert "Truth as recorded" in page
+        assert "truth as recorded" in page
         artifact: Any = Artifact.get("benchmark-tiny-methods")
         assert "## Differences to 3dgs" in artifact.data
         assert "| phantom/0 | sparse | quick | coarse | 2 |" in artifact.data

@@ -30,6 +30,7 @@ from extrags.enhance.captions import KEY_VARIABLE, caption_of
 from extrags.enhance.clips import keep_known
 from extrags.enhance.pretrained import checkpoint_driver
 from extrags.enhance.pretrained.canvas import Canvas
+from extrags.enhance.pretrained.fingerprint import files_fingerprint
 from extrags.enhance.pretrained.inputs import clip_inputs, ranked_references, window_seed
 from extrags.enhance.pretrained.real_views import RealViews
 from extrags.enhance.pretrained.windows import cross_faded, padded_to, plan_windows
@@ -44,9 +45,9 @@ from extrags.errors import (
 from extrags.scene import Scene
 from extrags.sequence import Sequence
 
-__all__ = ["CheckpointEnhancer", "check_clone", "relative_poses"]
+__all__ = ["CheckpointEnhancer", "check_clone", "check_interpreter", "clone_fingerprint", "relative_poses"]
 
-FORMAT = 1
+FORMAT = 2
 """Raised when a saved restorer cannot be read by newer code."""
 CLONE_FILES = ("utils/utils.py", "lvdm/models/samplers/ddim.py")
 """What the driver imports besides the model's own class."""
@@ -81,6 +82,7 @@ class CheckpointEnhancer:
         seed: of the noise, together with clip and window.
         views: training frames.
         caption: text the model is told.
+        model_digest: fingerprint of checkpoint, config and code the restorer was prepared with.
         record: for the provenance.
     """
 
@@ -88,6 +90,7 @@ class CheckpointEnhancer:
     seed: int
     views: RealViews
     caption: str
+    model_digest: str
     record: dict[str, Any]
 
     name = "dynamicrafter"
@@ -107,8 +110,8 @@ class CheckpointEnhancer:
             MissingDependencyError: when the interpreter lacks a package of the clone.
             ExtragsError: when the process ends otherwise than it should.
         """
+        check_interpreter(config.checkpoint)
         clone = check_clone(config.checkpoint)
-        _start(clone, config.checkpoint, {}, {}, check=True)
         caption = caption_of(sequence, config.caption)
         record = {
             "interface": config.checkpoint.interface,
@@ -116,7 +119,14 @@ class CheckpointEnhancer:
             "checkpoint_bytes": clone.checkpoint.stat().st_size,
             "caption": caption.as_dict(),
         }
-        return cls(config.checkpoint, config.seed, RealViews.gather(scene, sequence), caption.text, record)
+        return cls(
+            config.checkpoint,
+            config.seed,
+            RealViews.gather(scene, sequence),
+            caption.text,
+            clone_fingerprint(config.checkpoint),
+            record,
+        )
 
     def restore(self, clip: Clip) -> Restoration:
         """Restore all views of a clip, in one process for all its windows.
@@ -125,13 +135,19 @@ class CheckpointEnhancer:
 
         Raises:
             ConfigError: when a setting is missing or does not fit.
-            WeightsError: when the checkpoint is gone, does not fit, or is a pickle nobody vouched for.
+            WeightsError: when the checkpoint is gone, another one than the restorer was prepared with, does
+                not fit, or is a pickle nobody vouched for.
             MissingDependencyError: when the interpreter lacks a package of the clone.
             ExtragsError: when the process fails or takes too long; with the end of what it wrote.
             NonFiniteError: when the model returns NaN.
         """
         settings = self.settings
         clone = check_clone(settings)
+        if clone_fingerprint(settings) != self.model_digest:
+            raise WeightsError(
+                f"{clone.checkpoint}, its config or its code is another one than when this restorer was "
+                "prepared; run the stage enhance-train again (--refresh)"
+            )
         base, unknown = clip_inputs(clip, 0.5, 0)
         rendered = clip.layers.get("rendered").clamp(0, 1).permute(0, 2, 3, 1).contiguous().numpy()
         uncertainty = clip.layers.get("uncertainty")[:, 0, :, :, None].numpy()
@@ -179,6 +195,7 @@ class CheckpointEnhancer:
             "eta": settings.eta,
             "guidance_scale": _guidance(settings),
             "seed": self.seed,
+            "model_digest": self.model_digest,
             **self.record,
         }
         return Restoration(rgb, None, provenance)
@@ -193,6 +210,7 @@ class CheckpointEnhancer:
             "settings": self.settings.model_dump(mode="json"),
             "seed": self.seed,
             "caption": self.caption,
+            "model_digest": self.model_digest,
             "record": self.record,
         }
         (path / "restorer.json").write_text(json.dumps(description, indent=2) + "\n")
@@ -219,6 +237,7 @@ class CheckpointEnhancer:
             int(description["seed"]),
             RealViews.load(path / "references"),
             description["caption"],
+            description["model_digest"],
             description["record"],
         )
 
@@ -270,6 +289,32 @@ def check_clone(settings: CheckpointConfig) -> _Clone:
             f"{settings.frames}, the first of which is a real view"
         )
     return _Clone(root, config, checkpoint, target, settings.python or sys.executable)
+
+
+def check_interpreter(settings: CheckpointConfig) -> None:
+    """As `check_clone`, and import the clone's modules in a process of their own, which takes seconds.
+
+    Raises:
+        ConfigError: as `check_clone`, or when the interpreter cannot be run.
+        WeightsError: as `check_clone`.
+        MissingDependencyError: when the interpreter lacks a package of the clone.
+        ExtragsError: when the process ends otherwise than it should.
+    """
+    _start(check_clone(settings), settings, {}, {}, check=True)
+
+
+def clone_fingerprint(settings: CheckpointConfig) -> str:
+    """Digest of everything that makes the model: checkpoint, config, and the code it is run by.
+
+    Raises:
+        ConfigError: as `check_clone`.
+        WeightsError: as `check_clone`.
+    """
+    clone = check_clone(settings)
+    packages = {*(file.split("/")[0] for file in CLONE_FILES), clone.target.split(".")[0]}
+    code = [file for package in packages for file in (clone.root / package).rglob("*.py")]
+    named = {file.relative_to(clone.root).as_posix(): file for file in code if file.is_file()}
+    return files_fingerprint({**named, "config": clone.config, "checkpoint": clone.checkpoint})
 
 
 def _target(config: Path) -> str:

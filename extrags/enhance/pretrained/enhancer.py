@@ -19,9 +19,10 @@ from extrags.enhance.captions import caption_of
 from extrags.enhance.clips import keep_known
 from extrags.enhance.pretrained.adapter import Adapter, Window
 from extrags.enhance.pretrained.canvas import Canvas
+from extrags.enhance.pretrained.fingerprint import fingerprint
 from extrags.enhance.pretrained.inputs import clip_inputs, ranked_references, window_seed
 from extrags.enhance.pretrained.ltx import LtxCondition
-from extrags.enhance.pretrained.model import find_model, fingerprint
+from extrags.enhance.pretrained.model import check_device, find_model
 from extrags.enhance.pretrained.real_views import RealViews
 from extrags.enhance.pretrained.stable_diffusion import StableDiffusionImageToImage, StableDiffusionInpaint
 from extrags.enhance.pretrained.stable_video import StableVideo
@@ -32,7 +33,7 @@ from extrags.errors import ConfigError, WeightsError
 from extrags.scene import Scene
 from extrags.sequence import Sequence
 
-__all__ = ["ADAPTERS", "PretrainedEnhancer"]
+__all__ = ["ADAPTERS", "PretrainedEnhancer", "check_pipeline"]
 
 FORMAT = 1
 """Raised when a saved restorer cannot be read by newer code."""
@@ -90,8 +91,7 @@ class PretrainedEnhancer:
             ConfigError: when a setting does not fit the machine.
         """
         adapter = ADAPTERS[config.backend]
-        folder = find_model(adapter.rule, config.pretrained)
-        _check(adapter, config.pretrained)
+        folder = check_pipeline(config)
         text: dict[str, Tensor] = {}
         record: dict[str, Any] = {
             "model": config.pretrained.model or adapter.rule.usual_model,
@@ -232,17 +232,32 @@ def _digest(text: dict[str, Tensor]) -> str:
     return hashlib.blake2b(save(text), digest_size=16).hexdigest()
 
 
-def _check(adapter: type[Adapter], settings: PretrainedConfig) -> None:
-    """Settings that only fail with the first window, told before."""
-    frames = settings.frames or adapter.rule.frames
-    if (frames - 1) % adapter.rule.frame_step:
-        near = valid_frame_count(frames, adapter.rule.frame_step)
+def check_pipeline(config: EnhanceConfig) -> Path:
+    """Look for everything a backend needs, and for settings that would fail with the first window.
+
+    Args:
+        config: with a backend of `ADAPTERS`.
+
+    Returns:
+        The folder of the saved pipeline.
+
+    Raises:
+        WeightsError: when the model is not there; says how to get it.
+        MissingDependencyError: without diffusers.
+        ConfigError: when a setting does not fit the pipeline or the machine.
+    """
+    rule, settings = ADAPTERS[config.backend].rule, config.pretrained
+    frames = settings.frames or rule.frames
+    if (frames - 1) % rule.frame_step:
+        near = valid_frame_count(frames, rule.frame_step)
         raise ConfigError(
-            f"enhance.pretrained.frames={frames}: {adapter.rule.pipeline} takes "
-            f"{adapter.rule.frame_step}k+1 frames, {near} for example"
+            f"enhance.pretrained.frames={frames}: {rule.pipeline} takes "
+            f"{rule.frame_step}k+1 frames, {near} for example"
         )
     if frames - 1 <= settings.overlap:
         raise ConfigError(
             f"enhance.pretrained.overlap={settings.overlap} leaves no new frame in windows of {frames}, "
             "the first of which is a real view"
         )
+    check_device(settings)
+    return find_model(rule, settings)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import importlib.util
 import inspect
@@ -17,15 +16,17 @@ from typing import Any
 import torch
 
 from extrags.config import PretrainedConfig
+from extrags.enhance.pretrained.parts import missing_part
 from extrags.errors import ConfigError, MissingDependencyError, WeightsError
 
 __all__ = [
     "INSTALL",
     "PipelineRule",
+    "check_device",
+    "check_packages",
     "chosen_device",
     "chosen_dtype",
     "find_model",
-    "fingerprint",
     "load_pipeline",
     "require_diffusers",
 ]
@@ -34,8 +35,6 @@ INSTALL = "pip install extrags[diffusers]"
 PACKAGES = ("diffusers", "transformers", "accelerate", "ftfy")
 """ftfy because Wan's text clean-up fails with a NameError without it."""
 INDEX = "model_index.json"
-EDGE_BYTES = 1 << 20
-"""Of each weight file so much is read at both ends for the fingerprint: whole files are gigabytes."""
 
 _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 
@@ -82,8 +81,8 @@ class PipelineRule:
     absent: tuple[str, ...] = ()
 
 
-def require_diffusers() -> Any:
-    """The diffusers package.
+def check_packages() -> None:
+    """Look for the packages of the extra, without loading them.
 
     Raises:
         MissingDependencyError: with the command that installs what is missing.
@@ -93,6 +92,15 @@ def require_diffusers() -> Any:
         raise MissingDependencyError(
             f"the pretrained backends need {', '.join(missing)}: not installed. Install with: {INSTALL}"
         )
+
+
+def require_diffusers() -> Any:
+    """The diffusers package.
+
+    Raises:
+        MissingDependencyError: as `check_packages`.
+    """
+    check_packages()
     return importlib.import_module("diffusers")
 
 
@@ -104,10 +112,10 @@ def find_model(rule: PipelineRule, settings: PretrainedConfig) -> Path:
         settings: which model; whether it may be downloaded.
 
     Raises:
-        WeightsError: when it is not there, or is another pipeline; says how to get it.
+        WeightsError: when it is not there, not whole, or another pipeline; says how to get it.
         MissingDependencyError: without diffusers.
     """
-    require_diffusers()
+    check_packages()
     model = settings.model or rule.usual_model
     folder = Path(model).expanduser()
     if not folder.is_dir():
@@ -118,12 +126,19 @@ def find_model(rule: PipelineRule, settings: PretrainedConfig) -> Path:
             f"{folder} holds no {INDEX}, so it is no saved diffusers pipeline. {_how_to_get(model, rule)}"
         )
     try:
-        found = json.loads(index.read_text()).get("_class_name")
-    except ValueError as error:
-        raise WeightsError(f"{index}: not readable as JSON ({error})") from error
+        description = dict(json.loads(index.read_text()))
+    except (ValueError, TypeError) as error:
+        raise WeightsError(f"{index}: not readable as a JSON object ({error})") from error
+    found = description.get("_class_name")
     if found not in rule.accepts:
         raise WeightsError(
             f"{index} names a {found}; enhance.backend={rule.backend} needs one of {', '.join(rule.accepts)}"
+        )
+    missing = missing_part(folder, description, (*rule.text_parts, *rule.image_parts), rule.absent)
+    if missing is not None:
+        raise WeightsError(
+            f"{folder} is not whole, {missing} is missing (weights are read from .safetensors alone). Was "
+            f"its download interrupted? {_how_to_get(model, rule)}"
         )
     return folder
 
@@ -157,26 +172,6 @@ def _how_to_get(model: str, rule: PipelineRule) -> str:
     )
 
 
-def fingerprint(folder: Path) -> str:
-    """Digest of a saved pipeline: names and sizes of its files, small ones whole, weights at both ends.
-
-    Enough to notice that a folder holds another model than when its restorer was prepared.
-    """
-    digest = hashlib.blake2b(digest_size=16)
-    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
-        name = file.relative_to(folder)
-        if any(part.startswith(".") for part in name.parts):
-            continue
-        size = file.stat().st_size
-        digest.update(f"{name.as_posix()}\0{size}\0".encode())
-        with file.open("rb") as stream:
-            digest.update(stream.read(EDGE_BYTES))
-            if size > EDGE_BYTES:
-                stream.seek(max(EDGE_BYTES, size - EDGE_BYTES))
-                digest.update(stream.read(EDGE_BYTES))
-    return digest.hexdigest()
-
-
 def chosen_device(name: str) -> torch.device:
     """The device a setting means.
 
@@ -187,6 +182,21 @@ def chosen_device(name: str) -> torch.device:
     if name == "cuda" and not there:
         raise ConfigError("device=cuda, but torch sees no CUDA device; use auto or cpu")
     return torch.device("cuda" if there and name != "cpu" else "cpu")
+
+
+def check_device(settings: PretrainedConfig) -> torch.device:
+    """The device a pipeline will run on.
+
+    Raises:
+        ConfigError: when cuda is asked for and there is none, or offload on a processor.
+    """
+    device = chosen_device(settings.device)
+    if settings.offload != "none" and device.type != "cuda":
+        raise ConfigError(
+            f"enhance.pretrained.offload={settings.offload} moves idle parts off a CUDA device; none is in "
+            "use. Set it to none"
+        )
+    return device
 
 
 def chosen_dtype(name: str, device: torch.device) -> torch.dtype:
@@ -218,12 +228,7 @@ def load_pipeline(
         WeightsError: when a file is missing or does not fit.
     """
     diffusers = require_diffusers()
-    device = chosen_device(settings.device)
-    if settings.offload != "none" and device.type != "cuda":
-        raise ConfigError(
-            f"enhance.pretrained.offload={settings.offload} moves idle parts off a CUDA device; none is in "
-            "use. Set it to none"
-        )
+    device = check_device(settings)
     dtype = chosen_dtype(settings.dtype, device)
     dtypes: Mapping[str, torch.dtype] = {"default": dtype, **dict.fromkeys(float32_parts, torch.float32)}
     absent = {name: None for name in (*without, *rule.absent) if name in _components(diffusers, rule)}

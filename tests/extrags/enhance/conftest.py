@@ -131,6 +131,7 @@ SMALL = EnhanceConfig(
     references=4,
     learning_rate=2e-3,
     precision="float32",
+    pretrained_weights="none",
 )
 
 

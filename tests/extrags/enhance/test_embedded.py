@@ -8,16 +8,24 @@ import torch
 
 from extrags.config import CoarseConfig
 from extrags.enhance.backends import load_enhancer, train_enhancer
+from extrags.enhance.calibration import Calibration
 from extrags.enhance.classical import ClassicalEnhancer
 from extrags.enhance.clips import render_clips
 from extrags.enhance.conditioning import CONDITION_CHANNELS, Conditioning
-from extrags.enhance.diffusion import Batch, TrainingSettings, restoration_loss, sample, train_network
+from extrags.enhance.diffusion import (
+    Batch,
+    Predicted,
+    TrainingSettings,
+    restoration_loss,
+    sample,
+    train_network,
+)
 from extrags.enhance.embedded import EmbeddedEnhancer
 from extrags.enhance.gamut import Gamut
 from extrags.enhance.network import build_network
 from extrags.enhance.pairs import Pairs
 from extrags.enhance.protocol import Clip, Enhancer
-from extrags.errors import DivergedError, WeightsError
+from extrags.errors import ConfigError, DivergedError, WeightsError
 from tests.extrags.enhance.conftest import SMALL, Tube, tube_cameras
 
 WIDTHS = (16, 24, 32)
@@ -26,7 +34,8 @@ WIDTHS = (16, 24, 32)
 def _conditioning(n: int, height: int, width: int, seed: int = 0) -> Conditioning:
     generator = torch.Generator().manual_seed(seed)
     channels = torch.randn(n, CONDITION_CHANNELS, height, width, generator=generator)
-    return Conditioning(channels, torch.rand(n, 3, height, width, generator=generator), channels[:, :1])
+    depth = 10 + 20 * torch.rand(n, 1, height, width, generator=generator)
+    return Conditioning(channels, torch.rand(n, 3, height, width, generator=generator), depth)
 
 
 class TestNetwork:
@@ -35,7 +44,8 @@ class TestNetwork:
         conditioning = _conditioning(2, 40, 24)
         noise = torch.randn(2, 3, 40, 24, generator=torch.Generator().manual_seed(2))
         restored = sample(network, conditioning, noise, steps=1, half_precision=False)
-        torch.testing.assert_close(restored, conditioning.base, atol=1e-5, rtol=0)
+        torch.testing.assert_close(restored.rgb, conditioning.base, atol=1e-5, rtol=0)
+        torch.testing.assert_close(restored.depth_mm, conditioning.depth_mm, atol=0, rtol=1e-5)
 
     @pytest.mark.parametrize(("height", "width"), [(32, 32), (33, 47)])
     def test_any_size(self, height: int, width: int) -> None:
@@ -43,9 +53,10 @@ class TestNetwork:
         torch.nn.init.normal_(network.exit.weight, std=0.1, generator=torch.Generator().manual_seed(3))
         noise = torch.zeros(1, 3, height, width)
         restored = sample(network, _conditioning(1, height, width), noise, steps=2, half_precision=False)
-        assert restored.shape == (1, 3, height, width)
-        assert restored.min() >= 0
-        assert restored.max() <= 1
+        assert restored.rgb.shape == (1, 3, height, width)
+        assert restored.rgb.min() >= 0
+        assert restored.rgb.max() <= 1
+        assert restored.depth_mm.shape == restored.error.shape == (1, 1, height, width)
 
     def test_weights_come_from_the_generator_alone(self) -> None:
         torch.manual_seed(11)
@@ -62,23 +73,30 @@ class TestTraining:
         conditioning = _conditioning(3, 32, 32)
         clean = torch.rand(3, 3, 4, 4, generator=torch.Generator().manual_seed(5))
         clean = torch.nn.functional.interpolate(clean, size=(32, 32), mode="bilinear")
-        batch = Batch(conditioning, clean, torch.ones(3, 1, 32, 32))
+        far = torch.full((3, 1, 32, 32), 30.0)
+        batch = Batch(conditioning, clean, torch.ones(3, 1, 32, 32), far)
         network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
         noise = torch.randn(3, 3, 32, 32, generator=torch.Generator().manual_seed(9))
 
-        def loss() -> float:
+        def errors() -> tuple[float, float, float]:
             restored = sample(network, conditioning, noise, steps=1, half_precision=False)
-            return float(restoration_loss(restored, clean, batch.weight))
+            color = (restored.rgb - clean).abs().mean()
+            depth = (restored.depth_mm.log() - far.log()).abs().mean()
+            return float(color), float(depth), float((restored.error.mean() / color).log().abs())
 
-        before = loss()
+        before = errors()
         generator = torch.Generator().manual_seed(2)
         train_network(network, lambda: batch, TrainingSettings(150, 4e-3, False), generator)
-        assert loss() < 0.4 * before
+        color, depth, doubt = errors()
+        assert color < 0.4 * before[0]
+        assert depth < 0.7 * before[1]
+        # The expected error follows the true one down.
+        assert doubt < 0.7 < before[2]
 
     def test_a_diverging_loss_is_named(self) -> None:
         conditioning = _conditioning(1, 32, 32)
         broken = Conditioning(conditioning.channels, conditioning.base * torch.nan, conditioning.depth_mm)
-        batch = Batch(broken, conditioning.base, torch.ones(1, 1, 32, 32))
+        batch = Batch(broken, conditioning.base, torch.ones(1, 1, 32, 32), conditioning.depth_mm)
         network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
         with pytest.raises(DivergedError, match="iteration 0"):
             train_network(network, lambda: batch, TrainingSettings(3, 1e-3, False), torch.Generator())
@@ -89,7 +107,37 @@ class TestTraining:
         wrong[..., :4] = 1
         weight = torch.ones(1, 1, 16, 16)
         weight[..., :10] = 0
-        assert restoration_loss(wrong, clean, weight) < 1e-2
+        depth = torch.full((1, 1, 16, 16), 20.0)
+        batch = Batch(_conditioning(1, 16, 16), clean, weight, depth)
+        predicted = Predicted(wrong, depth.log(), torch.zeros(1, 1, 16, 16))
+        assert restoration_loss(predicted, batch) < 1e-2
+
+    def test_unknown_depth_does_not_count(self) -> None:
+        clean = torch.full((1, 3, 16, 16), 0.5)
+        depth = torch.full((1, 1, 16, 16), 20.0)
+        depth[..., :8] = 0
+        wrong = torch.full((1, 1, 16, 16), 20.0)
+        wrong[..., :8] = 1e3
+        batch = Batch(_conditioning(1, 16, 16), clean, torch.ones(1, 1, 16, 16), depth)
+        doubt = torch.zeros(1, 1, 16, 16)
+        assert restoration_loss(Predicted(clean, wrong.log(), doubt), batch) < 1e-2
+        assert restoration_loss(Predicted(clean, wrong.log() + 0.5, doubt), batch) > 0.02
+
+    def test_the_expected_error_is_cheapest_when_true(self) -> None:
+        clean = torch.full((1, 3, 16, 16), 0.5)
+        batch = Batch(_conditioning(1, 16, 16), clean, torch.ones(1, 1, 16, 16), torch.zeros(1, 1, 16, 16))
+        costs = [
+            float(
+                restoration_loss(
+                    Predicted(
+                        clean + 0.1, torch.zeros(1, 1, 16, 16), torch.full((1, 1, 16, 16), expected).log()
+                    ),
+                    batch,
+                )
+            )
+            for expected in (0.05, 0.08, 0.1, 0.125, 0.2)
+        ]
+        assert int(np.argmin(costs)) == 2
 
 
 @pytest.fixture(scope="module")
@@ -131,12 +179,62 @@ class TestEmbedded:
         assert np.array_equal(loaded.restore(clip).rgb, trained.restore(clip).rgb)
         assert loaded.restore(clip).provenance == trained.restore(clip).provenance
 
-    def test_samples_give_a_deviation(self, trained: EmbeddedEnhancer, clip: Clip) -> None:
-        several = replace(trained, steps=4, samples=3).restore(clip)
+    def test_samples_add_to_the_expected_error(self, trained: EmbeddedEnhancer, clip: Clip) -> None:
+        plain = replace(trained, steps=4, calibration=Calibration())
+        one, several = plain.restore(clip), replace(plain, samples=3).restore(clip)
+        assert one.deviation is not None
         assert several.deviation is not None
         assert several.deviation.shape == several.rgb.shape[:3]
-        assert several.deviation.max() > 0
-        assert trained.restore(clip).deviation is None
+        assert several.deviation.mean() > 0
+        assert np.abs(several.deviation - one.deviation).max() > 0
+        assert several.depth_mm is not None
+        assert (several.depth_mm > 0).all()
+
+    def test_training_that_does_not_help_is_not_kept(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
+    ) -> None:
+        harmful = SMALL.model_copy(update={"scene_learning_rate": 0.5, "train_iterations": 3})
+        kept = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, harmful, trained)
+        assert kept.record["scene_training_kept"] is False
+        for one, two in zip(
+            kept.network.state_dict().values(), trained.network.state_dict().values(), strict=True
+        ):
+            assert torch.equal(one, two)
+
+    def test_training_that_helps_is_kept(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
+    ) -> None:
+        crude = EmbeddedEnhancer.train(
+            tube_pairs, tube.references.transfer, SMALL.model_copy(update={"train_iterations": 4})
+        )
+        more = SMALL.model_copy(update={"scene_learning_rate": 2e-3})
+        kept = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, more, crude)
+        scores = kept.record["validation"]
+        assert kept.record["scene_training_kept"] is True
+        assert scores["embedded_1"]["psnr"] > scores["untrained_embedded_1"]["psnr"]
+
+    def test_without_iterations_the_pretrained_restorer_serves(
+        self, tube: Tube, trained: EmbeddedEnhancer, clip: Clip, tmp_path
+    ) -> None:
+        trained.save(tmp_path, half=True)
+        config = SMALL.model_copy(update={"train_iterations": 0, "pretrained_weights": str(tmp_path)})
+        served = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+        assert isinstance(served, EmbeddedEnhancer)
+        difference = np.abs(served.restore(clip).rgb - trained.restore(clip).rgb)
+        assert difference.mean() < 0.01
+        with pytest.raises(ConfigError, match="nothing would restore"):
+            train_enhancer(
+                tube.scene,
+                tube.sequence,
+                SMALL.model_copy(update={"train_iterations": 0}),
+                CoarseConfig(),
+            )
+
+    def test_a_plain_regression_needs_no_noise(self, tube: Tube, tube_pairs: Pairs, clip: Clip) -> None:
+        plain = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL, deterministic=True)
+        assert plain.steps == 1
+        assert plain.record["validation"].keys() == {"none", "classical", "embedded_1"}
+        assert np.array_equal(plain.restore(clip).rgb, replace(plain, seed=5).restore(clip).rgb)
 
     def test_without_weights_it_says_what_to_do(self, tmp_path) -> None:
         with pytest.raises(WeightsError, match="train the restorer"):

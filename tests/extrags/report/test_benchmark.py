@@ -96,7 +96,8 @@ def test_is_one_file_and_the_same_twice(inputs: BenchmarkInputs, html: str) -> N
 
 def test_pictures_stand_side_by_side(html: str) -> None:
     alts = [str(image["alt"]) for image in Page(html).images]
-    for wanted in ("3dgs render", "coarse render", "Truth as recorded", "error of 3dgs", "error of coarse"):
+    shown = (", 3dgs render", ", coarse render", "truth as recorded")
+    for wanted in (*shown, "error of the 3dgs render", "error of the coarse render"):
         assert sum(wanted in alt for alt in alts) == 2, wanted
 
 

@@ -14,8 +14,8 @@ from extrags.report import DatasetRow, ReportInputs, build_dataset_report
 from extrags.report.animation import write_animation
 from extrags.report.charts import drawing_style, history_chart, views_chart
 from extrags.report.encode import as_uint8, color_mapped, fitted_image, outlined, png_image
+from extrags.report.image_table import evenly_spaced
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
-from extrags.report.views import evenly_spaced
 from extrags.report.wording import METRICS, compare, duration, number
 
 from .conftest import metrics_of

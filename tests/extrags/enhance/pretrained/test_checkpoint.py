@@ -13,7 +13,12 @@ from extrags.config import CheckpointConfig, CoarseConfig, EnhanceConfig
 from extrags.enhance.backends import load_enhancer, train_enhancer
 from extrags.enhance.clips import render_clips
 from extrags.enhance.pretrained import checkpoint_driver
-from extrags.enhance.pretrained.checkpoint import CheckpointEnhancer, check_clone, relative_poses
+from extrags.enhance.pretrained.checkpoint import (
+    CheckpointEnhancer,
+    check_clone,
+    clone_fingerprint,
+    relative_poses,
+)
 from extrags.enhance.pretrained.inputs import clip_inputs
 from extrags.enhance.pretrained.real_views import RealViews
 from extrags.enhance.protocol import Clip
@@ -48,7 +53,8 @@ def settings(clone: Path, **further: Any) -> CheckpointConfig:
 
 
 def unprepared(tube: Tube, config: CheckpointConfig, caption: str = "pink wall") -> CheckpointEnhancer:
-    return CheckpointEnhancer(config, 4, RealViews.gather(tube.scene, tube.sequence), caption, {})
+    views = RealViews.gather(tube.scene, tube.sequence)
+    return CheckpointEnhancer(config, 4, views, caption, clone_fingerprint(config), {})
 
 
 class TestDriver:
@@ -117,12 +123,12 @@ class TestDriver:
         with pytest.raises(checkpoint_driver.Failure, match=r"model\.ckpt"):
             checkpoint_driver._weights(str(file), True, torch)
 
-    def test_weights_of_another_model_are_named(self, tube: Tube, clip: Clip, clone: Path) -> None:
-        state = tiny_state()
-        del state["mix.bias"]
-        torch.save({"state_dict": state}, clone / "enhancer.ckpt")
-        with pytest.raises(WeightsError, match=r"(?s)does not fit .*mix\.bias"):
-            unprepared(tube, settings(clone)).restore(clip)
+    def test_weights_of_another_model_are_named(self, clone: Path) -> None:
+        described = settings(clone).model_dump()
+        model = torch.nn.ModuleDict({"mix": torch.nn.Conv3d(3, 3, 3), "further": torch.nn.Linear(2, 2)})
+        with pytest.raises(checkpoint_driver.Failure, match=r"(?s)does not fit .*further\.bias") as caught:
+            checkpoint_driver._load(model, described, torch)
+        assert caught.value.kind == "weights"
 
     def test_missing_packages_of_the_clone_are_named(self, tube: Tube, tmp_path: Path) -> None:
         root = write_clone(tmp_path / "clone", needs="pytorch_lightning_that_is_not_here")
@@ -133,6 +139,14 @@ class TestDriver:
     def test_a_process_that_takes_too_long_is_stopped(self, tube: Tube, clip: Clip, clone: Path) -> None:
         with pytest.raises(ExtragsError, match=r"longer than 0\.2 s and was stopped"):
             unprepared(tube, settings(clone, timeout_s=0.2)).restore(clip)
+
+    @pytest.mark.parametrize("part", ["enhancer.ckpt", "configs/inference.yaml", "lvdm/models/ddpm3d.py"])
+    def test_a_clone_that_changed_is_noticed(self, tube: Tube, clip: Clip, clone: Path, part: str) -> None:
+        made = unprepared(tube, settings(clone))
+        with (clone / part).open("ab") as stream:
+            stream.write(b"\n")
+        with pytest.raises(WeightsError, match=r"another one than when .* enhance-train again"):
+            made.restore(clip)
 
     def test_an_interpreter_that_is_not_there(self, tube: Tube, clip: Clip, clone: Path) -> None:
         with pytest.raises(ConfigError, match=r"checkpoint\.python=/no/python: cannot be run"):

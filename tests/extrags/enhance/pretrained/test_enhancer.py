@@ -19,8 +19,9 @@ from extrags.enhance.backends import load_enhancer, train_enhancer
 from extrags.enhance.clips import make_pseudo_observations, render_clips
 from extrags.enhance.pretrained import enhancer as enhancer_module
 from extrags.enhance.pretrained.enhancer import ADAPTERS, PretrainedEnhancer
+from extrags.enhance.pretrained.fingerprint import fingerprint
 from extrags.enhance.pretrained.inputs import clip_inputs, ranked_references, window_seed
-from extrags.enhance.pretrained.model import find_model, fingerprint, require_diffusers
+from extrags.enhance.pretrained.model import find_model, require_diffusers
 from extrags.enhance.pretrained.real_views import RealViews
 from extrags.enhance.protocol import Clip
 from extrags.errors import ConfigError, MissingDependencyError, WeightsError

@@ -1,0 +1,52 @@
+"""Whether a saved pipeline is whole: a broken download shall not be found out after the reconstruction."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+__all__ = ["missing_part"]
+
+STEMS = {"diffusers": "diffusion_pytorch_model", "transformers": "model"}
+"""Name of the weights by the library a part belongs to."""
+
+
+def missing_part(
+    folder: Path, index: Mapping[str, Any], weighty: Collection[str], absent: Collection[str]
+) -> str | None:
+    """The first part of a saved pipeline that is not there, or not whole.
+
+    Args:
+        folder: of the pipeline.
+        index: content of its `model_index.json`: `{part: [library, class]}` among other things.
+        weighty: parts that hold weights, if they have a `config.json`; tokenizers have none.
+        absent: parts that are never loaded.
+
+    Returns:
+        What is missing, by its path; None when all is there.
+    """
+    for part, described in index.items():
+        if part in absent or not isinstance(described, list) or described[0] is None:
+            continue
+        if not (folder / part).is_dir() or not any((folder / part).iterdir()):
+            return f"{part}/"
+        if part in weighty and (folder / part / "config.json").is_file() and described[0] in STEMS:
+            missing = _missing_weights(folder / part, f"{STEMS[described[0]]}.safetensors")
+            if missing is not None:
+                return f"{part}/{missing}"
+    return None
+
+
+def _missing_weights(folder: Path, name: str) -> str | None:
+    if (folder / name).is_file():
+        return None
+    shards = folder / f"{name}.index.json"
+    if not shards.is_file():
+        return name
+    try:
+        names = sorted(set(json.loads(shards.read_text())["weight_map"].values()))
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return shards.name
+    return next((shard for shard in names if not (folder / shard).is_file()), None)

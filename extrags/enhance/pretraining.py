@@ -1,0 +1,134 @@
+"""How the weights that come with the package are made: one network, trained on many practice scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence as AbstractSequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from extrags.enhance.augmentation import CropSampler, MixedSampler
+from extrags.enhance.calibration import Calibration
+from extrags.enhance.conditioning import CONDITION_CHANNELS
+from extrags.enhance.diffusion import TrainingSettings, train_network
+from extrags.enhance.embedded import EmbeddedEnhancer, has_fast_half_precision, validation_scores
+from extrags.enhance.gamut import Gamut
+from extrags.enhance.network import build_network
+from extrags.enhance.practice import PracticeScene
+from extrags.errors import ConfigError
+from extrags.metrics.lpips import Lpips
+from extrags.stage_config import StageConfig
+
+__all__ = ["PretrainingConfig", "pretrain"]
+
+ANY_HUE = Gamut(0.0, 1e6, 0.0, 1e6)
+MOST_STEPS = 4
+
+
+class PretrainingConfig(StageConfig):
+    """Budget of a pretraining."""
+
+    scenes: int = Field(108, ge=2, description="practice scenes in all")
+    kept_back: int = Field(8, ge=1, description="how many of them, the last ones, only judge")
+    iterations: int = Field(20_000, ge=1, description="optimisation steps")
+    batch: int = Field(4, ge=1, description="crops per step, each from a scene of its own")
+    crop: int = Field(96, ge=32, description="side of a crop in pixels, a multiple of 8")
+    channels: tuple[int, int, int] = Field((48, 96, 160), description="widths of the U-Net's levels")
+    learning_rate: float = Field(8e-4, gt=0, description="the peak, after the warm-up")
+    ema_decay: float = Field(0.999, ge=0, lt=1, description="memory of the running mean of the weights")
+    perceptual: bool = Field(
+        True, description="LPIPS with SqueezeNet counts beside the pixels' errors; its weights are needed"
+    )
+    deterministic: bool = Field(False, description="a plain regression instead of a diffusion")
+    seed: int = Field(0, ge=0)
+
+
+def pretrain(
+    files: AbstractSequence[Path], config: PretrainingConfig, *, stage: str = "pretrain"
+) -> EmbeddedEnhancer:
+    """Train on practice scenes; the last ones choose the number of steps and calibrate the expected error.
+
+    The same files, settings and number of threads give the same weights.
+
+    Args:
+        files: practice scenes in order; as many as the settings say.
+        config: budget.
+        stage: named in progress events.
+
+    Raises:
+        ConfigError: when the number of files does not fit the settings.
+        WeightsError: when a file is not a practice scene, or the perceptual distance has no weights.
+        DivergedError: when the loss stops being finite.
+    """
+    if len(files) != config.scenes or config.kept_back >= config.scenes:
+        raise ConfigError(
+            f"{len(files)} practice scenes, {config.scenes} were announced, {config.kept_back} judge"
+        )
+    perceptual = Lpips.load(net="squeeze") if config.perceptual else None
+    samplers = []
+    for number, file in enumerate(files[: -config.kept_back]):
+        scene = PracticeScene.load(file)
+        samplers.append(
+            CropSampler(
+                scene.pairs, scene.transfer, batch=1, crop_px=config.crop, seed=_scene_seed(config, number)
+            )
+        )
+    mixed = MixedSampler(samplers, batch=config.batch, seed=config.seed)
+    generator = torch.Generator().manual_seed(config.seed)
+    network = build_network(CONDITION_CHANNELS, config.channels, generator)
+    half = has_fast_half_precision()
+    settings = TrainingSettings(
+        config.iterations,
+        config.learning_rate,
+        half,
+        perceptual,
+        deterministic=config.deterministic,
+        ema_decay=config.ema_decay,
+    )
+    network, history = train_network(network, mixed.draw, settings, generator, stage=stage)
+    record: dict[str, Any] = {
+        "pretraining": config.model_dump(mode="json"),
+        "threads": torch.get_num_threads(),
+        "history": history[:: max(1, len(history) // 200)],
+    }
+    trained = EmbeddedEnhancer(
+        network, 1, 1, config.seed, half, ANY_HUE, record, deterministic=config.deterministic
+    )
+    return judged(trained, files[-config.kept_back :])
+
+
+def judged(enhancer: EmbeddedEnhancer, files: AbstractSequence[Path]) -> EmbeddedEnhancer:
+    """With calibration and scores from practice scenes it was not trained on.
+
+    Args:
+        enhancer: trained.
+        files: practice scenes that only judge.
+    """
+    candidates = (1,) if enhancer.deterministic else (1, MOST_STEPS)
+    scores: dict[str, list[dict[str, float]]] = {}
+    expected, true = [], []
+    for file in files:
+        scene = PracticeScene.load(file)
+        for name, values in validation_scores(enhancer, scene.pairs, scene.transfer, candidates).items():
+            scores.setdefault(name, []).append(values)
+        cells = enhancer.cell_errors(scene.pairs, scene.transfer)
+        expected.append(cells[0])
+        true.append(cells[1])
+    means = {
+        name: {
+            key: round(float(np.mean([one[key] for one in values if key in one])), 4)
+            for key in ("psnr", "ssim", "psnr_hole")
+        }
+        for name, values in scores.items()
+    }
+    calibration = Calibration.fitted(np.concatenate(expected), np.concatenate(true))
+    record = {**enhancer.record, "kept_back_scores": means}
+    return replace(enhancer, calibration=calibration, record=record)
+
+
+def _scene_seed(config: PretrainingConfig, number: int) -> int:
+    return config.seed * 100_003 + number

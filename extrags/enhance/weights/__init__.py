@@ -1,0 +1,73 @@
+"""Weights of the embedded restorer that come with the package, and how others are found.
+
+`restorer.safetensors` beside this file is what the project trained by itself; `restorer.json` says with
+which command, on what, and how good it is. A user's own pair of such files is taken by its path.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from importlib.resources import files
+from pathlib import Path
+
+from extrags.errors import WeightsError
+
+__all__ = ["BUNDLED", "DESCRIPTION", "NONE", "WEIGHTS", "find_weights", "weights_digest"]
+
+BUNDLED = "bundled"
+"""Setting: the weights of the package."""
+NONE = "none"
+"""Setting: no weights; the restorer of a scene is trained from nothing."""
+WEIGHTS = "restorer.safetensors"
+DESCRIPTION = "restorer.json"
+
+
+def find_weights(setting: str) -> Path | None:
+    """Where the weights lie that a scene's restorer starts from.
+
+    Args:
+        setting: `bundled`, `none`, or the path of a .safetensors file with its .json beside it, or of a
+            folder that holds `restorer.safetensors` and `restorer.json` (a saved restorer is one).
+
+    Returns:
+        The .safetensors file, its description beside it with the suffix .json; None for `none`.
+
+    Raises:
+        WeightsError: when a file is missing; says what can be done.
+    """
+    if setting == NONE:
+        return None
+    if setting == BUNDLED:
+        weights = Path(str(files(__name__))) / WEIGHTS
+        cure = f"this installation is incomplete: reinstall extrags, or set enhance.pretrained_weights={NONE}"
+    else:
+        given = Path(setting).expanduser()
+        weights = given / WEIGHTS if given.is_dir() else given
+        cure = (
+            "expected a .safetensors file with its .json beside it, or a folder that holds "
+            f"{WEIGHTS} and {DESCRIPTION}; {BUNDLED} takes the weights of the package, {NONE} trains from "
+            "nothing"
+        )
+    for file in (weights, weights.with_suffix(".json")):
+        if not file.is_file():
+            raise WeightsError(f"enhance.pretrained_weights={setting}: there is no file {file}; {cure}")
+    return weights
+
+
+def weights_digest(setting: str) -> str | None:
+    """Digest of weights and description, wherever they lie; None without weights.
+
+    Raises:
+        WeightsError: as `find_weights`.
+    """
+    weights = find_weights(setting)
+    if weights is None:
+        return None
+    digest = hashlib.blake2b(digest_size=16)
+    for file in (weights, weights.with_suffix(".json")):
+        # The length first: no byte can move from one file to the other unnoticed.
+        digest.update(f"{file.stat().st_size}\0".encode())
+        with file.open("rb") as stream:
+            while block := stream.read(1 << 20):
+                digest.update(block)
+    return digest.hexdigest()

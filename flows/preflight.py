@@ -1,0 +1,36 @@
+"""What a run would otherwise only find out after the reconstruction is looked for before it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from extrags.config import PipelineConfig
+from flows.settings import STAGES
+
+__all__ = ["check_before"]
+
+
+def check_before(config: PipelineConfig, until: str, leave_out: Collection[str] = ()) -> None:
+    """Look for models, weights and packages that the settings name.
+
+    Args:
+        config: settings of all stages.
+        until: last stage to run.
+        leave_out: stages that are left out whatever the plan says.
+
+    Raises:
+        WeightsError: when weights are not there; says how to get them.
+        MissingDependencyError: when a package is not there; says how to install it.
+        ConfigError: when settings of the restorer do not fit each other, the model or the machine.
+        ExtragsError: when the code a checkpoint needs does not start.
+    """
+    if STAGES.index(until) < STAGES.index("enhance"):
+        return
+    # Here, because they load torch, which looking up a deployment must not.
+    from tasks.weights import lpips_weights
+
+    lpips_weights(config.evaluate)
+    if "enhance" not in leave_out:
+        from extrags.enhance.preconditions import check_restorer
+
+        check_restorer(config.enhance)

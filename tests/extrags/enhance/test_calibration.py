@@ -1,0 +1,40 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.enhance.calibration import Calibration, cell_means
+
+
+def test_it_turns_expected_errors_into_true_ones_and_keeps_their_order() -> None:
+    generator = np.random.default_rng(1)
+    expected = generator.uniform(0.01, 0.2, 20_000)
+    true = 0.5 * expected**1.5 * generator.exponential(1, expected.size)
+    calibration = Calibration.fitted(expected, true)
+    tested = np.linspace(0.02, 0.19, 50)
+    assert calibration.applied(tested) == pytest.approx(0.5 * tested**1.5, rel=0.12)
+    assert (np.diff(calibration.applied(np.linspace(0, 0.5, 400))) >= 0).all()
+
+
+def test_beyond_the_knots_errors_go_on_in_proportion() -> None:
+    calibration = Calibration((0.1, 0.2), (0.2, 0.3))
+    assert calibration.applied(np.array([0.4])) == pytest.approx(np.array([0.6]))
+    assert calibration.applied(np.array([0.05])) == pytest.approx(np.array([0.1]))
+
+
+def test_too_few_cells_give_no_curve() -> None:
+    calibration = Calibration.fitted(np.linspace(0.1, 0.2, 20), np.zeros(20))
+    values = np.array([0.1, 0.4])
+    assert calibration.applied(values) is values
+
+
+def test_cell_means_leave_out_what_has_no_weight() -> None:
+    values = torch.ones(1, 1, 16, 8)
+    values[..., :4] = 100
+    weight = torch.ones(1, 1, 16, 8)
+    weight[..., :4] = 0
+    weight[:, :, 8:] = 0
+    mean, share = cell_means(values, weight)
+    assert mean[0] == pytest.approx(1)
+    assert share.tolist() == pytest.approx([0.5, 0])

@@ -1,0 +1,184 @@
+"""A missing model is told before anything is reconstructed; a changed one is another artefact."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from extrags.config import EnhanceConfig
+from extrags.enhance.pretrained.enhancer import ADAPTERS
+from extrags.errors import ConfigError, WeightsError
+from extrags.store import Ref, Store
+from flows.benchmark import benchmark
+from flows.cli import main
+from flows.methods import METHODS
+from flows.outcome import SequenceOutcome
+from flows.preflight import check_before
+from flows.runners import DirectRunner, NotInStoreError, StoreRunner
+from flows.settings import pipeline_config
+from flows.wiring import run_sequence
+from tasks.enhance import train
+from tasks.stage import stage_key
+from tasks.weights import restorer_digest
+from tests.extrags.enhance.pretrained.fake_clone import write_clone
+from tests.flows.tiny import SEQUENCE, tiny_config
+
+MISSING = {"enhance.pretrained_weights": "no/such.safetensors"}
+
+
+@pytest.fixture(autouse=True)
+def untouched_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The command sets up Prefect through the environment; put it back."""
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.fixture
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """`extrags run` with settings: its exit code and its one sentence."""
+
+    def command(*settings: str) -> tuple[int, str]:
+        store = tmp_path / "store"
+        given = [part for setting in settings for part in ("--set", setting)]
+        code = main(["run", SEQUENCE, "--profile", "quick", "--store", str(store), *given])
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert not list((store / "artefacts").glob("*"))
+        return code, said.removeprefix("extrags: ").strip()
+
+    return command
+
+
+class TestSentences:
+    @pytest.mark.parametrize("backend", sorted(ADAPTERS))
+    def test_models(
+        self,
+        backend: str,
+        run: Callable[..., tuple[int, str]],
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        pytest.importorskip("diffusers", reason="needs extrags[diffusers]")
+        import huggingface_hub.constants
+
+        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_CACHE", str(tmp_path / "hub"))
+        rule = ADAPTERS[backend].rule
+        assert run(f"enhance.backend={backend}") == (
+            1,
+            f"the model {rule.usual_model} is neither a folder here nor in the local Hugging Face cache. "
+            f"extrags downloads nothing by default. Get it once with `hf download {rule.usual_model}` "
+            f"({rule.size}), or set enhance.pretrained.model to a folder where a {rule.pipeline} was saved "
+            "(it holds model_index.json), or allow the download with "
+            "enhance.pretrained.local_files_only=false.",
+        )
+
+    def test_checkpoints(self, run: Callable[..., tuple[int, str]]) -> None:
+        assert run("enhance.backend=dynamicrafter") == (
+            2,
+            "enhance.backend=dynamicrafter needs enhance.checkpoint.root; set root (your clone of the "
+            "model's code), config (its YAML file) and checkpoint (its weights)",
+        )
+
+    def test_weights_of_the_embedded_restorer(self, run: Callable[..., tuple[int, str]]) -> None:
+        code, said = run("enhance.pretrained_weights=no/such.safetensors")
+        assert code == 1
+        assert said.startswith(
+            "enhance.pretrained_weights=no/such.safetensors: there is no file no/such.safetensors; expected"
+        )
+
+    def test_weights_of_lpips(self, run: Callable[..., tuple[int, str]]) -> None:
+        code, said = run("evaluate.lpips_weights=no/such.npz")
+        assert code == 1
+        assert "no/such.npz" in said
+
+
+class TestWhatIsLookedFor:
+    def test_nothing_that_the_run_does_not_reach(self) -> None:
+        config = pipeline_config("quick", MISSING)
+        check_before(config, "explore")
+        check_before(config, "report", METHODS["coarse"].leave_out)
+        for until in ("enhance", "report"):
+            with pytest.raises(WeightsError, match="no/such"):
+                check_before(config, until)
+
+    @pytest.mark.usefixtures("prefect_server")
+    def test_a_benchmark_looks_before_its_first_run(self, tmp_path: Path) -> None:
+        with pytest.raises(WeightsError, match="no/such"):
+            benchmark(
+                sequences=[SEQUENCE], methods=["coarse", "extrags"], settings=MISSING, store=str(tmp_path)
+            )
+        assert Store(str(tmp_path)).ls() == []
+
+
+class TestKeys:
+    def test_other_weights_are_another_restorer(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        store, _ = finished
+        weights = tmp_path / "mine.safetensors"
+        weights.with_suffix(".json").write_text("{}")
+        config = tiny_config(enhance__pretrained_weights=str(weights))
+        # The plan lists all settings: it is another one. What follows it up to the restorer is not.
+        run_sequence(SEQUENCE, config, store, DirectRunner(store), until="explore")
+        missing = []
+        for content in (b"first", b"other"):
+            weights.write_bytes(content)
+            with pytest.raises(NotInStoreError) as caught:
+                run_sequence(SEQUENCE, config, store, StoreRunner(store))
+            missing += re.findall(r"enhance-train-v\S+", str(caught.value))
+        assert len(set(missing)) == 2
+
+    def test_a_changed_checkpoint_is_prepared_again(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        store, outcome = finished
+        root = write_clone(tmp_path / "clone")
+        config = EnhanceConfig.model_validate(
+            {
+                "backend": "dynamicrafter",
+                "checkpoint": {
+                    "root": str(root),
+                    "config": "configs/inference.yaml",
+                    "checkpoint": str(root / "enhancer.ckpt"),
+                    "device": "cpu",
+                },
+            }
+        )
+        inputs: dict[str, Any] = {
+            "scene": at(outcome, "coarse"),
+            "sequence": at(outcome, "training"),
+            "config": config,
+            "coarse": tiny_config().coarse,
+            "model_digest": restorer_digest(config),
+        }
+        first = train.fn(store=store, **inputs)
+        assert Store(store).find(stage_key(train, inputs)) == first
+        with (root / "lvdm" / "models" / "ddpm3d.py").open("a") as stream:
+            stream.write("\n")
+        # Whoever began before cannot store the new one under the old one's key.
+        changed = {**inputs, "model_digest": restorer_digest(config)}
+        assert Store(store).find(stage_key(train, changed)) is None
+        Store(store).rm(stage_key(train, inputs))
+        with pytest.raises(WeightsError, match="not the one this run began with"):
+            train.fn(store=store, **inputs)
+        assert train.fn(store=store, **changed).digest != first.digest
+
+    def test_a_model_that_is_gone_fails_the_run_when_nobody_looked(
+        self, finished: tuple[str, SequenceOutcome]
+    ) -> None:
+        store, _ = finished
+        config = tiny_config(enhance__backend="dynamicrafter")
+        outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store))
+        assert outcome.status == "failed"
+        assert isinstance(outcome.error, ConfigError)
+
+
+def at(outcome: SequenceOutcome, name: str) -> Ref:
+    return Ref(uri=outcome.artefacts[name], digest=outcome.digests[name])
