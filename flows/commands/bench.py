@@ -1,4 +1,4 @@
-"""`bench raster`, `bench train`, `bench stability`."""
+"""`bench raster`, `bench train`, `bench stability`, `bench enhance`."""
 
 from __future__ import annotations
 
@@ -6,15 +6,16 @@ import argparse
 import os
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from rich.table import Table
 
 from extrags.errors import ConfigError
-from flows.commands.common import set_up_logging, write_json
+from flows.commands.common import parsed_settings, set_up_logging, write_json
 from flows.terminal import console
 
-__all__ = ["raster", "stability", "train"]
+__all__ = ["enhance", "raster", "stability", "train"]
 
 
 def raster(given: argparse.Namespace) -> int:
@@ -39,6 +40,43 @@ def stability(given: argparse.Namespace) -> int:
         _print(names, [[case[name] for name in names] for case in found["cases"]])
     write_json(found, given.json)
     return 0 if all(case["ok"] for case in found["cases"]) else 1
+
+
+def enhance(given: argparse.Namespace) -> int:
+    """`extrags bench enhance`."""
+    set_up_logging(debug=given.debug, terminal=True)
+    _let_waiting_threads_sleep()
+    from flows.settings import pipeline_config
+
+    config = pipeline_config(given.profile, parsed_settings(given.settings), given.seed)
+    from data_catalog.catalog import read, resolve
+    from extrags.enhance.bench import bench_enhance, check_methods
+    from extrags.metrics.lpips import Lpips
+    from tasks.weights import lpips_weights
+
+    methods = check_methods(_items(given.methods))
+    # All of them before the first takes its minutes: a name that is wrong is said at once.
+    sources = [resolve(name) for name in given.sequences]
+    weights = lpips_weights(config.evaluate)
+    lpips = None if weights.path is None else Lpips.load(weights.path, net=weights.net)
+    found = bench_enhance(
+        (read(source, config.ingest) for source in sources), config, methods=methods, lpips=lpips
+    )
+    found = {"profile": given.profile, **found, "lpips_reason": weights.reason}
+    if given.json != "-":
+        _print_restorers(found["cases"])
+    write_json(found, given.json)
+    if given.figure is not None:
+        from extrags.report.calibration_plot import write_calibration_plot
+
+        several = len(sources) > 1
+        curves = {
+            f"{case['sequence']} {case['method']}" if several else case["method"]: case["calibration"]
+            for case in found["cases"]
+            if case["calibration"] is not None
+        }
+        write_calibration_plot(curves, Path(given.figure))
+    return 0
 
 
 def _kernels(given: argparse.Namespace, *, training: bool) -> int:
@@ -129,6 +167,27 @@ def _print_kernels(cases: list[dict[str, Any]]) -> None:
                 f"{case['roofline']['floor_ms']:.3g} ms, {case['roofline']['share']:.0%} of the time taken",
                 soft_wrap=True,
             )
+
+
+def _print_restorers(cases: list[dict[str, Any]]) -> None:
+    """A table per sequence; what is kept of known texture is what fine-tuning is given."""
+    header = ["method", "PSNR", "SSIM", "LPIPS", "well", "hole", "observed", "unobserved", "kept PSNR"]
+    header += ["kept well", "changed", "flicker", "rank corr.", "s/frame", "prepared in s"]
+    for sequence in dict.fromkeys(case["sequence"] for case in cases):
+        chosen = [case for case in cases if case["sequence"] == sequence]
+        shares = ", ".join(f"{name} {share:.0%}" for name, share in chosen[0]["pixel_share"].items())
+        console().print(
+            f"{sequence}: {chosen[0]['views']} held-out views; {shares} of the pixels", soft_wrap=True
+        )
+        rows = []
+        for case in chosen:
+            calibration, kept = case["calibration"], case["kept"]
+            row = [case["method"], case["psnr"], case["ssim"], case["lpips_alex"]]
+            row += [case[part]["psnr"] for part in ("well", "hole", "observed", "unobserved")]
+            row += [kept["psnr"], kept["well"]["psnr"], case["changed_share"], case["flicker"]]
+            row += [None if calibration is None else calibration["rank_correlation"]]
+            rows.append([*row, case["seconds_per_frame"], case["prepare_seconds"]])
+        _print(header, rows)
 
 
 def _print(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

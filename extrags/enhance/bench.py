@@ -1,0 +1,278 @@
+"""Restorers beside each other on held-out views: `extrags bench enhance`."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Sequence as AbstractSequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from extrags.config import CoarseConfig, EnhanceConfig, PipelineConfig
+from extrags.enhance.assessment import AsRendered, Trial, TrueViews, WithoutReferences, held_out_clips
+from extrags.enhance.backends import train_enhancer
+from extrags.enhance.classical import ClassicalEnhancer
+from extrags.enhance.embedded import EmbeddedEnhancer
+from extrags.enhance.pairs import make_pairs
+from extrags.enhance.protocol import Enhancer
+from extrags.enhance.references import ReferenceViews
+from extrags.errors import CaptureError, ConfigError
+from extrags.events import Progress, emit
+from extrags.metrics.lpips import Lpips
+from extrags.raster.bench import machine
+from extrags.scene import Scene
+from extrags.sequence import Sequence
+from extrags.training import reconstruct
+from extrags.training.pose_refinement import with_refined_poses
+
+__all__ = [
+    "METHODS",
+    "NO_REFERENCES",
+    "RECIPES",
+    "Method",
+    "bench_enhance",
+    "check_methods",
+    "coarse_scene",
+    "compare_methods",
+    "prepared",
+]
+
+NO_REFERENCES = "/no-references"
+"""Suffix of a method's name: the same restorer, not told what real views see."""
+
+logger = logging.getLogger(__name__)
+
+Recipe = Callable[[Scene, Sequence, EnhanceConfig, CoarseConfig], Enhancer]
+
+
+def _unrestored(
+    _scene: Scene, _sequence: Sequence, _config: EnhanceConfig, _coarse: CoarseConfig
+) -> Enhancer:
+    return AsRendered()
+
+
+def _classical(_scene: Scene, _sequence: Sequence, _config: EnhanceConfig, _coarse: CoarseConfig) -> Enhancer:
+    return ClassicalEnhancer()
+
+
+def _embedded(**changes: Any) -> Recipe:
+    """The embedded restorer with changed settings."""
+
+    def recipe(scene: Scene, sequence: Sequence, config: EnhanceConfig, coarse: CoarseConfig) -> Enhancer:
+        settings = EnhanceConfig.model_validate({**config.model_dump(), "backend": "embedded", **changes})
+        return train_enhancer(scene, sequence, settings, coarse)
+
+    return recipe
+
+
+def _deterministic(scene: Scene, sequence: Sequence, config: EnhanceConfig, coarse: CoarseConfig) -> Enhancer:
+    """The same network from the same pairs, trained as a plain regression from nothing."""
+    pairs = make_pairs(scene, sequence, config, coarse)
+    transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
+    return EmbeddedEnhancer.train(pairs, transfer, config, deterministic=True)
+
+
+RECIPES: dict[str, Recipe] = {
+    "none": _unrestored,
+    "classical": _classical,
+    "embedded": _embedded(),
+    "scratch": _embedded(pretrained_weights="none"),
+    "zero-shot": _embedded(train_iterations=0),
+    "deterministic": _deterministic,
+}
+"""What is made for a scene. What takes long is made once, however many methods start from it."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the table.
+
+    Args:
+        recipe: of `RECIPES`.
+        adjust: what is changed about the restorer that comes out; None leaves it.
+    """
+
+    recipe: str
+    adjust: Callable[[Enhancer], Enhancer] | None = None
+
+
+def _in_steps(steps: int) -> Callable[[Enhancer], Enhancer]:
+    def adjust(enhancer: Enhancer) -> Enhancer:
+        if not isinstance(enhancer, EmbeddedEnhancer):
+            raise ConfigError(f"{enhancer.name} has no steps that could be set")
+        return replace(enhancer, steps=steps)
+
+    return adjust
+
+
+METHODS: dict[str, Method] = {
+    "none": Method("none"),
+    "classical": Method("classical"),
+    "embedded": Method("embedded"),
+    "embedded-1": Method("embedded", _in_steps(1)),
+    "embedded-4": Method("embedded", _in_steps(4)),
+    "scratch": Method("scratch"),
+    "zero-shot": Method("zero-shot"),
+    "deterministic": Method("deterministic"),
+}
+"""By name; each also with the suffix `/no-references`."""
+
+
+def check_methods(names: Iterable[str]) -> list[str]:
+    """The names, each once.
+
+    Raises:
+        ConfigError: for an unknown one, or none at all.
+    """
+    chosen = list(dict.fromkeys(names))
+    unknown = [name for name in chosen if name.removesuffix(NO_REFERENCES) not in METHODS]
+    if unknown or not chosen:
+        raise ConfigError(
+            f"unknown methods {', '.join(unknown) or '(none named)'}; expected {', '.join(METHODS)}, "
+            f"each also with {NO_REFERENCES} behind it"
+        )
+    return chosen
+
+
+def prepared(
+    names: AbstractSequence[str],
+    scene: Scene,
+    sequence: Sequence,
+    config: EnhanceConfig,
+    coarse: CoarseConfig,
+) -> Iterator[tuple[str, Enhancer, float]]:
+    """The restorers of a scene, one after the other.
+
+    Args:
+        names: of methods.
+        scene: the coarse scene.
+        sequence: its training frames.
+        config: settings of the restorers.
+        coarse: settings of leave-out reconstructions.
+
+    Yields:
+        Name, restorer, and the seconds its recipe took; equal recipes are followed once, and each of the
+        methods that start from one is charged with all of it.
+
+    Raises:
+        ConfigError: for an unknown method.
+    """
+    made: dict[str, tuple[Enhancer, float]] = {}
+    for name in check_methods(names):
+        method = METHODS[name.removesuffix(NO_REFERENCES)]
+        if method.recipe not in made:
+            begun = time.perf_counter()
+            enhancer = RECIPES[method.recipe](scene, sequence, config, coarse)
+            made[method.recipe] = enhancer, time.perf_counter() - begun
+        enhancer, seconds = made[method.recipe]
+        if method.adjust is not None:
+            enhancer = method.adjust(enhancer)
+        yield name, WithoutReferences(enhancer) if name.endswith(NO_REFERENCES) else enhancer, seconds
+
+
+def coarse_scene(sequence: Sequence, config: CoarseConfig) -> tuple[Scene, Sequence]:
+    """The coarse scene of a sequence, and the sequence with the poses that the scene belongs to."""
+    result = reconstruct(sequence.training_part(), config)
+    if result.refined is not None:
+        sequence = with_refined_poses(sequence, result.refined.world_from_camera)
+    return result.scene, sequence
+
+
+def compare_methods(
+    scene: Scene,
+    sequence: Sequence,
+    config: PipelineConfig,
+    methods: AbstractSequence[str],
+    lpips: Lpips | None,
+) -> list[dict[str, Any]]:
+    """Judge methods on the held-out views of a sequence.
+
+    Args:
+        scene: its coarse scene.
+        sequence: with the held-out frames; restorers are given the training frames alone.
+        config: settings; `enhance` and `coarse` count.
+        methods: names.
+        lpips: the metric; None leaves it out.
+
+    Returns:
+        One case per method: `{sequence, seed, method, steps, psnr, ssim, lpips_alex, well, hole, ...,
+        seconds_per_frame, prepare_seconds, pixel_share, views}`; see `Trial.figures`.
+
+    Raises:
+        CaptureError: without held-out frames, or too few to train on.
+        ConfigError: for an unknown method.
+    """
+    methods = check_methods(methods)
+    training = sequence.training_part()
+    references = ReferenceViews.gather(scene, training, training.train)
+    clips = held_out_clips(
+        scene, references, sequence, np.asarray(sequence.test), count=config.enhance.references
+    )
+    trial = Trial(clips, TrueViews.of_sequence(sequence, np.asarray(sequence.test)), lpips)
+    cases = []
+    restorers = prepared(methods, scene, training, config.enhance, config.coarse)
+    for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
+        figures = trial.judge(enhancer)
+        cases.append(
+            {
+                "sequence": sequence.name,
+                "seed": config.enhance.seed,
+                "method": name,
+                "steps": _steps(enhancer),
+                **figures,
+                "prepare_seconds": seconds,
+                "pixel_share": trial.pixel_share,
+                "views": len(trial.truth),
+            }
+        )
+        logger.info("bench enhance: %s %s %.2f dB", sequence.name, name, figures["psnr"] or 0.0)
+        emit(Progress("bench enhance", done, len(methods)))
+    return cases
+
+
+def bench_enhance(
+    sequences: Iterable[Sequence],
+    config: PipelineConfig,
+    *,
+    methods: AbstractSequence[str] = ("none", "classical", "embedded"),
+    lpips: Lpips | None = None,
+) -> dict[str, Any]:
+    """Reconstruct each sequence and judge restorers on its held-out views.
+
+    Args:
+        sequences: with poses and held-out frames.
+        config: settings of `coarse` and `enhance`, seeds included.
+        methods: names of `METHODS`, possibly with `/no-references`.
+        lpips: the metric; None leaves it out.
+
+    Returns:
+        `{machine, cases}`; see `compare_methods`. `coarse_seconds` is beside each case.
+
+    Raises:
+        CaptureError: a sequence without poses or held-out frames.
+        ConfigError: for an unknown method.
+    """
+    methods = check_methods(methods)
+    cases = []
+    for sequence in sequences:
+        if sequence.world_from_camera is None:
+            raise CaptureError(
+                f"{sequence.name} has no poses; `extrags run` estimates them, and `extrags export --to "
+                "colmap` writes a folder that has them"
+            )
+        if len(sequence.test) == 0:
+            raise CaptureError(f"{sequence.name}: no held-out frames to judge a restorer on")
+        begun = time.perf_counter()
+        scene, posed = coarse_scene(sequence, config.coarse)
+        seconds = time.perf_counter() - begun
+        found = compare_methods(scene, posed, config, methods, lpips)
+        cases += [{**case, "coarse_seconds": seconds} for case in found]
+    return {"machine": machine(), "cases": cases}
+
+
+def _steps(enhancer: Enhancer) -> int | None:
+    inner = enhancer.enhancer if isinstance(enhancer, WithoutReferences) else enhancer
+    return inner.steps if isinstance(inner, EmbeddedEnhancer) else None

@@ -1,0 +1,528 @@
+"""What restoration is worth: `python tests/benchmarks/bench_enhance.py table|enduse|realism`.
+
+* `table`: restorers on held-out views with real degraded renders, over sequences and seeds; a markdown table
+  of what each gains over no restoration and over the classical fill, mean and smallest..largest.
+* `enduse`: what pseudo-observations bring to the scene. Per sequence and seed one coarse scene, explored as
+  the pipeline explores it, fine-tuned once per arm, always from that same coarse scene and always with the
+  same number of steps on real views. An arm with pseudo-observations takes `finetune.iterations` steps, of
+  which a fixed pattern gives R to real views; the arm `real` is fine-tuned for R steps, with its schedule
+  compressed to them: rates start and end where the other arms' do, densification ends at the same share, and
+  is run fewer times because it comes every so many steps.
+* `realism`: real tissue. Laparoscopy frames with holes cut out and parts blurred, without depth or real views
+  to borrow from, by a restorer that has never seen them (but is told their hues, as it is of any scene); and
+  held-out views of the real sinus. Writes contact sheets.
+
+Nothing is cached: every figure belongs to the code it was run with. `--json FILE` is written anew after every
+sequence and seed, so that a long run can be looked at.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+
+from data_catalog.catalog import read, resolve
+from data_catalog.content import content_circle
+from extrags.assess import assess
+from extrags.cameras import Cameras, pixel_rays
+from extrags.confidence import PerceptualDifference
+from extrags.config import PipelineConfig
+from extrags.enhance.assessment import Trial, TrueViews, held_out_clips, restore_views
+from extrags.enhance.backends import load_enhancer
+from extrags.enhance.bench import METHODS, check_methods, coarse_scene, compare_methods, prepared
+from extrags.enhance.clips import choose_views, make_pseudo_observations
+from extrags.enhance.conditioning import LAYER_CHANNELS, Layers
+from extrags.enhance.embedded import EmbeddedEnhancer
+from extrags.enhance.gamut import Gamut
+from extrags.enhance.protocol import Clip, Enhancer
+from extrags.enhance.references import LightTransfer, ReferenceViews
+from extrags.explore import Exploration, explore
+from extrags.freespace import carve
+from extrags.metrics.image import mean_of_known, psnr
+from extrags.metrics.lpips import Lpips
+from extrags.metrics.protocol import RenderedViews, evaluate_views
+from extrags.raster import set_num_threads
+from extrags.raster.bench import machine
+from extrags.scene import Scene
+from extrags.sequence import Sequence
+from extrags.surface import fuse_surface
+from extrags.training import finetune
+from extrags.training.finetuning import _virtual_steps
+from flows.commands.common import parsed_settings
+from flows.settings import pipeline_config
+from tasks.weights import lpips_weights
+
+Case = dict[str, Any]
+Sink = Callable[[list[Case]], None]
+
+LAPAROSCOPY = Path(__file__).resolve().parents[3] / "shared" / "data" / "laparoscopy_frames_40"
+TISSUE_PX = (192, 160)
+SHEET_ROWS = 8
+
+
+def loaded(name: str, config: PipelineConfig) -> Sequence:
+    """A sequence by name, or from a folder that `Sequence.save` wrote."""
+    if (Path(name) / "zarr.json").exists():
+        return Sequence.load(Path(name))
+    return read(resolve(name), config.ingest)
+
+
+def perceptual(config: PipelineConfig) -> Lpips | None:
+    weights = lpips_weights(config.evaluate)
+    return None if weights.path is None else Lpips.load(weights.path, net=weights.net)
+
+
+# table
+
+
+def table(names: list[str], methods: list[str], configs: list[PipelineConfig], sink: Sink) -> list[Case]:
+    cases: list[Case] = []
+    for name in names:
+        for config in configs:
+            begun = time.perf_counter()
+            scene, posed = coarse_scene(loaded(name, config), config.coarse)
+            seconds = time.perf_counter() - begun
+            found = compare_methods(scene, posed, config, methods, perceptual(config))
+            cases += [{**case, "coarse_seconds": seconds} for case in found]
+            sink(cases)
+    return cases
+
+
+RESTORED = {
+    "PSNR": ("psnr",),
+    "aligned": ("aligned_psnr",),
+    "well": ("well", "psnr"),
+    "hole": ("hole", "psnr"),
+    "unobserved": ("unobserved", "psnr"),
+    "SSIM": ("ssim",),
+    "LPIPS": ("lpips_alex",),
+    "kept PSNR": ("kept", "psnr"),
+    "kept well": ("kept", "well", "psnr"),
+    "rank corr.": ("calibration", "rank_correlation"),
+    "error flicker": ("error_flicker",),
+    "s/frame": ("seconds_per_frame",),
+    "prepared in s": ("prepare_seconds",),
+}
+FINE_TUNED = {
+    "PSNR": ("psnr",),
+    "observed": ("observed", "psnr"),
+    "unobserved": ("unobserved", "psnr"),
+    "SSIM": ("ssim",),
+    "LPIPS": ("lpips_alex",),
+    "AbsRel": ("depth_absrel",),
+    "training PSNR": ("train_psnr",),
+    "fine-tuned in s": ("seconds", "finetune"),
+}
+
+
+def markdown(
+    cases: list[Case], figures: dict[str, tuple[str, ...]], key: str, baselines: list[str], gained: list[str]
+) -> str:
+    """Means of every figure, then gains over each baseline: mean (smallest..largest) over all runs.
+
+    LPIPS is given as a multiple of the baseline's.
+    """
+    rows = list(dict.fromkeys(case[key] for case in cases))
+    blocks = [f"Means over {len({(c['sequence'], c['seed']) for c in cases})} runs.\n"]
+    cells = [
+        [_mean([_at(c, path) for c in cases if c[key] == row]) for path in figures.values()] for row in rows
+    ]
+    blocks.append(
+        _markdown_table([key, *figures], [[row, *line] for row, line in zip(rows, cells, strict=True)])
+    )
+    for baseline in baselines:
+        if baseline not in rows:
+            continue
+        paths = {name: figures[name] for name in gained}
+        lines = [
+            [row, *(_gain(cases, key, row, baseline, name, path) for name, path in paths.items())]
+            for row in rows
+            if row != baseline
+        ]
+        blocks.append(f"\nGains over `{baseline}`, mean (smallest..largest).\n")
+        blocks.append(_markdown_table([key, *paths], lines))
+    return "\n".join(blocks) + "\n"
+
+
+def _gain(cases: list[Case], key: str, row: str, baseline: str, name: str, path: tuple[str, ...]) -> str:
+    found = {(c["sequence"], c["seed"], c[key]): _at(c, path) for c in cases}
+    pairs = [
+        (value, found.get((sequence, seed, baseline)))
+        for (sequence, seed, which), value in found.items()
+        if which == row
+    ]
+    known = [(own, other) for own, other in pairs if own is not None and other is not None]
+    if not known:
+        return "-"
+    if name == "LPIPS":
+        ratios = [own / other for own, other in known]
+        if len(ratios) == 1:
+            return f"x{ratios[0]:.2f}"
+        return f"x{np.mean(ratios):.2f} ({min(ratios):.2f}..{max(ratios):.2f})"
+    gains = [own - other for own, other in known]
+    if len(gains) == 1:
+        return f"{gains[0]:+.3g}"
+    return f"{np.mean(gains):+.3g} ({min(gains):+.3g}..{max(gains):+.3g})"
+
+
+def _at(case: Case, path: tuple[str, ...]) -> float | None:
+    value: Any = case
+    for part in path:
+        value = None if value is None else value.get(part)
+    return None if value is None else float(value)
+
+
+def _mean(values: list[float | None]) -> str:
+    mean = mean_of_known(values)
+    return "-" if mean is None else f"{mean:.4g}"
+
+
+def _markdown_table(header: list[str], rows: list[list[str]]) -> str:
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+# enduse
+
+
+@contextmanager
+def timed(seconds: dict[str, float], part: str) -> Iterator[None]:
+    begun = time.perf_counter()
+    yield
+    seconds[part] = time.perf_counter() - begun
+
+
+def explored(
+    scene: Scene, training: Sequence, config: PipelineConfig, seconds: dict[str, float]
+) -> tuple[Exploration, PipelineConfig]:
+    """Trajectories as the pipeline's stages make them, and the settings with the plan's budgets."""
+    cameras = training.cameras[training.train]
+    with timed(seconds, "assess"):
+        plan = assess(scene, training, config)
+    config = plan.applied_to(config)
+    if not plan.decision("explore").run:
+        raise SystemExit(
+            f"{training.name}: {plan.decision('explore').reason}; --set assess.force=true explores"
+        )
+    with timed(seconds, "surface"):
+        mesh = fuse_surface(scene, cameras, config.surface)
+    with timed(seconds, "freespace"):
+        space = carve(scene, mesh, cameras, config.freespace)
+    with timed(seconds, "explore"):
+        return explore(scene, training, space, config.explore), config
+
+
+def enduse(names: list[str], arms: list[str], configs: list[PipelineConfig], sink: Sink) -> list[Case]:
+    cases: list[Case] = []
+    for name in names:
+        for config in configs:
+            for case in _arms(loaded(name, config), arms, config):
+                cases.append(case)
+                sink(cases)
+    return cases
+
+
+def _arms(sequence: Sequence, arms: list[str], config: PipelineConfig) -> Iterator[Case]:
+    shared: dict[str, float] = {}
+    with timed(shared, "coarse"):
+        scene, posed = coarse_scene(sequence, config.coarse)
+    training = posed.training_part()
+    exploration, config = explored(scene, training, config, shared)
+    trajectories = exploration.trajectories
+    chosen = choose_views([len(cameras) for cameras in trajectories], config.enhance.max_views)
+    virtual = [cameras[views] for cameras, views in zip(trajectories, chosen, strict=True)]
+    lpips = perceptual(config)
+    references = ReferenceViews.gather(scene, training, training.train)
+    before = [value.clone() for value in _contents(scene)]
+    pattern = _virtual_steps(config.finetune, True)
+    real_steps = int((~pattern).sum())
+    about = {
+        "sequence": posed.name,
+        "seed": config.finetune.seed,
+        "trajectories": len(exploration),
+        "virtual_views": sum(len(views) for views in virtual),
+        "real_steps": real_steps,
+    }
+    yield {**about, "arm": "coarse", **held_out_figures(scene, posed, lpips), "seconds": dict(shared)}
+    if "real" in arms:
+        seconds = dict(shared)
+        alone = config.finetune.model_copy(update={"iterations": real_steps})
+        with timed(seconds, "finetune"):
+            result = finetune(scene, training, None, alone, config.coarse)
+        found = held_out_figures(result.scene, posed, lpips)
+        yield {**about, "arm": "real", "steps": alone.iterations, **found, "seconds": seconds}
+    restorers = [arm for arm in arms if arm != "real"]
+    for arm, enhancer, preparation in prepared(restorers, scene, training, config.enhance, config.coarse):
+        seconds = {**shared, "prepare": preparation}
+        with timed(seconds, "restore"):
+            pseudo = make_pseudo_observations(
+                scene,
+                references,
+                virtual,
+                enhancer,
+                PerceptualDifference(lpips, "" if lpips is not None else "no LPIPS weights"),
+                count=config.enhance.references,
+            )
+        with timed(seconds, "finetune"):
+            result = finetune(scene, training, pseudo, config.finetune, config.coarse)
+        if not all(torch.equal(a, b) for a, b in zip(before, _contents(scene), strict=True)):
+            raise RuntimeError(
+                f"{posed.name}: arm {arm} has changed the coarse scene that all arms start from"
+            )
+        found = held_out_figures(result.scene, posed, lpips)
+        more = {"steps": config.finetune.iterations, "changed_share": pseudo.changed_share}
+        yield {**about, "arm": arm, **more, **found, "seconds": seconds}
+
+
+def _contents(scene: Scene) -> list[torch.Tensor]:
+    gaussians = scene.gaussians
+    contents = [gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh]
+    return contents if scene.light is None else [*contents, *scene.light.parameters().values()]
+
+
+def rendered(scene: Scene, sequence: Sequence, frames: np.ndarray) -> RenderedViews:
+    gains = None
+    if scene.light is not None:
+        gains = scene.light.exposures_of(frames, sequence.train, sequence.recording)
+    parts = []
+    for position, frame in enumerate(frames):
+        with torch.no_grad():
+            exposure = None if gains is None else gains[position : position + 1]
+            parts.append(scene.render(sequence.cameras[int(frame)], exposure=exposure))
+    return RenderedViews(
+        np.concatenate([part.rgb.numpy() for part in parts]),
+        np.concatenate([part.alpha.numpy() for part in parts]),
+        np.concatenate([part.depth.numpy() for part in parts]),
+        len(scene.gaussians),
+    )
+
+
+def held_out_figures(scene: Scene, sequence: Sequence, lpips: Lpips | None) -> Case:
+    """Metrics of the protocol on held-out views, and the PSNR of the training views."""
+    frames = np.asarray(sequence.test)
+    metrics = evaluate_views(rendered(scene, sequence, frames), sequence, frames, lpips).metrics
+    train = np.asarray(sequence.train)
+    shown = torch.from_numpy(rendered(scene, sequence, train).rgb).clamp(0, 1)
+    truth = torch.from_numpy(sequence.rgb[train].astype(np.float32) / 255)
+    return {**metrics, "train_psnr": psnr(shown, truth, torch.from_numpy(sequence.mask[train]))}
+
+
+# realism
+
+
+def realism(
+    methods: list[str],
+    config: PipelineConfig,
+    *,
+    trained_on: str,
+    restorer: Path | None,
+    frames: int,
+    folder: Path,
+    sink: Sink,
+) -> list[Case]:
+    cases: list[Case] = []
+    lpips = perceptual(config)
+    trial = laparoscopy_trial(frames, config.enhance.seed, lpips)
+    simple = [name for name in methods if METHODS[name].recipe in ("none", "classical")]
+    scene, posed = coarse_scene(loaded(trained_on, config), config.coarse)
+    wanted = simple if restorer is not None else methods
+    strangers: list[tuple[str, Enhancer]] = []
+    if wanted:
+        made = prepared(wanted, scene, posed.training_part(), config.enhance, config.coarse)
+        strangers = [(name, enhancer) for name, enhancer, _ in made]
+    if restorer is not None:
+        strangers.append((restorer.name, load_enhancer(restorer)))
+    # As a scene's own frames would bound it.
+    truth = torch.from_numpy(trial.truth.rgb).permute(0, 3, 1, 2)
+    hues = Gamut.of_images(truth, torch.ones_like(truth[:, :1]))
+    strangers = [
+        (name, replace(enhancer, gamut=hues) if isinstance(enhancer, EmbeddedEnhancer) else enhancer)
+        for name, enhancer in strangers
+    ]
+    cases += shown(trial, strangers, folder / "laparoscopy.png", "laparoscopy", config.enhance.seed)
+    sink(cases)
+    scene, posed = coarse_scene(loaded("sinus/hopkins", config), config.coarse)
+    training = posed.training_part()
+    references = ReferenceViews.gather(scene, training, training.train)
+    test = np.asarray(posed.test)
+    clips = held_out_clips(scene, references, posed, test, count=config.enhance.references)
+    natives = prepared(methods, scene, training, config.enhance, config.coarse)
+    own = [(name, enhancer) for name, enhancer, _ in natives]
+    trial = Trial(clips, TrueViews.of_sequence(posed, test), lpips)
+    cases += shown(trial, own, folder / "sinus.png", posed.name, config.enhance.seed)
+    sink(cases)
+    return cases
+
+
+def shown(
+    trial: Trial, restorers: list[tuple[str, Enhancer]], file: Path, sequence: str, seed: int
+) -> list[Case]:
+    """Figures of each restorer, and a contact sheet: truth, rendering, restorations."""
+    columns = {"truth": trial.truth.rgb}
+    cases = []
+    for name, enhancer in restorers:
+        restored = restore_views(enhancer, trial.clips)
+        columns[name] = restored.rgb
+        found = trial.figures(restored)
+        cases.append({"sequence": sequence, "seed": seed, "method": name, **found})
+    contact_sheet(columns, file)
+    return cases
+
+
+def laparoscopy_trial(frames: int, seed: int, lpips: Lpips | None) -> Trial:
+    """Real frames with holes and blur, at a constant depth, without any real view to borrow from."""
+    from PIL import Image
+
+    files = sorted(LAPAROSCOPY.glob("*.jpg"))
+    if not files:
+        raise SystemExit(f"no frames in {LAPAROSCOPY}")
+    chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, frames).round().astype(int))]
+    images = []
+    for file in chosen:
+        picture = Image.open(file).convert("RGB")
+        part = picture.resize(TISSUE_PX, Image.Resampling.BOX, box=tissue_box(np.asarray(picture)))
+        images.append(np.asarray(part, np.float32) / 255)
+    rgb = np.stack(images)
+    mask = np.ones(rgb.shape[:3], bool)
+    clips = [degraded_clip(image, index, seed) for index, image in enumerate(rgb)]
+    return Trial(clips, TrueViews(rgb, mask), lpips)
+
+
+def tissue_box(picture: np.ndarray) -> tuple[float, float, float, float]:
+    """The largest box of the wanted shape inside the round picture: no dark frame, no overlay text."""
+    height, width = picture.shape[:2]
+    circle = content_circle(picture[None])
+    x, y, radius = width / 2, height / 2, height / 2
+    if circle is not None:
+        x, y, radius = circle.center_x, circle.center_y, circle.radius_px
+    shape = np.array(TISSUE_PX) / np.hypot(*TISSUE_PX)
+    half = 0.95 * radius * shape
+    half *= min(1.0, min(x, width - x) / half[0], min(y, height - y) / half[1])
+    return x - half[0], y - half[1], x + half[0], y + half[1]
+
+
+def degraded_clip(image: np.ndarray, index: int, seed: int) -> Clip:
+    """One frame as a rendering that has lost an eighth of its pixels and the detail of half of the rest."""
+    height, width = image.shape[:2]
+    generator = np.random.default_rng([seed, index])
+
+    def blobs(share: float, size_px: float) -> np.ndarray:
+        field = gaussian_filter(generator.standard_normal((height, width)), size_px)
+        edge = np.quantile(field, 1 - share)
+        return np.asarray(np.clip((field - edge) / (0.15 * field.std()) + 0.5, 0, 1), np.float32)
+
+    hole, soft = blobs(0.125, 0.04 * width), blobs(0.5, 0.06 * width)
+    blurred = gaussian_filter(image, (2.5, 2.5, 0))
+    seen = image + soft[..., None] * (blurred - image)
+    depth = 50.0
+    K = np.array([[[float(width), 0, width / 2], [0, float(width), height / 2], [0, 0, 1]]])
+    camera = Cameras(K, np.eye(4)[None], width, height)
+    layers = Layers(torch.zeros(1, LAYER_CHANNELS, height, width))
+    planes = {
+        "alpha": 1 - hole,
+        "depth_mm": depth * (hole < 0.98),
+        "uncertainty": 1 - (1 - 0.6 * soft) * (1 - hole),
+        "ray_length": np.linalg.norm(pixel_rays(camera)[0], axis=-1),
+    }
+    for name, plane in planes.items():
+        layers.get(name)[0, 0] = torch.from_numpy(np.asarray(plane, np.float32))
+    layers.get("rendered")[0] = torch.from_numpy(seen * (1 - hole[..., None])).permute(2, 0, 1)
+    return Clip(index, camera, layers, LightTransfer(None, 0.0, depth), np.zeros(1, int), np.ones(1))
+
+
+def contact_sheet(columns: dict[str, np.ndarray], file: Path) -> None:
+    from PIL import Image, ImageDraw
+
+    views, height, width = next(iter(columns.values())).shape[:3]
+    rows = np.unique(np.linspace(0, views - 1, min(views, SHEET_ROWS)).round().astype(int))
+    margin, title = 4, 16
+    sheet = Image.new(
+        "RGB", (len(columns) * (width + margin), title + len(rows) * (height + margin)), "white"
+    )
+    pen = ImageDraw.Draw(sheet)
+    for column, (name, images) in enumerate(columns.items()):
+        pen.text((column * (width + margin) + 2, 2), name, fill="black")
+        for row, view in enumerate(rows):
+            picture = Image.fromarray(np.rint(255 * np.clip(images[view], 0, 1)).astype(np.uint8))
+            sheet.paste(picture, (column * (width + margin), title + row * (height + margin)))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    sheet.save(file)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("what", choices=("table", "enduse", "realism"))
+    parser.add_argument("--sequences", nargs="+", default=[f"phantom/{k}@distanced" for k in range(5)])
+    parser.add_argument("--methods", nargs="+", default=["none", "classical", "embedded"])
+    parser.add_argument("--arms", nargs="+", default=["real", "classical", "embedded"])
+    parser.add_argument("--profile", default="quick")
+    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="NAME=VALUE")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
+    parser.add_argument("--threads", type=int, help="of torch and of the kernels (default: theirs)")
+    parser.add_argument("--json", default="-", metavar="FILE|-")
+    parser.add_argument("--trained-on", default="phantom/11@sparse", help="realism: where strangers learned")
+    parser.add_argument("--restorer", type=Path, help="realism: a saved restorer instead")
+    parser.add_argument("--frames", type=int, default=16, help="realism: laparoscopy frames")
+    parser.add_argument("--sheets", type=Path, default=Path(), help="realism: folder for contact sheets")
+    given = parser.parse_args()
+    if given.threads is not None:
+        torch.set_num_threads(given.threads)
+        set_num_threads(given.threads)
+    settings = parsed_settings(given.settings)
+    configs = [pipeline_config(given.profile, settings, seed) for seed in given.seeds]
+    methods = check_methods(given.methods)
+    check_methods(arm for arm in [*given.arms, "none"] if arm != "real")
+
+    def sink(cases: list[Case]) -> None:
+        sys.stderr.write(f"{cases[-1]['sequence']} seed {cases[-1]['seed']} done, {len(cases)} cases\n")
+        if given.json != "-":
+            text = json.dumps({"machine": machine(), "profile": given.profile, "cases": cases}, indent=1)
+            Path(given.json).write_text(text + "\n")
+
+    quality = ["PSNR", "well", "hole", "unobserved", "SSIM", "LPIPS", "kept PSNR", "kept well"]
+    if given.what == "table":
+        cases = table(given.sequences, methods, configs, sink)
+        said = markdown(cases, RESTORED, "method", ["none", "classical"], quality)
+    elif given.what == "enduse":
+        cases = enduse(given.sequences, given.arms, configs, sink)
+        said = markdown(
+            cases,
+            FINE_TUNED,
+            "arm",
+            ["real", "classical"],
+            ["PSNR", "observed", "unobserved", "SSIM", "LPIPS", "AbsRel", "training PSNR"],
+        )
+    else:
+        cases = realism(
+            methods,
+            configs[0],
+            trained_on=given.trained_on,
+            restorer=given.restorer,
+            frames=given.frames,
+            folder=given.sheets,
+            sink=sink,
+        )
+        said = "\n".join(
+            f"{name}\n\n"
+            + markdown([c for c in cases if c["sequence"] == name], RESTORED, "method", ["none"], quality)
+            for name in dict.fromkeys(case["sequence"] for case in cases)
+        )
+    if given.json == "-":
+        sys.stdout.write(json.dumps({"machine": machine(), "profile": given.profile, "cases": cases}) + "\n")
+    (sys.stderr if given.json == "-" else sys.stdout).write(said)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
