@@ -379,15 +379,18 @@ class FinetuneConfig(StageConfig):
     pseudo_share: float = Field(
         0.5, ge=0, lt=1, description="share of virtual views among the steps, at the start"
     )
-    pseudo_share_final: float = Field(0.25, ge=0, lt=1, description="the same at the end; linear in between")
+    pseudo_share_final: float = Field(0.0, ge=0, lt=1, description="the same at the end; linear in between")
     pseudo_weight: float = Field(
         3.0,
         gt=0,
         description="weight of all virtual views: U_img alone is about 0.2 in a tube, which "
         "would let the real views overrule what the virtual ones add",
     )
+    pseudo_depth: bool = Field(
+        True, description="restored depth supervises where the scene knows nothing of a pixel"
+    )
     growth: float = Field(
-        1.4, ge=1, description="room for new Gaussians: times the coarse stage's largest number"
+        2.0, ge=1, description="room for new Gaussians: times the coarse stage's largest number"
     )
     seed_holes: bool = Field(
         True, description="place new Gaussians where the restored view has surface and none is"
@@ -487,7 +490,7 @@ PROFILES: dict[str, PipelineConfig] = {
             # A short run has no time for the published rates.
             optimiser=OptimiserConfig(means=3.2e-4, sh0=5e-3),
         ),
-        explore=ExploreConfig(trajectories=12, length=10),
+        explore=ExploreConfig(trajectories=12, length=10, rotation_deg=20.0, orbit_deg=20.0),
         enhance=EnhanceConfig(train_iterations=220, max_views=96, batch=4),
         finetune=FinetuneConfig(iterations=1000),
     ),
@@ -503,6 +506,7 @@ PROFILES: dict[str, PipelineConfig] = {
             channels=(48, 96, 160),
             max_views=240,
         ),
+        explore=ExploreConfig(rotation_deg=20.0, orbit_deg=20.0),
         finetune=FinetuneConfig(iterations=4000),
     ),
     # The paper's counts.

@@ -12,7 +12,7 @@ __all__ = ["assemble", "restore", "train"]
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=2)
+@stage("enhance-train", version=3)
 def train(
     slot: Slot,
     scene: Ref,
@@ -41,7 +41,7 @@ def train(
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=2, ignore=("weights",))
+@stage("enhance-restore", version=3, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,
@@ -83,7 +83,7 @@ def restore(
     slot.counts["views"] = len(observations)
 
 
-@stage("enhance", version=1)
+@stage("enhance", version=2)
 def assemble(slot: Slot, parts: list[Ref]) -> None:
     """Join the batches; writes `pseudo/`."""
     from extrags.enhance.pseudo import PseudoObservations

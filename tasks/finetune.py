@@ -12,7 +12,7 @@ from tasks.stage import stage
 __all__ = ["finetune"]
 
 
-@stage("finetune", version=2)
+@stage("finetune", version=3)
 def finetune(
     slot: Slot,
     scene: Ref,

@@ -190,7 +190,7 @@ class RestoredViews:
     Args:
         rgb: what the restorer made, in [0, 1], [V, H, W, 3].
         target: the same with known texture kept; what the fine-tuning is given, [V, H, W, 3].
-        predicted_error: `Restoration.deviation`, [V, H, W]; None where the restorer predicts none.
+        predicted_error: `Restoration.expected_error`, [V, H, W]; None where the restorer predicts none.
         seconds_per_frame: median over the clips.
         provenance: of the first clip.
     """
@@ -218,11 +218,11 @@ def restore_views(enhancer: Enhancer, clips: AbstractSequence[Clip]) -> Restored
         restorations.append(restoration)
         rendered = _image(clip.layers.get("rendered").clamp(0, 1))
         targets.append(keep_known(rendered, restoration.rgb, _plane(clip.layers.get("uncertainty")))[0])
-    deviations = [item.deviation for item in restorations if item.deviation is not None]
+    expected = [item.expected_error for item in restorations if item.expected_error is not None]
     return RestoredViews(
         np.concatenate([item.rgb for item in restorations]),
         np.concatenate(targets),
-        np.concatenate(deviations) if len(deviations) == len(restorations) else None,
+        np.concatenate(expected) if len(expected) == len(restorations) else None,
         float(np.median(seconds)),
         restorations[0].provenance,
     )

@@ -207,6 +207,7 @@ def _pseudo_observation(
         reference=clip.reference,
         clip=np.full(len(clip), clip.index, dtype=np.int64),
         provenance=provenance,
+        expected_error=restoration.expected_error,
     )
 
 

@@ -35,6 +35,9 @@ FORMAT = 2
 CANDIDATE_STEPS = (1, 4)
 """More steps never gained on held-out pairs; which of these does differs from scene to scene."""
 VIEWS_AT_ONCE = 4
+SHORTEST_PROBED = 200
+PROBE_PART = 5
+"""A training on a scene of so many steps and more is tried out with a part of them."""
 LEAST_GAIN_DB = 0.1
 """Training on a scene must gain so much on pairs kept back; less is chance."""
 
@@ -113,15 +116,26 @@ class EmbeddedEnhancer:
         base = base.with_settings(config, gamut)
         candidates = base.candidate_steps(config)
         before = {} if start is None else validation_scores(base, pairs, transfer, candidates)
-        trained = replace(base, network=copy.deepcopy(base.network))
-        sampler = CropSampler(pairs, transfer, batch=config.batch, crop_px=config.crop, seed=config.seed)
-        settings = TrainingSettings(
-            config.train_iterations, rate, base.half_precision, deterministic=deterministic
-        )
-        _, history = train_network(trained.network, sampler.draw, settings, generator)
-        after = validation_scores(trained, pairs, transfer, candidates)
+
+        def trained_for(iterations: int) -> tuple[EmbeddedEnhancer, list[dict[str, float]], float]:
+            """Trained on the scene, and by how much that helped."""
+            learner = replace(base, network=copy.deepcopy(base.network))
+            sampler = CropSampler(pairs, transfer, batch=config.batch, crop_px=config.crop, seed=config.seed)
+            settings = TrainingSettings(iterations, rate, base.half_precision, deterministic=deterministic)
+            _, history = train_network(learner.network, sampler.draw, settings, generator)
+            after.update(validation_scores(learner, pairs, transfer, candidates))
+            gain = _best(after, candidates)[1] - (_best(before, candidates)[1] if before else -math.inf)
+            return learner, history, gain
+
+        after: dict[str, dict[str, float]] = {}
+        iterations = config.train_iterations
+        if start is not None and iterations >= SHORTEST_PROBED:
+            # A short training first: where it brings nothing, the long one is not worth its time.
+            trained, history, gain = trained_for(iterations // PROBE_PART)
+            iterations = config.train_iterations if gain > 0 else iterations // PROBE_PART
+        if start is None or iterations == config.train_iterations:
+            trained, history, gain = trained_for(iterations)
         scores = {**after, **{f"untrained_{name}": value for name, value in _embedded_only(before).items()}}
-        gain = _best(after, candidates)[1] - (_best(before, candidates)[1] if before else -math.inf)
         helped = gain > LEAST_GAIN_DB
         kept = trained if helped else base
         steps = _best(after if helped else before, candidates)[0]
@@ -131,7 +145,7 @@ class EmbeddedEnhancer:
             **base.record,
             "training_pairs": int((~pairs.validation).sum()),
             "validation_pairs": int(pairs.validation.sum()),
-            "iterations": config.train_iterations,
+            "iterations": iterations,
             "history": history,
             "validation": scores,
             "scene_training_kept": helped,

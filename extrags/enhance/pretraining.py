@@ -118,13 +118,11 @@ def judged(enhancer: EmbeddedEnhancer, files: AbstractSequence[Path]) -> Embedde
         cells = enhancer.cell_errors(scene.pairs, scene.transfer)
         expected.append(cells[0])
         true.append(cells[1])
-    means = {
-        name: {
-            key: round(float(np.mean([one[key] for one in values if key in one])), 4)
-            for key in ("psnr", "ssim", "psnr_hole")
-        }
-        for name, values in scores.items()
-    }
+    means: dict[str, dict[str, float]] = {}
+    for name, values in scores.items():
+        # A scene without holes has no figure for them.
+        known = {key: [one[key] for one in values if key in one] for key in ("psnr", "ssim", "psnr_hole")}
+        means[name] = {key: round(float(np.mean(found)), 4) for key, found in known.items() if found}
     calibration = Calibration.fitted(np.concatenate(expected), np.concatenate(true))
     record = {**enhancer.record, "kept_back_scores": means}
     return replace(enhancer, calibration=calibration, record=record)

@@ -56,7 +56,7 @@ class Restoration:
 
     Args:
         rgb: in [0, 1], [T, H, W, 3].
-        deviation: expected absolute error of a pixel, mean of the channels, or None where the restorer
+        expected_error: expected absolute error of a pixel, mean of the channels, or None where the restorer
             has no idea of it, [T, H, W].
         provenance: backend, steps, seed, ...; ready for JSON.
         depth_mm: z-depth without gaps, where the restorer completes it better than smooth filling does,
@@ -64,7 +64,7 @@ class Restoration:
     """
 
     rgb: Float[np.ndarray, "t h w 3"]
-    deviation: Float[np.ndarray, "t h w"] | None
+    expected_error: Float[np.ndarray, "t h w"] | None
     provenance: dict[str, Any] = field(default_factory=dict)
     depth_mm: Float[np.ndarray, "t h w"] | None = None
 

@@ -42,6 +42,8 @@ class PseudoObservations:
         reference: position among the training frames of the one that sees most of the same surface, [V].
         clip: index of the clip each view belongs to, [V].
         provenance: backend, steps, seed, perceptual measure, ...; ready for JSON.
+        expected_error: absolute error of a restored pixel, mean of its channels, as the enhancer expects it;
+            None where it has no idea of it, [V, H, W].
 
     Raises:
         ShapeError: when the arrays do not fit each other.
@@ -59,6 +61,7 @@ class PseudoObservations:
     reference: Int[np.ndarray, "v"]
     clip: Int[np.ndarray, "v"]
     provenance: dict[str, Any] = field(default_factory=dict)
+    expected_error: Float[np.ndarray, "v h w"] | None = None
 
     def __post_init__(self) -> None:
         views = len(self.cameras)
@@ -66,6 +69,8 @@ class PseudoObservations:
         expected: dict[str, tuple[int, ...]] = dict.fromkeys(_IMAGES, (*size, 3))
         expected.update(dict.fromkeys((*_SHARES, "depth_mm"), size))
         expected.update(dict.fromkeys(("image_confidence", "reference", "clip"), (views,)))
+        if self.expected_error is not None:
+            expected["expected_error"] = size
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 raise ShapeError(f"{name} has shape {getattr(self, name).shape}, expected {shape}")
@@ -91,6 +96,9 @@ class PseudoObservations:
             raise ShapeError("no pseudo-observations to join")
         names = (*_IMAGES, *_SHARES, "depth_mm", "image_confidence", "reference", "clip")
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        errors = [part.expected_error for part in parts if part.expected_error is not None]
+        if len(errors) == len(parts):
+            arrays["expected_error"] = np.concatenate(errors)
         cameras = Cameras.concatenated([part.cameras for part in parts])
         return PseudoObservations(cameras, **arrays, provenance=dict(parts[0].provenance))
 
@@ -99,6 +107,8 @@ class PseudoObservations:
         group = open_group(path, mode="w")
         for name in (*_IMAGES, *_SHARES):
             write_frames(group, name, _as_bytes(getattr(self, name)))
+        if self.expected_error is not None:
+            write_frames(group, "expected_error", _as_bytes(self.expected_error))
         write_frames(group, "depth_mm", self.depth_mm.astype(np.float32))
         write_array(group, "image_confidence", self.image_confidence.astype(np.float32))
         write_array(group, "reference", self.reference.astype(np.int64))
@@ -121,7 +131,7 @@ class PseudoObservations:
         attributes: Any = dict(group.attrs)
         arrays: dict[str, Any] = {
             name: read_array(group, name).astype(np.float32) / np.float32(255)
-            for name in (*_IMAGES, *_SHARES)
+            for name in (*_IMAGES, *_SHARES, *(("expected_error",) if "expected_error" in group else ()))
         }
         for name in ("depth_mm", "image_confidence", "reference", "clip"):
             arrays[name] = read_array(group, name)

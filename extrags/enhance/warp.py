@@ -183,11 +183,11 @@ def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> 
     distance = offsets.norm(dim=-1).clamp_min(1e-9)
     center = torch.from_numpy(camera.centers[0].astype(np.float32))
     cosine = 1 / rays.norm(dim=-1).reshape(-1)
-    normal = surface_normals(cameras_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
+    normal = depth_normals(camera_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
     return _Surface(center + offsets, distance, offsets / distance[:, None], cosine, normal)
 
 
-def surface_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]) -> Float[Tensor, "h w 3"]:
+def depth_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]) -> Float[Tensor, "h w 3"]:
     """Unit normals of the surface that a depth map without gaps describes, in the rays' frame.
 
     Differences over a few pixels: what a lamp shades is the wall, not the roughness of a rendered depth.
@@ -208,7 +208,7 @@ def surface_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w
     return unit
 
 
-def cameras_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
+def camera_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
     """Rays of a single camera in the world's frame, at unit z-depth."""
     return torch.from_numpy(pixel_rays(camera)[0].astype(np.float32))
 

@@ -15,7 +15,7 @@ from extrags.scene import Scene
 from extrags.sequence import Sequence
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent
-from extrags.training.starting import median_depth, thin_out
+from extrags.training.starting import median_depth, surface_normals, thin_out
 from extrags.training.views import View, epochs, real_views
 
 __all__ = ["finetune", "hole_gaussians", "virtual_views"]
@@ -23,8 +23,17 @@ __all__ = ["finetune", "hole_gaussians", "virtual_views"]
 HOLE_ALPHA = 0.5
 """A virtual pixel below this alpha shows a hole that new Gaussians may fill."""
 
+UNKNOWN = 0.5
+"""Uncertainty of a pixel from which its restored depth supervises."""
+
 CARVED_MARGIN = 0.05
 """A new Gaussian nearer than a real view's surface by this share of its depth would hide it."""
+
+FEWEST_POINTS = 8
+"""Fewer hole points have neither neighbours nor normals."""
+
+LEAST_GAIN = 0.05
+"""Albedo in a hole is no brighter than this much light allows: far and grazing guesses are not certain."""
 
 HOLE_STRIDE_PX = 2
 """Hole pixels are taken on a grid of this step; thinning would drop most of them anyway."""
@@ -62,7 +71,7 @@ def finetune(
     max_gaussians = round(config.growth * coarse.densify.max_gaussians)
     if pseudo is not None and config.seed_holes:
         room = max_gaussians - len(scene.gaussians)
-        born = hole_gaussians(scene, sequence, pseudo, room)
+        born = hole_gaussians(scene, sequence, pseudo, room, thickness=coarse.thickness)
         if born is not None:
             start = Scene(Gaussians.concatenated(scene.gaussians, born), scene.light)
     real = real_views(sequence, frames)
@@ -98,6 +107,8 @@ def virtual_views(pseudo: PseudoObservations, config: FinetuneConfig) -> list[Vi
     """Pseudo-observations as views, with both levels of confidence as weights."""
     views = []
     confidence = np.maximum(pseudo.pixel_confidence, config.confidence_floor)
+    # Where the scene knows its surface, a completed depth has nothing to teach it.
+    depth = np.where(pseudo.uncertainty > UNKNOWN, pseudo.depth_mm, 0).astype(np.float32)
     for index in range(len(pseudo.cameras)):
         weight = config.pseudo_weight * float(pseudo.image_confidence[index])
         if weight <= 0:
@@ -108,7 +119,7 @@ def virtual_views(pseudo: PseudoObservations, config: FinetuneConfig) -> list[Vi
                 camera=pseudo.cameras[index],
                 rgb=torch.from_numpy(np.asarray(target, dtype=np.float32)),
                 weight=torch.from_numpy(confidence[index].astype(np.float32)),
-                depth_mm=None,
+                depth_mm=torch.from_numpy(depth[index]) if config.pseudo_depth else None,
                 frame=None,
                 loss_weight=weight,
             )
@@ -117,18 +128,25 @@ def virtual_views(pseudo: PseudoObservations, config: FinetuneConfig) -> list[Vi
 
 
 def hole_gaussians(
-    scene: Scene, sequence: Sequence, pseudo: PseudoObservations, room: int
+    scene: Scene,
+    sequence: Sequence,
+    pseudo: PseudoObservations,
+    room: int,
+    *,
+    thickness: float = 1.0,
 ) -> Gaussians | None:
     """New Gaussians where a restored virtual view shows surface and the scene has none.
 
     Points come from the completed depth of hole pixels, their albedo from the restored colour with the
-    light divided out. Points that would stand in front of what a real view saw are dropped.
+    light divided out; like the scene's first Gaussians they lie flat on the surface, which the light's
+    cosine asks for. Points that would stand in front of what a real view saw are dropped.
 
     Args:
         scene: the coarse scene.
         sequence: posed frames; training frames carve.
         pseudo: restored virtual views.
         room: at most so many new Gaussians.
+        thickness: along the surface's normal, as a share of the radius.
 
     Returns:
         The new Gaussians, or None where there is nothing to fill.
@@ -144,22 +162,32 @@ def hole_gaussians(
     rays = pixel_rays(cameras).reshape(-1, 3)[chosen]
     points = cameras.centers[view] + pseudo.depth_mm.reshape(-1)[chosen, None] * rays
     rgb = np.asarray(pseudo.target, dtype=np.float64).reshape(-1, 3)[chosen]
+    if len(points) < FEWEST_POINTS:
+        return None
     if scene.light is not None:
-        local = np.einsum(
-            "nji,nj->ni", cameras.world_from_camera[view, :3, :3], points - cameras.centers[view]
-        )
-        lit = torch.from_numpy(rgb), torch.from_numpy(local)
-        rgb = scene.light.albedo(*lit, least_gain=1e-2).detach().numpy()
+        into_camera = cameras.world_from_camera[view, :3, :3]
+        local = np.einsum("nji,nj->ni", into_camera, points - cameras.centers[view])
+        normals = np.einsum("nji,nj->ni", into_camera, surface_normals(points))
+        lit = torch.from_numpy(rgb), torch.from_numpy(local), torch.from_numpy(normals)
+        rgb = scene.light.albedo(*lit, least_gain=LEAST_GAIN).detach().numpy()
     unseen = ~_in_front_of_real_surface(points, scene, sequence)
     points, rgb = points[unseen], rgb[unseen]
-    if len(points) < 4:
+    if len(points) < FEWEST_POINTS:
         return None
     spacing = _typical_spacing(scene.gaussians)
     points, rgb = _one_per_cell(points, rgb, spacing)
     points, rgb = thin_out(points, rgb, room)
     radius = np.full(len(points), 0.7 * spacing)
+    if len(points) < FEWEST_POINTS:
+        return None
     return Gaussians.from_points(
-        points, rgb.clip(0, None), radius, opacity=0.3, sh_degree=scene.gaussians.sh_degree
+        points,
+        rgb.clip(0, None),
+        radius,
+        opacity=0.3,
+        sh_degree=scene.gaussians.sh_degree,
+        normals=surface_normals(points) if thickness != 1 else None,
+        thickness=thickness,
     )
 
 

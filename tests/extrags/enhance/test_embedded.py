@@ -182,11 +182,11 @@ class TestEmbedded:
     def test_samples_add_to_the_expected_error(self, trained: EmbeddedEnhancer, clip: Clip) -> None:
         plain = replace(trained, steps=4, calibration=Calibration())
         one, several = plain.restore(clip), replace(plain, samples=3).restore(clip)
-        assert one.deviation is not None
-        assert several.deviation is not None
-        assert several.deviation.shape == several.rgb.shape[:3]
-        assert several.deviation.mean() > 0
-        assert np.abs(several.deviation - one.deviation).max() > 0
+        assert one.expected_error is not None
+        assert several.expected_error is not None
+        assert several.expected_error.shape == several.rgb.shape[:3]
+        assert several.expected_error.mean() > 0
+        assert np.abs(several.expected_error - one.expected_error).max() > 0
         assert several.depth_mm is not None
         assert (several.depth_mm > 0).all()
 

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from extrags.cameras import pixel_rays
 from extrags.enhance.references import LightTransfer
-from extrags.enhance.warp import covisibility, fit_falloff_exponent, warp_references
+from extrags.enhance.warp import covisibility, depth_normals, fit_falloff_exponent, warp_references
 from tests.extrags.enhance.conftest import cast_tube, exact_references, tube_cameras, tube_light
 
 
@@ -79,3 +82,42 @@ def test_the_falloff_exponent_is_found_from_the_images(exponent: float) -> None:
     fall = torch.from_numpy(((distance / 20) ** -exponent).astype(np.float32))
     references.packed[:, :3] *= fall[:, None]
     assert abs(fit_falloff_exponent(references) - exponent) < 0.12
+
+
+def test_the_angle_to_the_wall_is_compensated() -> None:
+    """A lamp that darkens slanted walls: carried into another view, the wall has the right brightness."""
+    light = replace(tube_light(6), cosine=torch.tensor(0.9))
+    cameras = tube_cameras(8)
+    colors = []
+    for camera in range(len(cameras)):
+        view = cameras[camera]
+        rgb, depth = cast_tube(view, tube_light(6))
+        rays = torch.from_numpy(pixel_rays(view)[0].astype(np.float32))
+        normals = depth_normals(rays, torch.from_numpy(depth.astype(np.float32)))
+        points = view.centers[:, None, None] + depth[..., None] * pixel_rays(view)
+        radial = np.concatenate([points[..., :2], np.zeros_like(points[..., :1])], axis=-1)
+        exact = (radial / np.linalg.norm(radial, axis=-1, keepdims=True))[0]
+        facing = (pixel_rays(view)[0] * exact).sum(-1) / np.linalg.norm(pixel_rays(view)[0], axis=-1)
+        near = depth[0] < 60
+        agreement = np.abs((normals.numpy() * exact).sum(-1))[near]
+        assert np.median(agreement) > 0.995
+        turned = torch.from_numpy(facing)
+        near_lens = torch.ones_like(turned)
+        darker = light.falloff(near_lens, None, turned) / light.falloff(near_lens)
+        colors.append(rgb * darker.numpy()[None, ..., None])
+    references = exact_references(cameras[list(range(6))], light)
+    packed = references.packed.clone()
+    packed[:, :3] = torch.from_numpy(np.concatenate(colors[:6]).astype(np.float32)).permute(0, 3, 1, 2)
+    references = replace(references, packed=packed)
+    _, depth = cast_tube(cameras[[7]], light)
+    depth_mm = torch.from_numpy(depth.astype(np.float32))[:, None]
+    truth = torch.from_numpy(colors[7].astype(np.float32)).permute(0, 3, 1, 2)
+    blind = references.with_transfer(
+        replace(references.transfer, light=replace(light, cosine=torch.tensor(0.0)))
+    )
+    errors = []
+    for views in (references, blind):
+        warped = warp_references(views, cameras[[7]], depth_mm, count=4)
+        sure = (warped.blend_weight > 0.5).expand(-1, 3, -1, -1)
+        errors.append(float((warped.blend - truth).abs()[sure].mean()))
+    assert errors[0] < 0.6 * errors[1]
