@@ -425,10 +425,18 @@ def _add_pretrain(verbs: Any) -> None:
         metavar="FOLDER",
         help="where practice scenes are kept, 40 MB each (default: %(default)s)",
     )
-    made.add_argument("--scenes", type=int, metavar="N", help="practice scenes (default: 108)")
-    made.add_argument("--kept-back", type=int, metavar="N", help="how many of them only judge (default: 8)")
-    made.add_argument("--iterations", type=int, metavar="N", help="optimisation steps (default: 20000)")
+    made.add_argument("--scenes", type=int, metavar="N", help="practice scenes (default: 86)")
+    made.add_argument("--kept-back", type=int, metavar="N", help="how many of them only judge (default: 6)")
+    made.add_argument("--iterations", type=int, metavar="N", help="optimisation steps (default: 13500)")
     made.add_argument("--batch", type=int, metavar="N", help="crops per step (default: 4)")
+    made.add_argument("--start", metavar="FOLDER", help="go on from these weights instead of from nothing")
+    made.add_argument("--learning-rate", type=float, metavar="X", help="the peak (default: 8e-4)")
+    made.add_argument(
+        "--perceptual-weight", type=float, metavar="X", help="of the perceptual distance (default: 0.15)"
+    )
+    made.add_argument(
+        "--doubt-weight", type=float, metavar="X", help="of the expected error's likelihood (default: 0.02)"
+    )
     made.add_argument("--seed", type=int, metavar="N", help="of the training (default: 0)")
     made.add_argument("--threads", type=int, metavar="N", help="threads of the training (default: all)")
     made.add_argument(

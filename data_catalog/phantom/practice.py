@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig, Setting, stream
 from data_catalog.phantom.imaging import recording_sensor
-from data_catalog.phantom.recording import Phantom
+from data_catalog.phantom.recording import TRAINS, Phantom
 from data_catalog.phantom.trajectories import camera_path
 from extrags.cameras import Cameras, rotation_about
 from extrags.sequence import Sequence, Split
@@ -26,7 +26,6 @@ FIRST_PRACTICE_SCENE = 100_000
 """Practice scenes are numbered from here; the catalogue's scenes lie far below."""
 _SIZES = ((160, 128), (144, 144), (176, 112), (160, 128), (136, 128))
 _TARGETS: tuple[tuple[str, int], ...] = (("between", 6), ("sparse", 10), ("distanced", 20), ("searching", 12))
-_TRAINS = 1
 
 
 def practice_config(index: int) -> PhantomConfig:
@@ -59,19 +58,18 @@ def practice_sequence(index: int) -> Sequence:
     phantom = Phantom(config)
     rng = stream(config.scene, "variation", 2)
     gain = phantom.scene_gain()
-    sensor = recording_sensor(config, _TRAINS, gain)
+    sensor = recording_sensor(config, TRAINS, gain)
     video = np.arange(0, config.video_frames, config.train_every)
     train = phantom.cameras("b", video / (config.video_frames - 1))
     targets = _target_cameras(phantom, rng)
     rgb, exposures = [], []
     for k, frame in enumerate(video):
-        image, exposure = phantom.photograph(train[k], sensor, _TRAINS, int(frame))
+        image, exposure = phantom.photograph(train[k], sensor, TRAINS, int(frame))
         rgb.append(image)
         exposures.append(exposure)
     quiet = replace(sensor, noise=False, drift=0.0)
     rgb += [
-        phantom.photograph(targets[k], quiet, _TRAINS, config.video_frames + k)[0]
-        for k in range(len(targets))
+        phantom.photograph(targets[k], quiet, TRAINS, config.video_frames + k)[0] for k in range(len(targets))
     ]
     cameras = Cameras.concatenated([train, targets])
     depth = np.stack([phantom.z_depth(cameras[k]) for k in range(len(cameras))])

@@ -77,7 +77,8 @@ class CropSampler:
         generator, pairs = self._generator, self._pairs
         top, left = self._corner()
         window = (..., slice(top, top + self._side), slice(left, left + self._side))
-        layers = Layers(pairs.layers.data[index : index + 1][window].clone())
+        # Many scenes are kept in half precision; crops are not. The copy is changed below.
+        layers = Layers(pairs.layers.data[index : index + 1][window].clone().float())
         clean = pairs.target[index : index + 1][window]
         weight = pairs.weight[index : index + 1][window]
         depth = pairs.depth_mm[index : index + 1][window]

@@ -22,7 +22,7 @@ from extrags.errors import ConfigError, WeightsError
 from extrags.scene import Scene
 from extrags.sequence import Sequence
 
-__all__ = ["load_enhancer", "train_enhancer"]
+__all__ = ["load_enhancer", "scene_gamut", "starting_restorer", "train_enhancer"]
 
 
 def train_enhancer(scene: Scene, sequence: Sequence, config: EnhanceConfig, coarse: CoarseConfig) -> Enhancer:
@@ -47,17 +47,30 @@ def train_enhancer(scene: Scene, sequence: Sequence, config: EnhanceConfig, coar
         return CheckpointEnhancer.prepare(scene, sequence, config)
     if config.backend in ADAPTERS:
         return PretrainedEnhancer.prepare(scene, sequence, config)
-    weights = find_weights(config.pretrained_weights)
-    start = None if weights is None else EmbeddedEnhancer.load(weights)
-    if config.train_iterations == 0:
-        if start is None:
-            raise ConfigError(
-                "enhance.train_iterations is 0 and enhance.pretrained_weights is none: nothing would restore"
-            )
+    start = starting_restorer(config)
+    if start is not None and config.train_iterations == 0:
         return start.with_settings(config, scene_gamut(sequence))
     pairs = make_pairs(scene, sequence, config, coarse)
     transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
     return EmbeddedEnhancer.train(pairs, transfer, config, start)
+
+
+def starting_restorer(config: EnhanceConfig) -> EmbeddedEnhancer | None:
+    """What the embedded backend starts from; None where it learns from the scene's pairs alone.
+
+    Args:
+        config: weights and budget.
+
+    Raises:
+        WeightsError: when the weights are not there, or do not fit.
+        ConfigError: when there would be neither weights nor training.
+    """
+    weights = find_weights(config.pretrained_weights)
+    if weights is None and config.train_iterations == 0:
+        raise ConfigError(
+            "enhance.train_iterations is 0 and enhance.pretrained_weights is none: nothing would restore"
+        )
+    return None if weights is None else EmbeddedEnhancer.load(weights)
 
 
 def scene_gamut(sequence: Sequence) -> Gamut:

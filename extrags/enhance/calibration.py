@@ -1,7 +1,8 @@
 """From the error a restorer expects to the error it makes, measured on pairs it has not learned from.
 
 A network knows where it errs long before it knows by how much. Errors of cells of pixels, predicted and
-true, are put in order; the best rising curve through them turns one into the other and keeps all ranks.
+true, are put in order; a curve through their means that never falls turns one into the other. It turns no
+order round; where it is level, different predictions become equal.
 """
 
 from __future__ import annotations
@@ -18,14 +19,14 @@ __all__ = ["CELL_PX", "Calibration", "cell_means"]
 CELL_PX = 8
 """Predicted and true errors are compared in squares of this side: single pixels are noise."""
 KNOTS = 17
-FEWEST_CELLS = 200
+FEWEST_CELLS = 2000
 """Fewer cells say nothing about a curve."""
 SMALLEST_ERROR = 1e-4
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A rising curve.
+    """A curve that never falls.
 
     Args:
         predicted: knots, rising.
@@ -37,7 +38,9 @@ class Calibration:
 
     @classmethod
     def fitted(cls, predicted: Float[np.ndarray, "n"], true: Float[np.ndarray, "n"]) -> Calibration:
-        """The best rising curve (least squares) through errors of cells; none where there are too few.
+        """The best curve (least squares) that never falls through means of cells; none where they are few.
+
+        Cells are put in order by prediction and averaged in equal shares, one per knot.
 
         Args:
             predicted: errors as the restorer expects them.

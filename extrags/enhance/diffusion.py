@@ -40,9 +40,7 @@ PURE_NOISE_SHARE = 0.7
 TIME_LOGIT_MEAN = 0.3
 TIME_LOGIT_DEVIATION = 1.2
 STRUCTURE_WEIGHT = 0.1
-PERCEPTUAL_WEIGHT = 0.15
 DEPTH_WEIGHT = 0.1
-DOUBT_WEIGHT = 0.02
 CHARBONNIER_EPS = 1e-3
 DEPTH_LIMIT = 1.5
 """Log-depths are corrected by no more than this; larger errors count no more either."""
@@ -95,6 +93,8 @@ class TrainingSettings:
         learning_rate: the peak, after the warm-up.
         half_precision: convolutions in bfloat16.
         perceptual: a perceptual distance that counts beside the pixels' errors; None without.
+        perceptual_weight: of that distance.
+        doubt_weight: of the expected error's likelihood.
         deterministic: no noise, one step only: the same network as a plain regression.
         ema_decay: memory of the running mean of the weights.
     """
@@ -103,6 +103,8 @@ class TrainingSettings:
     learning_rate: float
     half_precision: bool
     perceptual: Lpips | None = None
+    perceptual_weight: float = 0.15
+    doubt_weight: float = 0.02
     deterministic: bool = False
     ema_decay: float = 0.995
 
@@ -212,23 +214,21 @@ def _diffusion_loss(
     mix = time[:, None, None, None]
     noisy = (1 - mix) * clean + mix * noise
     predicted = _predict(network, batch.conditioning, noisy, time, half_precision=settings.half_precision)
-    return restoration_loss(predicted, batch, settings.perceptual)
+    return restoration_loss(predicted, batch, settings)
 
 
-def restoration_loss(
-    predicted: Predicted, batch: Batch, perceptual: Lpips | None = None
-) -> Float[Tensor, ""]:
+def restoration_loss(predicted: Predicted, batch: Batch, settings: TrainingSettings) -> Float[Tensor, ""]:
     r"""What a prediction costs, averaged over weighted pixels.
 
     Charbonnier on normalised colours, a tenth of 1 - SSIM, the absolute error of the log-depth, and for
     the expected error :math:`b` of a pixel with error :math:`e` the negative log-likelihood
     :math:`e / b + \log b` of Laplace; :math:`e` is taken as it is, so that the colours do not follow their
-    own doubts. With `perceptual` its distance is added.
+    own doubts. A perceptual distance may be added.
 
     Args:
         predicted: the network's answer.
         batch: the truth.
-        perceptual: a perceptual distance, or None.
+        settings: the perceptual distance, if there is one, and the weights.
 
     Source: for the expected error, Kendall and Gal: What Uncertainties Do We Need in Bayesian Deep
     Learning for Computer Vision?, NeurIPS 2017, equation 5 with a Laplace likelihood.
@@ -243,13 +243,13 @@ def restoration_loss(
     depth = (predicted.log_depth - batch.depth_mm.clamp_min(1e-6).log()).abs().clamp(max=DEPTH_LIMIT) * known
     error = (predicted.rgb.detach() - clean).abs().mean(dim=1, keepdim=True)
     doubt = ((error * (-predicted.log_error).exp() + predicted.log_error) * weight).sum()
-    loss: Tensor = (charbonnier + STRUCTURE_WEIGHT * structure + DOUBT_WEIGHT * doubt) / total
+    loss: Tensor = (charbonnier + STRUCTURE_WEIGHT * structure + settings.doubt_weight * doubt) / total
     loss = loss + DEPTH_WEIGHT * depth.sum() / known.sum().clamp_min(1e-6)
-    if perceptual is not None:
+    if settings.perceptual is not None:
         # Where nothing is known of the truth, nothing shall differ from it.
         shown = (weight * predicted.rgb + (1 - weight) * clean).clamp(0, 1)
-        distance = perceptual.distance(shown.permute(0, 2, 3, 1), clean.permute(0, 2, 3, 1))
-        loss = loss + PERCEPTUAL_WEIGHT * distance.mean()
+        distance = settings.perceptual.distance(shown.permute(0, 2, 3, 1), clean.permute(0, 2, 3, 1))
+        loss = loss + settings.perceptual_weight * distance.mean()
     return loss
 
 

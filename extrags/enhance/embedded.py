@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+from collections.abc import Sequence as AbstractSequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,13 @@ from extrags.enhance.augmentation import CropSampler
 from extrags.enhance.calibration import Calibration, cell_means
 from extrags.enhance.conditioning import CONDITION_CHANNELS, Layers, condition
 from extrags.enhance.diffusion import Sampled, TrainingSettings, sample, train_network
+from extrags.enhance.doubts import Doubts, error_features
 from extrags.enhance.gamut import Gamut
 from extrags.enhance.network import RestorationNetwork, build_network
 from extrags.enhance.pairs import Pairs
 from extrags.enhance.protocol import Clip, Restoration
 from extrags.enhance.references import LightTransfer
+from extrags.enhance.weights import DESCRIPTION, WEIGHTS
 from extrags.errors import WeightsError
 from extrags.events import MetricRecorded, emit
 from extrags.metrics.image import psnr_per_image, ssim_map
@@ -35,6 +38,8 @@ FORMAT = 2
 CANDIDATE_STEPS = (1, 4)
 """More steps never gained on held-out pairs; which of these does differs from scene to scene."""
 VIEWS_AT_ONCE = 4
+MOSTLY_VALID = 0.5
+"""Cells with a smaller share of valid pixels judge nothing."""
 SHORTEST_PROBED = 200
 PROBE_PART = 5
 """A training on a scene of so many steps and more is tried out with a part of them."""
@@ -59,7 +64,8 @@ class EmbeddedEnhancer:
         half_precision: convolutions in bfloat16.
         gamut: hues of the scene's real frames, bounds of the restored ones.
         record: how it was trained and what it reached on validation pairs.
-        calibration: from the error the network expects to the one it makes.
+        doubts: the expected error, from the network's own and from what it was given.
+        calibration: from the expected error to the one it makes.
         deterministic: trained as a plain regression: no noise, one step.
     """
 
@@ -70,6 +76,7 @@ class EmbeddedEnhancer:
     half_precision: bool
     gamut: Gamut
     record: dict[str, Any]
+    doubts: Doubts = field(default_factory=Doubts)
     calibration: Calibration = field(default_factory=Calibration)
     deterministic: bool = False
 
@@ -136,7 +143,8 @@ class EmbeddedEnhancer:
         if start is None or iterations == config.train_iterations:
             trained, history, gain = trained_for(iterations)
         scores = {**after, **{f"untrained_{name}": value for name, value in _embedded_only(before).items()}}
-        helped = gain > LEAST_GAIN_DB
+        # Without pairs kept back nothing can be said, and what has practised is trusted.
+        helped = gain > LEAST_GAIN_DB and (start is None or _kept_back(pairs) is not None)
         kept = trained if helped else base
         steps = _best(after if helped else before, candidates)[0]
         for method, values in scores.items():
@@ -152,20 +160,6 @@ class EmbeddedEnhancer:
         }
         kept = replace(kept, steps=steps, record=record)
         return kept.calibrated(pairs, transfer)
-
-    @classmethod
-    def practised(cls, path: Path, config: EnhanceConfig, gamut: Gamut) -> EmbeddedEnhancer:
-        """A restorer from weights that practised on other scenes, with the settings of this one.
-
-        Args:
-            path: folder or file as `load` takes it.
-            config: sampler settings.
-            gamut: hues of this scene.
-
-        Raises:
-            WeightsError: as `load`.
-        """
-        return cls.load(path).with_settings(config, gamut)
 
     def with_settings(self, config: EnhanceConfig, gamut: Gamut) -> EmbeddedEnhancer:
         """The same network under a scene's settings."""
@@ -188,6 +182,8 @@ class EmbeddedEnhancer:
     def calibrated(self, pairs: Pairs, transfer: LightTransfer) -> EmbeddedEnhancer:
         """With the curve that the pairs kept back show; the present one where they are too few.
 
+        The line below it stays: a few pairs of one scene are enough for a curve, not for six weights.
+
         Args:
             pairs: all pairs.
             transfer: how brightness changes with distance.
@@ -197,6 +193,30 @@ class EmbeddedEnhancer:
             return self
         calibration = Calibration.fitted(*self.cell_errors(kept, transfer))
         return replace(self, calibration=calibration) if calibration.predicted else self
+
+    def with_doubts(self, scenes: AbstractSequence[tuple[Pairs, LightTransfer]]) -> EmbeddedEnhancer:
+        """With line and curve of the expected error fitted to pairs of many scenes.
+
+        Args:
+            scenes: pairs that were not trained on, and how brightness changes with distance in each.
+        """
+        plain = replace(self, doubts=Doubts(), calibration=Calibration())
+        features, errors = [], []
+        for pairs, transfer in scenes:
+            for view in range(len(pairs)):
+                layers, weight = pairs.layers[view], pairs.weight[view : view + 1]
+                noise = plain._noise((int(weight.shape[-2]), int(weight.shape[-1])), view, 0)
+                restored = plain.restored_layers(layers, transfer, noise, steps=plain.steps)
+                error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
+                mean, share = cell_means(error, weight)
+                each = error_features(layers, restored.rgb, restored.error)
+                columns = [cell_means(each[:, [k]], weight)[0] for k in range(each.shape[1])]
+                features.append(np.stack(columns, axis=1)[share > MOSTLY_VALID])
+                errors.append(mean[share > MOSTLY_VALID])
+        lined = replace(plain, doubts=Doubts.fitted(np.concatenate(features), np.concatenate(errors)))
+        cells = [lined.cell_errors(pairs, transfer) for pairs, transfer in scenes]
+        expected, true = (np.concatenate(part) for part in zip(*cells, strict=True))
+        return replace(lined, calibration=Calibration.fitted(expected, true))
 
     def cell_errors(
         self, pairs: Pairs, transfer: LightTransfer
@@ -215,8 +235,8 @@ class EmbeddedEnhancer:
             weight = pairs.weight[view : view + 1]
             error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
             predicted, share = cell_means(restored.error, weight)
-            expected.append(predicted[share > 0.5])
-            true.append(cell_means(error, weight)[0][share > 0.5])
+            expected.append(predicted[share > MOSTLY_VALID])
+            true.append(cell_means(error, weight)[0][share > MOSTLY_VALID])
         return np.concatenate(expected), np.concatenate(true)
 
     def restore(self, clip: Clip) -> Restoration:
@@ -265,7 +285,9 @@ class EmbeddedEnhancer:
             restored = sample(
                 self.network, conditioning, start, steps=steps, half_precision=self.half_precision
             )
-            parts.append(replace(restored, rgb=self.gamut.bounded(restored.rgb)))
+            rgb = self.gamut.bounded(restored.rgb)
+            features = error_features(layers[first : first + VIEWS_AT_ONCE], rgb, restored.error)
+            parts.append(replace(restored, rgb=rgb, error=self.doubts.applied(features)))
         return Sampled(
             torch.cat([part.rgb for part in parts]),
             torch.cat([part.depth_mm for part in parts]),
@@ -304,7 +326,7 @@ class EmbeddedEnhancer:
             name: (value.half() if half else value).contiguous()
             for name, value in self.network.state_dict().items()
         }
-        save_file(weights, str(path / "restorer.safetensors"))
+        save_file(weights, str(path / WEIGHTS))
         description = {
             "backend": self.name,
             "format": FORMAT,
@@ -315,11 +337,12 @@ class EmbeddedEnhancer:
             "seed": self.seed,
             "half_precision": self.half_precision,
             "gamut": self.gamut.as_dict(),
+            "doubts": self.doubts.as_dict(),
             "calibration": self.calibration.as_dict(),
             "deterministic": self.deterministic,
             "record": self.record,
         }
-        (path / "restorer.json").write_text(json.dumps(description, indent=2) + "\n")
+        (path / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
 
     @classmethod
     def load(cls, path: Path) -> EmbeddedEnhancer:
@@ -331,39 +354,50 @@ class EmbeddedEnhancer:
         Raises:
             WeightsError: when a file is missing, or does not fit this version.
         """
+        from safetensors import SafetensorError
         from safetensors.torch import load_file
 
-        weights_file = path / "restorer.safetensors" if path.suffix != ".safetensors" else path
+        weights_file = path / WEIGHTS if path.is_dir() or path.suffix != ".safetensors" else path
         description_file = weights_file.with_suffix(".json")
         for file in (weights_file, description_file):
             if not file.exists():
                 raise WeightsError(f"{file}: no such file; train the restorer first (stage enhance)")
-        description = json.loads(description_file.read_text())
-        if description.get("format") != FORMAT or description["condition_channels"] != CONDITION_CHANNELS:
+        try:
+            description = dict(json.loads(description_file.read_text()))
+        except (ValueError, TypeError) as error:
+            raise WeightsError(f"{description_file}: not readable as a JSON object ({error})") from error
+        if description.get("format") != FORMAT or description.get("condition_channels") != CONDITION_CHANNELS:
             raise WeightsError(
                 f"{description_file}: format {description.get('format')} with "
                 f"{description.get('condition_channels')} channels, this version reads format {FORMAT} "
                 f"with {CONDITION_CHANNELS}; train the restorer again"
             )
-        first, second, third = description["widths"]
-        network = build_network(CONDITION_CHANNELS, (first, second, third), torch.Generator())
+        try:
+            first, second, third = description["widths"]
+            network = build_network(CONDITION_CHANNELS, (first, second, third), torch.Generator())
+            enhancer = cls(
+                network.eval(),
+                int(description["steps"]),
+                int(description["samples"]),
+                int(description["seed"]),
+                bool(description["half_precision"]),
+                Gamut(**description["gamut"]),
+                description["record"],
+                Doubts(tuple(description["doubts"]["weights"]), float(description["doubts"]["offset"])),
+                Calibration(**{k: tuple(v) for k, v in description["calibration"].items()}),
+                bool(description["deterministic"]),
+            )
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise WeightsError(
+                f"{description_file}: not the description of a restorer ({error!r})"
+            ) from error
         try:
             network.load_state_dict(
                 {name: value.float() for name, value in load_file(str(weights_file)).items()}
             )
-        except RuntimeError as error:
+        except (OSError, RuntimeError, SafetensorError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
-        return cls(
-            network.eval(),
-            int(description["steps"]),
-            int(description["samples"]),
-            int(description["seed"]),
-            bool(description["half_precision"]),
-            Gamut(**description["gamut"]),
-            description["record"],
-            Calibration(**{k: tuple(v) for k, v in description["calibration"].items()}),
-            bool(description["deterministic"]),
-        )
+        return enhancer
 
 
 def validation_scores(

@@ -26,7 +26,7 @@ from extrags.scene import Scene
 from extrags.sequence import Sequence
 from extrags.training.optimise import optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent
-from extrags.training.starting import median_depth, starting_gaussians
+from extrags.training.starting import median_depth, starting_gaussians, surface_normals
 from extrags.training.views import epochs, real_views
 
 __all__ = ["Pairs", "cheap_pairs", "fold_pairs", "leave_out_folds", "make_pairs", "pair_views"]
@@ -39,6 +39,10 @@ VALIDATION_EVERY = 5
 """Every n-th training frame is never a target of the training, only of the validation."""
 TARGETS_PER_SUBSET = 4
 CHEAP_GAUSSIANS = 8000
+FLAT = 0.1
+"""Thickness of cheap Gaussians, as a share of their radius."""
+LEAST_GAIN = 0.05
+"""Darker places are treated as if they received this much light: noise is not albedo."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +202,13 @@ def _partial_scene(
         }
     )
     start = starting_gaussians(
-        sequence, kept, brief.max_points, light=light, sh_degree=brief.sh_degree, seed=brief.seed
+        sequence,
+        kept,
+        brief.max_points,
+        light=light,
+        sh_degree=brief.sh_degree,
+        seed=brief.seed,
+        thickness=brief.thickness,
     )
     views = real_views(sequence, kept)
     order = epochs(len(views), np.random.default_rng(brief.seed))
@@ -298,13 +308,15 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
     depth = 1 / packed[chosen, 4]
     offsets = rays[chosen] * depth[:, None]
     distance = np.linalg.norm(offsets, axis=1)
-    seen = (
-        torch.from_numpy(distance.astype(np.float32)),
-        torch.from_numpy((depth / distance).astype(np.float32)),
+    # Flat on the surface, as a scene's Gaussians are: the light darkens what is turned away from it.
+    normals = surface_normals(views.cameras.centers[view] + offsets)
+    facing = (normals * offsets).sum(axis=1) / distance
+    seen = tuple(
+        torch.from_numpy(values.astype(np.float32)) for values in (distance, depth / distance, facing)
     )
     falloff = views.transfer.falloff(*seen).numpy()
     signal = views.transfer.signal(torch.from_numpy(packed[chosen, :3])).numpy()
-    albedo = signal / np.maximum(falloff, 1e-2)[:, None]
+    albedo = signal / np.maximum(falloff, LEAST_GAIN)[:, None]
     albedo = albedo / views.exposure.numpy()[view, None]
     # Without a light the colour of a distance cannot be divided out twice: it stays as it was seen.
     colors = albedo if views.transfer.light is not None else packed[chosen, :3]
@@ -321,7 +333,14 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
     radius = np.where(floats, radius * inward, radius)
     keep = _outside_random_balls(points, float(np.median(depth)), generator)
     opacity = float(generator.uniform(0.4, 0.95))
-    return Gaussians.from_points(points[keep], colors[keep].clip(0, None), radius[keep], opacity=opacity)
+    return Gaussians.from_points(
+        points[keep],
+        colors[keep].clip(0, None),
+        radius[keep],
+        opacity=opacity,
+        normals=normals[keep],
+        thickness=FLAT,
+    )
 
 
 def pair_views(sequence: Sequence, layers: Layers, frames: Int[np.ndarray, "m"], *, cheap: bool) -> Pairs:

@@ -18,13 +18,15 @@ from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.enhance.conditioning import Layers, observe_views
 from extrags.enhance.pairs import Pairs, pair_views
 from extrags.enhance.references import LightTransfer, ReferenceViews
-from extrags.errors import WeightsError
+from extrags.errors import ShapeError, WeightsError
 from extrags.illumination import NearFieldLight
 from extrags.sequence import Sequence
 from extrags.training.reconstruction import reconstruct
 
 __all__ = ["PracticeScene", "practise_scene"]
 
+PRACTICE_VERSION = 1
+"""Raised by hand whenever the same scene and settings give other pairs."""
 ITERATIONS = (400, 2000)
 """A practice scene is trained for a number of steps between these: renderings good and less good."""
 GAUSSIANS = (0.35, 1.0)
@@ -43,8 +45,13 @@ class PracticeScene:
     pairs: Pairs
     transfer: LightTransfer
 
-    def save(self, path: Path) -> None:
-        """Write one safetensors file: colours and layers in half precision."""
+    def save(self, path: Path, *, origin: str = "") -> None:
+        """Write one safetensors file: colours and layers in half precision.
+
+        Args:
+            path: the file.
+            origin: what the scene was made from, given back by `made_from`.
+        """
         from safetensors.torch import save_file
 
         light = self.transfer.light
@@ -67,9 +74,22 @@ class PracticeScene:
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_suffix(".partial")
         save_file(
-            {k: v.contiguous() for k, v in tensors.items()}, str(partial), {"scales": json.dumps(scales)}
+            {k: v.contiguous() for k, v in tensors.items()},
+            str(partial),
+            {"scales": json.dumps(scales), "origin": origin},
         )
         partial.replace(path)
+
+    @staticmethod
+    def made_from(path: Path) -> str | None:
+        """The `origin` a file was saved with; None where there is no such file."""
+        from safetensors import SafetensorError, safe_open
+
+        try:
+            with safe_open(str(path), "pt") as file:
+                return str((file.metadata() or {}).get("origin", ""))
+        except (OSError, SafetensorError):
+            return None
 
     @classmethod
     def load(cls, path: Path) -> PracticeScene:
@@ -85,6 +105,11 @@ class PracticeScene:
                 metadata = file.metadata() or {}
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             scales = json.loads(metadata["scales"])
+            light = None
+            if scales["reference_distance"] is not None:
+                values = {k.removeprefix("light."): v for k, v in tensors.items() if k.startswith("light.")}
+                light = NearFieldLight(**values, reference_distance=scales["reference_distance"])
+            transfer = LightTransfer(light, scales["exponent"], scales["scale_mm"])
             count = len(tensors["frame"])
             pairs = Pairs(
                 Layers(tensors["layers"].float()),
@@ -95,13 +120,9 @@ class PracticeScene:
                 np.zeros(count, dtype=bool),
                 np.zeros(count, dtype=bool),
             )
-        except (OSError, SafetensorError, KeyError) as error:
+        except (OSError, SafetensorError, KeyError, ValueError, TypeError, ShapeError) as error:
             raise WeightsError(f"{path}: not the pairs of a practice scene ({error})") from error
-        light = None
-        if scales["reference_distance"] is not None:
-            values = {k.removeprefix("light."): v for k, v in tensors.items() if k.startswith("light.")}
-            light = NearFieldLight(**values, reference_distance=scales["reference_distance"])
-        return cls(pairs, LightTransfer(light, scales["exponent"], scales["scale_mm"]))
+        return cls(pairs, transfer)
 
 
 def practise_scene(

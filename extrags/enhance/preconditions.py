@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 
 from extrags.config import EnhanceConfig
+from extrags.enhance.backends import starting_restorer
 from extrags.enhance.captions import check_source
 from extrags.enhance.embedded import EmbeddedEnhancer
 from extrags.enhance.pretrained.checkpoint import CheckpointEnhancer, check_interpreter, clone_fingerprint
 from extrags.enhance.pretrained.enhancer import ADAPTERS, check_pipeline
 from extrags.enhance.pretrained.fingerprint import files_fingerprint, fingerprint
-from extrags.enhance.weights import find_weights, weights_digest
-from extrags.errors import ConfigError
+from extrags.enhance.weights import weights_digest
 
 __all__ = ["check_restorer", "model_digest"]
 
@@ -34,7 +34,8 @@ def check_restorer(config: EnhanceConfig) -> None:
     if _reads_text(config):
         check_source(config.caption)
     if config.backend == EmbeddedEnhancer.name:
-        _check_embedded(config)
+        # A few megabytes are loaded: whether they fit this version shows at once.
+        starting_restorer(config)
     elif config.backend == CheckpointEnhancer.name:
         check_interpreter(config.checkpoint)
     elif config.backend in ADAPTERS:
@@ -68,17 +69,6 @@ def model_digest(config: EnhanceConfig) -> str | None:
         return model
     parts = f"{model} {files_fingerprint({'texts': texts})}"
     return hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()
-
-
-def _check_embedded(config: EnhanceConfig) -> None:
-    weights = find_weights(config.pretrained_weights)
-    if weights is not None:
-        # A few megabytes: whether they fit this version shows at once.
-        EmbeddedEnhancer.load(weights)
-    elif config.train_iterations == 0:
-        raise ConfigError(
-            "enhance.train_iterations is 0 and enhance.pretrained_weights is none: nothing would restore"
-        )
 
 
 def _reads_text(config: EnhanceConfig) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence as AbstractSequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,8 +13,7 @@ import torch
 from pydantic import Field
 
 from extrags.enhance.augmentation import CropSampler, MixedSampler
-from extrags.enhance.calibration import Calibration
-from extrags.enhance.conditioning import CONDITION_CHANNELS
+from extrags.enhance.conditioning import CONDITION_CHANNELS, Layers
 from extrags.enhance.diffusion import TrainingSettings, train_network
 from extrags.enhance.embedded import EmbeddedEnhancer, has_fast_half_precision, validation_scores
 from extrags.enhance.gamut import Gamut
@@ -32,9 +32,9 @@ MOST_STEPS = 4
 class PretrainingConfig(StageConfig):
     """Budget of a pretraining."""
 
-    scenes: int = Field(108, ge=2, description="practice scenes in all")
-    kept_back: int = Field(8, ge=1, description="how many of them, the last ones, only judge")
-    iterations: int = Field(20_000, ge=1, description="optimisation steps")
+    scenes: int = Field(86, ge=2, description="practice scenes in all")
+    kept_back: int = Field(6, ge=1, description="how many of them, the last ones, only judge")
+    iterations: int = Field(13_500, ge=1, description="optimisation steps")
     batch: int = Field(4, ge=1, description="crops per step, each from a scene of its own")
     crop: int = Field(96, ge=32, description="side of a crop in pixels, a multiple of 8")
     channels: tuple[int, int, int] = Field((48, 96, 160), description="widths of the U-Net's levels")
@@ -43,20 +43,27 @@ class PretrainingConfig(StageConfig):
     perceptual: bool = Field(
         True, description="LPIPS with SqueezeNet counts beside the pixels' errors; its weights are needed"
     )
+    perceptual_weight: float = Field(0.15, gt=0, description="of that distance")
+    doubt_weight: float = Field(0.02, gt=0, description="of the expected error's likelihood")
     deterministic: bool = Field(False, description="a plain regression instead of a diffusion")
     seed: int = Field(0, ge=0)
 
 
 def pretrain(
-    files: AbstractSequence[Path], config: PretrainingConfig, *, stage: str = "pretrain"
+    files: AbstractSequence[Path],
+    config: PretrainingConfig,
+    start: EmbeddedEnhancer | None = None,
+    *,
+    stage: str = "pretrain",
 ) -> EmbeddedEnhancer:
-    """Train on practice scenes; the last ones choose the number of steps and calibrate the expected error.
+    """Train on practice scenes; the last ones judge it, and calibrate the expected error of one step.
 
     The same files, settings and number of threads give the same weights.
 
     Args:
         files: practice scenes in order; as many as the settings say.
         config: budget.
+        start: weights to go on from; None begins anew.
         stage: named in progress events.
 
     Raises:
@@ -72,26 +79,36 @@ def pretrain(
     samplers = []
     for number, file in enumerate(files[: -config.kept_back]):
         scene = PracticeScene.load(file)
-        samplers.append(
-            CropSampler(
-                scene.pairs, scene.transfer, batch=1, crop_px=config.crop, seed=_scene_seed(config, number)
-            )
-        )
+        # As they lie in the file: in full precision a hundred scenes would take ten gigabytes.
+        pairs = replace(scene.pairs, layers=Layers(scene.pairs.layers.data.half()))
+        seed = _scene_seed(config, number)
+        samplers.append(CropSampler(pairs, scene.transfer, batch=1, crop_px=config.crop, seed=seed))
     mixed = MixedSampler(samplers, batch=config.batch, seed=config.seed)
     generator = torch.Generator().manual_seed(config.seed)
-    network = build_network(CONDITION_CHANNELS, config.channels, generator)
+    if start is None:
+        network = build_network(CONDITION_CHANNELS, config.channels, generator)
+    else:
+        if start.network.widths != config.channels or start.deterministic != config.deterministic:
+            raise ConfigError(
+                f"the weights to go on from have channels {start.network.widths}, deterministic is "
+                f"{start.deterministic}; the settings say {config.channels} and {config.deterministic}"
+            )
+        network = copy.deepcopy(start.network)
     half = has_fast_half_precision()
     settings = TrainingSettings(
         config.iterations,
         config.learning_rate,
         half,
         perceptual,
+        config.perceptual_weight,
+        config.doubt_weight,
         deterministic=config.deterministic,
         ema_decay=config.ema_decay,
     )
     network, history = train_network(network, mixed.draw, settings, generator, stage=stage)
     record: dict[str, Any] = {
         "pretraining": config.model_dump(mode="json"),
+        "before": None if start is None else start.record,
         "threads": torch.get_num_threads(),
         "history": history[:: max(1, len(history) // 200)],
     }
@@ -109,23 +126,18 @@ def judged(enhancer: EmbeddedEnhancer, files: AbstractSequence[Path]) -> Embedde
         files: practice scenes that only judge.
     """
     candidates = (1,) if enhancer.deterministic else (1, MOST_STEPS)
+    loaded = [PracticeScene.load(file) for file in files]
     scores: dict[str, list[dict[str, float]]] = {}
-    expected, true = [], []
-    for file in files:
-        scene = PracticeScene.load(file)
+    for scene in loaded:
         for name, values in validation_scores(enhancer, scene.pairs, scene.transfer, candidates).items():
             scores.setdefault(name, []).append(values)
-        cells = enhancer.cell_errors(scene.pairs, scene.transfer)
-        expected.append(cells[0])
-        true.append(cells[1])
     means: dict[str, dict[str, float]] = {}
-    for name, values in scores.items():
+    for name, judgements in scores.items():
         # A scene without holes has no figure for them.
-        known = {key: [one[key] for one in values if key in one] for key in ("psnr", "ssim", "psnr_hole")}
+        known = {key: [one[key] for one in judgements if key in one] for key in ("psnr", "ssim", "psnr_hole")}
         means[name] = {key: round(float(np.mean(found)), 4) for key, found in known.items() if found}
-    calibration = Calibration.fitted(np.concatenate(expected), np.concatenate(true))
     record = {**enhancer.record, "kept_back_scores": means}
-    return replace(enhancer, calibration=calibration, record=record)
+    return replace(enhancer, record=record).with_doubts([(one.pairs, one.transfer) for one in loaded])
 
 
 def _scene_seed(config: PretrainingConfig, number: int) -> int:

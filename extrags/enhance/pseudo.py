@@ -108,7 +108,8 @@ class PseudoObservations:
         for name in (*_IMAGES, *_SHARES):
             write_frames(group, name, _as_bytes(getattr(self, name)))
         if self.expected_error is not None:
-            write_frames(group, "expected_error", _as_bytes(self.expected_error))
+            # Errors are a few of the 255 steps of a byte.
+            write_frames(group, "expected_error", self.expected_error.astype(np.float16))
         write_frames(group, "depth_mm", self.depth_mm.astype(np.float32))
         write_array(group, "image_confidence", self.image_confidence.astype(np.float32))
         write_array(group, "reference", self.reference.astype(np.int64))
@@ -131,8 +132,10 @@ class PseudoObservations:
         attributes: Any = dict(group.attrs)
         arrays: dict[str, Any] = {
             name: read_array(group, name).astype(np.float32) / np.float32(255)
-            for name in (*_IMAGES, *_SHARES, *(("expected_error",) if "expected_error" in group else ()))
+            for name in (*_IMAGES, *_SHARES)
         }
+        if "expected_error" in group:
+            arrays["expected_error"] = read_array(group, "expected_error").astype(np.float32)
         for name in ("depth_mm", "image_confidence", "reference", "clip"):
             arrays[name] = read_array(group, name)
         cameras = Cameras(

@@ -48,10 +48,12 @@ def finetune(
 ) -> TrainingResult:
     r"""Fine-tune a scene on real and virtual views together.
 
-    Virtual views weigh :math:`w U_{img} (|I^P - \hat I| \odot U_{pixel} + L_{D-SSIM})` with w the
-    `pseudo_weight`; which kind a step draws follows a fixed pattern whose share of virtual views falls
-    linearly. The position learning rate starts anew. Without pseudo-observations only real views are
-    used: the control of a comparison.
+    Virtual views weigh
+    :math:`w U_{img} (|I^P - \hat I| \odot U_{pixel} + L_{D-SSIM} + \lambda_d L_{depth})` with w the
+    `pseudo_weight`; the depth term, with `pseudo_depth` alone, is that of the real views, on pixels whose
+    surface the scene does not know. Which kind a step draws follows a fixed pattern whose share of virtual
+    views falls linearly. The position learning rate starts anew. Without pseudo-observations only real
+    views are used: the control of a comparison.
 
     Args:
         scene: the coarse scene.
@@ -63,7 +65,7 @@ def finetune(
     Raises:
         DivergedError: when the optimisation does not stay finite.
 
-    Source: paper equations 10 (training views) and 11 (virtual views).
+    Source: paper equations 10 (training views) and 11 (virtual views); their depth term is our own.
     """
     frames = sequence.train
     depth = median_depth(sequence, frames)

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
 from flows.commands.common import set_up_logging
 from flows.terminal import console
+
+if TYPE_CHECKING:
+    from extrags.enhance.pretraining import PretrainingConfig
 
 __all__ = ["pretrain"]
 
@@ -22,6 +27,9 @@ def pretrain(given: argparse.Namespace) -> int:
     set_up_logging(debug=given.debug, terminal=terminal)
     # Before torch is imported: threads that spin while they wait slow each other down.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    import torch
+
+    from extrags.enhance.embedded import EmbeddedEnhancer
     from extrags.enhance.pretraining import PretrainingConfig
     from extrags.enhance.pretraining import pretrain as trained
     from extrags.raster.bench import machine
@@ -32,7 +40,10 @@ def pretrain(given: argparse.Namespace) -> int:
         "kept_back": given.kept_back,
         "iterations": given.iterations,
         "batch": given.batch,
+        "learning_rate": given.learning_rate,
         "perceptual": not given.without_perceptual,
+        "perceptual_weight": given.perceptual_weight,
+        "doubt_weight": given.doubt_weight,
         "deterministic": given.deterministic,
         "seed": given.seed,
     }
@@ -41,18 +52,16 @@ def pretrain(given: argparse.Namespace) -> int:
         config = PretrainingConfig(**known)
     except ValueError as error:
         raise ConfigError(f"extrags pretrain: {error}") from error
-    folder = Path(given.scenes_folder)
+    start = None if given.start is None else EmbeddedEnhancer.load(Path(given.start))
+    checked(given, config)
+    # As things are now: in some hours the working tree may be another.
+    about: dict[str, Any] = {"command": _command(given), "machine": machine()}
     with watched(terminal=terminal):
-        files = make_scenes(folder, config.scenes, given.workers)
+        files = make_scenes(Path(given.scenes_folder), config.scenes, given.workers)
         if given.threads is not None:
-            import torch
-
             torch.set_num_threads(given.threads)
-        enhancer = trained(files, config)
-        record: dict[str, Any] = {**enhancer.record, "command": _command(given), "machine": machine()}
-        from dataclasses import replace
-
-        replace(enhancer, record=record).save(Path(given.out), half=True)
+        enhancer = trained(files, config, start)
+        replace(enhancer, record={**enhancer.record, **about}).save(Path(given.out), half=True)
     out = console()
     for method, scores in enhancer.record["kept_back_scores"].items():
         out.print(f"{method:12} " + "  ".join(f"{name} {value}" for name, value in scores.items()))
@@ -60,36 +69,79 @@ def pretrain(given: argparse.Namespace) -> int:
     return 0
 
 
+def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
+    """Look at everything that would otherwise fail after hours.
+
+    Raises:
+        ConfigError: for settings that do not fit each other, or a folder that cannot be written.
+        WeightsError: when the perceptual distance has no weights.
+    """
+    from extrags.metrics.lpips import find_weights
+
+    if config.kept_back >= config.scenes:
+        raise ConfigError(
+            f"{config.kept_back} of {config.scenes} scenes are kept back; none is left to learn"
+        )
+    for name in ("workers", "threads"):
+        value = getattr(given, name)
+        if value is not None and value < 1:
+            raise ConfigError(f"--{name} {value}: expected 1 or more")
+    if config.perceptual:
+        find_weights(None, "squeeze")
+    for folder in (given.out, given.scenes_folder):
+        try:
+            Path(folder).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"{folder} cannot be written: {error.strerror or error}") from error
+
+
 def make_scenes(folder: Path, count: int, workers: int) -> list[Path]:
-    """Practice scenes 0 to count - 1 as files; those that are there already stay.
+    """Practice scenes 0 to count - 1 as files; those that are there and made in the same way stay.
 
     Args:
         folder: where they are kept.
         count: how many.
         workers: processes at once.
     """
+    from extrags.enhance.practice import PracticeScene
     from extrags.events import Progress, emit
 
     files = [folder / f"{index:04d}.safetensors" for index in range(count)]
-    missing = [index for index, file in enumerate(files) if not file.is_file()]
+    missing = [index for index, file in enumerate(files) if PracticeScene.made_from(file) != origin(index)]
     done = count - len(missing)
     emit(Progress("practice-scenes", done, count))
-    if workers == 1:
-        for index in missing:
-            make_scene(index, files[index])
-            done += 1
-            emit(Progress("practice-scenes", done, count))
-        return files
     import multiprocessing
 
-    # Spawned: a fork would take over OpenMP's threads in whatever state they are.
+    # In processes of their own: they set their numbers of threads, and a fork would take over OpenMP's.
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
         running = [pool.submit(make_scene, index, files[index]) for index in missing]
-        for future in running:
-            future.result()
-            done += 1
-            emit(Progress("practice-scenes", done, count))
+        try:
+            for future in running:
+                future.result()
+                done += 1
+                emit(Progress("practice-scenes", done, count))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
     return files
+
+
+def origin(index: int) -> str:
+    """What a practice scene depends on, as text: a scene made otherwise is made again."""
+    from data_catalog.phantom.config import GENERATOR_VERSION
+    from data_catalog.phantom.practice import practice_config
+    from extrags.config import profile_config
+    from extrags.enhance.practice import PRACTICE_VERSION
+
+    quick = profile_config("quick")
+    parts = {
+        "generator": GENERATOR_VERSION,
+        "practice": PRACTICE_VERSION,
+        "phantom": practice_config(index).model_dump(mode="json"),
+        "coarse": quick.coarse.model_dump(mode="json"),
+        "references": quick.enhance.references,
+    }
+    return json.dumps(parts, sort_keys=True)
 
 
 def make_scene(index: int, file: Path) -> None:
@@ -103,13 +155,17 @@ def make_scene(index: int, file: Path) -> None:
 
     torch.set_num_threads(1)
     set_num_threads(1)
-    profile = profile_config("quick")
-    practise_scene(practice_sequence(index), profile.enhance, profile.coarse, index).save(file)
+    quick = profile_config("quick")
+    scene = practise_scene(practice_sequence(index), quick.enhance, quick.coarse, index)
+    scene.save(file, origin=origin(index))
 
 
 def _command(given: argparse.Namespace) -> str:
     parts = ["extrags pretrain"]
-    for name in ("scenes", "kept_back", "iterations", "batch", "threads", "seed"):
+    for name in (
+        *("start", "scenes", "kept_back", "iterations", "batch", "learning_rate", "perceptual_weight"),
+        *("doubt_weight", "threads", "seed"),
+    ):
         value = getattr(given, name)
         if value is not None:
             parts.append(f"--{name.replace('_', '-')} {value}")

@@ -33,7 +33,7 @@ def find_weights(setting: str) -> Path | None:
         The .safetensors file, its description beside it with the suffix .json; None for `none`.
 
     Raises:
-        WeightsError: when a file is missing; says what can be done.
+        WeightsError: when a file is missing or another kind is named; says what can be done.
     """
     if setting == NONE:
         return None
@@ -51,6 +51,8 @@ def find_weights(setting: str) -> Path | None:
     for file in (weights, weights.with_suffix(".json")):
         if not file.is_file():
             raise WeightsError(f"enhance.pretrained_weights={setting}: there is no file {file}; {cure}")
+    if weights.suffix != ".safetensors":
+        raise WeightsError(f"enhance.pretrained_weights={setting}: {weights} is no .safetensors file; {cure}")
     return weights
 
 

@@ -5,6 +5,8 @@ import pytest
 import torch
 
 from extrags.enhance.calibration import Calibration, cell_means
+from extrags.enhance.conditioning import LAYER_CHANNELS, Layers
+from extrags.enhance.doubts import LEAST_CONTRAST, LEAST_ERROR, Doubts, error_features
 
 
 def test_it_turns_expected_errors_into_true_ones_and_keeps_their_order() -> None:
@@ -38,3 +40,30 @@ def test_cell_means_leave_out_what_has_no_weight() -> None:
     mean, share = cell_means(values, weight)
     assert mean[0] == pytest.approx(1)
     assert share.tolist() == pytest.approx([0.5, 0])
+
+
+class TestDoubts:
+    def _features(self, count: int) -> torch.Tensor:
+        generator = torch.Generator().manual_seed(2)
+        layers = Layers(torch.rand(count, LAYER_CHANNELS, 16, 16, generator=generator))
+        rgb = torch.rand(count, 3, 16, 16, generator=generator)
+        error = 0.02 + 0.1 * torch.rand(count, 1, 16, 16, generator=generator)
+        return error_features(layers, rgb, error)
+
+    def test_at_first_they_are_those_of_the_network(self) -> None:
+        features = self._features(2)
+        torch.testing.assert_close(Doubts().applied(features), features[:, :1].exp())
+
+    def test_the_line_is_found_again(self) -> None:
+        features = self._features(40)
+        true = Doubts((0.6, 0.2, 0.5, -0.1, -0.3, 0.15), -0.4)
+        error = true.applied(features)
+        flat = features.permute(0, 2, 3, 1).reshape(-1, 6).numpy()
+        fitted = Doubts.fitted(flat, error.flatten().numpy() - LEAST_ERROR)
+        torch.testing.assert_close(fitted.applied(features), error, rtol=1e-3, atol=1e-5)
+
+    def test_an_image_without_contrast_has_the_least(self) -> None:
+        layers = Layers(torch.rand(1, LAYER_CHANNELS, 16, 16, generator=torch.Generator().manual_seed(1)))
+        flat = torch.full((1, 3, 16, 16), 0.4)
+        contrast = error_features(layers, flat, torch.full((1, 1, 16, 16), 0.1))[:, 1].exp()
+        torch.testing.assert_close(contrast, torch.full_like(contrast, LEAST_CONTRAST), rtol=1e-3, atol=0)

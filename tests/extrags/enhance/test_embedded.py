@@ -29,6 +29,7 @@ from extrags.errors import ConfigError, DivergedError, WeightsError
 from tests.extrags.enhance.conftest import SMALL, Tube, tube_cameras
 
 WIDTHS = (16, 24, 32)
+PLAIN = TrainingSettings(1, 1e-3, False)
 
 
 def _conditioning(n: int, height: int, width: int, seed: int = 0) -> Conditioning:
@@ -110,7 +111,7 @@ class TestTraining:
         depth = torch.full((1, 1, 16, 16), 20.0)
         batch = Batch(_conditioning(1, 16, 16), clean, weight, depth)
         predicted = Predicted(wrong, depth.log(), torch.zeros(1, 1, 16, 16))
-        assert restoration_loss(predicted, batch) < 1e-2
+        assert restoration_loss(predicted, batch, PLAIN) < 1e-2
 
     def test_unknown_depth_does_not_count(self) -> None:
         clean = torch.full((1, 3, 16, 16), 0.5)
@@ -120,8 +121,8 @@ class TestTraining:
         wrong[..., :8] = 1e3
         batch = Batch(_conditioning(1, 16, 16), clean, torch.ones(1, 1, 16, 16), depth)
         doubt = torch.zeros(1, 1, 16, 16)
-        assert restoration_loss(Predicted(clean, wrong.log(), doubt), batch) < 1e-2
-        assert restoration_loss(Predicted(clean, wrong.log() + 0.5, doubt), batch) > 0.02
+        assert restoration_loss(Predicted(clean, wrong.log(), doubt), batch, PLAIN) < 1e-2
+        assert restoration_loss(Predicted(clean, wrong.log() + 0.5, doubt), batch, PLAIN) > 0.02
 
     def test_the_expected_error_is_cheapest_when_true(self) -> None:
         clean = torch.full((1, 3, 16, 16), 0.5)
@@ -133,6 +134,7 @@ class TestTraining:
                         clean + 0.1, torch.zeros(1, 1, 16, 16), torch.full((1, 1, 16, 16), expected).log()
                     ),
                     batch,
+                    PLAIN,
                 )
             )
             for expected in (0.05, 0.08, 0.1, 0.125, 0.2)
