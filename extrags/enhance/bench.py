@@ -43,6 +43,9 @@ __all__ = [
 NO_REFERENCES = "/no-references"
 """Suffix of a method's name: the same restorer, not told what real views see."""
 
+SCENE_ITERATIONS = 220
+"""Steps on the scene's own pairs where the profile trains on none."""
+
 logger = logging.getLogger(__name__)
 
 Recipe = Callable[[Scene, Sequence, EnhanceConfig, CoarseConfig], Enhancer]
@@ -58,10 +61,18 @@ def _classical(_scene: Scene, _sequence: Sequence, _config: EnhanceConfig, _coar
     return ClassicalEnhancer()
 
 
-def _embedded(**changes: Any) -> Recipe:
-    """The embedded restorer with changed settings."""
+def _learning(config: EnhanceConfig) -> EnhanceConfig:
+    """Settings that train on the scene's pairs, whatever the profile says of that."""
+    if config.train_iterations > 0:
+        return config
+    return config.model_copy(update={"train_iterations": SCENE_ITERATIONS})
+
+
+def _embedded(*, learning: bool = False, **changes: Any) -> Recipe:
+    """The embedded restorer with changed settings; with `learning` it trains on the scene's pairs."""
 
     def recipe(scene: Scene, sequence: Sequence, config: EnhanceConfig, coarse: CoarseConfig) -> Enhancer:
+        config = _learning(config) if learning else config
         settings = EnhanceConfig.model_validate({**config.model_dump(), "backend": "embedded", **changes})
         return train_enhancer(scene, sequence, settings, coarse)
 
@@ -72,14 +83,15 @@ def _deterministic(scene: Scene, sequence: Sequence, config: EnhanceConfig, coar
     """The same network from the same pairs, trained as a plain regression from nothing."""
     pairs = make_pairs(scene, sequence, config, coarse)
     transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
-    return EmbeddedEnhancer.train(pairs, transfer, config, deterministic=True)
+    return EmbeddedEnhancer.train(pairs, transfer, _learning(config), deterministic=True)
 
 
 RECIPES: dict[str, Recipe] = {
     "none": _unrestored,
     "classical": _classical,
     "embedded": _embedded(),
-    "scratch": _embedded(pretrained_weights="none"),
+    "scene-trained": _embedded(learning=True),
+    "scratch": _embedded(learning=True, pretrained_weights="none"),
     "zero-shot": _embedded(train_iterations=0),
     "deterministic": _deterministic,
 }
@@ -114,6 +126,7 @@ METHODS: dict[str, Method] = {
     "embedded": Method("embedded"),
     "embedded-1": Method("embedded", _in_steps(1)),
     "embedded-4": Method("embedded", _in_steps(4)),
+    "scene-trained": Method("scene-trained"),
     "scratch": Method("scratch"),
     "zero-shot": Method("zero-shot"),
     "deterministic": Method("deterministic"),
