@@ -32,6 +32,7 @@ class Scene:
         *,
         exposure: Float[Tensor, "c"] | None = None,
         sh_degree: int | None = None,
+        viewmats: Float[Tensor, "c 4 4"] | None = None,
         **options: Any,
     ) -> Rendering:
         """Render all cameras.
@@ -40,6 +41,7 @@ class Scene:
             cameras: the views.
             exposure: gain per camera; None is the mean exposure of the training frames.
             sh_degree: use spherical harmonics up to this degree only.
+            viewmats: camera from world instead of the cameras' own; gradients reach them.
             options: handed to `extrags.raster.rasterize` (visibility, query_points, ...).
 
         Returns:
@@ -53,7 +55,7 @@ class Scene:
             gaussians.scales.exp(),
             gaussians.opacities.sigmoid(),
             gaussians.sh,
-            torch.from_numpy(cameras.viewmats.astype(np.float32)),
+            torch.from_numpy(cameras.viewmats.astype(np.float32)) if viewmats is None else viewmats,
             torch.from_numpy(cameras.K.astype(np.float32)),
             cameras.width,
             cameras.height,

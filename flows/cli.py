@@ -506,9 +506,10 @@ def _add_bench_enhance(inner: Any) -> None:
         nargs="+",
         default=["none", "classical", "embedded"],
         metavar="METHOD",
-        help="none, classical, embedded (as the settings say), embedded-1, embedded-4 (steps), scratch "
-        "(without pretrained weights), zero-shot (without training on the scene), deterministic (a plain "
-        "regression), each also with /no-references behind it (default: none classical embedded)",
+        help="none, classical, embedded (as the settings say), embedded-1, embedded-4 (steps), zero-shot "
+        "(pretrained weights alone), scene-trained (trained further on the scene), scratch (trained on the "
+        "scene alone), deterministic (the same as a plain regression), each also with /no-references behind "
+        "it (default: none classical embedded)",
     )
     made.add_argument(
         "--profile",

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
-from extrags.raster import Rendering, SelectiveAdam, l1_ssim_loss, native_isa, rasterize
+from extrags.raster import Rendering, SelectiveAdam, l1_ssim_loss, native_isa
 from extrags.raster.direct import DirectStep, Target
 from extrags.raster.loss import inverse_depth_loss
 from extrags.scene import Scene
@@ -103,8 +103,12 @@ class AutogradStep:
         if scene.light is not None:
             exposure = scene.light.exposure(view.frame)[None]
         pose = None if viewmat is None else torch.from_numpy(viewmat.astype(np.float32)).requires_grad_()
-        rendering = _rendered(
-            scene, view, exposure, pose, iteration // schedule.sh_every, absgrad=density.needs_absgrad
+        rendering = scene.render(
+            view.camera,
+            exposure=exposure,
+            sh_degree=iteration // schedule.sh_every,
+            viewmats=None if pose is None else pose[None],
+            absgrad=density.needs_absgrad,
         )
         loss = l1_ssim_loss(rendering.rgb[0], view.rgb, dssim_weight=schedule.dssim_weight, mask=view.weight)
         if view.depth_mm is not None and schedule.depth_weight > 0:
@@ -229,38 +233,6 @@ class NativeStep:
         # An identity may be given again once its view is gone.
         targets[key] = (weakref.ref(view, lambda _: targets.pop(key, None)), target)
         return target
-
-
-def _rendered(
-    scene: Scene,
-    view: View,
-    exposure: Tensor | None,
-    viewmat: Tensor | None,
-    sh_degree: int,
-    *,
-    absgrad: bool,
-) -> Rendering:
-    """The view; from another pose, that gradients reach, where one is given."""
-    if viewmat is None:
-        return scene.render(view.camera, exposure=exposure, sh_degree=sh_degree, absgrad=absgrad)
-    gaussians = scene.gaussians
-    light = None
-    if scene.light is not None:
-        light = scene.light.of_cameras(torch.ones(1) if exposure is None else exposure)
-    return rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales.exp(),
-        gaussians.opacities.sigmoid(),
-        gaussians.sh,
-        viewmat[None],
-        torch.from_numpy(view.camera.K.astype(np.float32)),
-        view.camera.width,
-        view.camera.height,
-        sh_degree=min(sh_degree, gaussians.sh_degree),
-        light=light,
-        absgrad=absgrad,
-    )
 
 
 def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:
