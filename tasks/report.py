@@ -17,7 +17,7 @@ PAGE = "report.html"
 
 # `rows` says how long the stages took in this run. The page shows it, but other times are no reason to
 # build another page.
-@stage("report", version=1, ignore=("rows",))
+@stage("report", version=2, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],

@@ -62,6 +62,11 @@ class PseudoLike(Protocol):
         ...
 
     @property
+    def expected_error(self) -> np.ndarray | None:
+        """Absolute error of the restored colours as the enhancer expects it, [V, H, W]; None without."""
+        ...
+
+    @property
     def image_confidence(self) -> np.ndarray:
         """Weight of each view, [V]."""
         ...

@@ -115,7 +115,10 @@ def virtual_rows(pseudo: PseudoLike, sequence: Sequence, views: int, largest_byt
     """
     total = len(pseudo.rendered)
     rows = []
-    for index in map(int, evenly_spaced(total, views)):
+    chosen = [int(index) for index in evenly_spaced(total, views)]
+    errors = pseudo.expected_error
+    high = 0.0 if errors is None else scale_end([np.asarray(errors[chosen], dtype=np.float64)])
+    for index in chosen:
         u = np.asarray(pseudo.uncertainty[index], dtype=np.float64)
         reference = int(sequence.train[int(pseudo.reference[index])])
         clip = int(pseudo.clip[index])
@@ -124,7 +127,7 @@ def virtual_rows(pseudo: PseudoLike, sequence: Sequence, views: int, largest_byt
         changed = float((np.abs(after.astype(int) - before).max(-1) > CHANGED_LEVELS).mean())
         uncertainty = color_mapped(u, 0, 1, colormap=UNCERTAINTY_COLORMAP)
         name = sequence.frame_name(reference)
-        cells = (
+        cells = [
             image_cell(
                 sequence.rgb[reference],
                 None,
@@ -144,14 +147,21 @@ def virtual_rows(pseudo: PseudoLike, sequence: Sequence, views: int, largest_byt
                 f"Uncertainty of {where}, mean {u.mean():.2f}",
                 largest_bytes,
             ),
-        )
+        ]
+        if errors is not None:
+            expected = np.asarray(errors[index], dtype=np.float64)
+            shown = color_mapped(expected, 0, high, colormap=ERROR_COLORMAP)
+            alt = f"Expected error of {where}, mean {expected.mean():.3f}"
+            cells.append(image_cell(shown, None, "Expected error", alt, largest_bytes))
         note = (
             f"trajectory {clip + 1} · image weight {number(float(pseudo.image_confidence[index]), 2)} · "
             f"mean uncertainty {number(float(u.mean()), 2)} · {100 * changed:.0f} % of the pixels changed"
         )
-        rows.append(ImageRow(f"Virtual view {index + 1}", note, cells))
-    scale = ColorScale(color_bar(UNCERTAINTY_COLORMAP), "0 known", "1 unknown", "uncertainty u")
-    return ImageTable(tuple(rows), (scale,), len(rows), total)
+        rows.append(ImageRow(f"Virtual view {index + 1}", note, tuple(cells)))
+    scales = [ColorScale(color_bar(UNCERTAINTY_COLORMAP), "0 known", "1 unknown", "uncertainty u")]
+    if errors is not None:
+        scales.append(error_scale(high, "error the restorer expects of its own colours"))
+    return ImageTable(tuple(rows), tuple(scales), len(rows), total)
 
 
 def _renders(inputs: ReportInputs) -> list[tuple[str, RendersLike]]:

@@ -30,6 +30,7 @@ class Pseudo:
     restored: np.ndarray
     target: np.ndarray
     uncertainty: np.ndarray
+    expected_error: np.ndarray | None
     image_confidence: np.ndarray
     reference: np.ndarray
     clip: np.ndarray
@@ -132,6 +133,7 @@ def inputs(sequence: Sequence) -> ReportInputs:
         restored=noise // 2,
         target=noise // 2 + noise // 4,
         uncertainty=random.random((12, HEIGHT, WIDTH)).astype(np.float16),
+        expected_error=(0.1 * random.random((12, HEIGHT, WIDTH))).astype(np.float32),
         image_confidence=random.random(12).astype(np.float32),
         reference=np.arange(12) % 6,
         clip=np.arange(12) // 6,

@@ -60,6 +60,7 @@ def test_every_image_shows_something_and_says_what(page: Page) -> None:
     alts = [str(image["alt"]) for image in page.images]
     assert sum(alt.startswith("Frame b_") and "render, mean" in alt for alt in alts) == 2 * 3
     assert sum(alt.startswith("Uncertainty of virtual view") for alt in alts) == 4
+    assert sum(alt.startswith("Expected error of virtual view") for alt in alts) == 4
     assert sum(alt.startswith("The scene ") for alt in alts) == 3
     assert sum(alt.startswith("Slice of the occupancy grid") for alt in alts) == 3
 
@@ -222,7 +223,8 @@ def test_real_types_fit_the_protocols() -> None:
         FreeSpace: ("occupancy", "origin_mm", "axes", "voxel_mm"),
         Mesh: ("vertices", "triangles"),
         PseudoObservations: (
-            "rendered", "restored", "target", "uncertainty", "image_confidence", "reference", "clip",
+            "rendered", "restored", "target", "uncertainty", "expected_error", "image_confidence",
+            "reference", "clip",
         ),
     }  # fmt: skip
     for kind, names in fields.items():
