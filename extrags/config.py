@@ -353,6 +353,11 @@ class EnhanceConfig(StageConfig):
         description="steps of the diffusion's training on the scene's own pairs, kept where pairs kept back "
         "show a gain; 0: none are made. Where it was measured, that gain did not reach the final scene",
     )
+    judge: bool = Field(
+        True,
+        description="the embedded restorer must not be worse than blending and filling on leave-out pairs of "
+        "the scene, else that serves",
+    )
     batch: int = Field(4, ge=1, description="crops per step")
     crop: int = Field(96, ge=32, description="crop size in pixels, a multiple of 8")
     channels: tuple[int, int, int] = Field(

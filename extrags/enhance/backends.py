@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,19 +12,25 @@ import torch
 
 from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.enhance.classical import ClassicalEnhancer
-from extrags.enhance.embedded import EmbeddedEnhancer
+from extrags.enhance.embedded import EmbeddedEnhancer, validation_scores
 from extrags.enhance.gamut import Gamut
-from extrags.enhance.pairs import make_pairs
+from extrags.enhance.pairs import MIN_FRAMES, Pairs, make_pairs
 from extrags.enhance.pretrained.checkpoint import CheckpointEnhancer
 from extrags.enhance.pretrained.enhancer import ADAPTERS, PretrainedEnhancer
 from extrags.enhance.protocol import Enhancer
-from extrags.enhance.references import ReferenceViews
+from extrags.enhance.references import LightTransfer, ReferenceViews
 from extrags.enhance.weights import find_weights
 from extrags.errors import ConfigError, WeightsError
+from extrags.events import MetricRecorded, emit
 from extrags.scene import Scene
 from extrags.sequence import Sequence
 
-__all__ = ["load_enhancer", "scene_gamut", "starting_restorer", "train_enhancer"]
+__all__ = ["judged", "load_enhancer", "scene_gamut", "starting_restorer", "train_enhancer"]
+
+MOST_LOSS_DB = 0.5
+"""Leave-out views lie near the path, where there is little to restore: so much behind is not yet harm."""
+
+logger = logging.getLogger(__name__)
 
 
 def train_enhancer(scene: Scene, sequence: Sequence, config: EnhanceConfig, coarse: CoarseConfig) -> Enhancer:
@@ -48,11 +56,43 @@ def train_enhancer(scene: Scene, sequence: Sequence, config: EnhanceConfig, coar
     if config.backend in ADAPTERS:
         return PretrainedEnhancer.prepare(scene, sequence, config)
     start = starting_restorer(config)
-    if start is not None and config.train_iterations == 0:
-        return start.with_settings(config, scene_gamut(sequence))
-    pairs = make_pairs(scene, sequence, config, coarse)
     transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
-    return EmbeddedEnhancer.train(pairs, transfer, config, start)
+    if start is not None and config.train_iterations == 0:
+        practised = start.with_settings(config, scene_gamut(sequence))
+        if not config.judge or len(sequence.train) < MIN_FRAMES:
+            return practised
+        # Nothing is trained: all pairs judge, and torn ones would flatter who fills holes.
+        fresh = make_pairs(scene, sequence, config.model_copy(update={"cheap_views": 0}), coarse)
+        pairs = replace(fresh, validation=np.ones(len(fresh), dtype=bool))
+        return judged(practised, pairs, transfer)
+    pairs = make_pairs(scene, sequence, config, coarse)
+    trained = EmbeddedEnhancer.train(pairs, transfer, config, start)
+    return judged(trained, pairs, transfer) if config.judge else trained
+
+
+def judged(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> Enhancer:
+    """The restorer, unless blending and filling does better on the scene's leave-out pairs.
+
+    A network far from what it has learned from does harm: on such a scene the classical restorer serves,
+    and says why.
+
+    Args:
+        enhancer: ready for the scene.
+        pairs: those that validate were not trained on.
+        transfer: how brightness changes with distance.
+    """
+    scores = validation_scores(enhancer, pairs, transfer, (enhancer.steps,))
+    restored, filled = scores[f"embedded_{enhancer.steps}"]["psnr"], scores["classical"]["psnr"]
+    emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
+    if restored < filled - MOST_LOSS_DB:
+        reason = (
+            f"on leave-out pairs of this scene the embedded restorer reaches {restored:.2f} dB, blending and "
+            f"filling {filled:.2f} dB"
+        )
+        logger.warning("%s; the scene is restored by blending and filling", reason)
+        return ClassicalEnhancer(reason)
+    found = {**enhancer.record.get("validation", {}), **scores}
+    return replace(enhancer, record={**enhancer.record, "validation": found})
 
 
 def starting_restorer(config: EnhanceConfig) -> EmbeddedEnhancer | None:
@@ -91,7 +131,7 @@ def load_enhancer(path: Path) -> Enhancer:
         raise WeightsError(f"{description}: no such file; train the restorer first (stage enhance)")
     backend = json.loads(description.read_text()).get("backend")
     if backend == ClassicalEnhancer.name:
-        return ClassicalEnhancer()
+        return ClassicalEnhancer(json.loads(description.read_text()).get("reason", ""))
     if backend == EmbeddedEnhancer.name:
         return EmbeddedEnhancer.load(path)
     if backend == CheckpointEnhancer.name:

@@ -90,9 +90,11 @@ RECIPES: dict[str, Recipe] = {
     "none": _unrestored,
     "classical": _classical,
     "embedded": _embedded(),
-    "scene-trained": _embedded(learning=True),
-    "scratch": _embedded(learning=True, pretrained_weights="none"),
-    "zero-shot": _embedded(train_iterations=0),
+    # Each for itself, also where the judge would have it replaced.
+    "unjudged": _embedded(judge=False),
+    "scene-trained": _embedded(learning=True, judge=False),
+    "scratch": _embedded(learning=True, judge=False, pretrained_weights="none"),
+    "zero-shot": _embedded(judge=False, train_iterations=0),
     "deterministic": _deterministic,
 }
 """What is made for a scene. What takes long is made once, however many methods start from it."""
@@ -124,8 +126,8 @@ METHODS: dict[str, Method] = {
     "none": Method("none"),
     "classical": Method("classical"),
     "embedded": Method("embedded"),
-    "embedded-1": Method("embedded", _in_steps(1)),
-    "embedded-4": Method("embedded", _in_steps(4)),
+    "embedded-1": Method("unjudged", _in_steps(1)),
+    "embedded-4": Method("unjudged", _in_steps(4)),
     "scene-trained": Method("scene-trained"),
     "scratch": Method("scratch"),
     "zero-shot": Method("zero-shot"),

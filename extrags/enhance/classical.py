@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -13,12 +14,18 @@ from extrags.enhance.protocol import Clip, Restoration
 __all__ = ["ClassicalEnhancer"]
 
 
+@dataclass(frozen=True)
 class ClassicalEnhancer:
     """Multi-view blend where real views see the surface, the rendering elsewhere, holes filled.
 
-    The base image of the embedded diffusion, by itself: its baseline, and the choice where there are too
-    few frames to train on.
+    The base image of the embedded diffusion, by itself: its baseline, and what serves where the diffusion
+    would do harm.
+
+    Args:
+        reason: why it serves although another restorer was asked for; empty where it was asked for.
     """
+
+    reason: str = ""
 
     name = "classical"
 
@@ -27,9 +34,13 @@ class ClassicalEnhancer:
         with torch.no_grad():
             base = condition(clip.layers, clip.transfer).base
         rgb = base.permute(0, 2, 3, 1).contiguous().numpy()
-        return Restoration(rgb, None, {"backend": self.name})
+        return Restoration(rgb, None, self._about)
 
     def save(self, path: Path) -> None:
         """Write `restorer.json`; there are no weights."""
         path.mkdir(parents=True, exist_ok=True)
-        (path / "restorer.json").write_text(json.dumps({"backend": self.name}, indent=2) + "\n")
+        (path / "restorer.json").write_text(json.dumps(self._about, indent=2) + "\n")
+
+    @property
+    def _about(self) -> dict[str, str]:
+        return {"backend": self.name, **({"reason": self.reason} if self.reason else {})}

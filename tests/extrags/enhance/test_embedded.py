@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import pytest
 import torch
 
 from extrags.config import CoarseConfig
-from extrags.enhance.backends import load_enhancer, train_enhancer
+from extrags.enhance.backends import judged, load_enhancer, train_enhancer
 from extrags.enhance.calibration import Calibration
 from extrags.enhance.classical import ClassicalEnhancer
 from extrags.enhance.clips import render_clips
@@ -219,7 +220,9 @@ class TestEmbedded:
         self, tube: Tube, trained: EmbeddedEnhancer, clip: Clip, tmp_path
     ) -> None:
         trained.save(tmp_path, half=True)
-        config = SMALL.model_copy(update={"train_iterations": 0, "pretrained_weights": str(tmp_path)})
+        config = SMALL.model_copy(
+            update={"train_iterations": 0, "pretrained_weights": str(tmp_path), "judge": False}
+        )
         served = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
         assert isinstance(served, EmbeddedEnhancer)
         difference = np.abs(served.restore(clip).rgb - trained.restore(clip).rgb)
@@ -231,6 +234,22 @@ class TestEmbedded:
                 SMALL.model_copy(update={"train_iterations": 0}),
                 CoarseConfig(),
             )
+
+    def test_what_does_harm_gives_way_to_blending_and_filling(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, clip: Clip, tmp_path, caplog
+    ) -> None:
+        transfer = tube.references.transfer
+        kept = judged(trained, tube_pairs, transfer)
+        assert isinstance(kept, EmbeddedEnhancer)
+        assert f"embedded_{trained.steps}" in kept.provenance["validation"]
+        network = copy.deepcopy(trained.network)
+        torch.nn.init.normal_(network.exit.weight, std=0.3, generator=torch.Generator().manual_seed(3))
+        served = judged(replace(trained, network=network), tube_pairs, transfer)
+        assert isinstance(served, ClassicalEnhancer)
+        assert "restored by blending and filling" in caplog.text
+        served.save(tmp_path)
+        loaded = load_enhancer(tmp_path)
+        assert "on leave-out pairs of this scene" in loaded.restore(clip).provenance["reason"]
 
     def test_a_plain_regression_needs_no_noise(self, tube: Tube, tube_pairs: Pairs, clip: Clip) -> None:
         plain = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL, deterministic=True)
