@@ -8,7 +8,7 @@ from pydantic import Field
 
 from extrags.stage_config import StageConfig
 
-__all__ = ["CaptionConfig", "CheckpointConfig", "PretrainedConfig"]
+__all__ = ["CaptionConfig", "CheckpointConfig", "EnhanceConfig", "PretrainedConfig"]
 
 
 class CaptionConfig(StageConfig):
@@ -95,3 +95,65 @@ class CheckpointConfig(StageConfig):
     width: int = Field(512, ge=16, description="image width; images are stretched to it, as the paper does")
     height: int = Field(320, ge=16, description="image height")
     timeout_s: float = Field(3600.0, gt=0, description="of one clip, loading included; longer is an error")
+
+
+class EnhanceConfig(StageConfig):
+    """Restoration of the virtual views."""
+
+    backend: Literal[
+        "embedded",
+        "classical",
+        "wan-vace",
+        "stable-video",
+        "ltx",
+        "sd-img2img",
+        "sd-inpaint",
+        "dynamicrafter",
+    ] = Field(
+        "embedded",
+        description="embedded: the conditional diffusion; classical: blend and fill; dynamicrafter: a "
+        "checkpoint run by its own code; the others: pretrained diffusers pipelines",
+    )
+    pretrained_weights: str = Field(
+        "bundled",
+        min_length=1,
+        description="what the embedded backend starts from: bundled (weights of the package), none (the "
+        "scene's own pairs alone), or a path",
+    )
+    folds: int = Field(2, ge=1, description="leave-out reconstructions that make training pairs")
+    fold_iterations: int = Field(300, ge=1, description="optimisation steps of each of them")
+    cheap_views: int = Field(24, ge=0, description="further pairs from perturbed, unoptimised Gaussians")
+    train_iterations: int = Field(
+        0,
+        ge=0,
+        description="steps of the diffusion's training on the scene's own pairs, kept where pairs kept back "
+        "show a gain; 0: none are made. Where it was measured, that gain did not reach the final scene",
+    )
+    judge: bool = Field(
+        True,
+        description="the embedded restorer must not be worse than blending and filling on leave-out pairs of "
+        "the scene, else that serves",
+    )
+    batch: int = Field(4, ge=1, description="crops per step")
+    crop: int = Field(96, ge=32, description="crop size in pixels, a multiple of 8")
+    channels: tuple[int, int, int] = Field(
+        (32, 64, 96), description="widths of the U-Net's levels, where it starts from no weights"
+    )
+    learning_rate: float = Field(8e-4, gt=0, description="of a training from nothing")
+    scene_learning_rate: float = Field(2e-4, gt=0, description="of a training from pretrained weights")
+    steps: int | Literal["auto"] = Field(
+        "auto", description="sampling steps; auto: 1 or 4, chosen on held-out pairs"
+    )
+    samples: int = Field(
+        1, ge=1, le=16, description="samples per view, averaged; their spread adds to the expected error"
+    )
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto", description="of the convolutions; auto: bfloat16 where the processor computes it faster"
+    )
+    references: int = Field(8, ge=1, description="real views blended into the reference")
+    max_views: int = Field(160, ge=1, description="virtual views restored at most")
+    clips_per_batch: int = Field(4, ge=1, description="clips restored by one task")
+    caption: CaptionConfig = CaptionConfig()
+    pretrained: PretrainedConfig = PretrainedConfig()
+    checkpoint: CheckpointConfig = CheckpointConfig()
+    seed: int = Field(0, ge=0)

@@ -23,7 +23,7 @@ from torch.nn import functional
 from extrags.cameras import Cameras, pixel_rays
 from extrags.enhance.augmentation import drop_references
 from extrags.enhance.calibration_table import calibration, cell_correlation
-from extrags.enhance.clips import keep_known, render_clips
+from extrags.enhance.clips import as_images, as_planes, keep_known, render_clips
 from extrags.enhance.conditioning import Layers, observe_views
 from extrags.enhance.protocol import Clip, Enhancer, Restoration
 from extrags.enhance.references import ReferenceViews
@@ -150,7 +150,7 @@ class AsRendered:
 
     def restore(self, clip: Clip) -> Restoration:
         """The rendering itself."""
-        return Restoration(_image(clip.layers.get("rendered").clamp(0, 1)), None, {"backend": self.name})
+        return Restoration(as_images(clip.layers.get("rendered").clamp(0, 1)), None, {"backend": self.name})
 
     def save(self, path: Path) -> None:
         """There is nothing to keep.
@@ -216,8 +216,8 @@ def restore_views(enhancer: Enhancer, clips: AbstractSequence[Clip]) -> Restored
         restoration = enhancer.restore(clip)
         seconds.append((time.perf_counter() - begun) / len(clip))
         restorations.append(restoration)
-        rendered = _image(clip.layers.get("rendered").clamp(0, 1))
-        targets.append(keep_known(rendered, restoration.rgb, _plane(clip.layers.get("uncertainty")))[0])
+        rendered = as_images(clip.layers.get("rendered").clamp(0, 1))
+        targets.append(keep_known(rendered, restoration.rgb, as_planes(clip.layers.get("uncertainty")))[0])
     expected = [item.expected_error for item in restorations if item.expected_error is not None]
     return RestoredViews(
         np.concatenate([item.rgb for item in restorations]),
@@ -434,11 +434,3 @@ def _motion(
 def _carried(image: Float[Tensor, "h w 3"], grid: Float[Tensor, "1 h w 2"]) -> Float[Tensor, "h w 3"]:
     stack = image.permute(2, 0, 1)[None]
     return functional.grid_sample(stack, grid, padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
-
-
-def _image(colors: Float[Tensor, "t 3 h w"]) -> Float[np.ndarray, "t h w 3"]:
-    return np.asarray(colors.permute(0, 2, 3, 1).contiguous().numpy())
-
-
-def _plane(values: Float[Tensor, "t 1 h w"]) -> Float[np.ndarray, "t h w"]:
-    return np.asarray(values[:, 0].contiguous().numpy())

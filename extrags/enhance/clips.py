@@ -21,7 +21,15 @@ from extrags.events import Progress, emit
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.scene import Scene
 
-__all__ = ["choose_views", "keep_known", "make_pseudo_observations", "pseudo_observations", "render_clips"]
+__all__ = [
+    "as_images",
+    "as_planes",
+    "choose_views",
+    "keep_known",
+    "make_pseudo_observations",
+    "pseudo_observations",
+    "render_clips",
+]
 
 FEATHER_SIGMA_PX = 2.0
 FEATHER_RADIUS_PX = 6
@@ -185,12 +193,12 @@ def make_pseudo_observations(
 def _pseudo_observation(
     clip: Clip, restoration: Restoration, measure: PerceptualDifference
 ) -> PseudoObservations:
-    rendered = _image(clip.layers.get("rendered").clamp(0, 1))
-    target, uncertainty = keep_known(rendered, restoration.rgb, _plane(clip.layers.get("uncertainty")))
+    rendered = as_images(clip.layers.get("rendered").clamp(0, 1))
+    target, uncertainty = keep_known(rendered, restoration.rgb, as_planes(clip.layers.get("uncertainty")))
     depth = restoration.depth_mm
     if depth is None:
         with torch.no_grad():
-            depth = _plane(condition(clip.layers, clip.transfer).depth_mm)
+            depth = as_planes(condition(clip.layers, clip.transfer).depth_mm)
     provenance = {**restoration.provenance, "pixel_confidence": measure.name}
     if measure.reason:
         provenance["pixel_confidence_reason"] = measure.reason
@@ -199,7 +207,7 @@ def _pseudo_observation(
         rendered=rendered,
         restored=restoration.rgb,
         target=target,
-        alpha=_plane(clip.layers.get("alpha")),
+        alpha=as_planes(clip.layers.get("alpha")),
         depth_mm=depth,
         uncertainty=uncertainty,
         pixel_confidence=pixel_confidence(rendered, target, measure),
@@ -211,9 +219,11 @@ def _pseudo_observation(
     )
 
 
-def _image(colors: Float[Tensor, "t 3 h w"]) -> Float[np.ndarray, "t h w 3"]:
+def as_images(colors: Float[Tensor, "t 3 h w"]) -> Float[np.ndarray, "t h w 3"]:
+    """Colours with the channels last, as everything outside the network has them."""
     return np.asarray(colors.permute(0, 2, 3, 1).contiguous().numpy())
 
 
-def _plane(values: Float[Tensor, "t 1 h w"]) -> Float[np.ndarray, "t h w"]:
+def as_planes(values: Float[Tensor, "t 1 h w"]) -> Float[np.ndarray, "t h w"]:
+    """Single-channel layers without their channel axis."""
     return np.asarray(values[:, 0].contiguous().numpy())

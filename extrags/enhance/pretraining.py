@@ -115,10 +115,10 @@ def pretrain(
     trained = EmbeddedEnhancer(
         network, 1, 1, config.seed, half, ANY_HUE, record, deterministic=config.deterministic
     )
-    return judged(trained, files[-config.kept_back :])
+    return _scored(trained, files[-config.kept_back :])
 
 
-def judged(enhancer: EmbeddedEnhancer, files: AbstractSequence[Path]) -> EmbeddedEnhancer:
+def _scored(enhancer: EmbeddedEnhancer, files: AbstractSequence[Path]) -> EmbeddedEnhancer:
     """With calibration and scores from practice scenes it was not trained on.
 
     Args:

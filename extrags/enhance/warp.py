@@ -19,7 +19,7 @@ from extrags.cameras import Cameras, pixel_rays
 from extrags.enhance.references import LightTransfer, ReferenceViews
 from extrags.metrics.filters import filter_separable, gaussian_weights
 
-__all__ = ["Warped", "covisibility", "fit_falloff_exponent", "warp_references"]
+__all__ = ["Warped", "covisibility", "depth_normals", "fit_falloff_exponent", "warp_references"]
 
 AGREEMENT = 0.05
 """Relative depth difference at which a real view's word counts 1/e."""
@@ -183,7 +183,7 @@ def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> 
     distance = offsets.norm(dim=-1).clamp_min(1e-9)
     center = torch.from_numpy(camera.centers[0].astype(np.float32))
     cosine = 1 / rays.norm(dim=-1).reshape(-1)
-    normal = depth_normals(camera_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
+    normal = depth_normals(_camera_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
     return _Surface(center + offsets, distance, offsets / distance[:, None], cosine, normal)
 
 
@@ -208,7 +208,7 @@ def depth_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]
     return unit
 
 
-def camera_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
+def _camera_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
     """Rays of a single camera in the world's frame, at unit z-depth."""
     return torch.from_numpy(pixel_rays(camera)[0].astype(np.float32))
 

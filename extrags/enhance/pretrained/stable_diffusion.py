@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -101,23 +102,14 @@ class StableDiffusionInpaint(_StableDiffusion):
     diffusers 0.42.
     """
 
-    rule = PipelineRule(
+    rule = replace(
+        StableDiffusionImageToImage.rule,
         backend="sd-inpaint",
         pipeline="StableDiffusionInpaintPipeline",
         accepts=("StableDiffusionInpaintPipeline", "StableDiffusionPipeline"),
         usual_model="stable-diffusion-v1-5/stable-diffusion-inpainting",
-        size="about 5 GB",
-        frame_step=1,
-        size_multiple=8,
-        frames=16,
-        short_side_px=512,
-        steps=30,
         strength=0.9,
-        guidance_scale=5.0,
-        text_parts=_TEXT,
-        image_parts=_IMAGE,
         masked=True,
-        absent=_ABSENT,
     )
 
     def _further(self, window: Window, chosen: slice) -> dict[str, Any]:
