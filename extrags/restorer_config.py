@@ -1,4 +1,4 @@
-"""Settings of the restorers that others trained, and of the captions they are told."""
+"""Settings of the restoration: the embedded restorer, those that others trained, and their captions."""
 
 from __future__ import annotations
 
@@ -142,7 +142,9 @@ class EnhanceConfig(StageConfig):
     learning_rate: float = Field(8e-4, gt=0, description="of a training from nothing")
     scene_learning_rate: float = Field(2e-4, gt=0, description="of a training from pretrained weights")
     steps: int | Literal["auto"] = Field(
-        "auto", description="sampling steps; auto: 1 or 4, chosen on held-out pairs"
+        "auto",
+        description="sampling steps; auto: those of the weights, or, after training on the scene, 1 or 4, as "
+        "its pairs kept back decide",
     )
     samples: int = Field(
         1, ge=1, le=16, description="samples per view, averaged; their spread adds to the expected error"

@@ -116,20 +116,7 @@ def _add_store(made: argparse.ArgumentParser) -> None:
 
 
 def _add_settings(made: argparse.ArgumentParser) -> None:
-    made.add_argument(
-        "--profile",
-        choices=("quick", "balanced", "paper"),
-        default="balanced",
-        help="named settings: a look in minutes, the default, or the paper's counts",
-    )
-    made.add_argument(
-        "--set",
-        dest="settings",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help="override one setting, e.g. coarse.iterations=500; repeatable",
-    )
+    _add_profile(made, "balanced", "coarse.iterations=500")
     made.add_argument("--seed", type=int, metavar="N", help="seed of all stages (default: each stage's own)")
     made.add_argument(
         "--method",
@@ -138,6 +125,23 @@ def _add_settings(made: argparse.ArgumentParser) -> None:
         help="the whole pipeline (default), the coarse scene alone, plain 3DGS, ...",
     )
     _add_store(made)
+
+
+def _add_profile(made: argparse.ArgumentParser, usual: str, example: str) -> None:
+    made.add_argument(
+        "--profile",
+        choices=("quick", "balanced", "paper"),
+        default=usual,
+        help=f"named settings: a look, a good result, or the paper's counts (default: {usual})",
+    )
+    made.add_argument(
+        "--set",
+        dest="settings",
+        metavar="NAME=VALUE",
+        action="append",
+        default=[],
+        help=f"override one setting, e.g. {example}; repeatable",
+    )
 
 
 def _add_json(made: argparse.ArgumentParser) -> None:
@@ -511,20 +515,7 @@ def _add_bench_enhance(inner: Any) -> None:
         "scene alone), deterministic (the same as a plain regression), each also with /no-references behind "
         "it (default: none classical embedded)",
     )
-    made.add_argument(
-        "--profile",
-        choices=("quick", "balanced", "paper"),
-        default="quick",
-        help="named settings (default: quick)",
-    )
-    made.add_argument(
-        "--set",
-        dest="settings",
-        metavar="NAME=VALUE",
-        action="append",
-        default=[],
-        help="override one setting, e.g. enhance.samples=4; repeatable",
-    )
+    _add_profile(made, "quick", "enhance.samples=4")
     made.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")
     made.add_argument(
         "--figure", metavar="FILE.png", help="draw predicted against true error (the calibration)"
