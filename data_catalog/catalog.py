@@ -26,7 +26,7 @@ from data_catalog.formats import FolderFormat, folder_formats
 from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig, Setting
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError, UnknownSequenceError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "Descriptor",
@@ -60,7 +60,7 @@ class Descriptor(BaseModel):
     """Of the source, in pixels, before any downscaling."""
     height: int
     length_unit: str
-    """What a length of 1 in the `Sequence` means."""
+    """What a length of 1 in the `EndoscopicSequence` means."""
     axes: str
     """Camera and world axes on disk, and what is done to them."""
     has_depth: bool
@@ -213,8 +213,8 @@ def resolve(name_or_path: str | Path) -> Source:
     raise _unknown(text)
 
 
-def read(source: Source | str | Path, config: IngestConfig | None = None) -> Sequence:
-    """Read a source into a checked `Sequence`.
+def read(source: Source | str | Path, config: IngestConfig | None = None) -> EndoscopicSequence:
+    """Read a source into a checked `EndoscopicSequence`.
 
     Args:
         source: what `resolve` returns, or takes.

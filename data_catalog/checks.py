@@ -3,7 +3,7 @@
 What is refused: non-finite or mirrored poses, intrinsics that are no pinhole, depth with NaN, infinity or
 negative values (0 is the one mark for "unknown"; a reader whose format has others turns them into 0), a
 frame without any valid depth or mask, a split that leaks or points outside, and camera axes or a depth scale
-that depth itself contradicts. What is merely doubtful is told by `data_catalog.suspicions`.
+that depth itself contradicts. What is readable but questionable is reported by `data_catalog.diagnostics`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from extrags.cameras import as_rotation, invert_poses
 from extrags.errors import PoseError, SourceError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "axis_readings",
@@ -53,7 +53,7 @@ _KNOWN_FACTORS = {
 }
 
 
-def check_sequence(sequence: Sequence, *, file: object = None) -> None:
+def check_sequence(sequence: EndoscopicSequence, *, file: object = None) -> None:
     """Refuse a sequence that no stage could use.
 
     Args:
@@ -158,7 +158,7 @@ def check_depth(depth_mm: Float[np.ndarray, "h w"], *, frame: object = None, fil
         raise SourceError("no pixel has a depth", file=file, frame=frame, field="depth_mm")
 
 
-def check_axes(sequence: Sequence, *, file: object = None) -> None:
+def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
     """Refuse poses in other axes than OpenCV's camera-to-world, where depth can tell.
 
     Depth of one frame, carried to the next one by their poses, must meet that frame's depth. Where it does
@@ -197,7 +197,7 @@ def check_axes(sequence: Sequence, *, file: object = None) -> None:
         )
 
 
-def check_depth_scale(sequence: Sequence, *, file: object = None) -> None:
+def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> None:
     """Refuse depth in another unit than the poses.
 
     Depth carried from frame to frame meets the next frame's depth only when both have one unit. Where it does
@@ -236,7 +236,7 @@ def check_depth_scale(sequence: Sequence, *, file: object = None) -> None:
         )
 
 
-def _check_split(sequence: Sequence, file: object) -> None:
+def _check_split(sequence: EndoscopicSequence, file: object) -> None:
     frames = len(sequence)
     for name, indices in (("train", sequence.train), ("test", sequence.test)):
         if indices.size and (indices.min() < 0 or indices.max() >= frames):
@@ -259,7 +259,7 @@ def _check_split(sequence: Sequence, file: object) -> None:
         )
 
 
-def neighbouring_frames(sequence: Sequence, at_most: int = _CHECKED_PAIRS) -> list[tuple[int, int]]:
+def neighbouring_frames(sequence: EndoscopicSequence, at_most: int = _CHECKED_PAIRS) -> list[tuple[int, int]]:
     """Neighbouring frames of one recording, at most so many pairs, spread over the sequence."""
     recording = np.zeros(len(sequence), dtype=int) if sequence.recording is None else sequence.recording
     neighbours = [(k, k + 1) for k in range(len(sequence) - 1) if recording[k] == recording[k + 1]]
@@ -270,7 +270,7 @@ def neighbouring_frames(sequence: Sequence, at_most: int = _CHECKED_PAIRS) -> li
 
 
 def _reprojection_error(
-    sequence: Sequence, poses: Float[np.ndarray, "f 4 4"], pairs: list[tuple[int, int]]
+    sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"], pairs: list[tuple[int, int]]
 ) -> float:
     """Relative difference of carried and found depth: median over a pair's points, mean over pairs.
 

@@ -34,7 +34,7 @@ from data_catalog.posed_frames import PosedFrame, assembled, save_images
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["FORMAT", "model_folder", "points_of", "read_depth_map", "write_colmap", "write_depth_map"]
 
@@ -105,7 +105,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(found)
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     place = model_folder(folder)
     if place is None:
         raise SourceNotFoundError("no COLMAP model in this folder", file=folder)
@@ -161,7 +161,7 @@ FORMAT = FolderFormat(
 
 
 def write_colmap(
-    sequence: Sequence,
+    sequence: EndoscopicSequence,
     folder: Path,
     *,
     binary: bool = True,
@@ -218,7 +218,7 @@ def write_colmap(
 
 
 def points_of(
-    sequence: Sequence, at_most: int = 20_000
+    sequence: EndoscopicSequence, at_most: int = 20_000
 ) -> tuple[Float[np.ndarray, "p 3"], UInt8[np.ndarray, "p 3"]] | None:
     """Points to hand over with a sequence: its own, else its training frames' depth on a grid.
 

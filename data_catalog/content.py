@@ -23,8 +23,8 @@ _MARGIN_SHARE = 0.006
 _CIRCLE_TRIALS = 400
 _CIRCLE_TOLERANCE_SHARE = 0.006
 _CIRCLE_INLIERS = 0.75
-_FEWEST_FRAMES = 4
-_MOST_FRAMES = 32
+_MIN_FRAMES = 4
+_MAX_FRAMES = 32
 _LARGEST_WIDTH = 640
 _EDGE_STRENGTH = 24.0
 """Of burnt-in text, in grey values per pixel; blurred tissue under compression stays below."""
@@ -127,7 +127,7 @@ def overlay_mask(
 
     frames, height, width = rgb.shape[:3]
     nothing = np.zeros((height, width), dtype=bool)
-    if frames < _FEWEST_FRAMES:
+    if frames < _MIN_FRAMES:
         return nothing
     grey = np.stack([cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in rgb])
     change = np.percentile(grey, 90, axis=0) - np.percentile(grey, 10, axis=0)
@@ -166,8 +166,8 @@ def content_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
     import cv2
 
     height, width = rgb.shape[1:3]
-    if len(rgb) > _MOST_FRAMES:
-        rgb = rgb[np.round(np.linspace(0, len(rgb) - 1, _MOST_FRAMES)).astype(int)]
+    if len(rgb) > _MAX_FRAMES:
+        rgb = rgb[np.round(np.linspace(0, len(rgb) - 1, _MAX_FRAMES)).astype(int)]
     small = rgb
     if width > _LARGEST_WIDTH:
         size = (_LARGEST_WIDTH, round(_LARGEST_WIDTH * height / width))

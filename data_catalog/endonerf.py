@@ -36,7 +36,7 @@ from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, assembled
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["FORMAT", "POSES_FILE", "MaskPolarity", "mask_polarity", "polarity_of_images", "read_llff"]
 
@@ -79,7 +79,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted([folder / POSES_FILE, *(file for part in parts for file in part)])
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     file = folder / POSES_FILE
     images = _part(folder, _IMAGE_FOLDERS)
     poses, sizes, _ = read_llff(file)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from extrags.config import IngestConfig
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["FolderFormat", "folder_formats"]
 
@@ -22,7 +22,7 @@ class FolderFormat:
         summary: one line for messages.
         recognises: whether a folder holds this format, from file names only.
         files: every file that `read` may look at, as a sorted list.
-        read: the folder, the settings and the sequence's name to a checked `Sequence`.
+        read: the folder, the settings and the sequence's name to a checked `EndoscopicSequence`.
         conventions: axes and units on disk, in one line.
         notes: what reading has to find out about this folder, as sentences; raises what `read` raises.
     """
@@ -32,7 +32,7 @@ class FolderFormat:
     summary: str
     recognises: Callable[[Path], bool]
     files: Callable[[Path], list[Path]]
-    read: Callable[[Path, IngestConfig, str], Sequence]
+    read: Callable[[Path, IngestConfig, str], EndoscopicSequence]
     conventions: str = ""
     notes: Callable[[Path], tuple[str, ...]] | None = None
 

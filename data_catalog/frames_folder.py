@@ -25,7 +25,7 @@ from data_catalog.images import Resampling, colour_files, read_colour, read_mask
 from data_catalog.splits import every_nth
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["ASSUMED_FIELD_OF_VIEW_DEG", "FORMAT", "read_intrinsics"]
 
@@ -53,7 +53,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted([*_frames(folder), *(file for file in extra if file.is_file())])
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     files = _frames(folder)
     if not files:
         raise SourceNotFoundError("no image in this folder", file=folder)
@@ -71,7 +71,7 @@ def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
         if mask_file.is_file()
         else content_mask(colours)
     )
-    return Sequence(
+    return EndoscopicSequence(
         name=name,
         rgb=colours,
         K=np.repeat(resampling.intrinsics(K)[None], len(kept), axis=0),

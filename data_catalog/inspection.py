@@ -12,17 +12,17 @@ from jaxtyping import UInt8
 from pydantic import BaseModel, ConfigDict
 
 from data_catalog.catalog import Source, read, resolve
+from data_catalog.diagnostics import Finding, diagnose
 from data_catalog.formats import folder_formats
 from data_catalog.specular import saturated_mask, specular_masks
-from data_catalog.suspicions import Finding, suspicions
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
 
 _TILE_WIDTH = 240
-_MOST_TILES = 30
+_MAX_TILES = 30
 
 
 class Inspection(BaseModel):
@@ -59,7 +59,7 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
         ConfigError: settings that this source cannot be read with.
     """
     source: Source | None = None
-    sequence: Sequence | None = None
+    sequence: EndoscopicSequence | None = None
     conventions = ""
     notes: tuple[str, ...] = ()
     with _HeardWarnings() as heard:
@@ -75,7 +75,7 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
         except ExtragsError as error:
             findings = [_as_finding(error)]
     if sequence is not None and source is not None:
-        findings = suspicions(sequence, source.path or source.name)
+        findings = diagnose(sequence, source.path or source.name)
     return Inspection(
         name=source.name if source is not None else str(name_or_path),
         format=source.format if source is not None else None,
@@ -86,7 +86,7 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
     )
 
 
-def facts(sequence: Sequence) -> dict[str, Any]:
+def facts(sequence: EndoscopicSequence) -> dict[str, Any]:
     """Numbers that describe a sequence, ready for JSON.
 
     Lengths are millimetres where the sequence is metric.
@@ -132,14 +132,14 @@ def facts(sequence: Sequence) -> dict[str, Any]:
     return result
 
 
-def contact_sheet(sequence: Sequence) -> UInt8[np.ndarray, "h w 3"]:
+def contact_sheet(sequence: EndoscopicSequence) -> UInt8[np.ndarray, "h w 3"]:
     """Frames spread over the sequence: masked pixels blue, highlights green, held-out frames framed.
 
     Where there is depth, it stands below each frame (near is bright).
     """
     import cv2
 
-    count = min(len(sequence), _MOST_TILES)
+    count = min(len(sequence), _MAX_TILES)
     chosen = np.round(np.linspace(0, len(sequence) - 1, count)).astype(int)
     specular = (
         specular_masks(sequence.rgb[chosen], sequence.mask[chosen])

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from data_catalog.checks import axis_readings, neighbouring_frames, reading_name
 from extrags.cameras import invert_poses
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["FrameMatches", "PoseSupport", "match_neighbours", "pose_support"]
 
@@ -25,7 +25,7 @@ _CONTRAST = 0.005
 _RATIO = 0.75
 _NEAR_SHARE = 0.004
 """A match this near its epipolar line (share of the width, at least 1.5 px) supports the poses."""
-_FEWEST_MATCHES = 12
+_MIN_MATCHES = 12
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class PoseSupport:
     distance: float
 
 
-def match_neighbours(sequence: Sequence, pairs: int = 6) -> list[FrameMatches]:
+def match_neighbours(sequence: EndoscopicSequence, pairs: int = 6) -> list[FrameMatches]:
     """SIFT matches of neighbouring frames, spread over the sequence; pairs with few matches are left out."""
     import cv2
 
@@ -89,7 +89,7 @@ def match_neighbours(sequence: Sequence, pairs: int = 6) -> list[FrameMatches]:
             continue
         candidates = cv2.BFMatcher().knnMatch(mine, theirs, k=2)
         good = [best for best, other in candidates if best.distance < _RATIO * other.distance]
-        if len(good) >= _FEWEST_MATCHES:
+        if len(good) >= _MIN_MATCHES:
             matches.append(
                 FrameMatches(
                     first,
@@ -101,7 +101,7 @@ def match_neighbours(sequence: Sequence, pairs: int = 6) -> list[FrameMatches]:
     return matches
 
 
-def pose_support(sequence: Sequence, matches: list[FrameMatches]) -> PoseSupport:
+def pose_support(sequence: EndoscopicSequence, matches: list[FrameMatches]) -> PoseSupport:
     """Count the matches that support the poses as given, and in every other reading of the axes.
 
     Args:
@@ -128,7 +128,7 @@ def pose_support(sequence: Sequence, matches: list[FrameMatches]) -> PoseSupport
 
 
 def _supporting(
-    sequence: Sequence, poses: Float[np.ndarray, "f 4 4"], matches: list[FrameMatches]
+    sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"], matches: list[FrameMatches]
 ) -> tuple[int, Float[np.ndarray, "s"]]:
     near = max(1.5, _NEAR_SHARE * sequence.width)
     count, depths = 0, []

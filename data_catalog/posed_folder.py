@@ -46,7 +46,7 @@ from data_catalog.visibility import observed_from_depth
 from extrags.cameras import Cameras
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["FORMAT", "POSES_FILE"]
 
@@ -69,7 +69,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for file in [folder / POSES_FILE, *inside] if file.is_file())
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     file = folder / POSES_FILE
     content = _load(file)
     frames = content["frames"]
@@ -106,7 +106,7 @@ def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
     cameras = Cameras(np.stack(intrinsics), np.stack(poses), resampling.width, resampling.height)
     depth_mm = np.stack(depths) if depths else None
     split = _split([frames[index] for index in kept], config, file)
-    return Sequence(
+    return EndoscopicSequence(
         name=name,
         rgb=np.stack(colours),
         K=cameras.K,

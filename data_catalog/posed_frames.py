@@ -1,9 +1,8 @@
-"""From a list of frames with lens and pose to a `Sequence`: what readers of posed formats share."""
+"""From frames with lens and pose to an `EndoscopicSequence`: what readers of posed formats share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,7 +19,7 @@ from extrags.cameras import Cameras
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["PosedFrame", "assembled", "save_images"]
 
@@ -51,7 +50,7 @@ class PosedFrame:
 
 
 def assembled(
-    frames: AbstractSequence[PosedFrame],
+    frames: Sequence[PosedFrame],
     config: IngestConfig,
     *,
     name: str,
@@ -61,7 +60,7 @@ def assembled(
     white_is_tissue: bool = True,
     points: Float[np.ndarray, "p 3"] | None = None,
     points_rgb: UInt8[np.ndarray, "p 3"] | None = None,
-) -> Sequence:
+) -> EndoscopicSequence:
     """Read images, undo lenses, shrink, and put everything into one sequence.
 
     Args:
@@ -131,7 +130,7 @@ def assembled(
         raise SourceError("there is no frame", file=pose_file, field="frames")
     cameras = Cameras(np.stack(intrinsics), np.stack(poses), resampling.width, resampling.height)
     depth_mm = np.stack(depths) if depths else None
-    return Sequence(
+    return EndoscopicSequence(
         name=name,
         rgb=np.stack(colours),
         K=cameras.K,
@@ -150,7 +149,7 @@ def assembled(
     )
 
 
-def save_images(sequence: Sequence, folder: Path) -> list[str]:
+def save_images(sequence: EndoscopicSequence, folder: Path) -> list[str]:
     """Write colour images and masks of a sequence, as exporters do.
 
     Args:
@@ -183,7 +182,7 @@ def save_images(sequence: Sequence, folder: Path) -> list[str]:
     return names
 
 
-def _frame_names(frames: AbstractSequence[PosedFrame]) -> tuple[str, ...]:
+def _frame_names(frames: Sequence[PosedFrame]) -> tuple[str, ...]:
     """Names without their suffix; the folder stays where names would otherwise meet."""
     short = tuple(Path(frame.name).stem for frame in frames)
     if len(set(short)) == len(short):
@@ -219,7 +218,7 @@ def _check_size(
     )
 
 
-def _split(frames: AbstractSequence[PosedFrame], config: IngestConfig, file: Path) -> Split:
+def _split(frames: Sequence[PosedFrame], config: IngestConfig, file: Path) -> Split:
     if all(frame.split is None for frame in frames):
         return every_nth(len(frames), config.holdout_every, file=file)
     index = np.arange(len(frames))

@@ -29,7 +29,7 @@ from data_catalog.visibility import observed_from_depth
 from extrags.cameras import Cameras, compose
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["DEPTH_STEP_MM", "FORMAT", "decode_depth_mm", "intrinsics", "read_poses"]
 
@@ -51,7 +51,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for pattern in patterns for file in folder.glob(pattern))
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     poses = read_poses(folder)
     files = sorted(folder.glob("FrameBuffer_*.png"), key=lambda file: natural_key(file.name))
     numbers = [file.stem.split("_")[-1] for file in files]
@@ -93,7 +93,7 @@ def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
         np.repeat(K[None], len(kept), axis=0), world_from_camera, resampling.width, resampling.height
     )
     depth_mm = np.stack(depths)
-    return Sequence(
+    return EndoscopicSequence(
         name=name,
         rgb=np.stack(colours),
         K=cameras.K,

@@ -26,7 +26,7 @@ from data_catalog.splits import every_nth
 from extrags.cameras import compose
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["FORMAT", "read_points", "read_poses", "read_view_names"]
 
@@ -43,7 +43,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted([*(file for file in listed if file.is_file()), *(folder / "images").glob("*.jpg")])
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     views = read_view_names(folder)
     poses = read_poses(folder)
     if len(poses) != len(views):
@@ -65,7 +65,7 @@ def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
             resampling.colour(read_colour(file, frame=views[index]), file=file, frame=views[index])
         )
     small_mask = resampling.mask(mask)
-    return Sequence(
+    return EndoscopicSequence(
         name=name,
         rgb=np.stack(colours),
         K=np.repeat(K[None], len(kept), axis=0),

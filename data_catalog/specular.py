@@ -25,7 +25,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["SATURATED", "saturated_mask", "specular_mask", "specular_masks", "with_specular"]
 
@@ -88,7 +88,7 @@ def specular_masks(
     return np.stack([specular_mask(image, inside) for image, inside in zip(rgb, mask, strict=True)])
 
 
-def with_specular(sequence: Sequence) -> Sequence:
+def with_specular(sequence: EndoscopicSequence) -> EndoscopicSequence:
     """The sequence with its highlights marked."""
     return replace(sequence, specular=specular_masks(sequence.rgb, sequence.mask))
 

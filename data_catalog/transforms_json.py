@@ -31,7 +31,7 @@ from data_catalog.lens import LENS_PARAMETERS, Lens
 from data_catalog.posed_frames import PosedFrame, assembled, save_images
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["FORMAT", "TRANSFORMS_FILE", "write_transforms"]
 
@@ -58,7 +58,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for file in found if file.is_file() and file.is_relative_to(folder))
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     file = folder / TRANSFORMS_FILE
     content = _load(file)
     unit = content.get("length_unit", "arbitrary")
@@ -126,7 +126,7 @@ FORMAT = FolderFormat(
 
 
 def write_transforms(
-    sequence: Sequence,
+    sequence: EndoscopicSequence,
     folder: Path,
     *,
     points: Float[np.ndarray, "p 3"] | None = None,

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from extrags.metrics.surface import TrueSurface, surface_from_depth
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.surface import Mesh
 
 __all__ = ["true_surface"]
 
 
-def true_surface(sequence: Sequence) -> TrueSurface | None:
+def true_surface(sequence: EndoscopicSequence) -> TrueSurface | None:
     """What a reconstruction of the sequence is held against; None where nothing is known.
 
     The phantom's wall is made again from the settings that the sequence carries in `truth`.

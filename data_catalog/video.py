@@ -10,7 +10,7 @@ dense optical flow from a reference frame, as a share of the image width; the re
 move is plain, so that noise and trembling do not add up) and how sharp each frame is. The path is cut into
 steps of equal motion, and of each step the sharpest frame is taken; where the scope stands still nothing is
 taken twice. Then the chosen frames at full size. Steps are 3 % of the width; they grow where there would be
-more than `MOST_FRAMES` (or `ingest.max_frames`) and shrink where there would be fewer than 24, down to what
+more than `MAX_FRAMES` (or `ingest.max_frames`) and shrink where there would be fewer than 24, down to what
 the flow can tell. Frame names are the frames' numbers in the video.
 
 Source: sharpness as the mean absolute Laplacian over the mean brightness, after Pertuz et al., "Analysis of
@@ -38,25 +38,25 @@ from data_catalog.splits import every_nth
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.events import Progress, emit
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FORMAT", "MOST_FRAMES", "VIDEO_SUFFIXES", "VideoSurvey", "choose_frames", "survey", "video_file"]
+__all__ = ["FORMAT", "MAX_FRAMES", "VIDEO_SUFFIXES", "VideoSurvey", "choose_frames", "survey", "video_file"]
 
 logger = logging.getLogger(__name__)
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv")
-MOST_FRAMES = 200
+MAX_FRAMES = 200
 STEP_SHARE = 0.03
 """Usual motion between two chosen frames, as a share of the image width."""
 _SMALLEST_STEP = 0.0015
-_LEAST_MOTION = 0.01
+_MIN_MOTION = 0.01
 _FEW_FRAMES = 24
 _PLAIN_MOVE = 0.01
 """From here on the flow's reference follows."""
 _SURVEY_WIDTH = 192
 _SAMPLE_WIDTH = 640
-_MOST_SAMPLES = 32
-_LEAST_DECODED = 0.9
+_MAX_SAMPLES = 32
+_MIN_DECODED = 0.9
 _PROGRESS_EVERY = 20
 
 
@@ -102,12 +102,12 @@ def _files(place: Path) -> list[Path]:
     return sorted([file, *(other for other in beside if other.is_file())])
 
 
-def _read(place: Path, config: IngestConfig, name: str) -> Sequence:
+def _read(place: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     file = video_file(place)
     if file is None:
         raise SourceNotFoundError("no video here", file=place)
     found = survey(file)
-    chosen = choose_frames(found.path, found.sharpness, config.max_frames or MOST_FRAMES, file=file)
+    chosen = choose_frames(found.path, found.sharpness, config.max_frames or MAX_FRAMES, file=file)
     logger.info("%s: %d of %d frames chosen", name, len(chosen), len(found.path))
     resampling = Resampling.planned(found.width, found.height, config)
     mask_file = file.parent / "mask.png"
@@ -122,7 +122,7 @@ def _read(place: Path, config: IngestConfig, name: str) -> Sequence:
         raise SourceError(
             f"{len(chosen)} frames were wanted, {len(colours)} could be decoded the second time", file=file
         )
-    return Sequence(
+    return EndoscopicSequence(
         name=name,
         rgb=np.stack(colours),
         K=np.repeat(K[None], len(chosen), axis=0),
@@ -180,20 +180,20 @@ def survey(file: Path) -> VideoSurvey:
                 reference, behind = grey, path[-1]
             if index % sample_every == 0:
                 samples.append((index, _sample(image)))
-                if len(samples) > 2 * _MOST_SAMPLES:
+                if len(samples) > 2 * _MAX_SAMPLES:
                     sample_every *= 2
                     samples = [(number, kept) for number, kept in samples if number % sample_every == 0]
             if index % _PROGRESS_EVERY == 0 and announced > 0:
                 emit(Progress("ingest", index, 2 * announced))
     if not sharpness:
         raise SourceError("not a single frame can be decoded; is it a video, and whole?", file=file)
-    if announced > 0 and len(sharpness) < _LEAST_DECODED * announced:
+    if announced > 0 and len(sharpness) < _MIN_DECODED * announced:
         raise SourceError(
             f"{announced} frames announced, {len(sharpness)} decoded: the video is truncated or damaged",
             file=file,
             frame=len(sharpness),
         )
-    kept = samples[:: max(1, -(-len(samples) // _MOST_SAMPLES))]
+    kept = samples[:: max(1, -(-len(samples) // _MAX_SAMPLES))]
     return VideoSurvey(
         width=width,
         height=height,
@@ -225,10 +225,10 @@ def choose_frames(
         SourceError: the picture hardly moves.
     """
     total = float(path[-1])
-    if total < _LEAST_MOTION:
+    if total < _MIN_MOTION:
         raise SourceError(
             f"the picture moves by {total:.1%} of its width in {len(path)} frames; expected at least "
-            f"{_LEAST_MOTION:.0%} in all: nothing can be reconstructed from a scope that stands still",
+            f"{_MIN_MOTION:.0%} in all: nothing can be reconstructed from a scope that stands still",
             file=file,
             field="motion",
         )

@@ -14,11 +14,11 @@ from extrags.cameras import Cameras, rotation_about
 from extrags.config import AssessConfig, PipelineConfig, StageConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, emit
-from extrags.explore.coverage import direction_counts, training_coverage
-from extrags.explore.waves import start_views
+from extrags.exploration.coverage import direction_counts, training_coverage
+from extrags.exploration.waves import start_views
 from extrags.raster import rasterize
 from extrags.scene import Scene
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["Decision", "ScenePlan", "assess", "decide", "probe_views"]
 
@@ -70,7 +70,7 @@ class ScenePlan(StageConfig):
         return config.with_overrides(overrides)
 
 
-def assess(scene: Scene, sequence: Sequence, config: PipelineConfig) -> ScenePlan:
+def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig) -> ScenePlan:
     """Measure what the scene lacks in a fan of nearby views and decide what to do about it.
 
     A pixel of the fan lacks something when it is a hole (alpha too low) or is mostly made of Gaussians

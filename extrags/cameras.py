@@ -6,7 +6,7 @@ Axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5. Poses 
 
 from __future__ import annotations
 
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,7 +61,7 @@ class Cameras:
     def __len__(self) -> int:
         return int(self.world_from_camera.shape[0])
 
-    def __getitem__(self, index: int | slice | AbstractSequence[int] | np.ndarray) -> Cameras:
+    def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Cameras:
         """Select cameras; an integer keeps the batch axis."""
         chosen = np.arange(len(self))[index]
         chosen = np.atleast_1d(chosen)
@@ -90,7 +90,7 @@ class Cameras:
         return Cameras(K, self.world_from_camera, width, height)
 
     @staticmethod
-    def concatenated(parts: AbstractSequence[Cameras]) -> Cameras:
+    def concatenated(parts: Sequence[Cameras]) -> Cameras:
         """Join batches of equal image size."""
         sizes = {(part.width, part.height) for part in parts}
         if len(sizes) != 1:

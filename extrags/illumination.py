@@ -22,9 +22,9 @@ from extrags.raster.light import (
     COSINE_SOFTENING,
     SPREAD_MIN,
     CameraLight,
-    developed,
+    apply_response,
+    invert_response,
     light_gain,
-    undeveloped,
 )
 from extrags.zarr_io import open_group, read_array, write_array
 
@@ -176,11 +176,11 @@ class NearFieldLight:
 
     def signal(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """What reached the sensor, from image values in [0, 1]: the response undone."""
-        return undeveloped(rgb, self.log_shoulder.exp().to(rgb))
+        return invert_response(rgb, self.log_shoulder.exp().to(rgb))
 
-    def developed(self, signal: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    def apply_response(self, signal: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Image values of what reaches the sensor."""
-        return developed(signal, self.log_shoulder.exp().to(signal))
+        return apply_response(signal, self.log_shoulder.exp().to(signal))
 
     def albedo(
         self,
@@ -188,7 +188,7 @@ class NearFieldLight:
         points: Float[Tensor, "n 3"],
         normals: Float[Tensor, "n 3"] | None = None,
         *,
-        least_gain: float = 1e-3,
+        min_gain: float = 1e-3,
     ) -> Float[Tensor, "n 3"]:
         """Colours with light and response divided out.
 
@@ -196,9 +196,9 @@ class NearFieldLight:
             rgb: image values in [0, 1], at unit exposure.
             points: where they were seen, in the camera frame, in world units.
             normals: there; None takes every surface to face the lamp.
-            least_gain: darker places are treated as if they received this much: noise is not albedo.
+            min_gain: darker places are treated as if they received this much: noise is not albedo.
         """
-        return self.signal(rgb) / self.gain(points, normals).clamp_min(least_gain)[:, None]
+        return self.signal(rgb) / self.gain(points, normals).clamp_min(min_gain)[:, None]
 
     def _row(self, like: Tensor) -> Float[Tensor, "12"]:
         return self.of_cameras(torch.ones(1)).packed()[0].to(like)

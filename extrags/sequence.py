@@ -14,7 +14,7 @@ from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["PoseSource", "Sequence", "Split"]
+__all__ = ["EndoscopicSequence", "PoseSource", "Split"]
 
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
 """given: by the source; estimated: by COLMAP; aligned: by colour and depth; refined: corrected by the
@@ -39,7 +39,7 @@ class Split:
 
 
 @dataclass(frozen=True)
-class Sequence:
+class EndoscopicSequence:
     """Frames of one scene: colour, and depth, poses and ground truth where they exist.
 
     Frames of all recordings of the scene stand one after the other in one world frame.
@@ -141,11 +141,11 @@ class Sequence:
 
     def with_poses(
         self, world_from_camera: Float[np.ndarray, "f 4 4"], source: PoseSource = "given"
-    ) -> Sequence:
+    ) -> EndoscopicSequence:
         """The same sequence with poses."""
         return replace(self, world_from_camera=world_from_camera, pose_source=source)
 
-    def training_part(self) -> Sequence:
+    def training_part(self) -> EndoscopicSequence:
         """The training frames alone, with nothing that tells of the others.
 
         This is all that reconstruction, exploration and restoration are given: what is held out cannot
@@ -203,7 +203,7 @@ class Sequence:
             group.attrs["pose_source"] = self.pose_source
 
     @classmethod
-    def load(cls, path: Path) -> Sequence:
+    def load(cls, path: Path) -> EndoscopicSequence:
         """Read what `save` wrote."""
         group = zarr.open_group(str(path), mode="r")
         attributes = dict(group.attrs)

@@ -14,7 +14,7 @@ from extrags.errors import ConfigError
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
 from flows.pages import benchmark_page
-from flows.preflight import check_before
+from flows.preflight import preflight
 from flows.runners import PrefectRunner, Runner
 from flows.sequence import artifact_key, open_store
 from flows.settings import DEFAULT_STORE, ProfileName
@@ -88,7 +88,7 @@ def benchmark(
         for profile in profiles:
             # Wrong settings and missing models concern all runs: say so before the first hour.
             config = _config_of(method, profile, settings, variants or {}, 0)
-            check_before(config, "evaluate", METHODS[_variant(method, variants or {})[0]].leave_out)
+            preflight(config, "evaluate", METHODS[_variant(method, variants or {})[0]].leave_out)
     found = [
         run_method(method, sequence, profile, seed, settings, store, runner, variants=variants)
         for sequence in sequences

@@ -418,19 +418,21 @@ def _add_pretrain(verbs: Any) -> None:
         "pretrain",
         "pretrain.pretrain",
         "make the restorer's weights anew from procedural scenes",
-        description="Make practice scenes (colons that are never evaluated), reconstruct them, and train the "
-        "restorer on views far off their paths. This is how the weights of the package were made; hours on "
-        "two cores. Practice scenes that are in the folder already are taken from there.",
+        description="Make pretraining scenes (colons that are never evaluated), reconstruct them, and train "
+        "the restorer on views far off their paths. This is how the weights of the package were made; hours "
+        "on two cores. Pretraining scenes that are in the folder already are taken from there.",
     )
     made.add_argument("--out", required=True, metavar="FOLDER", help="where the weights go")
     made.add_argument(
         "--scenes-folder",
-        default=".extrags/practice",
+        default=".extrags/pretraining",
         metavar="FOLDER",
-        help="where practice scenes are kept, 40 MB each (default: %(default)s)",
+        help="where pretraining scenes are kept, 40 MB each (default: %(default)s)",
     )
-    made.add_argument("--scenes", type=int, metavar="N", help="practice scenes (default: 86)")
-    made.add_argument("--kept-back", type=int, metavar="N", help="how many of them only judge (default: 6)")
+    made.add_argument("--scenes", type=int, metavar="N", help="pretraining scenes (default: 86)")
+    made.add_argument(
+        "--validation-scenes", type=int, metavar="N", help="how many of them only judge (default: 6)"
+    )
     made.add_argument("--iterations", type=int, metavar="N", help="optimisation steps (default: 13500)")
     made.add_argument("--batch", type=int, metavar="N", help="crops per step (default: 4)")
     made.add_argument("--start", metavar="FOLDER", help="go on from these weights instead of from nothing")
@@ -439,7 +441,7 @@ def _add_pretrain(verbs: Any) -> None:
         "--perceptual-weight", type=float, metavar="X", help="of the perceptual distance (default: 0.15)"
     )
     made.add_argument(
-        "--doubt-weight", type=float, metavar="X", help="of the expected error's likelihood (default: 0.02)"
+        "--error-weight", type=float, metavar="X", help="of the expected error's likelihood (default: 0.02)"
     )
     made.add_argument("--seed", type=int, metavar="N", help="of the training (default: 0)")
     made.add_argument("--threads", type=int, metavar="N", help="threads of the training (default: all)")

@@ -15,7 +15,7 @@ from pydantic import Field
 from flows.methods import METHODS, MethodName, method_config, profile_label, refuse_pinned
 from flows.outcome import DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
-from flows.preflight import check_before
+from flows.preflight import preflight
 from flows.runners import PrefectRunner
 from flows.sequence import artifact_key, open_store, reconstruct_sequence
 from flows.settings import DEFAULT_STORE, ProfileName, StageName, task_runner
@@ -51,7 +51,7 @@ def reconstruct_dataset(
     refuse_pinned(method, settings or {})
     config = method_config(method, profile, settings, seed)
     open_store(store)
-    check_before(config, until, METHODS[method].leave_out)
+    preflight(config, until, METHODS[method].leave_out)
     one = reconstruct_sequence.with_options(task_runner=task_runner(runner))
 
     def reconstruct(sequence: str) -> SequenceOutcome:

@@ -7,10 +7,10 @@ from collections.abc import Collection
 from extrags.config import PipelineConfig
 from flows.settings import STAGES
 
-__all__ = ["check_before"]
+__all__ = ["preflight"]
 
 
-def check_before(config: PipelineConfig, until: str, leave_out: Collection[str] = ()) -> None:
+def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = ()) -> None:
     """Look for models, weights and packages that the settings name.
 
     Args:
@@ -31,6 +31,6 @@ def check_before(config: PipelineConfig, until: str, leave_out: Collection[str] 
 
     lpips_weights(config.evaluate)
     if "enhance" not in leave_out:
-        from extrags.enhance.preconditions import check_restorer
+        from extrags.restoration.preflight import check_restorer
 
         check_restorer(config.enhance)

@@ -13,7 +13,7 @@ from pydantic import Field
 from extrags.store import Store
 from flows.methods import METHODS, MethodName, method_config, profile_label, refuse_pinned
 from flows.outcome import SequenceFailedError, SequenceOutcome
-from flows.preflight import check_before
+from flows.preflight import preflight
 from flows.runners import PrefectRunner
 from flows.settings import DEFAULT_STORE, ProfileName, StageName
 from flows.tables import sequence_markdown
@@ -51,7 +51,7 @@ def reconstruct_sequence(
     refuse_pinned(method, settings or {})
     config = method_config(method, profile, settings, seed)
     open_store(store)
-    check_before(config, until, METHODS[method].leave_out)
+    preflight(config, until, METHODS[method].leave_out)
     outcome = run_sequence(
         sequence,
         config,

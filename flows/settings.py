@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from typing import Any, Literal, get_args
 
-from extrags.config import PipelineConfig, profile_config
+from extrags.config import PipelineConfig, ProfileName, profile_config
 from extrags.errors import ConfigError
 
 __all__ = [
@@ -20,8 +20,6 @@ __all__ = [
 ]
 
 DEFAULT_STORE = ".extrags"
-
-ProfileName = Literal["quick", "balanced", "paper"]
 
 StageName = Literal[
     "ingest",

@@ -20,11 +20,11 @@ def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig) -> None:
     """
     from extrags.assess import assess as measure
     from extrags.scene import Scene
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
 
     found = measure(
         Scene.load(slot.open(scene) / "scene"),
-        Sequence.load(slot.open(sequence) / "sequence"),
+        EndoscopicSequence.load(slot.open(sequence) / "sequence"),
         PipelineConfig(assess=config),
     )
     (slot.path / PLAN).write_text(found.model_dump_json(indent=1))

@@ -54,7 +54,7 @@ def benchmark_report(
     from extrags.metrics.protocol import RenderedViews
     from extrags.report.benchmark import BenchmarkInputs, ComparedViews, build_benchmark_report
     from extrags.report.comparison import RenderedMethod
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
 
     found = {
         index: json.loads((slot.open(ref) / METRICS_FILE).read_bytes()) for index, ref in metrics.items()
@@ -84,7 +84,7 @@ def benchmark_report(
             methods=methods,
             pictures=[
                 ComparedViews(
-                    Sequence.load(slot.open(sequences[pair["baseline"]]) / "sequence"),
+                    EndoscopicSequence.load(slot.open(sequences[pair["baseline"]]) / "sequence"),
                     pair["label"],
                     rendered(pair["baseline"]),
                     rendered(pair["contender"]),

@@ -23,11 +23,11 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     """
     import numpy as np
 
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
     from extrags.training import reconstruct
 
     with keeping_last_good(slot):
-        result = reconstruct(Sequence.load(slot.open(sequence) / "sequence"), config)
+        result = reconstruct(EndoscopicSequence.load(slot.open(sequence) / "sequence"), config)
     result.scene.save(slot.path / "scene")
     (slot.path / "history.json").write_text(json.dumps(result.history))
     slot.counts["n_gaussians"] = len(result.scene.gaussians)
@@ -43,11 +43,11 @@ def refined_frames(slot: Slot, sequence: Ref, coarse: Ref) -> None:
     """The whole sequence with the poses the coarse scene belongs to; writes `sequence/`."""
     import numpy as np
 
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
     from extrags.training.pose_refinement import with_refined_poses
 
     with (slot.open(coarse) / REFINED_POSES).open("rb") as file:
         refined = np.load(file)
-    whole = with_refined_poses(Sequence.load(slot.open(sequence) / "sequence"), refined)
+    whole = with_refined_poses(EndoscopicSequence.load(slot.open(sequence) / "sequence"), refined)
     whole.save(slot.path / "sequence")
     slot.counts.update(frames=len(whole), train=len(whole.train), test=len(whole.test))

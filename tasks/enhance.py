@@ -22,9 +22,9 @@ def train(
     model_digest: str | None,
 ) -> None:
     """Train the scene's restorer on its own pairs, or prepare a pretrained one; writes `restorer/`."""
-    from extrags.enhance.backends import train_enhancer
+    from extrags.restoration.backends import train_enhancer
     from extrags.scene import Scene
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
 
     if restorer_digest(config) != model_digest:
         raise WeightsError(
@@ -33,7 +33,7 @@ def train(
         )
     enhancer = train_enhancer(
         Scene.load(slot.open(scene) / "scene"),
-        Sequence.load(slot.open(sequence) / "sequence"),
+        EndoscopicSequence.load(slot.open(sequence) / "sequence"),
         config,
         coarse,
     )
@@ -55,16 +55,16 @@ def restore(
 ) -> None:
     """Render, restore and weigh one batch of trajectories; writes `pseudo/`."""
     from extrags.confidence import PerceptualDifference
-    from extrags.enhance.backends import load_enhancer
-    from extrags.enhance.clips import choose_views, make_pseudo_observations
-    from extrags.enhance.references import ReferenceViews
-    from extrags.explore import Exploration
+    from extrags.exploration import Exploration
     from extrags.metrics.lpips import Lpips
+    from extrags.restoration.backends import load_enhancer
+    from extrags.restoration.clips import choose_views, make_pseudo_observations
     from extrags.scene import Scene
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
+    from extrags.view_synthesis.references import ReferenceViews
 
     coarse = Scene.load(slot.open(scene) / "scene")
-    posed = Sequence.load(slot.open(sequence) / "sequence")
+    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
     trajectories = Exploration.load(slot.open(explore)).trajectories
     views = choose_views([len(cameras) for cameras in trajectories], config.max_views)
     first = batch * config.clips_per_batch
@@ -86,10 +86,8 @@ def restore(
 @stage("enhance", version=2)
 def assemble(slot: Slot, parts: list[Ref]) -> None:
     """Join the batches; writes `pseudo/`."""
-    from extrags.enhance.pseudo import PseudoObservations
+    from extrags.pseudo_views import PseudoViews
 
-    observations = PseudoObservations.concatenated(
-        [PseudoObservations.load(slot.open(part) / "pseudo") for part in parts]
-    )
+    observations = PseudoViews.concatenated([PseudoViews.load(slot.open(part) / "pseudo") for part in parts])
     observations.save(slot.path / "pseudo")
     slot.counts.update(views=len(observations), changed_share=round(observations.changed_share, 4))

@@ -27,10 +27,10 @@ def render(slot: Slot, scene: Ref, sequence: Ref) -> None:
     from extrags.metrics.protocol import RenderedViews
     from extrags.metrics.surface import scene_surface
     from extrags.scene import Scene
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
 
     shown = Scene.load(slot.open(scene) / "scene")
-    posed = Sequence.load(slot.open(sequence) / "sequence")
+    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
     gains = None
     if shown.light is not None:
         gains = shown.light.exposures_of(posed.test, posed.train, posed.recording)
@@ -75,10 +75,10 @@ def measure(
     from extrags.metrics.lpips import Lpips
     from extrags.metrics.protocol import RenderedViews, evaluate_views
     from extrags.metrics.surface import evaluate_surface
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 
-    posed = Sequence.load(slot.open(sequence) / "sequence")
+    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
     place = slot.open(renders)
     lpips = None if weights.path is None else Lpips.load(weights.path, net=weights.net)
     truth = None if posed.depth_mm is None else true_surface(posed)

@@ -16,8 +16,8 @@ from tasks.stage import stage
 
 if TYPE_CHECKING:
     from extrags.cameras import Cameras
-    from extrags.explore import SearchContext, WaveState
-    from extrags.sequence import Sequence
+    from extrags.exploration import SearchContext, WaveState
+    from extrags.sequence import EndoscopicSequence
 
 __all__ = ["NEXT", "branch", "explore", "merge", "start"]
 
@@ -27,7 +27,7 @@ NEXT = "next.json"
 @stage("explore-start", version=2)
 def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig) -> None:
     """Choose the anchors; writes `state/` and `next.json`."""
-    from extrags.explore import start_exploration
+    from extrags.exploration import start_exploration
 
     context, cameras, _ = _prepared(slot, scene, sequence, freespace, config)
     _write_state(slot, start_exploration(context, cameras))
@@ -38,7 +38,7 @@ def branch(
     slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, anchor: int, config: ExploreConfig
 ) -> None:
     """Grow the branch of one anchor; writes `branch/`."""
-    from extrags.explore import WaveState, grow
+    from extrags.exploration import WaveState, grow
 
     context, cameras, _ = _prepared(slot, scene, sequence, freespace, config)
     grown = grow(context, cameras, WaveState.load(slot.open(state) / "state").coverage, anchor)
@@ -49,7 +49,7 @@ def branch(
 @stage("explore-merge", version=1)
 def merge(slot: Slot, state: Ref, branches: list[Ref]) -> None:
     """Accept the branches of a wave; writes the next `state/` and `next.json`."""
-    from extrags.explore import Branch, WaveState
+    from extrags.exploration import Branch, WaveState
 
     before = WaveState.load(slot.open(state) / "state")
     _write_state(slot, before.merged([Branch.load(slot.open(ref) / "branch") for ref in branches]))
@@ -58,7 +58,7 @@ def merge(slot: Slot, state: Ref, branches: list[Ref]) -> None:
 @stage("explore", version=1)
 def explore(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, config: ExploreConfig) -> None:
     """Collect the accepted trajectories; writes `trajectories/` and `exploration.json`."""
-    from extrags.explore import WaveState, finish
+    from extrags.exploration import WaveState, finish
 
     context, _, posed = _prepared(slot, scene, sequence, freespace, config)
     exploration = finish(context, WaveState.load(slot.open(state) / "state"), posed.train)
@@ -73,13 +73,13 @@ def explore(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, c
 
 def _prepared(
     slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig
-) -> tuple[SearchContext, Cameras, Sequence]:
-    from extrags.explore import prepare_search
+) -> tuple[SearchContext, Cameras, EndoscopicSequence]:
+    from extrags.exploration import prepare_search
     from extrags.freespace import FreeSpace
     from extrags.scene import Scene
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
 
-    posed = Sequence.load(slot.open(sequence) / "sequence")
+    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
     cameras = posed.cameras[posed.train]
     context = prepare_search(
         Scene.load(slot.open(scene) / "scene"),

@@ -25,16 +25,16 @@ def finetune(
 
     Without pseudo-observations only the real views count: the control of a comparison.
     """
-    from extrags.enhance.pseudo import PseudoObservations
+    from extrags.pseudo_views import PseudoViews
     from extrags.scene import Scene
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
     from extrags.training import finetune as optimise_further
 
-    observations = None if pseudo is None else PseudoObservations.load(slot.open(pseudo) / "pseudo")
+    observations = None if pseudo is None else PseudoViews.load(slot.open(pseudo) / "pseudo")
     with keeping_last_good(slot):
         result = optimise_further(
             Scene.load(slot.open(scene) / "scene"),
-            Sequence.load(slot.open(sequence) / "sequence"),
+            EndoscopicSequence.load(slot.open(sequence) / "sequence"),
             observations,
             config,
             coarse,

@@ -14,10 +14,10 @@ def freespace(slot: Slot, scene: Ref, surface: Ref, sequence: Ref, config: Frees
     """Carve the space the training views look through; writes `freespace/`."""
     from extrags.freespace import carve
     from extrags.scene import Scene
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 
-    posed = Sequence.load(slot.open(sequence) / "sequence")
+    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
     space = carve(
         Scene.load(slot.open(scene) / "scene"),
         Mesh.load(slot.open(surface) / "mesh"),

@@ -1,4 +1,4 @@
-"""ingest: any source to a `Sequence`, and the part of it the reconstruction may see."""
+"""ingest: any source to an `EndoscopicSequence`, and the part of it the reconstruction may see."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: Inge
 @stage("training-frames", version=1)
 def training_frames(slot: Slot, sequence: Ref) -> None:
     """Take the held-out frames away; writes `sequence/`."""
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
 
-    part = Sequence.load(slot.open(sequence) / "sequence").training_part()
+    part = EndoscopicSequence.load(slot.open(sequence) / "sequence").training_part()
     part.save(slot.path / "sequence")
     slot.counts.update(frames=len(part))

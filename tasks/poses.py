@@ -19,22 +19,22 @@ def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
     them are in `poses.json` under `against_given`.
     """
     from extrags.poses import errors_against_given, estimate_poses, with_estimated_poses
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
 
-    unposed = Sequence.load(slot.open(sequence) / "sequence")
+    unposed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
     estimate = estimate_poses(unposed, config)
     posed = with_estimated_poses(unposed, estimate)
     posed.save(slot.path / "sequence")
     metric = estimate.metric and unposed.metric
-    account = {
+    report = {
         "method": estimate.method,
         "summary": estimate.summary,
         "registered": [bool(found) for found in estimate.registered],
         "mean_reprojection_px": estimate.mean_reprojection_px,
         "against_given": errors_against_given(unposed, estimate.world_from_camera, metric=metric),
-        **estimate.account,
+        **estimate.report,
     }
-    (slot.path / "poses.json").write_text(json.dumps(account, indent=1))
+    (slot.path / "poses.json").write_text(json.dumps(report, indent=1))
     slot.counts.update(
         frames=len(posed),
         train=len(posed.train),

@@ -38,13 +38,13 @@ def report(
         profile: name of the profile they started from.
         rows: `{stage, state, seconds, reason, made_seconds}` of each stage.
     """
-    from extrags.enhance.pseudo import PseudoObservations
-    from extrags.explore import Exploration
+    from extrags.exploration import Exploration
     from extrags.freespace import FreeSpace
     from extrags.metrics.protocol import RenderedViews
+    from extrags.pseudo_views import PseudoViews
     from extrags.report.build import build_report
     from extrags.report.inputs import ReportInputs
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 
     places = {name: slot.open(ref) for name, ref in parts.items()}
@@ -52,7 +52,7 @@ def report(
     def text(name: str, file: str) -> Any:
         return json.loads((places[name] / file).read_bytes()) if name in places else None
 
-    sequence = Sequence.load(places["sequence"] / "sequence")
+    sequence = EndoscopicSequence.load(places["sequence"] / "sequence")
     exploration = Exploration.load(places["explore"]) if "explore" in places else None
     coarse, final = (
         RenderedViews.load(places[name] / "renders") if name in places else None
@@ -65,7 +65,7 @@ def report(
         final=final,
         coarse_metrics=text("metrics_coarse", "metrics.json"),
         final_metrics=text("metrics_final", "metrics.json"),
-        pseudo=PseudoObservations.load(places["enhance"] / "pseudo") if "enhance" in places else None,
+        pseudo=PseudoViews.load(places["enhance"] / "pseudo") if "enhance" in places else None,
         trajectories=[]
         if exploration is None
         else [cameras.world_from_camera for cameras in exploration.trajectories],

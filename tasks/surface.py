@@ -13,10 +13,10 @@ __all__ = ["surface"]
 def surface(slot: Slot, scene: Ref, sequence: Ref, config: SurfaceConfig) -> None:
     """Fuse the training views' rendered depth; writes `mesh/` and `mesh.ply`."""
     from extrags.scene import Scene
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
     from extrags.surface import fuse_surface
 
-    posed = Sequence.load(slot.open(sequence) / "sequence")
+    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
     mesh = fuse_surface(Scene.load(slot.open(scene) / "scene"), posed.cameras[posed.train], config)
     mesh.save(slot.path / "mesh")
     mesh.write_ply(slot.path / "mesh.ply")

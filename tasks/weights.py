@@ -48,6 +48,6 @@ def restorer_digest(config: EnhanceConfig) -> str | None:
     Raises:
         ExtragsError: when it is not there; says how to get it.
     """
-    from extrags.enhance.preconditions import model_digest
+    from extrags.restoration.preflight import model_digest
 
     return model_digest(config)

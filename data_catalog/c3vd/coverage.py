@@ -5,7 +5,8 @@ of any of the video's frames met them, 2 where none did. The meshes of a scene's
 in the same order, so the motion between two worlds follows from them exactly (Procrustes).
 
 The flags speak of the whole video and of all the fisheye sees. What a *training frame* saw of a held-out
-frame's surface is another question, answered here by casting rays: it is what `Sequence.observed` holds.
+frame's surface is another question, answered here by casting rays: it is what
+`EndoscopicSequence.observed` holds.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""C3VD and C3VDv2 into a `Sequence`: one video alone, or two videos of a scene under a split manifest.
+"""C3VD and C3VDv2 as an `EndoscopicSequence`: one video, or two of a scene under a split manifest.
 
 Two videos each have a world of their own. The training video's is kept; the other's poses are carried into it
 by the motion between the coverage meshes. Every frame is resampled to one ideal pinhole (square pixels,
@@ -31,7 +31,7 @@ from extrags.cameras import Cameras
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.events import Progress, emit
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["FORMAT", "open_recording", "pair_files", "read_pair"]
 
@@ -52,7 +52,7 @@ class _Part:
     role: int
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> Sequence:
+def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     video = Video.open(folder)
     chosen = spread(len(video), config.max_frames)
     split = every_nth(len(chosen), config.holdout_every, file=folder)
@@ -130,7 +130,9 @@ def pair_files(train_folder: Path, test_folder: Path, pair: RecordingPair) -> li
     return [(f"{role}/{file.relative_to(video.folder).as_posix()}", file) for role, video, file in listed]
 
 
-def read_pair(train_folder: Path, test_folder: Path, pair: RecordingPair, config: IngestConfig) -> Sequence:
+def read_pair(
+    train_folder: Path, test_folder: Path, pair: RecordingPair, config: IngestConfig
+) -> EndoscopicSequence:
     """Two videos of one scene in one world: the training video's frames first, then the others.
 
     Args:
@@ -193,13 +195,13 @@ def _assembled(
     mesh: CoverageMesh | None,
     config: IngestConfig,
     truth: dict[str, Any],
-) -> Sequence:
+) -> EndoscopicSequence:
     """Read, resample and join; `mesh` stands in the world of the sequence."""
     total = sum(len(part.chosen) for part in parts)
     plan = _planned(parts[0], None, config)
     colours, depths, masks, poses, names, recording = [], [], [], [], [], []
     has_depth = all(part.video.depth_files for part in parts)
-    accounts = {}
+    reports = {}
     for part in parts:
         video, own_plan = part.video, _planned(part, plan, config)
         brightest = np.zeros((own_plan.camera.height, own_plan.camera.width, 3), dtype=np.uint8)
@@ -218,7 +220,7 @@ def _assembled(
         mask = own_plan.mask(_inside_picture(brightest))
         masks += [mask] * len(part.chosen)
         recording += [part.role] * len(part.chosen)
-        accounts[video.folder.resolve().name] = {
+        reports[video.folder.resolve().name] = {
             "camera": video.calibration,
             "pose_layout": video.layout,
             "masked_share": float(1 - mask.mean()),
@@ -226,7 +228,7 @@ def _assembled(
     cameras = Cameras(np.repeat(plan.K[None], total, axis=0), np.stack(poses), plan.width, plan.height)
     mask_stack = np.stack(masks)
     depth_mm = np.stack(depths) if has_depth else None
-    return Sequence(
+    return EndoscopicSequence(
         name=name,
         rgb=np.stack(colours),
         K=cameras.K,
@@ -238,7 +240,7 @@ def _assembled(
         frame_names=tuple(names),
         metric=True,
         observed=_observed(cameras, mask_stack, depth_mm, split, mesh),
-        truth={"c3vd": {**truth, "recordings": accounts}},
+        truth={"c3vd": {**truth, "recordings": reports}},
     )
 
 

@@ -1,4 +1,4 @@
-"""A recording of the phantom: rays in, a `Sequence` with exact ground truth out.
+"""A recording of the phantom: rays in, an `EndoscopicSequence` with exact ground truth out.
 
 Axes are OpenCV's, lengths millimetres, depth is z-depth at pixel centres. Frames of recording B (training)
 come first, then those of recording A (evaluation). Only frames that are used are rendered.
@@ -21,7 +21,7 @@ from data_catalog.phantom.variation import vary
 from data_catalog.ray_casting import RayCaster
 from extrags.cameras import Cameras, pixel_rays
 from extrags.events import Progress, emit
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["Phantom", "record"]
 
@@ -130,7 +130,7 @@ class Phantom:
         return sensor.develop(self.radiance(camera, self.config.supersample), exposure, rng), exposure
 
 
-def record(config: PhantomConfig, name: str) -> Sequence:
+def record(config: PhantomConfig, name: str) -> EndoscopicSequence:
     """Render a scene's two recordings and their ground truth."""
     phantom = Phantom(config)
     gain = phantom.scene_gain()
@@ -176,7 +176,7 @@ def record(config: PhantomConfig, name: str) -> Sequence:
         "polyps": [asdict(polyp) for polyp in phantom.wall.polyps],
         "separation": _separation(every[train], every[test], observed[test]),
     }
-    return Sequence(
+    return EndoscopicSequence(
         name=name,
         rgb=np.stack(rgb),
         K=every.K,

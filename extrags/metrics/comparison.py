@@ -9,8 +9,7 @@ evidence. `PROTOCOL.md`, section 7, has the rules in words.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -93,7 +92,7 @@ class Spread:
     largest: float
 
 
-def spread(values: AbstractSequence[float]) -> Spread:
+def spread(values: Sequence[float]) -> Spread:
     """Mean, deviation and 95 % interval of a sample.
 
     Raises:
@@ -129,7 +128,7 @@ def dataset_of(run: Run) -> str:
     return f"{dataset}@{run['setting']}" if run["setting"] else dataset
 
 
-def paired(runs: AbstractSequence[Run], method: str, baseline: str, name: str) -> list[tuple[Run, float]]:
+def paired(runs: Sequence[Run], method: str, baseline: str, name: str) -> list[tuple[Run, float]]:
     """Differences method - baseline of runs that share all but the method.
 
     Args:
@@ -153,7 +152,7 @@ def paired(runs: AbstractSequence[Run], method: str, baseline: str, name: str) -
     return found
 
 
-def compare_runs(runs: AbstractSequence[Run], baseline: str) -> dict[str, Any]:
+def compare_runs(runs: Sequence[Run], baseline: str) -> dict[str, Any]:
     """Spread and paired differences of all figures that any run has.
 
     Args:
@@ -207,8 +206,8 @@ def _by_dataset(run: Run) -> dict[str, Any]:
 
 
 def _grouped(
-    runs: AbstractSequence[Run],
-    figures: AbstractSequence[Figure],
+    runs: Sequence[Run],
+    figures: Sequence[Figure],
     about: Callable[[Run], dict[str, Any]],
 ) -> list[dict[str, Any]]:
     rows = []
@@ -228,9 +227,9 @@ def _grouped(
 
 
 def _paired(
-    runs: AbstractSequence[Run],
-    figures: AbstractSequence[Figure],
-    methods: AbstractSequence[str],
+    runs: Sequence[Run],
+    figures: Sequence[Figure],
+    methods: Sequence[str],
     baseline: str,
     about: Callable[[Run], dict[str, Any]],
 ) -> list[dict[str, Any]]:
@@ -253,9 +252,7 @@ def _paired(
     return rows
 
 
-def _sample(
-    values: AbstractSequence[tuple[Run, float]], about: Callable[[Run], dict[str, Any]]
-) -> list[float]:
+def _sample(values: Sequence[tuple[Run, float]], about: Callable[[Run], dict[str, Any]]) -> list[float]:
     """The values of a sequence's seeds; of a dataset, the mean of each sequence."""
     if about is _by_sequence:
         return [value for _, value in values]
@@ -266,7 +263,7 @@ def _sample(
 
 
 def _groups(
-    runs: AbstractSequence[Run], about: Callable[[Run], dict[str, Any]]
+    runs: Sequence[Run], about: Callable[[Run], dict[str, Any]]
 ) -> list[tuple[dict[str, Any], list[Run]]]:
     groups: dict[tuple[Any, ...], tuple[dict[str, Any], list[Run]]] = {}
     for run in runs:
@@ -275,7 +272,7 @@ def _groups(
     return list(groups.values())
 
 
-def _sizes(runs: AbstractSequence[Run]) -> dict[str, int]:
+def _sizes(runs: Sequence[Run]) -> dict[str, int]:
     return {
         "n_sequences": len({(run["sequence"], run["setting"]) for run in runs}),
         "n_seeds": len({run["seed"] for run in runs}),

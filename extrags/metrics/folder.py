@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
 from extrags.metrics.protocol import RenderedViews
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["read_renders"]
 
@@ -26,7 +26,7 @@ _NAMED_AT_MOST = 5
 
 def read_renders(
     folder: Path,
-    sequence: Sequence,
+    sequence: EndoscopicSequence,
     *,
     depth_folder: Path | None = None,
     depth_step_mm: float | None = None,
@@ -61,7 +61,7 @@ def read_renders(
     return RenderedViews(np.stack(rgb), np.ones((len(rgb), *shape), dtype=np.float32), depth, None)
 
 
-def _files_of(folder: Path, sequence: Sequence, suffixes: frozenset[str], kind: str) -> list[Path]:
+def _files_of(folder: Path, sequence: EndoscopicSequence, suffixes: frozenset[str], kind: str) -> list[Path]:
     """One file per held-out frame, in their order."""
     if not folder.is_dir():
         raise SourceNotFoundError(f"there is no such folder of {kind}s", file=folder)
@@ -92,7 +92,7 @@ def _files_of(folder: Path, sequence: Sequence, suffixes: frozenset[str], kind: 
 
 
 def _by_number(
-    files: list[Path], folder: Path, sequence: Sequence, kind: str, wanted: list[str]
+    files: list[Path], folder: Path, sequence: EndoscopicSequence, kind: str, wanted: list[str]
 ) -> list[Path]:
     if len(files) != len(wanted):
         raise SourceNotFoundError(

@@ -27,7 +27,7 @@ from extrags.metrics.flip import flip_map
 from extrags.metrics.image import mean_of_known, means_per_image, psnr_per_image, ssim_map
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.zarr_io import open_group, read_array, write_frames
 
 __all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
@@ -139,7 +139,7 @@ class EvaluationResult:
 
 def evaluate_views(
     renders: RenderedViews,
-    sequence: Sequence,
+    sequence: EndoscopicSequence,
     frames: Int[np.ndarray, "v"],
     lpips: Lpips | None,
     *,
@@ -187,7 +187,7 @@ def evaluate_views(
     )
 
 
-def _check(renders: RenderedViews, sequence: Sequence, frames: np.ndarray) -> None:
+def _check(renders: RenderedViews, sequence: EndoscopicSequence, frames: np.ndarray) -> None:
     if len(frames) == 0:
         raise ShapeError(f"{sequence.name}: there is no frame to evaluate on")
     expected = (len(frames), sequence.height, sequence.width, 3)
@@ -203,7 +203,7 @@ def _check(renders: RenderedViews, sequence: Sequence, frames: np.ndarray) -> No
 
 
 def _evaluate_chunk(
-    renders: RenderedViews, sequence: Sequence, frames: np.ndarray, part: slice, lpips: Lpips | None
+    renders: RenderedViews, sequence: EndoscopicSequence, frames: np.ndarray, part: slice, lpips: Lpips | None
 ) -> list[dict[str, Any]]:
     chosen = frames[part]
     render = torch.from_numpy(renders.rgb[part].astype(np.float32)).clamp(0, 1)
@@ -241,7 +241,7 @@ def _evaluate_chunk(
 
 
 def _parts_of(
-    sequence: Sequence, chosen: np.ndarray
+    sequence: EndoscopicSequence, chosen: np.ndarray
 ) -> tuple[dict[str, Tensor], dict[str, list[float | None]]]:
     """Observed and unobserved pixels, and their shares of the mask.
 
@@ -289,7 +289,7 @@ def _photometric(
 
 
 def _depth_metrics(
-    depth: np.ndarray, sequence: Sequence, frame: int, region: Tensor
+    depth: np.ndarray, sequence: EndoscopicSequence, frame: int, region: Tensor
 ) -> dict[str, float | None]:
     errors = None
     if sequence.depth_mm is not None:
@@ -311,7 +311,7 @@ def _mean_tree(views: list[dict[str, Any]]) -> dict[str, Any]:
 
 def _reasons(
     metrics: dict[str, Any],
-    sequence: Sequence,
+    sequence: EndoscopicSequence,
     frames: np.ndarray,
     lpips: Lpips | None,
     lpips_reason: str,

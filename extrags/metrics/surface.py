@@ -26,7 +26,7 @@ from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.scene import Scene
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.surface import Mesh, fuse_depth, rendered_depth
 
 __all__ = [
@@ -131,7 +131,7 @@ class SurfaceResult:
         }
 
 
-def scene_surface(scene: Scene, sequence: Sequence) -> Mesh | None:
+def scene_surface(scene: Scene, sequence: EndoscopicSequence) -> Mesh | None:
     """The surface of a scene as the protocol sees it, or None when the cameras see none.
 
     Args:
@@ -146,7 +146,7 @@ def scene_surface(scene: Scene, sequence: Sequence) -> Mesh | None:
         return None
 
 
-def surface_from_depth(sequence: Sequence) -> TrueSurface | None:
+def surface_from_depth(sequence: EndoscopicSequence) -> TrueSurface | None:
     """The true surface from the true depth of all frames; None without poses, depth or surface."""
     if sequence.depth_mm is None or sequence.world_from_camera is None:
         return None
@@ -159,7 +159,7 @@ def surface_from_depth(sequence: Sequence) -> TrueSurface | None:
         return None
 
 
-def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: Sequence) -> SurfaceResult:
+def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: EndoscopicSequence) -> SurfaceResult:
     """Surface figures of a reconstruction, observed and unobserved parts apart.
 
     Args:
@@ -305,7 +305,7 @@ def _fused(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"]) -> Mesh:
 
 
 def _parts(
-    points: Float[np.ndarray, "n 3"], truth: TrueSurface, sequence: Sequence
+    points: Float[np.ndarray, "n 3"], truth: TrueSurface, sequence: EndoscopicSequence
 ) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Which true points training cameras see, and which held-out cameras alone."""
     far = _reach(sequence)
@@ -317,7 +317,7 @@ def _parts(
     return observed, by(sequence.test) & ~observed
 
 
-def _reach(sequence: Sequence) -> float:
+def _reach(sequence: EndoscopicSequence) -> float:
     """Farther depth is not fused, so surface seen from farther only cannot be asked for."""
     frames = _all_frames(sequence)
     if sequence.depth_mm is None:
@@ -327,7 +327,7 @@ def _reach(sequence: Sequence) -> float:
     return float(np.quantile(known, PROTOCOL_FUSION.depth_quantile)) if known.size else float("inf")
 
 
-def _threshold(sequence: Sequence) -> float:
+def _threshold(sequence: EndoscopicSequence) -> float:
     if sequence.metric or sequence.depth_mm is None:
         return THRESHOLD_MM
     depth = sequence.depth_mm[sequence.train]
@@ -362,7 +362,7 @@ def _statistic(of: Any, values: np.ndarray) -> float | None:
     return float(of(values)) if values.size else None
 
 
-def _all_frames(sequence: Sequence) -> np.ndarray:
+def _all_frames(sequence: EndoscopicSequence) -> np.ndarray:
     return np.unique(np.concatenate([sequence.train, sequence.test]))
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from extrags.poses.account import errors_against_given
 from extrags.poses.estimate import PoseEstimate, estimate_poses, with_estimated_poses
+from extrags.poses.registration_report import errors_against_given
 from extrags.poses.rgbd import RgbdAlignment, align_by_depth
 from extrags.poses.scale import DepthScale, depth_scale
 

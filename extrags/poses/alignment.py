@@ -10,7 +10,7 @@ plane); Kerl, Sturm and Cremers: Dense visual SLAM for RGB-D cameras, IROS 2013 
 
 from __future__ import annotations
 
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,9 +31,9 @@ AGREES = 0.02
 ITERATIONS = 8
 SMALLEST_STEPS = (1e-3, 3e-4, 1e-4, 1e-5)
 """Per level, in radians and depths: what moves less has arrived."""
-FEWEST_POINTS = 60
-LEAST_GEOMETRIC_SCALE = 5e-4
-LEAST_TEXTURE_SCALE = 0.05
+MIN_POINTS = 60
+MIN_GEOMETRIC_SCALE = 5e-4
+MIN_TEXTURE_SCALE = 0.05
 TUKEY = 4.7
 NEAR_SHARE = 1e-3
 
@@ -80,7 +80,7 @@ class Agreement:
 def align(
     view: DepthView,
     start: Float[np.ndarray, "4 4"],
-    references: AbstractSequence[Posed],
+    references: Sequence[Posed],
     *,
     first_level: int = 0,
 ) -> Float[np.ndarray, "4 4"]:
@@ -99,7 +99,7 @@ def align(
     for level in range(first_level, len(LEVELS)):
         for _ in range(ITERATIONS):
             parts = [pair_equations(Posed(view, pose), other, level, pose[:3, 3]) for other in references]
-            if sum(part.count for part in parts) < FEWEST_POINTS:
+            if sum(part.count for part in parts) < MIN_POINTS:
                 return pose
             A, b = np.sum([part.A for part in parts], axis=0), np.sum([part.b for part in parts], axis=0)
             twist = _solved(A, b, view.median_depth)
@@ -129,12 +129,12 @@ def pair_equations(moving: Posed, reference: Posed, level: int, centre: Float[np
     normals = met.normals @ to_world.T
     distance = (met.normals * (met.points - met.surface)).sum(-1)
     jacobian = np.concatenate([np.cross(arm, normals), normals], axis=1)
-    scale = max(1.4826 * float(np.median(np.abs(distance))), LEAST_GEOMETRIC_SCALE * met.depth)
+    scale = max(1.4826 * float(np.median(np.abs(distance))), MIN_GEOMETRIC_SCALE * met.depth)
     weight = _tukey(distance / scale) / scale**2
     A += (jacobian * weight[:, None]).T @ jacobian
     b -= (jacobian * weight[:, None]).T @ distance
 
-    if len(met.textured) >= FEWEST_POINTS:
+    if len(met.textured) >= MIN_POINTS:
         rows = met.textured
         for channel in range(2):
             found, along_x, along_y = met.texture[:, channel].T
@@ -146,7 +146,7 @@ def pair_equations(moving: Posed, reference: Posed, level: int, centre: Float[np
             )
             gradient = gradient @ to_world.T
             jacobian = np.concatenate([np.cross(arm[rows], gradient), gradient], axis=1)
-            scale = max(1.4826 * float(np.median(np.abs(difference))), LEAST_TEXTURE_SCALE)
+            scale = max(1.4826 * float(np.median(np.abs(difference))), MIN_TEXTURE_SCALE)
             weight = _tukey(difference / scale) / scale**2
             A += (jacobian * weight[:, None]).T @ jacobian
             b -= (jacobian * weight[:, None]).T @ difference
@@ -154,7 +154,7 @@ def pair_equations(moving: Posed, reference: Posed, level: int, centre: Float[np
 
 
 def solve_twists(
-    pairs: AbstractSequence[tuple[int, int, Equations]], count: int, unit: float
+    pairs: Sequence[tuple[int, int, Equations]], count: int, unit: float
 ) -> Float[np.ndarray, "c 6"]:
     """Twists of all frames from the equations of pairs; the first frame stays.
 
@@ -189,7 +189,7 @@ def moved(
     return result
 
 
-def agreement(moving: Posed, references: AbstractSequence[Posed]) -> Agreement:
+def agreement(moving: Posed, references: Sequence[Posed]) -> Agreement:
     """How well a frame fits fixed ones, over all of them together."""
     seen, agree = 0, 0
     residuals: list[np.ndarray] = []
@@ -210,11 +210,11 @@ def agreement(moving: Posed, references: AbstractSequence[Posed]) -> Agreement:
         both = fits[met.textured]
         first.append(met.texture[both, 0, 0])
         second.append(met.own_texture[both, 0])
-    if seen < FEWEST_POINTS or agree == 0:
+    if seen < MIN_POINTS or agree == 0:
         return Agreement(0.0, 0.0, 0.0, float("inf"))
     a, b = np.concatenate(first), np.concatenate(second)
     texture = 0.0
-    if len(a) >= FEWEST_POINTS and a.std() > 1e-3 and b.std() > 1e-3:
+    if len(a) >= MIN_POINTS and a.std() > 1e-3 and b.std() > 1e-3:
         texture = float(np.corrcoef(a, b)[0, 1])
     overlap = seen / (len(moving.view.samples) * len(references))
     return Agreement(overlap, agree / seen, texture, float(np.median(np.concatenate(residuals))))
@@ -255,7 +255,7 @@ def _met(moving: Posed, reference: Posed, reach: float, level: int) -> _Met | No
     turned = view.normals.reshape(-1, 3)[samples[rows]] @ between[:3, :3].T
     counts = other.valid.reshape(-1)[pixel] & ((turned * normals).sum(-1) > 0.3)
     counts &= np.linalg.norm(points[rows] - surface, axis=1) < reach * z[rows]
-    if int(counts.sum()) < FEWEST_POINTS:
+    if int(counts.sum()) < MIN_POINTS:
         return None
     rows, pixel = rows[counts], pixel[counts]
     textured = np.flatnonzero(other.textured.reshape(-1)[pixel] & view.textured.reshape(-1)[samples[rows]])

@@ -24,7 +24,7 @@ __all__ = ["run_colmap"]
 
 MASK_EROSION_SHARE = 0.01
 """Features this near (in image widths) to masked-out pixels belong to the edge, which moves along."""
-FEWEST_POSE_INLIERS = 12
+MIN_POSE_INLIERS = 12
 POSE_INLIER_SHARE = 0.25
 POSE_MAX_ERROR_PX = 8.0
 _PAIRS_PER_CALL = 100
@@ -78,12 +78,12 @@ def run_colmap(folder: Path, job: PoseJob) -> PoseJobResult:
     _write_images(folder, job)
     with _opened(pycolmap, database_path):
         pass  # opening creates it, which importing images expects
-    account: dict[str, Any] = {"n_train": len(job.train), "n_test": len(job.test), "pairs": len(pairs)}
+    report: dict[str, Any] = {"n_train": len(job.train), "n_test": len(job.test), "pairs": len(pairs)}
 
     _extract(pycolmap, folder, job, job.train, told)
     _match(pycolmap, folder, pairs, seed, told)
     with _opened(pycolmap, database_path) as database:
-        account |= _match_account(pycolmap, database, job.train, pairs)
+        report |= _match_report(pycolmap, database, job.train, pairs)
 
     # The first pair of a model counts once, and further models count images again: told steps are
     # held below what the map is given, and set to it at its end.
@@ -100,16 +100,16 @@ def run_colmap(folder: Path, job: PoseJob) -> PoseJobResult:
         next_image_callback=mapped,
     )
     told.reach(map_made)
-    account["model_sizes"] = sorted((model.num_reg_images() for model in models.values()), reverse=True)
+    report["model_sizes"] = sorted((model.num_reg_images() for model in models.values()), reverse=True)
     poses = np.full((frames, 4, 4), np.nan)
     if not models:
         told.reach(told.total)
-        return _nothing(poses, account | {"registrations": {}})
+        return _nothing(poses, report | {"registrations": {}})
     # Ties go to the first model, whatever the order of the dictionary.
     best = models[
         max(models, key=lambda key: (models[key].num_reg_images(), models[key].num_points3D(), -key))
     ]
-    result = _read_model(best, poses, account)
+    result = _read_model(best, poses, report)
     _register_held_out(pycolmap, folder, job, best, result, schedule, told)
     told.reach(told.total, registered=float(np.isfinite(poses).all((1, 2)).sum()))
     return result
@@ -188,7 +188,7 @@ def _match(pycolmap: Any, folder: Path, pairs: list[Pair], seed: int, told: _Tol
             told.step(len(part))
 
 
-def _match_account(pycolmap: Any, database: Any, frames: np.ndarray, pairs: list[Pair]) -> dict[str, Any]:
+def _match_report(pycolmap: Any, database: Any, frames: np.ndarray, pairs: list[Pair]) -> dict[str, Any]:
     ids = {int(frame): database.read_image_with_name(_name(int(frame))).image_id for frame in frames}
     features = {frame: int(database.num_keypoints_for_image(number)) for frame, number in ids.items()}
     inliers = {
@@ -260,7 +260,7 @@ def _mapping_options(pycolmap: Any, settings: dict[str, Any]) -> Any:
     return options
 
 
-def _read_model(model: Any, poses: np.ndarray, account: dict[str, Any]) -> PoseJobResult:
+def _read_model(model: Any, poses: np.ndarray, report: dict[str, Any]) -> PoseJobResult:
     for number in sorted(model.reg_image_ids()):
         image = model.image(number)
         poses[_frame(image.name)] = _world_from_camera(image.cam_from_world())
@@ -272,9 +272,9 @@ def _read_model(model: Any, poses: np.ndarray, account: dict[str, Any]) -> PoseJ
             frames.append(_frame(image.name))
             points.append(index)
             pixels.append(image.point2D(element.point2D_idx).xy)
-    account["n_points"] = len(point_ids)
-    account["mean_track_length"] = float(model.compute_mean_track_length())
-    account["mean_reprojection_px"] = float(model.compute_mean_reprojection_error())
+    report["n_points"] = len(point_ids)
+    report["mean_track_length"] = float(model.compute_mean_track_length())
+    report["mean_reprojection_px"] = float(model.compute_mean_reprojection_error())
     return PoseJobResult(
         world_from_camera=poses,
         points=np.array([model.point3D(number).xyz for number in point_ids]).reshape(-1, 3),
@@ -284,7 +284,7 @@ def _read_model(model: Any, poses: np.ndarray, account: dict[str, Any]) -> PoseJ
         observed_frame=np.array(frames, dtype=np.int64),
         observed_point=np.array(points, dtype=np.int64),
         observed_px=np.array(pixels, dtype=np.float64).reshape(-1, 2),
-        account=account,
+        report=report,
     )
 
 
@@ -301,7 +301,7 @@ def _register_held_out(
     images = {_frame(model.image(number).name): model.image(number) for number in model.reg_image_ids()}
     mapped = np.array(sorted(images), dtype=np.int64)
     registrations: dict[str, dict[str, int]] = {}
-    result.account["registrations"] = registrations
+    result.report["registrations"] = registrations
     if len(job.test) == 0:
         return
     _extract(pycolmap, folder, job, job.test, told)
@@ -338,7 +338,7 @@ def _register_held_out(
 def _absolute_pose(
     pycolmap: Any, pixels: np.ndarray, points: np.ndarray, camera: Any, seed: int
 ) -> tuple[np.ndarray | None, int]:
-    if len(pixels) < FEWEST_POSE_INLIERS:
+    if len(pixels) < MIN_POSE_INLIERS:
         return None, 0
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = POSE_MAX_ERROR_PX
@@ -347,7 +347,7 @@ def _absolute_pose(
     if answer is None:
         return None, 0
     inliers = int(answer["num_inliers"])
-    if inliers < max(FEWEST_POSE_INLIERS, POSE_INLIER_SHARE * len(pixels)):
+    if inliers < max(MIN_POSE_INLIERS, POSE_INLIER_SHARE * len(pixels)):
         return None, inliers
     return _world_from_camera(answer["cam_from_world"]), inliers
 
@@ -358,7 +358,7 @@ def _world_from_camera(cam_from_world: Any) -> np.ndarray:
     return pose
 
 
-def _nothing(poses: np.ndarray, account: dict[str, Any]) -> PoseJobResult:
+def _nothing(poses: np.ndarray, report: dict[str, Any]) -> PoseJobResult:
     empty = np.zeros(0, dtype=np.int64)
     return PoseJobResult(
         world_from_camera=poses,
@@ -367,7 +367,7 @@ def _nothing(poses: np.ndarray, account: dict[str, Any]) -> PoseJobResult:
         observed_frame=empty,
         observed_point=empty,
         observed_px=np.zeros((0, 2)),
-        account=account,
+        report=report,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_erosion, gaussian_filter
 
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["LEVELS", "DepthView", "depth_view"]
 
@@ -17,7 +17,7 @@ LEVELS = (6.0, 3.0, 1.5, 0.7)
 NEIGHBOURHOOD_PX = 12.0
 """Textures are taken against the mean and spread of so wide a neighbourhood: the lamp rides on the scope,
 so brightness belongs to the view and not to the tissue."""
-LEAST_SPREAD = 0.02
+MIN_SPREAD = 0.02
 """Spread of the logarithm below which there is only noise."""
 SATURATED = 250
 EDGE_SHARE = 0.05
@@ -51,7 +51,7 @@ class DepthView:
     median_depth: float
 
 
-def depth_view(sequence: Sequence, frame: int, max_width: int) -> DepthView | None:
+def depth_view(sequence: EndoscopicSequence, frame: int, max_width: int) -> DepthView | None:
     """Prepare a frame; None where it has too little depth to be aligned.
 
     The size is divided by a whole number: depth is picked, never mixed across a fold; colours are averaged.
@@ -145,4 +145,4 @@ def _against_neighbourhood(channel: np.ndarray, weight: np.ndarray, sigma: float
     mean = smooth(channel, wide)
     fine = smooth(channel, sigma) - mean
     spread = np.sqrt(smooth(fine**2, wide))
-    return np.asarray(np.clip(fine / np.maximum(spread, LEAST_SPREAD), -3, 3))
+    return np.asarray(np.clip(fine / np.maximum(spread, MIN_SPREAD), -3, 3))

@@ -19,15 +19,15 @@ from extrags.cameras import as_rotation
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
-from extrags.poses.account import colmap_account, failure_message, frames_without_pose
 from extrags.poses.job import PoseJob, PoseJobResult
+from extrags.poses.registration_report import colmap_report, failure_message, frames_without_pose
 from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import depth_scale
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["PoseEstimate", "estimate_poses", "with_estimated_poses"]
 
-FEWEST_TRAINING_FRAMES = 3
+MIN_TRAINING_FRAMES = 3
 _LOG = logging.getLogger(__name__)
 
 
@@ -43,7 +43,7 @@ class PoseEstimate:
         points_rgb: their colours, [P, 3].
         mean_reprojection_px: over the observations in training frames; None without such.
         metric: true when the unit is the millimetre, from known depth.
-        account: counts of features, matches and registrations, ready for JSON.
+        report: counts of features, matches and registrations, ready for JSON.
     """
 
     method: Literal["colmap", "rgbd"]
@@ -53,12 +53,12 @@ class PoseEstimate:
     points_rgb: UInt8[np.ndarray, "p 3"]
     mean_reprojection_px: float | None
     metric: bool
-    account: dict[str, Any]
+    report: dict[str, Any]
 
     @property
     def summary(self) -> str:
         """One line for plans and logs."""
-        found = self.account
+        found = self.report
         by = "COLMAP" if self.method == "colmap" else "colour and depth"
         why = ""
         if "colmap" in found:
@@ -70,7 +70,7 @@ class PoseEstimate:
         )
 
 
-def estimate_poses(sequence: Sequence, config: PosesConfig) -> PoseEstimate:
+def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig) -> PoseEstimate:
     """Find the cameras of a sequence: by COLMAP, and where that fails, by colour and depth.
 
     *COLMAP*: SIFT inside the validity mask, known intrinsics held fixed, incremental mapping on the training
@@ -89,27 +89,27 @@ def estimate_poses(sequence: Sequence, config: PosesConfig) -> PoseEstimate:
         config: settings.
 
     Returns:
-        Poses of the frames that registered; the others are named in the log and in the account.
+        Poses of the frames that registered; the others are named in the log and in the report.
 
     Raises:
-        CaptureError: when too few training frames register, with an account of why; or when COLMAP's
+        CaptureError: when too few training frames register, with a report of why; or when COLMAP's
             process ends on its own.
 
     Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
     """
-    if len(sequence.train) < FEWEST_TRAINING_FRAMES:
+    if len(sequence.train) < MIN_TRAINING_FRAMES:
         raise CaptureError(
-            f"{sequence.name}: poses need at least {FEWEST_TRAINING_FRAMES} training frames, "
+            f"{sequence.name}: poses need at least {MIN_TRAINING_FRAMES} training frames, "
             f"found {len(sequence.train)}"
         )
     if config.fallback == "rgbd":
         return _by_depth(sequence, config, None)
     result = _run(_job(sequence, config), sequence.name)
     registered = np.isfinite(result.world_from_camera).all((1, 2))
-    account = colmap_account(sequence, result, registered)
-    if _enough(account, config):
-        _warn_of_missing(sequence, account)
-        return _from_colmap(sequence, result, registered, account)
+    report = colmap_report(sequence, result, registered)
+    if _enough(report, config):
+        _warn_of_missing(sequence, report)
+        return _from_colmap(sequence, result, registered, report)
     if config.fallback == "never":
         instead = "Alignment by colour and depth is switched off (poses.fallback)."
     elif sequence.depth_mm is None:
@@ -118,14 +118,14 @@ def estimate_poses(sequence: Sequence, config: PosesConfig) -> PoseEstimate:
         _LOG.warning(
             "%s: COLMAP registered %d of %d training frames; aligning by colour and depth instead",
             sequence.name,
-            account["registered_train"],
-            account["n_train"],
+            report["registered_train"],
+            report["n_train"],
         )
-        return _by_depth(sequence, config, account)
-    raise CaptureError(failure_message(sequence.name, account, config.min_registered_share, instead=instead))
+        return _by_depth(sequence, config, report)
+    raise CaptureError(failure_message(sequence.name, report, config.min_registered_share, instead=instead))
 
 
-def _job(sequence: Sequence, config: PosesConfig) -> PoseJob:
+def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
     recording = sequence.recording
     return PoseJob(
         rgb=sequence.rgb,
@@ -139,7 +139,7 @@ def _job(sequence: Sequence, config: PosesConfig) -> PoseJob:
 
 
 def _from_colmap(
-    sequence: Sequence, result: PoseJobResult, registered: np.ndarray, account: dict[str, Any]
+    sequence: EndoscopicSequence, result: PoseJobResult, registered: np.ndarray, report: dict[str, Any]
 ) -> PoseEstimate:
     poses, points = _cleaned(result.world_from_camera, registered), result.points
     scale = None
@@ -156,32 +156,34 @@ def _from_colmap(
     if scale is not None:
         poses[:, :3, 3] *= scale.mm_per_unit
         points = points * scale.mm_per_unit
-        account["scale"] = asdict(scale)
+        report["scale"] = asdict(scale)
     return PoseEstimate(
         method="colmap",
         world_from_camera=poses,
         registered=registered,
         points=points.astype(np.float32),
         points_rgb=result.points_rgb,
-        mean_reprojection_px=float(account["mean_reprojection_px"]),
+        mean_reprojection_px=float(report["mean_reprojection_px"]),
         metric=scale is not None,
-        account=account,
+        report=report,
     )
 
 
-def _by_depth(sequence: Sequence, config: PosesConfig, failed: dict[str, Any] | None) -> PoseEstimate:
-    """By colour and depth; `failed` is COLMAP's account, if it was asked first."""
+def _by_depth(
+    sequence: EndoscopicSequence, config: PosesConfig, failed: dict[str, Any] | None
+) -> PoseEstimate:
+    """By colour and depth; `failed` is COLMAP's report, if it was asked first."""
     found = align_by_depth(sequence, config)
     registered = np.isfinite(found.world_from_camera).all((1, 2))
-    account = found.account | frames_without_pose(sequence, registered)
+    report = found.report | frames_without_pose(sequence, registered)
     if failed is not None:
-        account["colmap"] = failed
-    if not _enough(account, config):
+        report["colmap"] = failed
+    if not _enough(report, config):
         message = (
-            f"{sequence.name}: alignment by colour and depth placed {account['registered_train']} of "
-            f"{account['n_train']} training frames, expected at least {config.min_registered_share:.0%}. "
-            f"Without a pose: {', '.join(account['unregistered_train'])}; of these without depth: "
-            f"{', '.join(account['without_depth']) or 'none'}. Give frames nearer together, or less "
+            f"{sequence.name}: alignment by colour and depth placed {report['registered_train']} of "
+            f"{report['n_train']} training frames, expected at least {config.min_registered_share:.0%}. "
+            f"Without a pose: {', '.join(report['unregistered_train'])}; of these without depth: "
+            f"{', '.join(report['without_depth']) or 'none'}. Give frames nearer together, or less "
             "noisy depth"
         )
         if failed is not None:
@@ -193,7 +195,7 @@ def _by_depth(sequence: Sequence, config: PosesConfig, failed: dict[str, Any] | 
             )
             message = f"{because} {message}"
         raise CaptureError(message)
-    _warn_of_missing(sequence, account)
+    _warn_of_missing(sequence, report)
     return PoseEstimate(
         method="rgbd",
         world_from_camera=_cleaned(found.world_from_camera, registered),
@@ -202,11 +204,11 @@ def _by_depth(sequence: Sequence, config: PosesConfig, failed: dict[str, Any] | 
         points_rgb=found.points_rgb,
         mean_reprojection_px=None,
         metric=sequence.metric,
-        account=account,
+        report=report,
     )
 
 
-def with_estimated_poses(sequence: Sequence, estimate: PoseEstimate) -> Sequence:
+def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -> EndoscopicSequence:
     """The sequence with poses and points, without the frames that did not register.
 
     Frames keep their names; the split is renumbered. `truth` is kept as it is.
@@ -289,17 +291,17 @@ def _cleaned(found: np.ndarray, registered: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _enough(account: dict[str, Any], config: PosesConfig) -> bool:
-    share = account["registered_train"] / account["n_train"]
-    return bool(account["registered_train"] > 0 and share >= config.min_registered_share)
+def _enough(report: dict[str, Any], config: PosesConfig) -> bool:
+    share = report["registered_train"] / report["n_train"]
+    return bool(report["registered_train"] > 0 and share >= config.min_registered_share)
 
 
-def _warn_of_missing(sequence: Sequence, account: dict[str, Any]) -> None:
+def _warn_of_missing(sequence: EndoscopicSequence, report: dict[str, Any]) -> None:
     for kind in ("train", "test"):
-        if account[f"unregistered_{kind}"]:
+        if report[f"unregistered_{kind}"]:
             _LOG.warning(
                 "%s: no pose for %s frames %s",
                 sequence.name,
                 "training" if kind == "train" else "held-out",
-                ", ".join(account[f"unregistered_{kind}"]),
+                ", ".join(report[f"unregistered_{kind}"]),
             )

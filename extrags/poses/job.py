@@ -65,7 +65,7 @@ class PoseJobResult:
         observed_frame: [O], training frames only.
         observed_point: [O], index into `points`.
         observed_px: [O, 2].
-        account: counts, ready for JSON.
+        report: counts, ready for JSON.
     """
 
     world_from_camera: np.ndarray
@@ -74,7 +74,7 @@ class PoseJobResult:
     observed_frame: np.ndarray
     observed_point: np.ndarray
     observed_px: np.ndarray
-    account: dict[str, Any]
+    report: dict[str, Any]
 
     def save(self, folder: Path) -> None:
         """Write the result."""
@@ -88,10 +88,10 @@ class PoseJobResult:
             observed_px=self.observed_px,
         )
         # Written last: its presence says that the result is whole.
-        (folder / "result.json").write_text(json.dumps(self.account))
+        (folder / "result.json").write_text(json.dumps(self.report))
 
     @classmethod
     def load(cls, folder: Path) -> PoseJobResult:
         """Read the result."""
         with np.load(folder / "result.npz") as arrays:
-            return cls(**dict(arrays.items()), account=json.loads((folder / "result.json").read_text()))
+            return cls(**dict(arrays.items()), report=json.loads((folder / "result.json").read_text()))

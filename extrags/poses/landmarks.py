@@ -12,14 +12,14 @@ from jaxtyping import Float, Int
 
 from extrags.cameras import invert_poses
 from extrags.metrics.pose import umeyama
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["Landmarks", "landmarks", "match_landmarks", "relative_pose"]
 
 FEATURES = 1500
 CONTRAST = 0.004
 RATIO = 0.9
-FEWEST_MATCHES = 8
+MIN_MATCHES = 8
 TRIPLETS = 400
 CLOSE_SHARE = 0.03
 """Landmarks that lie this near to each other, as a share of their depth, are the same."""
@@ -38,7 +38,7 @@ class Landmarks:
     descriptors: Float[np.ndarray, "n 128"]
 
 
-def landmarks(sequence: Sequence, frame: int) -> Landmarks:
+def landmarks(sequence: EndoscopicSequence, frame: int) -> Landmarks:
     """SIFT features of a frame, inside the mask and where depth is known.
 
     Source: Lowe: Distinctive image features from scale-invariant keypoints, IJCV 2004; root of the
@@ -105,7 +105,7 @@ def relative_pose(
     Source: Fischler and Bolles: Random sample consensus, CACM 1981.
     """
     matches = match_landmarks(moving, reference)
-    if len(matches) < FEWEST_MATCHES:
+    if len(matches) < MIN_MATCHES:
         return None, 0
     source, target = moving.points[matches[:, 0]], reference.points[matches[:, 1]]
     reach = CLOSE_SHARE * np.minimum(source[:, 2], target[:, 2])
@@ -116,14 +116,14 @@ def relative_pose(
         fits = _distances(motion, source, target) < reach
         if fits.sum() > best.sum():
             best = fits
-    if best.sum() < FEWEST_MATCHES:
+    if best.sum() < MIN_MATCHES:
         return None, int(best.sum())
     for _ in range(3):
         rigid = umeyama(source[best], target[best], with_scale=False)
         motion = np.eye(4)
         motion[:3, :3], motion[:3, 3] = rigid.rotation, rigid.translation
         fits = _distances(motion, source, target) < reach
-        if fits.sum() < FEWEST_MATCHES:
+        if fits.sum() < MIN_MATCHES:
             return None, int(fits.sum())
         best = fits
     return motion, int(best.sum())

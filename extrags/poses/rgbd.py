@@ -20,14 +20,14 @@ from extrags.poses.alignment import Agreement, Posed, agreement, align, moved, p
 from extrags.poses.depth_views import LEVELS, DepthView, depth_view
 from extrags.poses.landmarks import Landmarks, landmarks, relative_pose
 from extrags.poses.pairs import spread_evenly
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["RgbdAlignment", "align_by_depth"]
 
-LEAST_SURFACE = 0.6
+MIN_SURFACE = 0.6
 """Of the points of a frame that fall into placed frames, at least this share must meet their surface."""
-LEAST_OVERLAP = 0.15
-LEAST_EVIDENCE = 0.85
+MIN_OVERLAP = 0.15
+MIN_EVIDENCE = 0.85
 """Surface and texture together: a wall alone fits any other wall."""
 RECOGNISED = 15
 """So many landmarks that agree on a pose are evidence of their own."""
@@ -51,16 +51,16 @@ class RgbdAlignment:
             origin, lengths are those of the depth.
         points: of the surface the training frames show, [P, 3].
         points_rgb: their colours, [P, 3].
-        account: counts and residuals, ready for JSON.
+        report: counts and residuals, ready for JSON.
     """
 
     world_from_camera: Float[np.ndarray, "f 4 4"]
     points: Float[np.ndarray, "p 3"]
     points_rgb: UInt8[np.ndarray, "p 3"]
-    account: dict[str, Any]
+    report: dict[str, Any]
 
 
-def align_by_depth(sequence: Sequence, config: PosesConfig) -> RgbdAlignment:
+def align_by_depth(sequence: EndoscopicSequence, config: PosesConfig) -> RgbdAlignment:
     """Place the frames of a sequence by their colour and depth.
 
     A frame starts from where its predecessor is, from the same motion once more, and from where features it
@@ -80,7 +80,7 @@ def align_by_depth(sequence: Sequence, config: PosesConfig) -> RgbdAlignment:
 
 
 class _Alignment:
-    def __init__(self, sequence: Sequence, config: PosesConfig) -> None:
+    def __init__(self, sequence: EndoscopicSequence, config: PosesConfig) -> None:
         self.sequence, self.config = sequence, config
         frames = len(sequence)
         self.recording = (
@@ -212,7 +212,7 @@ class _Alignment:
             if other == without:
                 continue
             share = _overlap(Posed(view, pose), self.placed[other])
-            if share >= LEAST_OVERLAP:
+            if share >= MIN_OVERLAP:
                 scored.append((-share, other))
         return [self.placed[other] for _, other in sorted(scored)[:count]]
 
@@ -298,9 +298,9 @@ class _Alignment:
 
 
 def _convincing(fit: Agreement, recognised: int) -> bool:
-    if fit.overlap < LEAST_OVERLAP or fit.surface < LEAST_SURFACE:
+    if fit.overlap < MIN_OVERLAP or fit.surface < MIN_SURFACE:
         return False
-    return fit.surface + max(fit.texture, 0.0) >= LEAST_EVIDENCE or recognised >= RECOGNISED
+    return fit.surface + max(fit.texture, 0.0) >= MIN_EVIDENCE or recognised >= RECOGNISED
 
 
 def _overlap(moving: Posed, reference: Posed, stride: int = 8) -> float:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 __all__ = ["DepthScale", "depth_scale"]
 
-FEWEST_OBSERVATIONS = 20
+MIN_OBSERVATIONS = 20
 """A median over fewer is no measurement of scale."""
 
 
@@ -65,7 +65,7 @@ def depth_scale(
     pose = world_from_camera[frame]
     found = np.einsum("oi,oi->o", pose[:, :3, 2], points[point] - pose[:, :3, 3])
     counts = mask[frame, row, column] & np.isfinite(true) & (true > 0) & (found > 0)
-    if int(counts.sum()) < FEWEST_OBSERVATIONS:
+    if int(counts.sum()) < MIN_OBSERVATIONS:
         return None
     ratios = true[counts] / found[counts]
     median = float(np.median(ratios))

@@ -29,7 +29,7 @@ class SelectiveAdam:
 
     A step updates the rows flagged visible and leaves the others, their moments and their count of steps
     alone: untouched Gaussians cost nothing. The bias correction of a row counts that row's own steps, so
-    a row first seen late, or born in densification, starts as at step one. With all rows visible this is
+    a row first seen late, or added by densification, starts as at step one. With all rows visible this is
     `torch.optim.Adam`. The result depends on nothing but the inputs, whatever the number of threads.
 
     Parameters that are joined lie side by side in one array: the kernels that want them together need no
@@ -214,7 +214,7 @@ class SelectiveAdam:
             raise ShapeError(f"rows of {sorted(rows)}, expected {sorted(self.parameters)}")
         if len({len(value) for value in rows.values()}) > 1:
             raise ShapeError("the new rows differ in their number")
-        born = 0
+        new_gaussians = 0
         for name, value in self.parameters.items():
             new = rows[name].detach().to(value.dtype)
             if new.shape[1:] != value.shape[1:]:
@@ -222,11 +222,11 @@ class SelectiveAdam:
                     f"rows of {name} have shape {tuple(new.shape)}, expected (M, "
                     f"{', '.join(map(str, value.shape[1:]))})"
                 )
-            born = len(new)
+            new_gaussians = len(new)
             grown = torch.cat([value.detach(), new])
             self.parameters[name] = grown.requires_grad_(value.requires_grad)
             zeros = torch.zeros_like(new)
             self.first_moments[name] = torch.cat([self.first_moments[name], zeros])
             self.second_moments[name] = torch.cat([self.second_moments[name], zeros])
-        self.steps = torch.cat([self.steps, self.steps.new_zeros(born)])
+        self.steps = torch.cat([self.steps, self.steps.new_zeros(new_gaussians)])
         self._join()

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from extrags.raster.rotations import rotation_matrices
 
-__all__ = ["CameraLight", "developed", "light_gain", "lit_colors", "shortest_axes", "undeveloped"]
+__all__ = ["CameraLight", "apply_response", "invert_response", "light_gain", "lit_colors", "shortest_axes"]
 
 SQUARE_MIN = 1e-6
 """Nothing is nearer to the lamp than this (squared, in reference distances)."""
@@ -91,7 +91,7 @@ def lit_colors(
         light: a row of `CameraLight.packed`.
     """
     signal = albedo * light[:3] * light_gain(points, normals, light)[:, None]
-    return developed(signal, light[10])
+    return apply_response(signal, light[10])
 
 
 def light_gain(
@@ -111,12 +111,12 @@ def light_gain(
     return torch.exp2(logarithm.clamp(-LOG2_GAIN_MAX, LOG2_GAIN_MAX))
 
 
-def developed(signal: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
+def apply_response(signal: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
     """The camera's response I(x)."""
     return (1 + shoulder) * signal / (1 + shoulder * signal)
 
 
-def undeveloped(image: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
+def invert_response(image: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
     """The signal x whose response is I, for I in [0, 1]."""
     return image / (1 + shoulder * (1 - image))
 

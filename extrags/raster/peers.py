@@ -43,7 +43,7 @@ PEERS: dict[str, str] = {
     "gsplat": "gsplat's CUDA kernels",
 }
 
-MOST_ROUNDS = {"torch": 6, "reference": 3}
+MAX_ROUNDS = {"torch": 6, "reference": 3}
 """The slow ones run no oftener than this, one round of warming up included."""
 
 NOT_LEARNED = ("viewmats", "Ks", "target")
@@ -162,11 +162,11 @@ class Contestant:
     @property
     def finished(self) -> bool:
         """Whether a slow peer has run often enough."""
-        return len(self._wall) >= MOST_ROUNDS.get(self.backend, len(self._wall) + 1)
+        return len(self._wall) >= MAX_ROUNDS.get(self.backend, len(self._wall) + 1)
 
     def summary(self) -> dict[str, Any]:
         """Medians in milliseconds without the warming up, and the spread of the iteration."""
-        warm_up = 1 if self.backend in MOST_ROUNDS else 2
+        warm_up = 1 if self.backend in MAX_ROUNDS else 2
 
         def medians(record: list[dict[str, float]]) -> dict[str, float]:
             kept = record[warm_up:]

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +12,7 @@ from extrags.report.comparison import RenderedMethod, compared_rows
 from extrags.report.encode import DataImage
 from extrags.report.page import rendered_page
 from extrags.report.wording import count, duration, lpips_networks, number
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["BenchmarkInputs", "ComparedViews", "build_benchmark_report"]
 
@@ -61,7 +60,7 @@ class ComparedViews:
         contender: the other.
     """
 
-    sequence: Sequence
+    sequence: EndoscopicSequence
     label: str
     baseline: RenderedMethod
     contender: RenderedMethod
@@ -83,10 +82,10 @@ class BenchmarkInputs:
     """
 
     name: str
-    runs: AbstractSequence[Mapping[str, Any]]
+    runs: Sequence[Mapping[str, Any]]
     baseline: str
     methods: Mapping[str, str]
-    pictures: AbstractSequence[ComparedViews] = ()
+    pictures: Sequence[ComparedViews] = ()
     views: int = 4
     made: str = field(default="")
 
@@ -161,7 +160,7 @@ def _summary(comparison: Mapping[str, Any], inputs: BenchmarkInputs) -> str:
 
 
 def _rows(
-    rows: AbstractSequence[Mapping[str, Any]], columns: AbstractSequence[_Column], *, signed: bool = False
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], *, signed: bool = False
 ) -> list[dict[str, Any]]:
     return [
         {
@@ -214,7 +213,7 @@ def _sizes(row: Mapping[str, Any]) -> str:
 
 
 def _difference_chart(
-    rows: AbstractSequence[Mapping[str, Any]], columns: AbstractSequence[_Column], baseline: str
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], baseline: str
 ) -> tuple[DataImage, str] | None:
     panels = [column for column in columns if column.name in PANELS]
     if not rows or not panels:
@@ -234,7 +233,7 @@ def _difference_chart(
 
 
 def _figure_charts(
-    runs: AbstractSequence[Mapping[str, Any]], columns: AbstractSequence[_Column], inputs: BenchmarkInputs
+    runs: Sequence[Mapping[str, Any]], columns: Sequence[_Column], inputs: BenchmarkInputs
 ) -> list[tuple[DataImage, str]]:
     known = {column.name: column for column in columns}
     # Whole-mask figures only where the source cannot tell what was observed.
@@ -257,7 +256,7 @@ def _figure_charts(
 
 
 def _by_method(
-    runs: AbstractSequence[Mapping[str, Any]], values: AbstractSequence[float]
+    runs: Sequence[Mapping[str, Any]], values: Sequence[float]
 ) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
     for run, value in zip(runs, values, strict=True):

@@ -17,7 +17,7 @@ def calibration_chart(curves: Mapping[str, Mapping[str, Any]]) -> DataImage:
     """The plot for a page.
 
     Args:
-        curves: by label, what `extrags.enhance.calibration_table.calibration` returns.
+        curves: by label, what `extrags.restoration.uncertainty.reliability_diagram.calibration` returns.
 
     Raises:
         ConfigError: without any curve.
@@ -30,7 +30,7 @@ def write_calibration_plot(curves: Mapping[str, Mapping[str, Any]], path: Path) 
     """The plot as an image file; its suffix (`.png`, `.svg`, `.pdf`) names the format.
 
     Args:
-        curves: by label, what `extrags.enhance.calibration_table.calibration` returns.
+        curves: by label, what `extrags.restoration.uncertainty.reliability_diagram.calibration` returns.
         path: the file.
 
     Raises:

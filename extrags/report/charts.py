@@ -9,8 +9,7 @@ import io
 import re
 import textwrap
 import threading
-from collections.abc import Iterator, Mapping
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -103,7 +102,7 @@ def svg_image(figure: Any) -> DataImage:
     return DataImage(data_uri(text.encode("utf-8"), "image/svg+xml"), width, height)
 
 
-def history_chart(history: Mapping[str, AbstractSequence[Mapping[str, Any]]]) -> DataImage:
+def history_chart(history: Mapping[str, Sequence[Mapping[str, Any]]]) -> DataImage:
     """Training curves of the stages, one after the other on one axis of iterations.
 
     Args:
@@ -192,7 +191,7 @@ def views_chart(
         return svg_image(figure)
 
 
-def gain_chart(gains: AbstractSequence[float | int], colors: AbstractSequence[str]) -> DataImage:
+def gain_chart(gains: Sequence[float | int], colors: Sequence[str]) -> DataImage:
     """What each trajectory added, in the order of acceptance.
 
     Args:
@@ -212,7 +211,7 @@ def gain_chart(gains: AbstractSequence[float | int], colors: AbstractSequence[st
 
 
 def sequences_chart(
-    names: AbstractSequence[str],
+    names: Sequence[str],
     coarse: Float[np.ndarray, "s"],
     final: Float[np.ndarray, "s"],
     seconds: Float[np.ndarray, "s"],
@@ -249,7 +248,7 @@ def sequences_chart(
         return svg_image(figure)
 
 
-def method_colors(methods: AbstractSequence[str], baseline: str) -> dict[str, str]:
+def method_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
     """A colour per method: grey for the baseline, the accent for the first of the others."""
     others = [method for method in methods if method != baseline]
     colors = {method: METHOD_COLORS[index % len(METHOD_COLORS)] for index, method in enumerate(others)}
@@ -257,9 +256,9 @@ def method_colors(methods: AbstractSequence[str], baseline: str) -> dict[str, st
 
 
 def methods_chart(
-    groups: AbstractSequence[str],
-    values: Mapping[str, Mapping[str, AbstractSequence[float]]],
-    seconds: Mapping[str, Mapping[str, AbstractSequence[float]]],
+    groups: Sequence[str],
+    values: Mapping[str, Mapping[str, Sequence[float]]],
+    seconds: Mapping[str, Mapping[str, Sequence[float]]],
     colors: Mapping[str, str],
     title: str,
 ) -> DataImage:
@@ -304,8 +303,8 @@ def methods_chart(
 
 
 def pairs_chart(
-    panels: AbstractSequence[tuple[str, bool]],
-    rows: AbstractSequence[tuple[str, AbstractSequence[tuple[float, float | None, float | None] | None]]],
+    panels: Sequence[tuple[str, bool]],
+    rows: Sequence[tuple[str, Sequence[tuple[float, float | None, float | None] | None]]],
 ) -> DataImage:
     """Paired differences with their 95 % intervals, one panel per figure, zero marked.
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,7 +12,7 @@ from extrags.errors import ShapeError
 from extrags.report.encode import as_uint8
 from extrags.report.image_table import ImageTable, Judged, evenly_spaced, judged_table
 from extrags.report.wording import metric_of, number
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["RenderedMethod", "compared_rows"]
 
@@ -30,11 +29,14 @@ class RenderedMethod:
 
     name: str
     rgb: np.ndarray
-    per_view: AbstractSequence[Mapping[str, Any]]
+    per_view: Sequence[Mapping[str, Any]]
 
 
 def compared_rows(
-    sequence: Sequence, methods: tuple[RenderedMethod, RenderedMethod], views: int, largest_bytes: int
+    sequence: EndoscopicSequence,
+    methods: tuple[RenderedMethod, RenderedMethod],
+    views: int,
+    largest_bytes: int,
 ) -> ImageTable:
     """Both renders, the truth and both error maps of evenly spaced held-out views.
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -48,7 +47,7 @@ class DatasetRow:
     seconds: float | int
     coarse: Mapping[str, Any] | None = None
     final: Mapping[str, Any] | None = None
-    stages: AbstractSequence[Mapping[str, Any]] = ()
+    stages: Sequence[Mapping[str, Any]] = ()
     error: str = ""
     seed: int | None = None
     link: str = ""
@@ -60,7 +59,7 @@ class DatasetRow:
 
 
 def build_dataset_report(
-    rows: AbstractSequence[DatasetRow], *, name: str = "Dataset", made: str = "", profile: str = ""
+    rows: Sequence[DatasetRow], *, name: str = "Dataset", made: str = "", profile: str = ""
 ) -> str:
     """One self-contained HTML page that compares the sequences of a run.
 
@@ -112,7 +111,7 @@ def build_dataset_report(
     )
 
 
-def _summary(rows: AbstractSequence[DatasetRow]) -> str:
+def _summary(rows: Sequence[DatasetRow]) -> str:
     pairs = [pair for row in rows if (pair := _both(row, METRICS[0], ())) is not None]
     completed = sum(row.status == "completed" for row in rows)
     text = f"{completed} of {len(rows)} sequences completed."
@@ -126,7 +125,7 @@ def _summary(rows: AbstractSequence[DatasetRow]) -> str:
     )
 
 
-def _table_row(row: DatasetRow, metrics: AbstractSequence[Metric]) -> dict[str, Any]:
+def _table_row(row: DatasetRow, metrics: Sequence[Metric]) -> dict[str, Any]:
     states = [stage["state"] for stage in row.stages]
     said = [
         f"{states.count(state)} {state}"
@@ -153,7 +152,7 @@ def _both(row: DatasetRow, metric: Metric, path: tuple[str, ...]) -> tuple[float
     return None if coarse is None or final is None else (coarse, final)
 
 
-def _mean_cell(metric: Metric, rows: AbstractSequence[DatasetRow], path: tuple[str, ...]) -> dict[str, Any]:
+def _mean_cell(metric: Metric, rows: Sequence[DatasetRow], path: tuple[str, ...]) -> dict[str, Any]:
     pairs = [pair for row in rows if (pair := _both(row, metric, path)) is not None]
     if not pairs:
         return {"comparison": compare(metric, None, None), "deviation": ""}
@@ -162,7 +161,7 @@ def _mean_cell(metric: Metric, rows: AbstractSequence[DatasetRow], path: tuple[s
     return {"comparison": comparison, "deviation": _deviation(final - coarse, metric.digits)}
 
 
-def _seed_rows(rows: AbstractSequence[DatasetRow], metrics: AbstractSequence[Metric]) -> list[dict[str, Any]]:
+def _seed_rows(rows: Sequence[DatasetRow], metrics: Sequence[Metric]) -> list[dict[str, Any]]:
     groups: dict[str, list[DatasetRow]] = {}
     for row in rows:
         if row.seed is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ from extrags.report.encode import (
     fitted_image,
     outlined,
 )
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "ColorScale",
@@ -36,7 +36,7 @@ UNSEEN_RGB = (90, 220, 235)
 """Outline of surface no training frame saw: a cyan that magma does not hold."""
 SCALE_QUANTILE = 0.98
 """The colour scale ends here, so that holes and highlights do not flatten everything else."""
-LEAST_SCALE_END = 0.05
+FINAL_MIN_SCALE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,10 +97,10 @@ class Judged:
 
 
 def judged_table(
-    sequence: Sequence,
+    sequence: EndoscopicSequence,
     frames: Int[np.ndarray, "n"],
-    judged: AbstractSequence[Judged],
-    notes: AbstractSequence[str],
+    judged: Sequence[Judged],
+    notes: Sequence[str],
     total: int,
     largest_bytes: int,
 ) -> ImageTable:
@@ -155,12 +155,12 @@ def error_scale(high: float, label: str) -> ColorScale:
     return ColorScale(color_bar(ERROR_COLORMAP), "0", f"≥ {high:.2f}", label)
 
 
-def scale_end(parts: AbstractSequence[np.ndarray]) -> float:
+def scale_end(parts: Sequence[np.ndarray]) -> float:
     """Where a colour scale ends: a high quantile of all maps that share it, rounded up."""
     values = np.concatenate([part.ravel() for part in parts]) if parts else np.zeros(0)
     if not values.size:
-        return LEAST_SCALE_END
-    end = max(LEAST_SCALE_END, float(np.quantile(values, SCALE_QUANTILE)))
+        return FINAL_MIN_SCALE
+    end = max(FINAL_MIN_SCALE, float(np.quantile(values, SCALE_QUANTILE)))
     return float(np.ceil(end * 20 - 1e-9) / 20)
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -12,7 +11,7 @@ from jaxtyping import Float, Int
 
 from extrags.config import PipelineConfig
 from extrags.errors import ShapeError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["GridLike", "MeshLike", "PseudoLike", "RendersLike", "ReportInputs"]
 
@@ -39,7 +38,7 @@ class RendersLike(Protocol):
 
 @runtime_checkable
 class PseudoLike(Protocol):
-    """Virtual views before and after restoration: `extrags.enhance.pseudo.PseudoObservations`."""
+    """Virtual views before and after restoration: `extrags.pseudo_views.PseudoViews`."""
 
     @property
     def rendered(self) -> np.ndarray:
@@ -156,20 +155,20 @@ class ReportInputs:
     """
 
     name: str
-    sequence: Sequence
+    sequence: EndoscopicSequence
     held_out: Int[np.ndarray, "t"] | None = None
     coarse: RendersLike | None = None
     final: RendersLike | None = None
     coarse_metrics: Mapping[str, Any] | None = None
     final_metrics: Mapping[str, Any] | None = None
     pseudo: PseudoLike | None = None
-    trajectories: AbstractSequence[Float[np.ndarray, "_ 4 4"]] = ()
+    trajectories: Sequence[Float[np.ndarray, "_ 4 4"]] = ()
     exploration: Mapping[str, Any] | None = None
     grid: GridLike | None = None
     mesh: MeshLike | None = None
     plan: Mapping[str, Any] | None = None
-    stages: AbstractSequence[Mapping[str, Any]] = ()
-    history: Mapping[str, AbstractSequence[Mapping[str, Any]]] = field(default_factory=dict)
+    stages: Sequence[Mapping[str, Any]] = ()
+    history: Mapping[str, Sequence[Mapping[str, Any]]] = field(default_factory=dict)
     environment: Mapping[str, str] = field(default_factory=dict)
     config: PipelineConfig | None = None
     profile: str = ""

@@ -6,7 +6,7 @@ drawn, so that a tube is seen cut open, from whichever side one looks.
 
 from __future__ import annotations
 
-from collections.abc import Sequence as AbstractSequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,9 +20,9 @@ from extrags.report.inputs import GridLike, MeshLike
 
 __all__ = ["SceneFigure", "occupancy_slices", "scene_views", "trajectory_colors"]
 
-MOST_FACES = 20_000
+MAX_FACES = 20_000
 """Finer meshes are clustered: at this size of picture more would not be seen."""
-LEAST_ASPECT, MOST_ASPECT = 0.45, 1.1
+MIN_ASPECT, MAX_ASPECT = 0.45, 1.1
 """Bounds on height to width of the pictures, whatever the shape of the scene."""
 FRUSTUM_SHARE = 0.022
 """Drawn size of a camera, as a share of the picture's width."""
@@ -63,7 +63,7 @@ def trajectory_colors(count: int) -> list[str]:
 def scene_views(
     train: Cameras,
     held_out: Cameras,
-    trajectories: AbstractSequence[Float[np.ndarray, "_ 4 4"]],
+    trajectories: Sequence[Float[np.ndarray, "_ 4 4"]],
     mesh: MeshLike | None,
     grid: GridLike | None,
     *,
@@ -97,7 +97,7 @@ def scene_views(
     # One scale and one shape for all three, so that they stand in a row and can be compared.
     half = np.max([half for _, half in windows.values()], axis=0)
     half = np.where(half > 0, half, 1.0)  # a single camera has no extent
-    half = np.maximum(half, [half[1] / MOST_ASPECT, LEAST_ASPECT * half[0]])
+    half = np.maximum(half, [half[1] / MAX_ASPECT, MIN_ASPECT * half[0]])
     figures: list[SceneFigure] = []
     for title, turn in turns.items():
         window = (windows[title][0], half)
@@ -108,7 +108,7 @@ def scene_views(
 
 
 def occupancy_slices(
-    grid: GridLike, train: Cameras, trajectories: AbstractSequence[Float[np.ndarray, "_ 4 4"]]
+    grid: GridLike, train: Cameras, trajectories: Sequence[Float[np.ndarray, "_ 4 4"]]
 ) -> list[SceneFigure]:
     """The three slices of the grid through the median camera, with the cameras that lie in them.
 
@@ -161,7 +161,7 @@ def _clustered(vertices: np.ndarray, triangles: np.ndarray) -> Float[np.ndarray,
     diameter = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     cell = diameter / 400
     corners = vertices[triangles]
-    while len(corners) > MOST_FACES:
+    while len(corners) > MAX_FACES:
         _, label = np.unique(np.floor(vertices / cell).astype(np.int64), axis=0, return_inverse=True)
         label = label.reshape(-1)
         sums = np.stack([np.bincount(label, vertices[:, axis]) for axis in range(3)], axis=1)
@@ -203,7 +203,7 @@ def _scene_view(
     faces: _Faces | None,
     train: Cameras,
     held_out: Cameras,
-    trajectories: AbstractSequence[np.ndarray],
+    trajectories: Sequence[np.ndarray],
     window: tuple[np.ndarray, np.ndarray],
     unit: str,
     width_in: float,

@@ -24,7 +24,7 @@ from extrags.report.image_table import (
 )
 from extrags.report.inputs import PseudoLike, RendersLike, ReportInputs
 from extrags.report.wording import METRICS, metric_of, number
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["depth_rows", "held_out_rows", "virtual_rows"]
 
@@ -104,7 +104,9 @@ def depth_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> ImageTab
     return ImageTable(tuple(rows), scales, len(rows), len(inputs.frames))
 
 
-def virtual_rows(pseudo: PseudoLike, sequence: Sequence, views: int, largest_bytes: int) -> ImageTable:
+def virtual_rows(
+    pseudo: PseudoLike, sequence: EndoscopicSequence, views: int, largest_bytes: int
+) -> ImageTable:
     """Virtual views before and after restoration, evenly spaced over all trajectories.
 
     Args:

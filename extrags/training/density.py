@@ -62,14 +62,14 @@ class DensityRound:
 
     Args:
         keep: Gaussians that stay, over the set before the round, [N].
-        born: parameters of new Gaussians, appended after the kept ones.
+        new_gaussians: parameters of new Gaussians, appended after the kept ones.
         rewritten: rows, over the set before the round, that get other parameters in place, [R].
         values: their parameters.
         restarted: of the rewritten rows those that are new Gaussians and forget their moments, [R].
     """
 
     keep: Bool[Tensor, "n"]
-    born: dict[str, Tensor]
+    new_gaussians: dict[str, Tensor]
     rewritten: Int[Tensor, "r"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.long))
     values: dict[str, Tensor] = field(default_factory=dict)
     restarted: Bool[Tensor, "r"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.bool))
@@ -77,7 +77,7 @@ class DensityRound:
     @property
     def changed(self) -> bool:
         """Whether the set differs from before."""
-        return not bool(self.keep.all()) or len(self.born["means"]) > 0 or len(self.rewritten) > 0
+        return not bool(self.keep.all()) or len(self.new_gaussians["means"]) > 0 or len(self.rewritten) > 0
 
     @torch.no_grad()
     def apply(self, adam: SelectiveAdam) -> None:
@@ -91,8 +91,8 @@ class DensityRound:
             adam.steps[stale] = 0
         if not bool(self.keep.all()):
             adam.keep(self.keep)
-        if len(self.born["means"]):
-            adam.append(self.born)
+        if len(self.new_gaussians["means"]):
+            adam.append(self.new_gaussians)
 
 
 class DensityStrategy:
@@ -205,8 +205,8 @@ class DefaultStrategy(DensityStrategy):
             useless |= wide | (largest > limit)
         copies = _chosen(parameters, clones & ~useless)
         children = self._children(parameters, splits & ~useless_child)
-        born = {name: torch.cat([copies[name], children[name]]) for name in parameters}
-        return DensityRound(~(useless | splits), born)
+        new_gaussians = {name: torch.cat([copies[name], children[name]]) for name in parameters}
+        return DensityRound(~(useless | splits), new_gaussians)
 
     def reset_statistics(self, n_gaussians: int) -> None:
         """Start collecting anew."""

@@ -9,10 +9,10 @@ from scipy.spatial import cKDTree
 
 from extrags.cameras import pixel_rays
 from extrags.config import CoarseConfig, FinetuneConfig
-from extrags.enhance.pseudo import PseudoObservations
 from extrags.gaussians import Gaussians
+from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent
 from extrags.training.starting import median_depth, surface_normals, thin_out
@@ -29,10 +29,10 @@ UNKNOWN = 0.5
 CARVED_MARGIN = 0.05
 """A new Gaussian nearer than a real view's surface by this share of its depth would hide it."""
 
-FEWEST_POINTS = 8
+MIN_POINTS = 8
 """Fewer hole points have neither neighbours nor normals."""
 
-LEAST_GAIN = 0.05
+MIN_GAIN = 0.05
 """Albedo in a hole is no brighter than this much light allows: far and grazing guesses are not certain."""
 
 HOLE_STRIDE_PX = 2
@@ -41,8 +41,8 @@ HOLE_STRIDE_PX = 2
 
 def finetune(
     scene: Scene,
-    sequence: Sequence,
-    pseudo: PseudoObservations | None,
+    sequence: EndoscopicSequence,
+    pseudo: PseudoViews | None,
     config: FinetuneConfig,
     coarse: CoarseConfig,
 ) -> TrainingResult:
@@ -73,9 +73,9 @@ def finetune(
     max_gaussians = round(config.growth * coarse.densify.max_gaussians)
     if pseudo is not None and config.seed_holes:
         room = max_gaussians - len(scene.gaussians)
-        born = hole_gaussians(scene, sequence, pseudo, room, thickness=coarse.thickness)
-        if born is not None:
-            start = Scene(Gaussians.concatenated(scene.gaussians, born), scene.light)
+        new_gaussians = hole_gaussians(scene, sequence, pseudo, room, thickness=coarse.thickness)
+        if new_gaussians is not None:
+            start = Scene(Gaussians.concatenated(scene.gaussians, new_gaussians), scene.light)
     real = real_views(sequence, frames)
     virtual = [] if pseudo is None else virtual_views(pseudo, config)
     generator = np.random.default_rng(config.seed)
@@ -105,7 +105,7 @@ def _virtual_steps(config: FinetuneConfig, any_virtual: bool) -> Bool[np.ndarray
     return np.asarray(np.diff(np.floor(np.cumsum(share)), prepend=0) > 0)
 
 
-def virtual_views(pseudo: PseudoObservations, config: FinetuneConfig) -> list[View]:
+def virtual_views(pseudo: PseudoViews, config: FinetuneConfig) -> list[View]:
     """Pseudo-observations as views, with both levels of confidence as weights."""
     views = []
     confidence = np.maximum(pseudo.pixel_confidence, config.confidence_floor)
@@ -131,8 +131,8 @@ def virtual_views(pseudo: PseudoObservations, config: FinetuneConfig) -> list[Vi
 
 def hole_gaussians(
     scene: Scene,
-    sequence: Sequence,
-    pseudo: PseudoObservations,
+    sequence: EndoscopicSequence,
+    pseudo: PseudoViews,
     room: int,
     *,
     thickness: float = 1.0,
@@ -164,23 +164,23 @@ def hole_gaussians(
     rays = pixel_rays(cameras).reshape(-1, 3)[chosen]
     points = cameras.centers[view] + pseudo.depth_mm.reshape(-1)[chosen, None] * rays
     rgb = np.asarray(pseudo.target, dtype=np.float64).reshape(-1, 3)[chosen]
-    if len(points) < FEWEST_POINTS:
+    if len(points) < MIN_POINTS:
         return None
     if scene.light is not None:
         into_camera = cameras.world_from_camera[view, :3, :3]
         local = np.einsum("nji,nj->ni", into_camera, points - cameras.centers[view])
         normals = np.einsum("nji,nj->ni", into_camera, surface_normals(points))
         lit = torch.from_numpy(rgb), torch.from_numpy(local), torch.from_numpy(normals)
-        rgb = scene.light.albedo(*lit, least_gain=LEAST_GAIN).detach().numpy()
+        rgb = scene.light.albedo(*lit, min_gain=MIN_GAIN).detach().numpy()
     unseen = ~_in_front_of_real_surface(points, scene, sequence)
     points, rgb = points[unseen], rgb[unseen]
-    if len(points) < FEWEST_POINTS:
+    if len(points) < MIN_POINTS:
         return None
     spacing = _typical_spacing(scene.gaussians)
     points, rgb = _one_per_cell(points, rgb, spacing)
     points, rgb = thin_out(points, rgb, room)
     radius = np.full(len(points), 0.7 * spacing)
-    if len(points) < FEWEST_POINTS:
+    if len(points) < MIN_POINTS:
         return None
     return Gaussians.from_points(
         points,
@@ -217,7 +217,7 @@ def _one_per_cell(
 
 
 def _in_front_of_real_surface(
-    points: Float[np.ndarray, "n 3"], scene: Scene, sequence: Sequence
+    points: Float[np.ndarray, "n 3"], scene: Scene, sequence: EndoscopicSequence
 ) -> Bool[np.ndarray, "n"]:
     """Points that stand between a training camera and the surface it saw."""
     hides = np.zeros(len(points), dtype=bool)
@@ -237,7 +237,7 @@ def _in_front_of_real_surface(
     return hides
 
 
-def _real_depth(scene: Scene, sequence: Sequence, frame: int) -> Float[np.ndarray, "h w"]:
+def _real_depth(scene: Scene, sequence: EndoscopicSequence, frame: int) -> Float[np.ndarray, "h w"]:
     if sequence.depth_mm is not None:
         return np.asarray(np.where(sequence.mask[frame], sequence.depth_mm[frame], 0))
     with torch.no_grad():

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from extrags.cameras import Cameras, invert_poses
 from extrags.config import PoseRefinementConfig
 from extrags.errors import ShapeError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.training.starting import median_depth
 
 __all__ = ["PoseRefinement", "RefinedPoses", "with_refined_poses"]
@@ -138,7 +138,9 @@ class PoseRefinement:
         return math.exp((1 - share) * math.log(first) + share * math.log(last))
 
 
-def with_refined_poses(sequence: Sequence, refined: Float[np.ndarray, "m 4 4"]) -> Sequence:
+def with_refined_poses(
+    sequence: EndoscopicSequence, refined: Float[np.ndarray, "m 4 4"]
+) -> EndoscopicSequence:
     """The sequence with refined poses of its training frames; held-out frames go along with their neighbours.
 
     The correction of a held-out frame is the mean of the training frames' corrections, weighted by how near

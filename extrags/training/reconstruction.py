@@ -9,7 +9,7 @@ from extrags.config import CoarseConfig, DensifyConfig
 from extrags.errors import CaptureError
 from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.pose_refinement import PoseRefinement
 from extrags.training.schedule import Schedule
@@ -20,7 +20,7 @@ __all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent"]
 
 
 def reconstruct(
-    sequence: Sequence,
+    sequence: EndoscopicSequence,
     config: CoarseConfig,
     *,
     frames: Int[np.ndarray, "m"] | None = None,
@@ -70,7 +70,7 @@ def reconstruct(
     return optimise(Scene(gaussians, light), lambda _: views[next(order)], schedule, poses=poses)
 
 
-def refines_poses(sequence: Sequence, config: CoarseConfig) -> bool:
+def refines_poses(sequence: EndoscopicSequence, config: CoarseConfig) -> bool:
     """Whether `reconstruct` corrects poses: as the settings say; for `auto`, those that COLMAP estimated.
 
     Poses are refined once: those that came out of a reconstruction are left as they are.
@@ -106,7 +106,7 @@ def coarse_schedule(
     )
 
 
-def scene_extent(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> float:
+def scene_extent(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> float:
     """Length scale of positions: spread of the cameras, at least the median depth.
 
     3DGS takes the spread alone, which is nearly zero for a scope that hardly moves.

@@ -18,7 +18,7 @@ from extrags.training.density import DensityRound, DensityStrategy, Window
 
 __all__ = ["MCMCStrategy", "compute_relocation"]
 
-MOST_COPIES = 51
+MAX_COPIES = 51
 """More copies of one Gaussian than this are treated as this many, as in gsplat."""
 
 GROWTH = 1.05
@@ -49,12 +49,12 @@ def compute_relocation(
 
     Source: Kheradmand et al., 3D Gaussian Splatting as Markov Chain Monte Carlo, NeurIPS 2024, eq. 9.
     """
-    count = copies.clamp(1, MOST_COPIES)
+    count = copies.clamp(1, MAX_COPIES)
     old = opacities.double()
     new = -torch.expm1(torch.log1p(-old) / count)
-    k = torch.arange(1, MOST_COPIES + 1)
+    k = torch.arange(1, MAX_COPIES + 1)
     table = torch.tensor(
-        [[math.comb(n, j) for j in k.tolist()] for n in range(MOST_COPIES + 1)], dtype=torch.float64
+        [[math.comb(n, j) for j in k.tolist()] for n in range(MAX_COPIES + 1)], dtype=torch.float64
     )
     signed = table[count] * (1 - 2 * ((k - 1) % 2)) / k.double().sqrt()
     total = (signed * new[:, None] ** k).sum(1)
@@ -110,7 +110,7 @@ class MCMCStrategy(DensityStrategy):
         place = torch.searchsorted(rows, source)
         return DensityRound(
             keep=torch.ones_like(opacities, dtype=torch.bool),
-            born=_none(parameters),
+            new_gaussians=_none(parameters),
             rewritten=torch.cat([rows, dead]),
             values={name: torch.cat([value, value[place]]) for name, value in values.items()},
             restarted=torch.ones(len(rows) + len(dead), dtype=torch.bool),
@@ -128,7 +128,7 @@ class MCMCStrategy(DensityStrategy):
         place = torch.searchsorted(rows, source)
         return DensityRound(
             keep=torch.ones_like(opacities, dtype=torch.bool),
-            born={name: value[place] for name, value in values.items()},
+            new_gaussians={name: value[place] for name, value in values.items()},
             rewritten=rows,
             values=values,
             restarted=torch.zeros(len(rows), dtype=torch.bool),

@@ -11,7 +11,7 @@ from extrags.cameras import pixel_rays
 from extrags.errors import CaptureError
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["depth_from_points", "median_depth", "starting_gaussians", "surface_normals", "thin_out"]
 
@@ -22,7 +22,7 @@ MIN_POINTS_PER_VIEW = 20
 """A view with fewer visible sparse points gives no interpolated depth."""
 
 
-def median_depth(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> float:
+def median_depth(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> float:
     """Median distance from lens to surface over frames, in world units: the scene's length scale.
 
     Raises:
@@ -45,7 +45,7 @@ def median_depth(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> float:
 
 
 def starting_gaussians(
-    sequence: Sequence,
+    sequence: EndoscopicSequence,
     frames: Int[np.ndarray, "m"],
     max_points: int,
     *,
@@ -154,7 +154,9 @@ def _cell_keys(cells: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:
     return np.asarray((cells[:, 0] * span[1] + cells[:, 1]) * span[2] + cells[:, 2])
 
 
-def depth_from_points(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> Float[np.ndarray, "f h w"]:
+def depth_from_points(
+    sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]
+) -> Float[np.ndarray, "f h w"]:
     """Rough depth maps interpolated between the projections of sparse points.
 
     Only a start: linear inside the convex hull of the points in view, nearest outside it, nothing outside

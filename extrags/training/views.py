@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrags.cameras import Cameras
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 __all__ = ["SATURATED", "View", "epochs", "real_views"]
 
@@ -40,7 +40,7 @@ class View:
     loss_weight: float = 1.0
 
 
-def real_views(sequence: Sequence, frames: Int[np.ndarray, "m"]) -> list[View]:
+def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> list[View]:
     """The training frames as views; saturated pixels and specular highlights carry no weight."""
     cameras = sequence.cameras
     views = []

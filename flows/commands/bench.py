@@ -50,8 +50,8 @@ def enhance(given: argparse.Namespace) -> int:
 
     config = pipeline_config(given.profile, parsed_settings(given.settings), given.seed)
     from data_catalog.catalog import read, resolve
-    from extrags.enhance.bench import bench_enhance, check_methods
     from extrags.metrics.lpips import Lpips
+    from extrags.restoration.benchmark.comparison import bench_enhance, check_methods
     from tasks.weights import lpips_weights
 
     methods = check_methods(_items(given.methods))

@@ -16,7 +16,7 @@ from flows.terminal import console
 
 if TYPE_CHECKING:
     from extrags.config import IngestConfig
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
 
 __all__ = ["check", "list_all", "show"]
 
@@ -137,7 +137,7 @@ def _ingest(given: argparse.Namespace) -> IngestConfig:
     return pipeline_config("balanced", parsed_settings(given.settings)).ingest
 
 
-def _write_picture(sequence: Sequence, target: Path) -> None:
+def _write_picture(sequence: EndoscopicSequence, target: Path) -> None:
     from PIL import Image
 
     from data_catalog.inspection import contact_sheet

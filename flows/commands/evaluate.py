@@ -44,7 +44,7 @@ def _renders(given: argparse.Namespace, config: Any, root: str) -> dict[str, Any
     from extrags.metrics.folder import read_renders
     from extrags.metrics.lpips import Lpips
     from extrags.metrics.protocol import evaluate_views
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
     from flows.runners import DirectRunner
     from flows.wiring import SequenceRun
     from tasks.weights import lpips_weights
@@ -53,7 +53,7 @@ def _renders(given: argparse.Namespace, config: Any, root: str) -> dict[str, Any
     outcome = run.run("ingest")
     if outcome.error is not None:
         raise outcome.error
-    sequence = Sequence.load(run.store.open(run.refs["sequence"]) / "sequence")
+    sequence = EndoscopicSequence.load(run.store.open(run.refs["sequence"]) / "sequence")
     views = read_renders(
         Path(given.renders),
         sequence,

@@ -47,7 +47,7 @@ def _sequence(given: argparse.Namespace) -> int:
     from data_catalog.catalog import read
     from data_catalog.colmap_model import points_of, write_colmap
     from data_catalog.transforms_json import write_transforms
-    from extrags.sequence import Sequence
+    from extrags.sequence import EndoscopicSequence
 
     target = Path(given.output)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -56,7 +56,7 @@ def _sequence(given: argparse.Namespace) -> int:
     if sequence.world_from_camera is None:
         # Poses of a source that has none come from its run.
         run = _from_store(given, "poses")
-        sequence = Sequence.load(run.store.open(run.refs["poses"]) / "sequence")
+        sequence = EndoscopicSequence.load(run.store.open(run.refs["poses"]) / "sequence")
     found = points_of(sequence)
     points, points_rgb = found if found is not None else (None, None)
     try:

@@ -16,7 +16,7 @@ from flows.commands.common import set_up_logging
 from flows.terminal import console
 
 if TYPE_CHECKING:
-    from extrags.enhance.pretraining import PretrainingConfig
+    from extrags.restoration.diffusion.pretraining import PretrainingConfig
 
 __all__ = ["pretrain"]
 
@@ -29,21 +29,21 @@ def pretrain(given: argparse.Namespace) -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     import torch
 
-    from extrags.enhance.embedded import EmbeddedEnhancer
-    from extrags.enhance.pretraining import PretrainingConfig
-    from extrags.enhance.pretraining import pretrain as trained
     from extrags.raster.bench import machine
+    from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+    from extrags.restoration.diffusion.pretraining import PretrainingConfig
+    from extrags.restoration.diffusion.pretraining import pretrain as trained
     from flows.console import watched
 
     values = {
         "scenes": given.scenes,
-        "kept_back": given.kept_back,
+        "validation_scenes": given.validation_scenes,
         "iterations": given.iterations,
         "batch": given.batch,
         "learning_rate": given.learning_rate,
         "perceptual": not given.without_perceptual,
         "perceptual_weight": given.perceptual_weight,
-        "doubt_weight": given.doubt_weight,
+        "error_weight": given.error_weight,
         "deterministic": given.deterministic,
         "seed": given.seed,
     }
@@ -63,7 +63,7 @@ def pretrain(given: argparse.Namespace) -> int:
         enhancer = trained(files, config, start)
         replace(enhancer, record={**enhancer.record, **about}).save(Path(given.out), half=True)
     out = console()
-    for method, scores in enhancer.record["kept_back_scores"].items():
+    for method, scores in enhancer.record["validation_scores"].items():
         out.print(f"{method:12} " + "  ".join(f"{name} {value}" for name, value in scores.items()))
     out.print(f"written to {given.out}")
     return 0
@@ -78,9 +78,9 @@ def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
     """
     from extrags.metrics.lpips import find_weights
 
-    if config.kept_back >= config.scenes:
+    if config.validation_scenes >= config.scenes:
         raise ConfigError(
-            f"{config.kept_back} of {config.scenes} scenes are kept back; none is left to learn"
+            f"{config.validation_scenes} of {config.scenes} scenes are kept back; none is left to learn"
         )
     for name in ("workers", "threads"):
         value = getattr(given, name)
@@ -96,20 +96,20 @@ def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
 
 
 def make_scenes(folder: Path, count: int, workers: int) -> list[Path]:
-    """Practice scenes 0 to count - 1 as files; those that are there and made in the same way stay.
+    """Pretraining scenes 0 to count - 1 as files; those that are there and made in the same way stay.
 
     Args:
         folder: where they are kept.
         count: how many.
         workers: processes at once.
     """
-    from extrags.enhance.practice import PracticeScene
     from extrags.events import Progress, emit
+    from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 
     files = [folder / f"{index:04d}.safetensors" for index in range(count)]
-    missing = [index for index, file in enumerate(files) if PracticeScene.made_from(file) != origin(index)]
+    missing = [index for index, file in enumerate(files) if PretrainingScene.made_from(file) != origin(index)]
     done = count - len(missing)
-    emit(Progress("practice-scenes", done, count))
+    emit(Progress("pretraining-scenes", done, count))
     import multiprocessing
 
     # In processes of their own: they set their numbers of threads, and a fork would take over OpenMP's.
@@ -119,7 +119,7 @@ def make_scenes(folder: Path, count: int, workers: int) -> list[Path]:
             for future in running:
                 future.result()
                 done += 1
-                emit(Progress("practice-scenes", done, count))
+                emit(Progress("pretraining-scenes", done, count))
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
@@ -127,17 +127,17 @@ def make_scenes(folder: Path, count: int, workers: int) -> list[Path]:
 
 
 def origin(index: int) -> str:
-    """What a practice scene depends on, as text: a scene made otherwise is made again."""
+    """What a pretraining scene depends on, as text: a scene made otherwise is made again."""
     from data_catalog.phantom.config import GENERATOR_VERSION
-    from data_catalog.phantom.practice import practice_config
+    from data_catalog.phantom.pretraining import pretraining_scene_config
     from extrags.config import profile_config
-    from extrags.enhance.practice import PRACTICE_VERSION
+    from extrags.restoration.training_data.pretraining_scenes import PRETRAINING_DATA_VERSION
 
     quick = profile_config("quick")
     parts = {
         "generator": GENERATOR_VERSION,
-        "practice": PRACTICE_VERSION,
-        "phantom": practice_config(index).model_dump(mode="json"),
+        "data": PRETRAINING_DATA_VERSION,
+        "phantom": pretraining_scene_config(index).model_dump(mode="json"),
         "coarse": quick.coarse.model_dump(mode="json"),
         "references": quick.enhance.references,
     }
@@ -145,26 +145,34 @@ def origin(index: int) -> str:
 
 
 def make_scene(index: int, file: Path) -> None:
-    """One practice scene, on one thread: the same bits on every machine with the same instructions."""
+    """One pretraining scene, on one thread: the same bits on every machine with the same instructions."""
     import torch
 
-    from data_catalog.phantom.practice import practice_sequence
+    from data_catalog.phantom.pretraining import pretraining_sequence
     from extrags.config import profile_config
-    from extrags.enhance.practice import practise_scene
     from extrags.raster import set_num_threads
+    from extrags.restoration.training_data.pretraining_scenes import make_pretraining_scene
 
     torch.set_num_threads(1)
     set_num_threads(1)
     quick = profile_config("quick")
-    scene = practise_scene(practice_sequence(index), quick.enhance, quick.coarse, index)
+    scene = make_pretraining_scene(pretraining_sequence(index), quick.enhance, quick.coarse, index)
     scene.save(file, origin=origin(index))
 
 
 def _command(given: argparse.Namespace) -> str:
     parts = ["extrags pretrain"]
     for name in (
-        *("start", "scenes", "kept_back", "iterations", "batch", "learning_rate", "perceptual_weight"),
-        *("doubt_weight", "threads", "seed"),
+        *(
+            "start",
+            "scenes",
+            "validation_scenes",
+            "iterations",
+            "batch",
+            "learning_rate",
+            "perceptual_weight",
+        ),
+        *("error_weight", "threads", "seed"),
     ):
         value = getattr(given, name)
         if value is not None:

@@ -17,7 +17,7 @@ from flows.commands.common import parsed_settings, set_up_logging, store_root, w
 from flows.environment import prepare, without_heartbeat
 from flows.methods import METHODS, method_config, profile_label, refuse_pinned
 from flows.outcome import DatasetOutcome
-from flows.preflight import check_before
+from flows.preflight import preflight
 from flows.settings import STAGES, StageName
 
 __all__ = ["execute", "plan", "report", "run"]
@@ -126,7 +126,7 @@ def execute(
         if found is not None:
             return found
     # The flow looks as well; here it is said without waiting for a server.
-    check_before(config, until, METHODS[given.method].leave_out)
+    preflight(config, until, METHODS[given.method].leave_out)
     from flows.console import watched
     from flows.dataset import reconstruct_dataset
 

@@ -38,27 +38,38 @@ from extrags.assess import assess
 from extrags.cameras import Cameras, pixel_rays
 from extrags.confidence import PerceptualDifference
 from extrags.config import PipelineConfig
-from extrags.enhance.assessment import Trial, TrueViews, held_out_clips, restore_views
-from extrags.enhance.backends import load_enhancer
-from extrags.enhance.bench import METHODS, check_methods, coarse_scene, compare_methods, prepared
-from extrags.enhance.clips import choose_views, make_pseudo_observations
-from extrags.enhance.conditioning import LAYER_CHANNELS, Layers
-from extrags.enhance.embedded import EmbeddedEnhancer
-from extrags.enhance.gamut import Gamut
-from extrags.enhance.protocol import Clip, Enhancer
-from extrags.enhance.references import LightTransfer, ReferenceViews
-from extrags.explore import Exploration, explore
+from extrags.exploration import Exploration, explore
 from extrags.freespace import carve
 from extrags.metrics.image import mean_of_known, psnr
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.protocol import RenderedViews, evaluate_views
 from extrags.raster import set_num_threads
 from extrags.raster.bench import machine
+from extrags.restoration.backends import load_enhancer
+from extrags.restoration.benchmark.comparison import (
+    METHODS,
+    check_methods,
+    coarse_scene,
+    compare_methods,
+    prepared,
+)
+from extrags.restoration.benchmark.evaluation import (
+    RestorerBenchmark,
+    TrueViews,
+    held_out_clips,
+    restore_views,
+)
+from extrags.restoration.clips import choose_views, make_pseudo_observations
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.protocol import Clip, Enhancer
 from extrags.scene import Scene
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.surface import fuse_surface
 from extrags.training import finetune
 from extrags.training.finetuning import _virtual_steps
+from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
+from extrags.view_synthesis.gamut import Gamut
+from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 from flows.commands.common import parsed_settings
 from flows.settings import pipeline_config
 from tasks.weights import lpips_weights
@@ -71,10 +82,10 @@ TISSUE_PX = (192, 160)
 SHEET_ROWS = 8
 
 
-def loaded(name: str, config: PipelineConfig) -> Sequence:
-    """A sequence by name, or from a folder that `Sequence.save` wrote."""
+def loaded(name: str, config: PipelineConfig) -> EndoscopicSequence:
+    """A sequence by name, or from a folder that `EndoscopicSequence.save` wrote."""
     if (Path(name) / "zarr.json").exists():
-        return Sequence.load(Path(name))
+        return EndoscopicSequence.load(Path(name))
     return read(resolve(name), config.ingest)
 
 
@@ -204,7 +215,7 @@ def timed(seconds: dict[str, float], part: str) -> Iterator[None]:
 
 
 def explored(
-    scene: Scene, training: Sequence, config: PipelineConfig, seconds: dict[str, float]
+    scene: Scene, training: EndoscopicSequence, config: PipelineConfig, seconds: dict[str, float]
 ) -> tuple[Exploration, PipelineConfig]:
     """Trajectories as the pipeline's stages make them, and the settings with the plan's budgets."""
     cameras = training.cameras[training.train]
@@ -223,7 +234,7 @@ def explored(
         return explore(scene, training, space, config.explore), config
 
 
-def enduse(names: list[str], arms: list[str], configs: list[PipelineConfig], sink: Sink) -> list[Case]:
+def downstream(names: list[str], arms: list[str], configs: list[PipelineConfig], sink: Sink) -> list[Case]:
     cases: list[Case] = []
     for name in names:
         for config in configs:
@@ -233,7 +244,7 @@ def enduse(names: list[str], arms: list[str], configs: list[PipelineConfig], sin
     return cases
 
 
-def _arms(sequence: Sequence, arms: list[str], config: PipelineConfig) -> Iterator[Case]:
+def _arms(sequence: EndoscopicSequence, arms: list[str], config: PipelineConfig) -> Iterator[Case]:
     shared: dict[str, float] = {}
     with timed(shared, "coarse"):
         scene, posed = coarse_scene(sequence, config.coarse)
@@ -291,7 +302,7 @@ def _contents(scene: Scene) -> list[torch.Tensor]:
     return contents if scene.light is None else [*contents, *scene.light.parameters().values()]
 
 
-def rendered(scene: Scene, sequence: Sequence, frames: np.ndarray) -> RenderedViews:
+def rendered(scene: Scene, sequence: EndoscopicSequence, frames: np.ndarray) -> RenderedViews:
     gains = None
     if scene.light is not None:
         gains = scene.light.exposures_of(frames, sequence.train, sequence.recording)
@@ -308,7 +319,7 @@ def rendered(scene: Scene, sequence: Sequence, frames: np.ndarray) -> RenderedVi
     )
 
 
-def held_out_figures(scene: Scene, sequence: Sequence, lpips: Lpips | None) -> Case:
+def held_out_figures(scene: Scene, sequence: EndoscopicSequence, lpips: Lpips | None) -> Case:
     """Metrics of the protocol on held-out views, and the PSNR of the training views."""
     frames = np.asarray(sequence.test)
     metrics = evaluate_views(rendered(scene, sequence, frames), sequence, frames, lpips).metrics
@@ -333,7 +344,7 @@ def realism(
 ) -> list[Case]:
     cases: list[Case] = []
     lpips = perceptual(config)
-    trial = laparoscopy_trial(frames, config.enhance.seed, lpips)
+    benchmark = laparoscopy_benchmark(frames, config.enhance.seed, lpips)
     simple = [name for name in methods if METHODS[name].recipe in ("none", "classical")]
     scene, posed = coarse_scene(loaded(trained_on, config), config.coarse)
     wanted = simple if restorer is not None else methods
@@ -344,13 +355,13 @@ def realism(
     if restorer is not None:
         strangers.append((restorer.name, load_enhancer(restorer)))
     # As a scene's own frames would bound it.
-    truth = torch.from_numpy(trial.truth.rgb).permute(0, 3, 1, 2)
+    truth = torch.from_numpy(benchmark.truth.rgb).permute(0, 3, 1, 2)
     hues = Gamut.of_images(truth, torch.ones_like(truth[:, :1]))
     strangers = [
         (name, replace(enhancer, gamut=hues) if isinstance(enhancer, EmbeddedEnhancer) else enhancer)
         for name, enhancer in strangers
     ]
-    cases += shown(trial, strangers, folder / "laparoscopy.png", "laparoscopy", config.enhance.seed)
+    cases += shown(benchmark, strangers, folder / "laparoscopy.png", "laparoscopy", config.enhance.seed)
     sink(cases)
     scene, posed = coarse_scene(loaded("sinus/hopkins", config), config.coarse)
     training = posed.training_part()
@@ -359,28 +370,28 @@ def realism(
     clips = held_out_clips(scene, references, posed, test, count=config.enhance.references)
     natives = prepared(methods, scene, training, config.enhance, config.coarse)
     own = [(name, enhancer) for name, enhancer, _ in natives]
-    trial = Trial(clips, TrueViews.of_sequence(posed, test), lpips)
-    cases += shown(trial, own, folder / "sinus.png", posed.name, config.enhance.seed)
+    benchmark = RestorerBenchmark(clips, TrueViews.of_sequence(posed, test), lpips)
+    cases += shown(benchmark, own, folder / "sinus.png", posed.name, config.enhance.seed)
     sink(cases)
     return cases
 
 
 def shown(
-    trial: Trial, restorers: list[tuple[str, Enhancer]], file: Path, sequence: str, seed: int
+    benchmark: RestorerBenchmark, restorers: list[tuple[str, Enhancer]], file: Path, sequence: str, seed: int
 ) -> list[Case]:
     """Figures of each restorer, and a contact sheet: truth, rendering, restorations."""
-    columns = {"truth": trial.truth.rgb}
+    columns = {"truth": benchmark.truth.rgb}
     cases = []
     for name, enhancer in restorers:
-        restored = restore_views(enhancer, trial.clips)
+        restored = restore_views(enhancer, benchmark.clips)
         columns[name] = restored.rgb
-        found = trial.figures(restored)
+        found = benchmark.figures(restored)
         cases.append({"sequence": sequence, "seed": seed, "method": name, **found})
     contact_sheet(columns, file)
     return cases
 
 
-def laparoscopy_trial(frames: int, seed: int, lpips: Lpips | None) -> Trial:
+def laparoscopy_benchmark(frames: int, seed: int, lpips: Lpips | None) -> RestorerBenchmark:
     """Real frames with holes and blur, at a constant depth, without any real view to borrow from."""
     from PIL import Image
 
@@ -396,7 +407,7 @@ def laparoscopy_trial(frames: int, seed: int, lpips: Lpips | None) -> Trial:
     rgb = np.stack(images)
     mask = np.ones(rgb.shape[:3], bool)
     clips = [degraded_clip(image, index, seed) for index, image in enumerate(rgb)]
-    return Trial(clips, TrueViews(rgb, mask), lpips)
+    return RestorerBenchmark(clips, TrueViews(rgb, mask), lpips)
 
 
 def tissue_box(picture: np.ndarray) -> tuple[float, float, float, float]:
@@ -495,7 +506,7 @@ def main() -> int:
         cases = table(given.sequences, methods, configs, sink)
         said = markdown(cases, RESTORED, "method", ["none", "classical"], quality)
     elif given.what == "enduse":
-        cases = enduse(given.sequences, given.arms, configs, sink)
+        cases = downstream(given.sequences, given.arms, configs, sink)
         said = markdown(
             cases,
             FINE_TUNED,

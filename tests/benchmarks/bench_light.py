@@ -33,7 +33,7 @@ from extrags.metrics.image import mean_of_known, psnr, ssim
 from extrags.raster import SelectiveAdam, l1_ssim_loss, rasterize, set_num_threads
 from extrags.raster.bench import STANDARD_SIZES, bench_scene, machine
 from extrags.scene import Scene
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 from extrags.training import reconstruct
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -62,7 +62,9 @@ def settings(profile: str, changes: dict[str, Any], seed: int) -> CoarseConfig:
     return CoarseConfig.model_validate({**tree, "seed": seed})
 
 
-def rendered(scene: Scene, sequence: Sequence, frames: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
+def rendered(
+    scene: Scene, sequence: EndoscopicSequence, frames: np.ndarray
+) -> tuple[torch.Tensor, torch.Tensor]:
     exposure = None
     if scene.light is not None:
         exposure = scene.light.exposures_of(frames, sequence.train, sequence.recording)
@@ -71,7 +73,7 @@ def rendered(scene: Scene, sequence: Sequence, frames: np.ndarray) -> tuple[torc
     return shown.rgb.clamp(0, 1).double(), shown.depth
 
 
-def figures(scene: Scene, sequence: Sequence) -> dict[str, float]:
+def figures(scene: Scene, sequence: EndoscopicSequence) -> dict[str, float]:
     """Of held-out views, observed pixels: PSNR plain and aligned, SSIM, AbsRel; PSNR of training views."""
     result: dict[str, list[float | None]] = {}
 
@@ -267,7 +269,7 @@ def cost(rounds: int = 40) -> list[dict[str, Any]]:
     return cases
 
 
-def block_world(*, width: int = 160, height: int = 128, views: int = 48) -> Sequence:
+def block_world(*, width: int = 160, height: int = 128, views: int = 48) -> EndoscopicSequence:
     """Painted blocks on a plate under uniform light, photographed from a dome; every 8th view is held out."""
     import open3d as o3d
 
@@ -307,7 +309,7 @@ def block_world(*, width: int = 160, height: int = 128, views: int = 48) -> Sequ
             image = np.where(np.isfinite(z)[..., None], paint[owner, checks], 0.0)
             rgb.append(image.reshape(height, 2, width, 2, 3).mean((1, 3)))
     held = np.arange(views) % 8 == 4
-    return Sequence(
+    return EndoscopicSequence(
         name="blocks",
         rgb=(np.stack(rgb) * 255).round().astype(np.uint8),
         K=cameras.K,

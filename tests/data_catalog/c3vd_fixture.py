@@ -17,7 +17,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from extrags.cameras import invert_poses
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 PUBLISHED = {
     "c3vd": {
@@ -176,7 +176,7 @@ def write_calibration(file: Path, width: int, height: int, **changes: object) ->
     file.write_text(json.dumps({key: value for key, value in content.items() if value is not None}))
 
 
-def reprojection_mm(sequence: Sequence, first: int, second: int) -> tuple[float, float]:
+def reprojection_mm(sequence: EndoscopicSequence, first: int, second: int) -> tuple[float, float]:
     """Depth of one frame carried into another: median difference where they agree, share that agrees."""
     K, z = sequence.K[first], sequence.depth_mm[first].astype(float)
     row, column = np.nonzero(z > 0)

@@ -14,24 +14,24 @@ from PIL import Image
 
 from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.recording import record
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from tests.data_catalog.layouts import first_frames
 
 SMALL = {"width": 64, "height": 51}
 
 
 @pytest.fixture(scope="session")
-def sparse() -> Sequence:
+def sparse() -> EndoscopicSequence:
     return record(PhantomConfig(scene=0, setting="sparse", **SMALL), "phantom/0@sparse")
 
 
 @pytest.fixture(scope="session")
-def distanced() -> Sequence:
+def distanced() -> EndoscopicSequence:
     return record(PhantomConfig(scene=0, setting="distanced", **SMALL), "phantom/0@distanced")
 
 
 @pytest.fixture(scope="session")
-def clip() -> Sequence:
+def clip() -> EndoscopicSequence:
     """Ten neighbouring frames with depth, poses and texture enough to match: what importers are given."""
     config = PhantomConfig(
         scene=1, width=96, height=77, train_every=20, test_frames=1, shadows=False, supersample=1

@@ -9,10 +9,10 @@ import numpy as np
 from PIL import Image
 
 from extrags.cameras import invert_poses
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 
-def first_frames(sequence: Sequence, count: int) -> Sequence:
+def first_frames(sequence: EndoscopicSequence, count: int) -> EndoscopicSequence:
     """The first frames, the very first of them held out."""
     kept = np.arange(count)
     return replace(
@@ -30,7 +30,7 @@ def first_frames(sequence: Sequence, count: int) -> Sequence:
     )
 
 
-def carried_error_mm(sequence: Sequence) -> float:
+def carried_error_mm(sequence: EndoscopicSequence) -> float:
     """Depth of frame i carried into frame j and compared there: median over neighbouring frames, in mm."""
     assert sequence.depth_mm is not None
     cameras = sequence.cameras
@@ -56,7 +56,7 @@ def carried_error_mm(sequence: Sequence) -> float:
     return float(np.median(np.concatenate(errors)))
 
 
-def same_frames(first: Sequence, second: Sequence, *, atol: float) -> None:
+def same_frames(first: EndoscopicSequence, second: EndoscopicSequence, *, atol: float) -> None:
     """Everything an exporter promises to keep."""
     np.testing.assert_array_equal(first.rgb, second.rgb)
     np.testing.assert_array_equal(first.mask, second.mask)
@@ -70,7 +70,7 @@ def same_frames(first: Sequence, second: Sequence, *, atol: float) -> None:
     np.testing.assert_array_equal(first.test, second.test)
 
 
-def with_tool(sequence: Sequence) -> tuple[Sequence, np.ndarray]:
+def with_tool(sequence: EndoscopicSequence) -> tuple[EndoscopicSequence, np.ndarray]:
     """The sequence with a grey instrument in every frame, and where it is."""
     rgb, tool = sequence.rgb.copy(), np.zeros(sequence.mask.shape, dtype=bool)
     for k in range(len(sequence)):
@@ -80,7 +80,7 @@ def with_tool(sequence: Sequence) -> tuple[Sequence, np.ndarray]:
 
 
 def write_endonerf(
-    sequence: Sequence, folder: Path, masks: np.ndarray | None = None, *, mask_folder: str = "masks"
+    sequence: EndoscopicSequence, folder: Path, masks: np.ndarray | None = None, *, mask_folder: str = "masks"
 ) -> None:
     """EndoNeRF's layout: LLFF axes (down, right, backward), depth as 16-bit PNG, masks as given."""
     assert sequence.depth_mm is not None

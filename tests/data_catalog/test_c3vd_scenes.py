@@ -23,7 +23,7 @@ from data_catalog.catalog import (
 from extrags.cameras import invert_poses
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError, UnknownSequenceError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from tests.data_catalog.c3vd_fixture import (
     lens_rays,
     reprojection_mm,
@@ -287,7 +287,7 @@ def simulated(shared_data: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def simulated_sparse(simulated: Path) -> Sequence:
+def simulated_sparse(simulated: Path) -> EndoscopicSequence:
     return read(f"{SCENE}@sparse")
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from data_catalog.checks import check_depth_scale, check_sequence
+from data_catalog.diagnostics import diagnose
 from data_catalog.inspection import contact_sheet, facts, inspect
 from data_catalog.matches import match_neighbours, pose_support
-from data_catalog.suspicions import suspicions
 from extrags.cameras import invert_poses
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, UnknownSequenceError
@@ -18,8 +18,8 @@ from extrags.errors import SourceError, UnknownSequenceError
 
 class TestRightSources:
     def test_the_phantom(self, sparse, distanced) -> None:
-        assert suspicions(sparse, "phantom") == []
-        assert suspicions(distanced, "phantom") == []
+        assert diagnose(sparse, "phantom") == []
+        assert diagnose(distanced, "phantom") == []
 
     @pytest.mark.parametrize("name", ["sinus_hopkins", "simcol3d_s1", "c3vdv2_sim/c9_transverse1_t3_v1"])
     def test_shared_data(self, shared_data, name) -> None:

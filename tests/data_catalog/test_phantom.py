@@ -12,7 +12,7 @@ from data_catalog.phantom.trajectories import MIN_CLEARANCE_MM, camera_path
 from data_catalog.ray_casting import RayCaster
 from data_catalog.visibility import observed_from_depth
 from extrags.cameras import Cameras, invert_poses, pixel_rays
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 
 def carried(
@@ -49,14 +49,16 @@ class TestGroundTruth:
         assert len(np.concatenate(errors)) > 10_000
         assert np.median(np.concatenate(errors)) < 0.2
 
-    def test_depth_lies_on_the_wall(self, sparse: Sequence) -> None:
+    def test_depth_lies_on_the_wall(self, sparse: EndoscopicSequence) -> None:
         wall = build_wall(PhantomConfig(scene=0))
         assert sparse.depth_mm is not None
         rays = pixel_rays(sparse.cameras[25])[0]
         points = sparse.cameras.centers[25] + rays * sparse.depth_mm[25][..., None]
         assert RayCaster(wall.vertices, wall.triangles).clearance_mm(points.reshape(-1, 3)).max() < 0.01
 
-    def test_observed_agrees_with_a_depth_test(self, sparse: Sequence, distanced: Sequence) -> None:
+    def test_observed_agrees_with_a_depth_test(
+        self, sparse: EndoscopicSequence, distanced: EndoscopicSequence
+    ) -> None:
         """Occlusion rays and training depth maps are two ways to the same answer, but for pixel borders."""
         for sequence in (sparse, distanced):
             assert sequence.depth_mm is not None
@@ -68,7 +70,7 @@ class TestGroundTruth:
             assert agreement > 0.97
             assert not sequence.observed[sequence.train].any()
 
-    def test_every_pixel_has_depth(self, sparse: Sequence, distanced: Sequence) -> None:
+    def test_every_pixel_has_depth(self, sparse: EndoscopicSequence, distanced: EndoscopicSequence) -> None:
         for sequence in (sparse, distanced):
             assert sequence.depth_mm is not None
             assert (sequence.depth_mm > 3).all()
@@ -95,16 +97,16 @@ class TestGroundTruth:
         assert matched > 0.6
         assert abs(shifted) < 0.25
 
-    def test_truth_is_json_and_survives_the_disk(self, sparse: Sequence, tmp_path) -> None:
+    def test_truth_is_json_and_survives_the_disk(self, sparse: EndoscopicSequence, tmp_path) -> None:
         sparse.save(tmp_path / "sequence")
-        again = Sequence.load(tmp_path / "sequence")
+        again = EndoscopicSequence.load(tmp_path / "sequence")
         assert again.truth["separation"] == sparse.truth["separation"]
         assert len(again.truth["exposure"]) == len(sparse)
         np.testing.assert_array_equal(again.rgb, sparse.rgb)
 
 
 class TestRecordings:
-    def test_default_split(self, sparse: Sequence) -> None:
+    def test_default_split(self, sparse: EndoscopicSequence) -> None:
         assert len(sparse.train) == 20
         assert len(sparse.test) == 28
         assert sparse.recording is not None
@@ -113,7 +115,9 @@ class TestRecordings:
         # Every tenth frame of a video of 200.
         assert [sparse.frame_name(int(k)) for k in sparse.train[:3]] == ["b_0000", "b_0010", "b_0020"]
 
-    def test_settings_share_the_training_frames(self, sparse: Sequence, distanced: Sequence) -> None:
+    def test_settings_share_the_training_frames(
+        self, sparse: EndoscopicSequence, distanced: EndoscopicSequence
+    ) -> None:
         np.testing.assert_array_equal(sparse.rgb[sparse.train], distanced.rgb[distanced.train])
         assert not np.array_equal(sparse.rgb[sparse.test], distanced.rgb[distanced.test])
 
@@ -140,7 +144,7 @@ class TestRecordings:
                 steps = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
                 assert steps.max() < 2.5  # a path, not jumps: about 0.8 mm a step
 
-    def test_poses_are_rigid(self, distanced: Sequence) -> None:
+    def test_poses_are_rigid(self, distanced: EndoscopicSequence) -> None:
         poses = distanced.cameras.world_from_camera
         product = invert_poses(poses) @ poses
         np.testing.assert_allclose(product, np.broadcast_to(np.eye(4), poses.shape), atol=1e-12)
@@ -148,7 +152,7 @@ class TestRecordings:
 
 
 class TestImages:
-    def test_looks_like_mucosa(self, sparse: Sequence, distanced: Sequence) -> None:
+    def test_looks_like_mucosa(self, sparse: EndoscopicSequence, distanced: EndoscopicSequence) -> None:
         for sequence in (sparse, distanced):
             mean = sequence.rgb.mean(axis=(0, 1, 2))
             assert mean[0] > 1.3 * mean[1] > 1.3 * mean[2]
@@ -156,12 +160,12 @@ class TestImages:
             assert (sequence.rgb >= 250).any(axis=-1).mean() < 0.03
             assert (sequence.rgb.max(axis=-1) < 8).mean() < 0.05
 
-    def test_light_falls_with_distance(self, sparse: Sequence) -> None:
+    def test_light_falls_with_distance(self, sparse: EndoscopicSequence) -> None:
         assert sparse.depth_mm is not None
         grey = np.log(np.maximum(sparse.rgb[5].mean(axis=-1), 1))
         assert np.corrcoef(grey.ravel(), np.log(sparse.depth_mm[5]).ravel())[0, 1] < -0.7
 
-    def test_recordings_differ_in_exposure(self, sparse: Sequence) -> None:
+    def test_recordings_differ_in_exposure(self, sparse: EndoscopicSequence) -> None:
         gains = [sparse.truth["sensor"][letter]["gain"] for letter in "ab"]
         assert 0.005 < abs(gains[0] / gains[1] - 1) < 0.2
 
@@ -188,7 +192,7 @@ class TestDeterminism:
         np.testing.assert_array_equal(first.depth_mm, second.depth_mm)
         assert first.truth == second.truth
 
-    def test_a_frame_does_not_depend_on_its_company(self, sparse: Sequence) -> None:
+    def test_a_frame_does_not_depend_on_its_company(self, sparse: EndoscopicSequence) -> None:
         """Rendering fewer frames renders the same frames."""
         few = record(PhantomConfig(scene=0, max_frames=5, width=64, height=51), "x")
         for k in range(len(few)):

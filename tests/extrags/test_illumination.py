@@ -50,14 +50,14 @@ class TestNearFieldLight:
         points = torch.tensor([[0.0, 0.0, 3.0], [30.0, 5.0, 40.0]])
         normals = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
         torch.testing.assert_close(dark.gain(points, normals), torch.ones(2))
-        assert torch.equal(dark.developed(points), points)
+        assert torch.equal(dark.apply_response(points), points)
 
     def test_albedo_is_what_the_light_and_the_response_leave(self) -> None:
         start = NearFieldLight.initial(1, 25.0)
         albedo = torch.tensor([[0.2, 0.4, 0.6], [0.9, 0.5, 0.1]])
         points = torch.tensor([[4.0, -3.0, 20.0], [0.0, 10.0, 60.0]])
         normals = torch.nn.functional.normalize(torch.tensor([[0.3, 0.2, -1.0], [0.0, -1.0, 0.3]]), dim=-1)
-        seen = start.developed(albedo * start.gain(points, normals)[:, None])
+        seen = start.apply_response(albedo * start.gain(points, normals)[:, None])
         torch.testing.assert_close(start.albedo(seen, points, normals), albedo)
 
     def test_falloff_is_the_gain_of_surfaces_that_face_the_lens(self) -> None:

@@ -8,13 +8,13 @@ import pytest
 import zarr
 
 from extrags.errors import ShapeError
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 from extrags.store.manifest import content_digest
 
 
-def small_sequence(frames: int = 4) -> Sequence:
+def small_sequence(frames: int = 4) -> EndoscopicSequence:
     generator = np.random.default_rng(0)
-    return Sequence(
+    return EndoscopicSequence(
         name="test/0@half",
         rgb=generator.integers(0, 255, (frames, 6, 8, 3), dtype=np.uint8),
         K=np.tile(np.array([[8.0, 0, 4], [0, 8.0, 3], [0, 0, 1]]), (frames, 1, 1)),
@@ -35,7 +35,7 @@ class TestSequence:
     def test_round_trip_through_zarr(self, tmp_path: Path) -> None:
         sequence = small_sequence()
         sequence.save(tmp_path / "sequence")
-        loaded = Sequence.load(tmp_path / "sequence")
+        loaded = EndoscopicSequence.load(tmp_path / "sequence")
         for name in ("rgb", "K", "mask", "world_from_camera", "depth_mm", "recording", "observed",
                      "points", "points_rgb"):  # fmt: skip
             np.testing.assert_array_equal(getattr(loaded, name), getattr(sequence, name))
@@ -48,7 +48,7 @@ class TestSequence:
     def test_absent_parts_stay_absent(self, tmp_path: Path) -> None:
         bare = replace(small_sequence(), depth_mm=None, points=None, world_from_camera=None)
         bare.save(tmp_path / "sequence")
-        loaded = Sequence.load(tmp_path / "sequence")
+        loaded = EndoscopicSequence.load(tmp_path / "sequence")
         assert loaded.depth_mm is None
         assert loaded.points is None
         with pytest.raises(ShapeError, match="no poses"):

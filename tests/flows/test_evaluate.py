@@ -13,7 +13,7 @@ from PIL import Image
 
 from extrags.errors import ConfigError
 from extrags.metrics.protocol import RenderedViews
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from flows.cli import main
 from flows.commands.benchmark import items, parsed_seeds, parsed_variants
 from flows.outcome import SequenceOutcome
@@ -37,7 +37,7 @@ def folders(finished: tuple[str, SequenceOutcome], tmp_path_factory: pytest.Temp
     _, outcome = finished
     root = tmp_path_factory.mktemp("elsewhere")
     views = RenderedViews.load(Path(outcome.artefacts["renders_final"]) / "renders")
-    sequence = Sequence.load(Path(outcome.artefacts["sequence"]) / "sequence")
+    sequence = EndoscopicSequence.load(Path(outcome.artefacts["sequence"]) / "sequence")
     for name in ("renders", "depth"):
         (root / name).mkdir()
     for index, frame in enumerate(sequence.test):

@@ -11,21 +11,21 @@ from typing import Any
 import pytest
 
 from extrags.config import EnhanceConfig
-from extrags.enhance.pretrained.enhancer import ADAPTERS
 from extrags.errors import ConfigError, WeightsError
+from extrags.restoration.pretrained.enhancer import ADAPTERS
 from extrags.store import Ref, Store
 from flows.benchmark import benchmark
 from flows.cli import main
 from flows.methods import METHODS
 from flows.outcome import SequenceOutcome
-from flows.preflight import check_before
+from flows.preflight import preflight
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.settings import pipeline_config
 from flows.wiring import run_sequence
 from tasks.enhance import train
 from tasks.stage import stage_key
 from tasks.weights import restorer_digest
-from tests.extrags.enhance.pretrained.fake_clone import write_clone
+from tests.extrags.restoration.pretrained.fake_clone import write_clone
 from tests.flows.tiny import SEQUENCE, tiny_config
 
 MISSING = {"enhance.pretrained_weights": "no/such.safetensors"}
@@ -102,11 +102,11 @@ class TestSentences:
 class TestWhatIsLookedFor:
     def test_nothing_that_the_run_does_not_reach(self) -> None:
         config = pipeline_config("quick", MISSING)
-        check_before(config, "explore")
-        check_before(config, "report", METHODS["coarse"].leave_out)
+        preflight(config, "explore")
+        preflight(config, "report", METHODS["coarse"].leave_out)
         for until in ("enhance", "report"):
             with pytest.raises(WeightsError, match="no/such"):
-                check_before(config, until)
+                preflight(config, until)
 
     @pytest.mark.usefixtures("prefect_server")
     def test_a_benchmark_looks_before_its_first_run(self, tmp_path: Path) -> None:

@@ -7,23 +7,23 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.enhance.conditioning import LAYER_CHANNELS, Layers
-from extrags.enhance.embedded import EmbeddedEnhancer
-from extrags.enhance.pairs import Pairs
-from extrags.enhance.practice import PracticeScene
-from extrags.enhance.references import LightTransfer
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.training_data.pairs import Pairs
+from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
+from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
+from extrags.view_synthesis.references import LightTransfer
 from flows.cli import main
 from flows.commands import pretrain as command
 from flows.commands.pretrain import make_scenes, origin
 
 
-def small_scene(seed: int) -> PracticeScene:
+def small_scene(seed: int) -> PretrainingScene:
     generator = torch.Generator().manual_seed(seed)
     layers = torch.rand(2, LAYER_CHANNELS, 40, 48, generator=generator)
     layers[:, 4] = 20 + 10 * layers[:, 4]
     layers[:, 16] = 1 + 0.2 * layers[:, 16]
     none = np.zeros(2, dtype=bool)
-    return PracticeScene(
+    return PretrainingScene(
         Pairs(
             Layers(layers),
             torch.rand(2, 3, 40, 48, generator=generator),
@@ -39,7 +39,7 @@ def small_scene(seed: int) -> PracticeScene:
 
 @pytest.fixture
 def scenes(tmp_path: Path) -> Path:
-    folder = tmp_path / "practice"
+    folder = tmp_path / "pretraining"
     for index in range(3):
         small_scene(index).save(folder / f"{index:04d}.safetensors", origin=origin(index))
     return folder
@@ -81,7 +81,7 @@ class _Here:
 def test_weights_come_with_what_they_were_made_from(
     scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    common = ["--scenes-folder", str(scenes), "--scenes", "3", "--kept-back", "1", "--batch", "2"]
+    common = ["--scenes-folder", str(scenes), "--scenes", "3", "--validation-scenes", "1", "--batch", "2"]
     common += ["--without-perceptual", "--threads", "1"]
     first, second = tmp_path / "first", tmp_path / "second"
     assert main(["pretrain", "--out", str(first), "--iterations", "2", *common]) == 0
@@ -99,7 +99,7 @@ def test_what_would_fail_after_hours_is_said_at_once(
     scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = ["--out", str(tmp_path / "w"), "--scenes-folder", str(scenes)]
-    assert main(["pretrain", *out, "--scenes", "3", "--kept-back", "3"]) == 2
+    assert main(["pretrain", *out, "--scenes", "3", "--validation-scenes", "3"]) == 2
     assert "none is left to learn" in capsys.readouterr().err
     assert main(["pretrain", *out, "--workers", "0"]) == 2
     assert "--workers 0" in capsys.readouterr().err
@@ -109,13 +109,13 @@ def test_what_would_fail_after_hours_is_said_at_once(
 
 
 def test_the_weights_of_the_package_say_where_they_come_from() -> None:
-    from extrags.enhance.weights import find_weights
+    from extrags.restoration.diffusion.weights import find_weights
 
     weights = find_weights("bundled")
     assert weights is not None
     record = json.loads(weights.with_suffix(".json").read_text())["record"]
     assert record["command"].startswith("extrags pretrain ")
     assert record["before"]["command"].startswith("extrags pretrain ")
-    scores = record["kept_back_scores"]
+    scores = record["validation_scores"]
     assert scores["embedded_1"]["psnr"] > scores["classical"]["psnr"] + 1
     assert weights.stat().st_size < 8_000_000

@@ -31,7 +31,7 @@ TINY: dict[str, Any] = {
     "explore.safety_share": 0.02,
     "enhance.folds": 1,
     "enhance.fold_iterations": 10,
-    "enhance.cheap_views": 2,
+    "enhance.synthetic_views": 2,
     "enhance.train_iterations": 2,
     "enhance.batch": 2,
     "enhance.crop": 32,

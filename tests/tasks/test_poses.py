@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from extrags.config import CoarseConfig, PosesConfig
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.store import Ref, Slot, Store
 from tasks.coarse import coarse, refined_frames
 from tasks.ingest import training_frames
@@ -40,8 +40,8 @@ def training(store: str, posed: Ref) -> Ref:
     return training_frames.fn(store=store, sequence=posed)
 
 
-def read(store: str, ref: Ref) -> Sequence:
-    return Sequence.load(Store(store).open(ref) / "sequence")
+def read(store: str, ref: Ref) -> EndoscopicSequence:
+    return EndoscopicSequence.load(Store(store).open(ref) / "sequence")
 
 
 def test_the_method_stands_in_counts_and_account(store: str, posed: Ref) -> None:
@@ -49,9 +49,9 @@ def test_the_method_stands_in_counts_and_account(store: str, posed: Ref) -> None
     assert counts["method"] == "rgbd"
     assert counts["summary"] == "by colour and depth: 6 of 6 training frames, 1 of 1 held-out frames"
     assert counts["dropped"] == 0
-    account = json.loads((Store(store).open(posed) / "poses.json").read_bytes())
-    assert account["against_given"]["train"]["ate_rmse"] < 0.1
-    assert account["against_given"]["test"]["frames"] == 1
+    report = json.loads((Store(store).open(posed) / "poses.json").read_bytes())
+    assert report["against_given"]["train"]["ate_rmse"] < 0.1
+    assert report["against_given"]["test"]["frames"] == 1
     sequence = read(store, posed)
     assert sequence.pose_source == "aligned"
     assert sequence.world_from_camera is not None
@@ -92,8 +92,8 @@ def test_given_poses_are_left_alone(store: str) -> None:
 def test_where_poses_come_from_is_kept_on_disk(tmp_path: Path) -> None:
     sequence = room_sequence(4, width=40, height=30)
     sequence.save(tmp_path / "given")
-    assert Sequence.load(tmp_path / "given").pose_source == "given"
+    assert EndoscopicSequence.load(tmp_path / "given").pose_source == "given"
     assert "pose_source" not in (tmp_path / "given" / "zarr.json").read_text()
     replace(sequence, pose_source="refined").save(tmp_path / "refined")
-    assert Sequence.load(tmp_path / "refined").pose_source == "refined"
-    assert Sequence.load(tmp_path / "refined").training_part().pose_source == "refined"
+    assert EndoscopicSequence.load(tmp_path / "refined").pose_source == "refined"
+    assert EndoscopicSequence.load(tmp_path / "refined").training_part().pose_source == "refined"

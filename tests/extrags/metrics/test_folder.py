@@ -12,7 +12,7 @@ from PIL import Image
 from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
 from extrags.metrics.folder import read_renders
 from extrags.metrics.protocol import RenderedViews, evaluate_views
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 FRAMES, HEIGHT, WIDTH = 5, 24, 32
 TEST = np.array([3, 1, 4])
@@ -20,8 +20,8 @@ LEVELS = np.random.default_rng(0).integers(0, 256, (FRAMES, HEIGHT, WIDTH, 3), d
 
 
 @pytest.fixture
-def sequence() -> Sequence:
-    return Sequence(
+def sequence() -> EndoscopicSequence:
+    return EndoscopicSequence(
         name="made/up",
         rgb=LEVELS,
         K=np.tile(np.eye(3), (FRAMES, 1, 1)),
@@ -39,7 +39,7 @@ def write(folder: Path, images: dict[str, np.ndarray]) -> Path:
     return folder
 
 
-def test_names_decide_whatever_the_order(sequence: Sequence, tmp_path: Path) -> None:
+def test_names_decide_whatever_the_order(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in range(FRAMES)})
     renders = read_renders(folder, sequence)
     np.testing.assert_array_equal(np.rint(renders.rgb * 255), LEVELS[TEST])
@@ -47,13 +47,13 @@ def test_names_decide_whatever_the_order(sequence: Sequence, tmp_path: Path) -> 
     assert renders.n_gaussians is None
 
 
-def test_frames_named_like_files(sequence: Sequence, tmp_path: Path) -> None:
+def test_frames_named_like_files(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     named = replace(sequence, frame_names=tuple(f"rgb/b_{index:04d}.png" for index in range(FRAMES)))
     folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in TEST})
     np.testing.assert_array_equal(np.rint(read_renders(folder, named).rgb * 255), LEVELS[TEST])
 
 
-def test_else_numbers_decide_and_nine_comes_before_ten(sequence: Sequence, tmp_path: Path) -> None:
+def test_else_numbers_decide_and_nine_comes_before_ten(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     folder = write(
         tmp_path / "renders",
         {"view9.png": LEVELS[3], "view10.png": LEVELS[1], "view100.png": LEVELS[4]},
@@ -61,7 +61,7 @@ def test_else_numbers_decide_and_nine_comes_before_ten(sequence: Sequence, tmp_p
     np.testing.assert_array_equal(np.rint(read_renders(folder, sequence).rgb * 255), LEVELS[TEST])
 
 
-def test_the_same_figures_as_our_own_renders(sequence: Sequence, tmp_path: Path) -> None:
+def test_the_same_figures_as_our_own_renders(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     rgb = (LEVELS[TEST] / 255 + rng.normal(0, 0.1, (3, HEIGHT, WIDTH, 3))).astype(np.float32)
     depth = rng.uniform(18, 25, (3, HEIGHT, WIDTH)).astype(np.float32)
@@ -79,14 +79,14 @@ def test_the_same_figures_as_our_own_renders(sequence: Sequence, tmp_path: Path)
     assert theirs.reasons["n_gaussians"] == "the renders were made elsewhere"
 
 
-def test_without_depth_there_are_no_depth_figures(sequence: Sequence, tmp_path: Path) -> None:
+def test_without_depth_there_are_no_depth_figures(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
     result = evaluate_views(read_renders(folder, sequence), sequence, TEST, None)
     assert result.metrics["depth_absrel"] is None
     assert result.metrics["psnr"] is not None
 
 
-def test_integer_depth_needs_its_step(sequence: Sequence, tmp_path: Path) -> None:
+def test_integer_depth_needs_its_step(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
     steps = np.full((HEIGHT, WIDTH), 2200, dtype=np.uint16)
     depth = write(tmp_path / "depth", {f"{index}.png": steps for index in range(3)})
@@ -97,28 +97,28 @@ def test_integer_depth_needs_its_step(sequence: Sequence, tmp_path: Path) -> Non
 
 
 class TestRefused:
-    def test_no_folder(self, sequence: Sequence, tmp_path: Path) -> None:
+    def test_no_folder(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         with pytest.raises(SourceNotFoundError, match="no such folder"):
             read_renders(tmp_path / "nowhere", sequence)
         with pytest.raises(SourceNotFoundError, match="holds no image"):
             read_renders(write(tmp_path / "empty", {}), sequence)
 
-    def test_missing_frames_are_named(self, sequence: Sequence, tmp_path: Path) -> None:
+    def test_missing_frames_are_named(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         folder = write(tmp_path / "renders", {"b_0001.png": LEVELS[1]})
         with pytest.raises(SourceNotFoundError, match=r"2 of the 3 held-out frames .*: b_0003, b_0004"):
             read_renders(folder, sequence)
 
-    def test_strangers_among_frames(self, sequence: Sequence, tmp_path: Path) -> None:
+    def test_strangers_among_frames(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         folder = write(tmp_path / "renders", {"b_0001.png": LEVELS[1], "b_0077.png": LEVELS[2]})
         with pytest.raises(SourceError, match=r"some are not: b_0077\.png"):
             read_renders(folder, sequence)
 
-    def test_another_count(self, sequence: Sequence, tmp_path: Path) -> None:
+    def test_another_count(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[0] for index in range(4)})
         with pytest.raises(SourceNotFoundError, match="4 images for 3 held-out frames"):
             read_renders(folder, sequence)
 
-    def test_no_number_or_the_same(self, sequence: Sequence, tmp_path: Path) -> None:
+    def test_no_number_or_the_same(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         first = write(tmp_path / "first", {f"{name}.png": LEVELS[0] for name in ("a", "b1", "c2")})
         with pytest.raises(SourceError, match=r"without a number .*: a\.png"):
             read_renders(first, sequence)
@@ -126,12 +126,12 @@ class TestRefused:
         with pytest.raises(SourceError, match=r"same number: a1\.png, b1\.png"):
             read_renders(second, sequence)
 
-    def test_another_size_names_the_file(self, sequence: Sequence, tmp_path: Path) -> None:
+    def test_another_size_names_the_file(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         images = {f"{index}.png": LEVELS[index] for index in range(3)} | {"1.png": LEVELS[1, :20]}
         with pytest.raises(ShapeError, match=r"1\.png: 32 x 20 pixels, but .* 32 x 24"):
             read_renders(write(tmp_path / "renders", images), sequence)
 
-    def test_no_colours_or_no_image(self, sequence: Sequence, tmp_path: Path) -> None:
+    def test_no_colours_or_no_image(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         images = {f"{index}.png": LEVELS[index] for index in range(3)}
         folder = write(tmp_path / "renders", images | {"2.png": LEVELS[2, ..., 0]})
         with pytest.raises(SourceError, match="8-bit colour image, found the mode L") as refused:
@@ -141,7 +141,7 @@ class TestRefused:
         with pytest.raises(SourceError, match="no image that can be read"):
             read_renders(folder, sequence)
 
-    def test_bad_depth(self, sequence: Sequence, tmp_path: Path) -> None:
+    def test_bad_depth(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
         depth = tmp_path / "depth"
         depth.mkdir()

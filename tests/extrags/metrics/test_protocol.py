@@ -18,21 +18,21 @@ from extrags.metrics.image import psnr
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.protocol import PROTOCOL_VERSION, EvaluationResult, RenderedViews, evaluate_views
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 FRAMES, HEIGHT, WIDTH = 5, 48, 64
 TEST = np.array([1, 3])
 
 
 @pytest.fixture
-def sequence() -> Sequence:
+def sequence() -> EndoscopicSequence:
     rng = np.random.default_rng(0)
     mask = np.ones((FRAMES, HEIGHT, WIDTH), dtype=bool)
     mask[:, :, :8] = False
     observed = np.zeros((FRAMES, HEIGHT, WIDTH), dtype=bool)
     observed[1, :, :40] = True
     observed[3] = True
-    return Sequence(
+    return EndoscopicSequence(
         name="made/up@here",
         rgb=rng.integers(40, 200, (FRAMES, HEIGHT, WIDTH, 3), dtype=np.uint8),
         K=np.tile(np.eye(3), (FRAMES, 1, 1)),
@@ -43,7 +43,7 @@ def sequence() -> Sequence:
     )
 
 
-def renders_of(sequence: Sequence, frames: np.ndarray) -> RenderedViews:
+def renders_of(sequence: EndoscopicSequence, frames: np.ndarray) -> RenderedViews:
     rgb = sequence.rgb[frames].astype(np.float32) / 255
     return RenderedViews(
         rgb=rgb,
@@ -53,7 +53,7 @@ def renders_of(sequence: Sequence, frames: np.ndarray) -> RenderedViews:
     )
 
 
-def test_perfect_renders(sequence: Sequence) -> None:
+def test_perfect_renders(sequence: EndoscopicSequence) -> None:
     result = evaluate_views(renders_of(sequence, TEST), sequence, TEST, None)
     metrics = result.metrics
     assert metrics["psnr"] == pytest.approx(100, abs=0.1)
@@ -66,7 +66,7 @@ def test_perfect_renders(sequence: Sequence) -> None:
     assert result.protocol == PROTOCOL_VERSION
 
 
-def test_stable_keys_and_json(sequence: Sequence) -> None:
+def test_stable_keys_and_json(sequence: EndoscopicSequence) -> None:
     result = evaluate_views(renders_of(sequence, TEST), sequence, TEST, None)
     tree = json.loads(json.dumps(result.to_json(), allow_nan=False))
     photometric = {"psnr", "ssim", "lpips_alex", "flip"}
@@ -85,7 +85,7 @@ def test_stable_keys_and_json(sequence: Sequence) -> None:
     assert tree["n_views"] == 2
 
 
-def test_masked_out_pixels_do_not_count(sequence: Sequence) -> None:
+def test_masked_out_pixels_do_not_count(sequence: EndoscopicSequence) -> None:
     clean = renders_of(sequence, TEST)
     spoiled = clean.rgb.copy()
     spoiled[~sequence.mask[TEST]] = 1
@@ -98,7 +98,7 @@ def test_masked_out_pixels_do_not_count(sequence: Sequence) -> None:
     assert result.metrics["whole"]["psnr"] < 25
 
 
-def test_observed_and_unobserved_stand_apart(sequence: Sequence) -> None:
+def test_observed_and_unobserved_stand_apart(sequence: EndoscopicSequence) -> None:
     renders = renders_of(sequence, TEST)
     renders.rgb[0, :, 40:] *= 0.5
     result = evaluate_views(renders, sequence, TEST, None)
@@ -117,7 +117,7 @@ def test_observed_and_unobserved_stand_apart(sequence: Sequence) -> None:
     assert result.metrics["unobserved"]["pixel_share"] == pytest.approx(12 / 56)
 
 
-def test_a_few_pixels_are_no_part(sequence: Sequence) -> None:
+def test_a_few_pixels_are_no_part(sequence: EndoscopicSequence) -> None:
     assert sequence.observed is not None
     observed = sequence.observed.copy()
     observed[1] = True
@@ -128,7 +128,7 @@ def test_a_few_pixels_are_no_part(sequence: Sequence) -> None:
     assert result.per_view[0]["unobserved"]["pixel_share"] == pytest.approx(8 / (48 * 56))
 
 
-def test_exposure_is_mended_in_its_own_place_only(sequence: Sequence) -> None:
+def test_exposure_is_mended_in_its_own_place_only(sequence: EndoscopicSequence) -> None:
     clean = renders_of(sequence, TEST)
     dim = replace(clean, rgb=clean.rgb * np.array([0.6, 0.9], dtype=np.float32)[:, None, None, None])
     result = evaluate_views(dim, sequence, TEST, None)
@@ -142,7 +142,7 @@ def test_exposure_is_mended_in_its_own_place_only(sequence: Sequence) -> None:
     assert result.metrics["observed"]["aligned"]["psnr"] > 50
 
 
-def test_empty_render_has_depth_coverage_only(sequence: Sequence) -> None:
+def test_empty_render_has_depth_coverage_only(sequence: EndoscopicSequence) -> None:
     clean = renders_of(sequence, TEST)
     alpha = clean.alpha.copy()
     alpha[:, :, :36] = 0.2
@@ -151,7 +151,7 @@ def test_empty_render_has_depth_coverage_only(sequence: Sequence) -> None:
     assert result.metrics["depth_absrel"] == pytest.approx(0.1)
 
 
-def test_what_cannot_be_had_is_null_with_a_reason(sequence: Sequence) -> None:
+def test_what_cannot_be_had_is_null_with_a_reason(sequence: EndoscopicSequence) -> None:
     bare = replace(sequence, depth_mm=None, observed=None)
     result = evaluate_views(renders_of(bare, TEST), bare, TEST, None, lpips_reason="no file")
     assert result.metrics["depth_absrel"] is None
@@ -166,14 +166,14 @@ def test_what_cannot_be_had_is_null_with_a_reason(sequence: Sequence) -> None:
     }
 
 
-def test_training_frames_have_no_parts(sequence: Sequence) -> None:
+def test_training_frames_have_no_parts(sequence: EndoscopicSequence) -> None:
     train = sequence.train
     result = evaluate_views(renders_of(sequence, train), sequence, train, None)
     assert result.metrics["unobserved"]["psnr"] is None
     assert result.reasons["unobserved"] == "told apart for held-out frames only"
 
 
-def test_an_empty_mask_gives_nulls_not_nans(sequence: Sequence) -> None:
+def test_an_empty_mask_gives_nulls_not_nans(sequence: EndoscopicSequence) -> None:
     mask = sequence.mask.copy()
     mask[3] = False
     blind = replace(sequence, mask=mask)
@@ -188,7 +188,7 @@ def test_an_empty_mask_gives_nulls_not_nans(sequence: Sequence) -> None:
     assert "empty" in result.reasons["psnr"]
 
 
-def test_lpips_inside_the_mask(sequence: Sequence, shared_data: Path) -> None:
+def test_lpips_inside_the_mask(sequence: EndoscopicSequence, shared_data: Path) -> None:
     metric = Lpips.load(shared_data / "lpips_weights")
     clean = renders_of(sequence, TEST)
     rng = np.random.default_rng(1)
@@ -207,7 +207,9 @@ def test_lpips_inside_the_mask(sequence: Sequence, shared_data: Path) -> None:
     assert squeeze.reasons["lpips_alex"] == "LPIPS was taken with squeeze"
 
 
-def test_same_bits_twice_and_whatever_the_batch(sequence: Sequence, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_same_bits_twice_and_whatever_the_batch(
+    sequence: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
     renders = renders_of(sequence, TEST)
     renders.rgb[:, 10:20] = 0.3
     once = evaluate_views(renders, sequence, TEST, None).to_json()
@@ -218,7 +220,7 @@ def test_same_bits_twice_and_whatever_the_batch(sequence: Sequence, monkeypatch:
     assert single.metrics["ssim"] == pytest.approx(once["metrics"]["ssim"], abs=1e-6)
 
 
-def test_renders_count_as_8_bit_images(sequence: Sequence) -> None:
+def test_renders_count_as_8_bit_images(sequence: EndoscopicSequence) -> None:
     clean = renders_of(sequence, TEST)
     rng = np.random.default_rng(2)
     noisy = replace(clean, rgb=(clean.rgb + rng.normal(0, 0.1, clean.rgb.shape)).astype(np.float32))
@@ -227,7 +229,7 @@ def test_renders_count_as_8_bit_images(sequence: Sequence) -> None:
     assert evaluate_views(noisy, sequence, TEST, None) == evaluate_views(stored, sequence, TEST, None)
 
 
-def test_surface_stands_beside_the_images(sequence: Sequence) -> None:
+def test_surface_stands_beside_the_images(sequence: EndoscopicSequence) -> None:
     errors = SurfaceErrors(0.4, 0.2, 0.5, 0.3, 0.9, 0.8, 0.85)
     surface = SurfaceResult(errors, replace(errors, recall=0.1), 0.6, 0.7, 1.0, "mesh")
     result = evaluate_views(renders_of(sequence, TEST), sequence, TEST, None, surface=surface)
@@ -257,7 +259,7 @@ def test_the_protocol_in_words_is_of_this_version() -> None:
         assert f"`{item.name}`" in words
 
 
-def test_progress_is_told(sequence: Sequence) -> None:
+def test_progress_is_told(sequence: EndoscopicSequence) -> None:
     events: list[Event] = []
     with subscribed(events.append):
         evaluate_views(renders_of(sequence, TEST), sequence, TEST, None)
@@ -265,7 +267,7 @@ def test_progress_is_told(sequence: Sequence) -> None:
     assert (events[-1].done, events[-1].total) == (2, 2)  # type: ignore[union-attr]
 
 
-def test_bad_renders_are_named(sequence: Sequence) -> None:
+def test_bad_renders_are_named(sequence: EndoscopicSequence) -> None:
     renders = renders_of(sequence, TEST)
     with pytest.raises(ShapeError, match="no frame to evaluate"):
         evaluate_views(renders, sequence, np.zeros(0, dtype=np.int64), None)
@@ -278,7 +280,7 @@ def test_bad_renders_are_named(sequence: Sequence) -> None:
         RenderedViews(renders.rgb, renders.alpha[:1], renders.depth_mm, 1)
 
 
-def test_renders_survive_the_disk(sequence: Sequence, tmp_path: Path) -> None:
+def test_renders_survive_the_disk(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     renders = renders_of(sequence, TEST)
     renders.save(tmp_path / "renders")
     again = RenderedViews.load(tmp_path / "renders")

@@ -23,7 +23,7 @@ from extrags.metrics.surface import (
     surface_from_depth,
 )
 from extrags.scene import Scene
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 from extrags.surface import Mesh
 
 WIDTH, HEIGHT = 64, 48
@@ -177,14 +177,14 @@ def wall(low: tuple[float, float], high: tuple[float, float], behind: float = 0.
 
 
 @pytest.fixture(scope="module")
-def sequence() -> Sequence:
+def sequence() -> EndoscopicSequence:
     """Two cameras before the wall: the training one sees its left, the held-out one its right."""
     up = np.array([0.0, -1.0, 0.0])
     poses = np.stack([look_at(np.array([x, 0.0, 0.0]), np.array([x, 0.0, WALL_MM]), up) for x in (-4.0, 4.0)])
     slope = (np.arange(HEIGHT, dtype=np.float32) + 0.5 - HEIGHT / 2) / 64
     depth = np.broadcast_to((WALL_MM / (1 - TILT * slope))[None, :, None], (2, HEIGHT, WIDTH))
     K = np.tile(np.array([[64.0, 0, WIDTH / 2], [0, 64.0, HEIGHT / 2], [0, 0, 1]]), (2, 1, 1))
-    return Sequence(
+    return EndoscopicSequence(
         name="wall/0@two",
         rgb=np.zeros((2, HEIGHT, WIDTH, 3), dtype=np.uint8),
         K=K,
@@ -200,14 +200,14 @@ WALL = wall((-30, -30), (30, 30))
 
 
 class TestObserved:
-    def test_parts_are_what_the_cameras_see(self, sequence: Sequence) -> None:
+    def test_parts_are_what_the_cameras_see(self, sequence: EndoscopicSequence) -> None:
         result = evaluate_surface(WALL, TrueSurface(WALL, "mesh"), sequence)
         assert result.observed_share == pytest.approx(20 / 28, abs=0.02)
         assert result.coverage == 1
         assert result.observed.accuracy_mm == pytest.approx(0, abs=1e-5)
         assert result.threshold_mm == 1.0
 
-    def test_errors_stay_in_their_part(self, sequence: Sequence) -> None:
+    def test_errors_stay_in_their_part(self, sequence: EndoscopicSequence) -> None:
         left, right = wall((-30, -30), (6, 30)), wall((6, -30), (30, 30), behind=3.0)
         result = evaluate_surface(joined(left, right), TrueSurface(WALL, "mesh"), sequence)
         assert result.observed.recall == 1
@@ -216,35 +216,35 @@ class TestObserved:
         assert result.unobserved.recall == pytest.approx(1 / 8, abs=0.03)  # the strip beside the good half
         assert result.coverage == pytest.approx(21 / 28, abs=0.02)
 
-    def test_what_nobody_sees_does_not_count(self, sequence: Sequence) -> None:
+    def test_what_nobody_sees_does_not_count(self, sequence: EndoscopicSequence) -> None:
         astray = wall((100, 100), (140, 140))
         alone = evaluate_surface(WALL, TrueSurface(WALL, "mesh"), sequence)
         more = evaluate_surface(WALL, TrueSurface(joined(WALL, astray), "mesh"), sequence)
         assert more.coverage == alone.coverage == 1
         assert more.observed_share == pytest.approx(alone.observed_share, abs=0.02)
 
-    def test_hidden_surface_is_not_seen(self, sequence: Sequence) -> None:
+    def test_hidden_surface_is_not_seen(self, sequence: EndoscopicSequence) -> None:
         shield = rectangle((-30, -30), (-4, 30), 10)
         cameras, mask = sequence.cameras[[0]], sequence.mask[[0]]
         points = np.array([[-9.0, 0, WALL_MM], [1.0, 0, WALL_MM], [-6.0, 0, 10]])
         hidden = joined(WALL, shield)
         assert seen_by(points, hidden, cameras, mask, np.inf).tolist() == [False, True, True]
 
-    def test_masked_and_far_surface_is_not_seen(self, sequence: Sequence) -> None:
+    def test_masked_and_far_surface_is_not_seen(self, sequence: EndoscopicSequence) -> None:
         cameras, mask = sequence.cameras[[0]], sequence.mask[[0]].copy()
         points = np.array([[-9.0, 0, WALL_MM], [1.0, 0, WALL_MM]])
         mask[:, :, : WIDTH // 2] = False
         assert seen_by(points, WALL, cameras, mask, np.inf).tolist() == [False, True]
         assert seen_by(points, WALL, cameras, mask, WALL_MM - 1).tolist() == [False, False]
 
-    def test_the_threshold_follows_the_scene_without_millimetres(self, sequence: Sequence) -> None:
+    def test_the_threshold_follows_the_scene_without_millimetres(self, sequence: EndoscopicSequence) -> None:
         arbitrary = replace(sequence, metric=False)
         assert evaluate_surface(WALL, TrueSurface(WALL, "mesh"), arbitrary).threshold_mm == pytest.approx(1.0)
         assert sequence.depth_mm is not None
         small = replace(arbitrary, depth_mm=sequence.depth_mm / 10)
         assert evaluate_surface(WALL, TrueSurface(WALL, "mesh"), small).threshold_mm == pytest.approx(0.1)
 
-    def test_no_reconstruction_covers_nothing(self, sequence: Sequence) -> None:
+    def test_no_reconstruction_covers_nothing(self, sequence: EndoscopicSequence) -> None:
         tree = evaluate_surface(None, TrueSurface(WALL, "mesh"), sequence).to_json()
         assert (tree["coverage"], tree["recall"], tree["fscore"]) == (0.0, 0.0, 0.0)
         assert tree["accuracy_mm"] is None
@@ -252,7 +252,7 @@ class TestObserved:
 
 
 class TestFusion:
-    def test_true_depth_becomes_the_true_surface(self, sequence: Sequence) -> None:
+    def test_true_depth_becomes_the_true_surface(self, sequence: EndoscopicSequence) -> None:
         truth = surface_from_depth(sequence)
         assert truth is not None
         assert truth.kind == "depth"
@@ -260,12 +260,12 @@ class TestFusion:
         assert truth.mesh.vertices[:, 0].min() == pytest.approx(-14, abs=0.8)
         assert truth.mesh.vertices[:, 0].max() == pytest.approx(14, abs=0.8)
 
-    def test_no_depth_no_truth(self, sequence: Sequence) -> None:
+    def test_no_depth_no_truth(self, sequence: EndoscopicSequence) -> None:
         assert surface_from_depth(replace(sequence, depth_mm=None)) is None
         assert surface_from_depth(replace(sequence, world_from_camera=None)) is None
         assert surface_from_depth(replace(sequence, mask=np.zeros_like(sequence.mask))) is None
 
-    def test_a_scene_has_a_surface_of_its_own(self, sequence: Sequence) -> None:
+    def test_a_scene_has_a_surface_of_its_own(self, sequence: EndoscopicSequence) -> None:
         x, y = np.meshgrid(np.linspace(-16, 16, 60), np.linspace(-9, 9, 36))
         points = np.stack([x, y, WALL_MM + TILT * y], axis=-1).reshape(-1, 3)
         gaussians = Gaussians.from_points(

@@ -19,7 +19,7 @@ from extrags.events import Event, Progress, subscribed
 from extrags.metrics.pose import absolute_trajectory_error
 from extrags.poses import PoseEstimate, estimate_poses, with_estimated_poses
 from extrags.poses.job import PoseJobResult
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from tests.extrags.poses.textured_room import HALF_SIZE_MM, room_sequence, turning_room
 
 CONFIG = PosesConfig(n_features=600, fallback="never")
@@ -28,7 +28,7 @@ FRAMES, NOISE_FRAME, BLIND_COLUMNS = 9, 8, 40
 
 @dataclass(frozen=True)
 class Run:
-    sequence: Sequence
+    sequence: EndoscopicSequence
     estimate: PoseEstimate
     raw: PoseJobResult
     events: list[Event]
@@ -36,7 +36,7 @@ class Run:
 
 
 @pytest.fixture(scope="module")
-def sequence() -> Sequence:
+def sequence() -> EndoscopicSequence:
     """Seven training frames, and held-out ones, the last of which shows nothing but noise."""
     room = room_sequence(FRAMES, width=200, height=150)
     rng = np.random.default_rng(0)
@@ -52,7 +52,7 @@ def sequence() -> Sequence:
 
 
 @pytest.fixture(scope="module")
-def run(sequence: Sequence) -> Run:
+def run(sequence: EndoscopicSequence) -> Run:
     events: list[Event] = []
     kept: list[PoseJobResult] = []
     messages: list[str] = []
@@ -86,7 +86,7 @@ def test_poses_are_metric_and_right(run: Run) -> None:
     assert errors.rotation_mean_deg < 0.5
     assert run.estimate.mean_reprojection_px is not None
     assert run.estimate.mean_reprojection_px < 0.5
-    assert run.estimate.account["scale"]["relative_spread"] < 0.01
+    assert run.estimate.report["scale"]["relative_spread"] < 0.01
 
 
 def test_points_lie_on_the_walls(run: Run) -> None:
@@ -114,12 +114,12 @@ def test_no_point_comes_from_masked_pixels(run: Run) -> None:
 
 
 def test_a_frame_without_pose_is_named(run: Run) -> None:
-    assert run.estimate.account["unregistered_test"] == ["arc-8"]
-    assert run.estimate.account["unregistered_train"] == []
+    assert run.estimate.report["unregistered_test"] == ["arc-8"]
+    assert run.estimate.report["unregistered_train"] == []
     assert "no pose for held-out frames arc-8" in run.log
-    assert run.estimate.account["registrations"]["arc-3"]["inliers"] > 50
+    assert run.estimate.report["registrations"]["arc-3"]["inliers"] > 50
     assert run.estimate.summary == "by COLMAP: 7 of 7 training frames, 1 of 2 held-out frames"
-    json.dumps(run.estimate.account, allow_nan=False)
+    json.dumps(run.estimate.report, allow_nan=False)
 
 
 def test_progress_runs_to_its_end(run: Run) -> None:
@@ -180,7 +180,7 @@ def test_frames_in_the_middle_may_fail(run: Run) -> None:
         )
 
 
-def test_without_texture_the_account_says_so(sequence: Sequence) -> None:
+def test_without_texture_the_account_says_so(sequence: EndoscopicSequence) -> None:
     flat = replace(sequence, rgb=np.full_like(sequence.rgb, 128))
     with pytest.raises(
         CaptureError, match=r"poses for 0 of 7 training frames \(0%\), expected at least 50%"
@@ -195,34 +195,34 @@ def test_without_texture_the_account_says_so(sequence: Sequence) -> None:
 
 
 def test_the_account_tells_features_inliers_and_parallax(run: Run) -> None:
-    account = run.estimate.account
-    assert set(account["frames"]) == {f"arc-{k}" for k in (0, 1, 2, 4, 5, 6, 7)}
+    report = run.estimate.report
+    assert set(report["frames"]) == {f"arc-{k}" for k in (0, 1, 2, 4, 5, 6, 7)}
     assert all(
         frame["registered"] and frame["features"] > 100 and frame["best_pair_inliers"] > 30
-        for frame in account["frames"].values()
+        for frame in report["frames"].values()
     )
-    assert account["pairs_examined"] == account["pairs_verified"] > 10
-    assert account["pairs_turn_only"] == 0
+    assert report["pairs_examined"] == report["pairs_verified"] > 10
+    assert report["pairs_turn_only"] == 0
     # The arc is 12 mm wide, the walls are about 20 mm away.
-    assert 3 < account["pair_angle_deg"] < 40
-    assert 5 < account["triangulation_angle_deg"] < 60
+    assert 3 < report["pair_angle_deg"] < 40
+    assert 5 < report["triangulation_angle_deg"] < 60
 
 
 @pytest.fixture(scope="module")
-def turning() -> Sequence:
+def turning() -> EndoscopicSequence:
     return turning_room(6)
 
 
 @pytest.fixture(scope="module")
-def no_parallax(turning: Sequence) -> PoseJobResult:
+def no_parallax(turning: EndoscopicSequence) -> PoseJobResult:
     """What COLMAP makes of a scope that only turns."""
     return estimate_module._run(estimate_module._job(turning, CONFIG), turning.name)
 
 
 def test_a_scope_that_only_turns(
-    turning: Sequence, no_parallax: PoseJobResult, monkeypatch: pytest.MonkeyPatch
+    turning: EndoscopicSequence, no_parallax: PoseJobResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Good matches from one point: the account must name the parallax."""
+    """Good matches from one point: the report must name the parallax."""
     monkeypatch.setattr(estimate_module, "_run", lambda *_: no_parallax)
     for fallback, instead in (
         ("never", r"switched off \(poses.fallback\)"),
@@ -233,7 +233,7 @@ def test_a_scope_that_only_turns(
 
 
 def test_depth_steps_in_where_colmap_fails(
-    turning: Sequence, no_parallax: PoseJobResult, monkeypatch: pytest.MonkeyPatch
+    turning: EndoscopicSequence, no_parallax: PoseJobResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(estimate_module, "_run", lambda *_: no_parallax)
     messages: list[str] = []
@@ -248,18 +248,18 @@ def test_depth_steps_in_where_colmap_fails(
     assert found.metric
     assert found.mean_reprojection_px is None
     assert any("aligning by colour and depth instead" in message for message in messages)
-    assert found.account["colmap"]["registered_train"] < 0.5 * len(turning.train)
+    assert found.report["colmap"]["registered_train"] < 0.5 * len(turning.train)
     assert "by colour and depth: 6 of 6 training frames (COLMAP registered only" in found.summary
     # All frames stand in one place, so that an alignment of centres would say nothing.
     assert turning.world_from_camera is not None
     there = turning.world_from_camera[0] @ found.world_from_camera
     assert np.linalg.norm((there - turning.world_from_camera)[:, :3, 3], axis=1).max() < 0.05
     assert rotation_angle_deg(there[:, :3, :3], turning.world_from_camera[:, :3, :3]).max() < 0.1
-    json.dumps(found.account, allow_nan=False)
+    json.dumps(found.report, allow_nan=False)
 
 
 def test_depth_fails_as_well(
-    turning: Sequence, no_parallax: PoseJobResult, monkeypatch: pytest.MonkeyPatch
+    turning: EndoscopicSequence, no_parallax: PoseJobResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(estimate_module, "_run", lambda *_: no_parallax)
     assert turning.depth_mm is not None
@@ -272,14 +272,14 @@ def test_depth_fails_as_well(
     assert "of these without depth: arc-2, arc-3, arc-4, arc-5" in str(told.value)
 
 
-def test_too_few_frames(sequence: Sequence) -> None:
+def test_too_few_frames(sequence: EndoscopicSequence) -> None:
     two = replace(sequence, split=replace(sequence.split, train=np.array([0, 1])))
     with pytest.raises(CaptureError, match="at least 3 training frames, found 2"):
         estimate_poses(two, CONFIG)
 
 
 def test_a_process_that_dies_is_told_with_its_last_words(
-    sequence: Sequence, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    sequence: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     program = tmp_path / "python"
     program.write_text("#!/bin/sh\necho 'zlib: out of luck' >&2\nexit 7\n")

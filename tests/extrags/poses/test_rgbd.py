@@ -15,14 +15,14 @@ from extrags.poses import RgbdAlignment, align_by_depth, errors_against_given
 from extrags.poses.alignment import Posed, agreement, align, pair_equations
 from extrags.poses.depth_views import depth_view
 from extrags.poses.landmarks import Landmarks, landmarks, match_landmarks, relative_pose
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 from tests.extrags.poses.textured_room import HALF_SIZE_MM, room_sequence
 
 CONFIG = PosesConfig(rgbd_width=100)
 
 
 @pytest.fixture(scope="module")
-def sequence() -> Sequence:
+def sequence() -> EndoscopicSequence:
     """Seven training frames with noisy depth, two held out, of which the last shows nothing but noise."""
     room = room_sequence(9, width=200, height=150)
     assert room.depth_mm is not None
@@ -39,14 +39,16 @@ def sequence() -> Sequence:
 
 
 @pytest.fixture(scope="module")
-def found(sequence: Sequence) -> tuple[RgbdAlignment, list[Event]]:
+def found(sequence: EndoscopicSequence) -> tuple[RgbdAlignment, list[Event]]:
     events: list[Event] = []
     with subscribed(events.append):
         alignment = align_by_depth(sequence, CONFIG)
     return alignment, events
 
 
-def test_poses_are_metric_and_right(sequence: Sequence, found: tuple[RgbdAlignment, list[Event]]) -> None:
+def test_poses_are_metric_and_right(
+    sequence: EndoscopicSequence, found: tuple[RgbdAlignment, list[Event]]
+) -> None:
     poses = found[0].world_from_camera
     assert np.flatnonzero(np.isfinite(poses).all((1, 2))).tolist() == list(range(8))
     np.testing.assert_array_equal(poses[0], np.eye(4))
@@ -58,7 +60,9 @@ def test_poses_are_metric_and_right(sequence: Sequence, found: tuple[RgbdAlignme
     assert errors["train"]["rpe_translation_rmse"] < 0.1
 
 
-def test_points_lie_on_the_walls(sequence: Sequence, found: tuple[RgbdAlignment, list[Event]]) -> None:
+def test_points_lie_on_the_walls(
+    sequence: EndoscopicSequence, found: tuple[RgbdAlignment, list[Event]]
+) -> None:
     assert sequence.world_from_camera is not None
     first = sequence.world_from_camera[0]
     points = found[0].points @ first[:3, :3].T + first[:3, 3]
@@ -68,20 +72,20 @@ def test_points_lie_on_the_walls(sequence: Sequence, found: tuple[RgbdAlignment,
     assert found[0].points_rgb.std() > 5
 
 
-def test_progress_and_account(sequence: Sequence, found: tuple[RgbdAlignment, list[Event]]) -> None:
+def test_progress_and_account(sequence: EndoscopicSequence, found: tuple[RgbdAlignment, list[Event]]) -> None:
     alignment, events = found
     steps = [event for event in events if isinstance(event, Progress)]
     assert [step.done for step in steps] == sorted(step.done for step in steps)
     assert steps[-1].done == steps[-1].total
     assert steps[-1].values["registered"] == 8
-    assert alignment.account["frames"]["arc-3"]["placed"]
-    assert not alignment.account["frames"].get("arc-8", {"placed": False})["placed"]
-    assert 0 < alignment.account["surface_residual_mm"] < 0.3
-    json.dumps(alignment.account, allow_nan=False)
+    assert alignment.report["frames"]["arc-3"]["placed"]
+    assert not alignment.report["frames"].get("arc-8", {"placed": False})["placed"]
+    assert 0 < alignment.report["surface_residual_mm"] < 0.3
+    json.dumps(alignment.report, allow_nan=False)
 
 
 def test_same_bits_and_nothing_of_held_out_frames_in_the_model(
-    sequence: Sequence, found: tuple[RgbdAlignment, list[Event]]
+    sequence: EndoscopicSequence, found: tuple[RgbdAlignment, list[Event]]
 ) -> None:
     rgb = sequence.rgb.copy()
     rgb[3] = 0
@@ -92,7 +96,7 @@ def test_same_bits_and_nothing_of_held_out_frames_in_the_model(
     np.testing.assert_array_equal(again.points, found[0].points)
 
 
-def test_without_texture_the_shape_may_do(sequence: Sequence) -> None:
+def test_without_texture_the_shape_may_do(sequence: EndoscopicSequence) -> None:
     """A room seen into its corners is known by its walls alone."""
     room = room_sequence(5, width=200, height=150, holdout_every=9)
     found = align_by_depth(replace(room, rgb=np.full_like(room.rgb, 128)), CONFIG)
@@ -101,7 +105,7 @@ def test_without_texture_the_shape_may_do(sequence: Sequence) -> None:
     assert errors["train"]["ate_rmse"] < 0.2
 
 
-def test_depth_is_needed(sequence: Sequence) -> None:
+def test_depth_is_needed(sequence: EndoscopicSequence) -> None:
     with pytest.raises(CaptureError, match="needs depth, and there is none"):
         align_by_depth(replace(sequence, depth_mm=None), CONFIG)
     assert sequence.depth_mm is not None
@@ -110,7 +114,7 @@ def test_depth_is_needed(sequence: Sequence) -> None:
         align_by_depth(replace(sequence, depth_mm=empty), CONFIG)
 
 
-def test_a_frame_without_depth_is_named(sequence: Sequence) -> None:
+def test_a_frame_without_depth_is_named(sequence: EndoscopicSequence) -> None:
     assert sequence.depth_mm is not None
     depth = sequence.depth_mm.copy()
     depth[4] = 0
@@ -118,14 +122,14 @@ def test_a_frame_without_depth_is_named(sequence: Sequence) -> None:
         sequence, depth_mm=depth, split=Split("part", np.array([0, 1, 2, 4, 5]), np.array([], dtype=np.int64))
     )
     found = align_by_depth(part, CONFIG)
-    assert found.account["without_depth"] == ["arc-4"]
+    assert found.report["without_depth"] == ["arc-4"]
     assert np.isfinite(found.world_from_camera).all((1, 2))[[0, 1, 2, 4, 5]].tolist() == [
         True, True, True, False, True,
     ]  # fmt: skip
 
 
 class TestAlign:
-    def test_from_a_rough_guess(self, sequence: Sequence) -> None:
+    def test_from_a_rough_guess(self, sequence: EndoscopicSequence) -> None:
         assert sequence.world_from_camera is not None
         truth = sequence.world_from_camera
         first, second = (depth_view(sequence, frame, 100) for frame in (0, 2))
@@ -141,7 +145,7 @@ class TestAlign:
         assert right.texture > 0.5
         assert right.score > wrong.score + 0.3
 
-    def test_nothing_in_common_changes_nothing(self, sequence: Sequence) -> None:
+    def test_nothing_in_common_changes_nothing(self, sequence: EndoscopicSequence) -> None:
         assert sequence.world_from_camera is not None
         view = depth_view(sequence, 0, 100)
         assert view is not None
@@ -152,7 +156,7 @@ class TestAlign:
         assert pair_equations(Posed(view, away), reference, 0, away[:3, 3]).count == 0
         assert agreement(Posed(view, away), [reference]).score == 0.0
 
-    def test_size_and_normals(self, sequence: Sequence) -> None:
+    def test_size_and_normals(self, sequence: EndoscopicSequence) -> None:
         view = depth_view(sequence, 0, 70)
         assert view is not None
         # 200 / 3: sizes are divided by whole numbers.
@@ -166,7 +170,7 @@ class TestAlign:
 
 
 class TestLandmarks:
-    def test_relative_pose(self, sequence: Sequence) -> None:
+    def test_relative_pose(self, sequence: EndoscopicSequence) -> None:
         assert sequence.world_from_camera is not None
         truth = np.linalg.inv(sequence.world_from_camera[0]) @ sequence.world_from_camera[2]
         between, support = relative_pose(landmarks(sequence, 2), landmarks(sequence, 0), seed=0)
@@ -187,7 +191,7 @@ class TestLandmarks:
         np.testing.assert_allclose(between[:3, 3], shift, atol=0.05)
         assert 38 <= support <= 45
 
-    def test_no_landmarks(self, sequence: Sequence) -> None:
+    def test_no_landmarks(self, sequence: EndoscopicSequence) -> None:
         none = landmarks(replace(sequence, rgb=np.full_like(sequence.rgb, 90)), 0)
         assert len(none.points) == 0
         assert len(match_landmarks(none, none)) == 0

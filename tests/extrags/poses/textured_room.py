@@ -8,13 +8,15 @@ import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from extrags.cameras import Cameras, look_at, pixel_rays
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 HALF_SIZE_MM = np.array([14.0, 11.0, 16.0])
 TEXELS = 420
 
 
-def room_sequence(n_frames: int, *, width: int = 240, height: int = 180, holdout_every: int = 4) -> Sequence:
+def room_sequence(
+    n_frames: int, *, width: int = 240, height: int = 180, holdout_every: int = 4
+) -> EndoscopicSequence:
     """Frames on an arc inside the room; every n-th is held out."""
     t = np.linspace(-1, 1, n_frames)
     centers = np.stack([6 * np.sin(1.2 * t), 2.0 * np.cos(2.3 * t), -9 + 2.5 * t], axis=1)
@@ -28,7 +30,7 @@ def room_sequence(n_frames: int, *, width: int = 240, height: int = 180, holdout
     rgb, depth = render_room(cameras)
     frames = np.arange(n_frames)
     held_out = frames % holdout_every == holdout_every - 1
-    return Sequence(
+    return EndoscopicSequence(
         name="room/arc",
         rgb=rgb,
         K=K,
@@ -40,7 +42,7 @@ def room_sequence(n_frames: int, *, width: int = 240, height: int = 180, holdout
     )
 
 
-def turning_room(n_frames: int) -> Sequence:
+def turning_room(n_frames: int) -> EndoscopicSequence:
     """All from one place, held out none: good matches, no parallax."""
     room = room_sequence(n_frames, width=200, height=150)
     turn = np.linspace(-0.35, 0.35, n_frames)

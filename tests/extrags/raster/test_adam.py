@@ -86,8 +86,8 @@ def test_keep_and_append() -> None:
     mask = torch.arange(10) % 2 == 0
     adam.keep(mask)
     assert torch.equal(adam.first_moments["sh"], first[mask])
-    born = {k: torch.full((3, *v.shape[1:]), 0.5) for k, v in adam.parameters.items()}
-    adam.append(born)
+    new_gaussians = {k: torch.full((3, *v.shape[1:]), 0.5) for k, v in adam.parameters.items()}
+    adam.append(new_gaussians)
     assert adam.steps.tolist() == [1] * 5 + [0] * 3
     for name, value in adam.parameters.items():
         assert value.is_leaf
@@ -181,7 +181,7 @@ def _split_parameters(n: int, coefficients: int) -> dict[str, torch.Tensor]:
 def test_joined_parameters_step_as_if_apart(coefficients: int, isa: str) -> None:
     apart = SelectiveAdam(_split_parameters(70, coefficients), JOINED_RATES)
     together = SelectiveAdam(_split_parameters(70, coefficients), JOINED_RATES, joined=JOINED)
-    born = {k: v.detach()[:5].clone() for k, v in apart.parameters.items()}
+    new_gaussians = {k: v.detach()[:5].clone() for k, v in apart.parameters.items()}
     for step in range(12):
         n = len(apart.steps)
         _set_gradients(apart.parameters, step)
@@ -193,7 +193,7 @@ def test_joined_parameters_step_as_if_apart(coefficients: int, isa: str) -> None
         if step in (3, 7):
             for adam in (apart, together):
                 adam.keep(torch.arange(n) % 3 != 0)
-                adam.append(born)
+                adam.append(new_gaussians)
         if step == 5:
             for adam in (apart, together):
                 with torch.no_grad():

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from extrags.errors import NonFiniteError
 from extrags.raster import CameraLight, set_num_threads
-from extrags.raster.light import developed, light_gain, lit_colors, shortest_axes, undeveloped
+from extrags.raster.light import apply_response, invert_response, light_gain, lit_colors, shortest_axes
 from tests.extrags.raster.scenes import RasterScene, relative_l2, tube, weighted_sum
 
 LEARNED = ("exposure", "softening", "exponent", "spread", "cosine", "offset", "shoulder")
@@ -125,10 +125,10 @@ def test_inverse_square_far_from_the_lamp() -> None:
 def test_response_and_its_inverse() -> None:
     signal = torch.linspace(0, 3, 50, dtype=torch.float64)
     shoulder = torch.tensor(0.8, dtype=torch.float64)
-    image = developed(signal, shoulder)
+    image = apply_response(signal, shoulder)
     assert image[0] == 0
     assert torch.all(image.diff() > 0)
-    torch.testing.assert_close(undeveloped(image, shoulder), signal)
+    torch.testing.assert_close(invert_response(image, shoulder), signal)
 
 
 def test_normals_are_the_shortest_axes() -> None:

@@ -11,7 +11,7 @@ from extrags.cameras import look_at, pixel_rays, rotation_about
 from extrags.config import PipelineConfig
 from extrags.metrics.protocol import PROTOCOL_VERSION
 from extrags.report import ReportInputs
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 WIDTH, HEIGHT, RADIUS_MM = 48, 40, 10.0
 TRAIN, TEST = np.arange(6), np.arange(6, 11)
@@ -51,7 +51,7 @@ class TubeMesh:
 
 
 @pytest.fixture(scope="session")
-def sequence() -> Sequence:
+def sequence() -> EndoscopicSequence:
     """Eleven views along a straight tube whose axis is x, its wall striped."""
     places = np.linspace(0, 30, 11)
     poses = np.stack(
@@ -61,7 +61,7 @@ def sequence() -> Sequence:
         ]
     )
     K = np.tile(np.array([[30.0, 0, WIDTH / 2], [0, 30.0, HEIGHT / 2], [0, 0, 1]]), (11, 1, 1))
-    bare = Sequence(
+    bare = EndoscopicSequence(
         name="tube/0@sparse",
         rgb=np.zeros((11, HEIGHT, WIDTH, 3), dtype=np.uint8),
         K=K,
@@ -78,7 +78,7 @@ def sequence() -> Sequence:
     points = center + depth[..., None] * rays
     stripes = 0.5 + 0.3 * np.sin(points[..., 0]) * np.cos(4 * np.arctan2(points[..., 2], points[..., 1]))
     color = stripes[..., None] * np.array([0.9, 0.6, 0.5]) * (12 / (depth[..., None] + 12))
-    return Sequence(
+    return EndoscopicSequence(
         name=bare.name,
         rgb=np.rint(255 * np.clip(color, 0, 1)).astype(np.uint8),
         K=K,
@@ -115,7 +115,7 @@ def result_of(psnr: float, n_gaussians: int) -> dict[str, object]:
 
 
 @pytest.fixture(scope="session")
-def inputs(sequence: Sequence) -> ReportInputs:
+def inputs(sequence: EndoscopicSequence) -> ReportInputs:
     """Everything is there."""
     random = np.random.default_rng(0)
     truth = sequence.rgb[TEST].astype(np.float32) / 255

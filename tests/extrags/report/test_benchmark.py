@@ -12,7 +12,7 @@ from extrags.errors import ConfigError, ShapeError
 from extrags.report.benchmark import BenchmarkInputs, ComparedViews, build_benchmark_report
 from extrags.report.charts import method_colors
 from extrags.report.comparison import RenderedMethod, compared_rows
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 
 from .conftest import TEST, metrics_of
 from .pages import Page, decoded
@@ -45,7 +45,7 @@ def runs_of(gains: dict[str, float], seeds: int = 3) -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def compared(sequence: Sequence) -> ComparedViews:
+def compared(sequence: EndoscopicSequence) -> ComparedViews:
     truth = sequence.rgb[TEST].astype(np.float32) / 255
     waves = np.sin(np.arange(truth.size).reshape(truth.shape) / 7)
     views = {

@@ -212,17 +212,17 @@ def test_protocol_words_agree_with_the_metrics(page: Page) -> None:
 
 
 def test_real_types_fit_the_protocols() -> None:
-    from extrags.enhance.pseudo import PseudoObservations
-    from extrags.explore import Exploration
+    from extrags.exploration import Exploration
     from extrags.freespace import FreeSpace
     from extrags.metrics.protocol import RenderedViews
+    from extrags.pseudo_views import PseudoViews
     from extrags.surface import Mesh
 
     fields = {
         RenderedViews: ("rgb", "alpha", "depth_mm"),
         FreeSpace: ("occupancy", "origin_mm", "axes", "voxel_mm"),
         Mesh: ("vertices", "triangles"),
-        PseudoObservations: (
+        PseudoViews: (
             "rendered", "restored", "target", "uncertainty", "expected_error", "image_confidence",
             "reference", "clip",
         ),

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from extrags.enhance.calibration_table import calibration
 from extrags.errors import ConfigError
 from extrags.report.calibration_plot import calibration_chart, write_calibration_plot
+from extrags.restoration.uncertainty.reliability_diagram import calibration
 
 
 def curve(bias: float) -> dict[str, object]:

@@ -12,7 +12,7 @@ from extrags.cameras import Cameras, look_at
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 
 WIDTH, HEIGHT = 48, 36
 
@@ -53,13 +53,13 @@ def tube_light() -> NearFieldLight:
 
 
 @pytest.fixture(scope="session")
-def tube_sequence() -> Sequence:
+def tube_sequence() -> EndoscopicSequence:
     scene = Scene(tube_gaussians(), tube_light())
     cameras = tube_cameras()
     with torch.no_grad():
         rendering = scene.render(cameras)
     depth = torch.where(rendering.alpha > 0.5, rendering.depth, torch.zeros(()))
-    return Sequence(
+    return EndoscopicSequence(
         name="test/tube@half",
         rgb=(rendering.rgb.clamp(0, 1) * 255).round().to(torch.uint8).numpy(),
         K=cameras.K,

@@ -66,7 +66,7 @@ class TestDefaultStrategy:
         density.observe(strong(10, [2, 7]))
         decision = density.decide(parameters, 100)
         assert bool(decision.keep.all())
-        assert torch.equal(decision.born["means"], parameters["means"][[2, 7]])
+        assert torch.equal(decision.new_gaussians["means"], parameters["means"][[2, 7]])
 
     def test_large_strong_gaussians_are_split(self) -> None:
         parameters = tube_gaussians(10).parameters()
@@ -74,11 +74,11 @@ class TestDefaultStrategy:
         density.observe(strong(10, [4]))
         decision = density.decide(parameters, 100)
         assert decision.keep.tolist() == [i != 4 for i in range(10)]
-        assert len(decision.born["means"]) == 2
+        assert len(decision.new_gaussians["means"]) == 2
         torch.testing.assert_close(
-            decision.born["scales"].exp(), (parameters["scales"][4].exp() / 1.6).expand(2, 3)
+            decision.new_gaussians["scales"].exp(), (parameters["scales"][4].exp() / 1.6).expand(2, 3)
         )
-        moved = (decision.born["means"] - parameters["means"][4]).norm(dim=1)
+        moved = (decision.new_gaussians["means"] - parameters["means"][4]).norm(dim=1)
         assert bool((moved > 0).all())
         assert bool((moved < 5 * 1.2).all())
 
@@ -88,7 +88,7 @@ class TestDefaultStrategy:
         parameters["scales"][3] = 3.0
         decision = strategy(10).decide(parameters, 100)
         assert [i for i in range(10) if not decision.keep[i]] == [1, 3]
-        assert len(decision.born["means"]) == 0
+        assert len(decision.new_gaussians["means"]) == 0
 
     def test_huge_gaussians_wait_for_the_first_reset(self) -> None:
         parameters = tube_gaussians(10).parameters()
@@ -104,7 +104,7 @@ class TestDefaultStrategy:
         density.observe(strong(10, [3]))
         decision = density.decide(parameters, 100)
         assert not bool(decision.keep[3])
-        assert len(decision.born["means"]) == 2
+        assert len(decision.new_gaussians["means"]) == 2
 
     @pytest.mark.parametrize(("cap", "kept"), [(11, [9]), (12, [8, 9]), (10, [])])
     def test_the_cap_takes_the_strongest(self, cap: int, kept: list[int]) -> None:
@@ -113,7 +113,7 @@ class TestDefaultStrategy:
         density._config = DensifyConfig().model_copy(update={"max_gaussians": cap})
         density.observe(seen(torch.arange(10.0)[None, :, None].expand(1, 10, 2)))
         decision = density.decide(parameters, 100)
-        assert torch.equal(decision.born["means"], parameters["means"][kept])
+        assert torch.equal(decision.new_gaussians["means"], parameters["means"][kept])
 
     def test_the_cap_holds_for_sizes_in_the_image_too(self) -> None:
         parameters = small_ones(10)
@@ -123,7 +123,7 @@ class TestDefaultStrategy:
         decision = density.decide(parameters, 100)
         # Three reach beyond a twentieth of 48 pixels and more; there is room for two.
         assert [i for i in range(10) if not decision.keep[i]] == [8, 9]
-        assert len(decision.born["means"]) == 4
+        assert len(decision.new_gaussians["means"]) == 4
 
     def test_mean_gradient_counts_visible_views_only(self) -> None:
         parameters = small_ones(3)
@@ -133,7 +133,7 @@ class TestDefaultStrategy:
             density = strategy(3, gradient_threshold=threshold)
             density.observe(seen(torch.ones(1, 3, 2), visible, width=2, height=2))
             density.observe(seen(torch.zeros(1, 3, 2), torch.tensor([[True, False, False]])))
-            rounds[threshold] = len(density.decide(parameters, 100).born["means"])
+            rounds[threshold] = len(density.decide(parameters, 100).new_gaussians["means"])
         # Half of sqrt 2, sqrt 2 and nothing
         assert rounds == {1.0: 1, 1.2: 1, 1.5: 0}
 
@@ -144,7 +144,7 @@ class TestDefaultStrategy:
             density = strategy(2, absgrad=absgrad)
             assert density.needs_absgrad is absgrad
             density.observe(rendering)
-            assert len(density.decide(parameters, 100).born["means"]) == int(absgrad)
+            assert len(density.decide(parameters, 100).new_gaussians["means"]) == int(absgrad)
 
     def test_steps_follow_the_window(self) -> None:
         """Rounds every 10 iterations, from 100 to 600 of 1000; the optimiser keeps up."""

@@ -13,7 +13,7 @@ from extrags.config import CoarseConfig, DensifyConfig, PoseRefinementConfig
 from extrags.errors import ShapeError
 from extrags.metrics.pose import absolute_trajectory_error
 from extrags.scene import Scene
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.training import TrainingResult, reconstruct
 from extrags.training.density import DensityStrategy
 from extrags.training.pose_refinement import PoseRefinement, _gauge, with_refined_poses
@@ -59,7 +59,7 @@ def loss_from(step: TrainingStep, view: View, pose: np.ndarray) -> tuple[float, 
 
 
 @pytest.fixture
-def step_and_view(tube_sequence: Sequence) -> tuple[Scene, View]:
+def step_and_view(tube_sequence: EndoscopicSequence) -> tuple[Scene, View]:
     """The true scene, seen in training frame 1."""
     light = tube_light()
     scene = Scene(tube_gaussians(), replace(light, log_exposure=torch.zeros(4)))
@@ -68,7 +68,9 @@ def step_and_view(tube_sequence: Sequence) -> tuple[Scene, View]:
 
 @pytest.mark.parametrize("kind", [AutogradStep, NativeStep])
 def test_gradient_of_turn_and_shift_against_differences(
-    step_and_view: tuple[Scene, View], tube_sequence: Sequence, kind: type[AutogradStep | NativeStep]
+    step_and_view: tuple[Scene, View],
+    tube_sequence: EndoscopicSequence,
+    kind: type[AutogradStep | NativeStep],
 ) -> None:
     scene, view = step_and_view
     step = kind(scene, coarse_schedule(CONFIG, 20.0, DEPTH_MM, "coarse"))
@@ -148,12 +150,12 @@ def test_the_prior_draws_back() -> None:
 
 
 @pytest.fixture(scope="module")
-def exact() -> Sequence:
+def exact() -> EndoscopicSequence:
     return room_sequence(8, width=100, height=76)
 
 
 @pytest.fixture(scope="module")
-def knocked_room(exact: Sequence) -> Sequence:
+def knocked_room(exact: EndoscopicSequence) -> EndoscopicSequence:
     """Training frames 0.6 mm and 1 degree off; the held-out ones are exact."""
     assert exact.world_from_camera is not None
     poses = exact.world_from_camera.copy()
@@ -161,7 +163,7 @@ def knocked_room(exact: Sequence) -> Sequence:
     return replace(exact, world_from_camera=poses, pose_source="estimated")
 
 
-def reconstruction(sequence: Sequence, *, refine: bool) -> TrainingResult:
+def reconstruction(sequence: EndoscopicSequence, *, refine: bool) -> TrainingResult:
     settings = PoseRefinementConfig(learning_rate=2e-3, prior=0.0)
     return reconstruct(
         sequence,
@@ -172,11 +174,13 @@ def reconstruction(sequence: Sequence, *, refine: bool) -> TrainingResult:
 
 
 @pytest.fixture(scope="module")
-def refined(knocked_room: Sequence) -> TrainingResult:
+def refined(knocked_room: EndoscopicSequence) -> TrainingResult:
     return reconstruction(knocked_room, refine=True)
 
 
-def test_knocked_poses_come_back(exact: Sequence, knocked_room: Sequence, refined: TrainingResult) -> None:
+def test_knocked_poses_come_back(
+    exact: EndoscopicSequence, knocked_room: EndoscopicSequence, refined: TrainingResult
+) -> None:
     assert exact.world_from_camera is not None
     assert knocked_room.world_from_camera is not None
     assert refined.refined is not None
@@ -190,7 +194,9 @@ def test_knocked_poses_come_back(exact: Sequence, knocked_room: Sequence, refine
     assert 0.2 < refined.refined.mean_shift < 0.8
 
 
-def test_held_out_views_gain(exact: Sequence, knocked_room: Sequence, refined: TrainingResult) -> None:
+def test_held_out_views_gain(
+    exact: EndoscopicSequence, knocked_room: EndoscopicSequence, refined: TrainingResult
+) -> None:
     plain = reconstruction(knocked_room, refine=False)
     assert plain.refined is None
 
@@ -204,7 +210,7 @@ def test_held_out_views_gain(exact: Sequence, knocked_room: Sequence, refined: T
     assert refined.history[-1]["psnr"] > plain.history[-1]["psnr"] + 0.5
 
 
-def test_same_input_same_bits(knocked_room: Sequence) -> None:
+def test_same_input_same_bits(knocked_room: EndoscopicSequence) -> None:
     config = CoarseConfig(iterations=40, max_points=300, refine_poses=True)
     first, second = (reconstruct(knocked_room, config).refined for _ in range(2))
     assert first is not None
@@ -213,7 +219,7 @@ def test_same_input_same_bits(knocked_room: Sequence) -> None:
     assert first.mean_turn_deg > 0
 
 
-def test_which_poses_are_refined(tube_sequence: Sequence) -> None:
+def test_which_poses_are_refined(tube_sequence: EndoscopicSequence) -> None:
     estimated = replace(tube_sequence, pose_source="estimated")
     done = replace(tube_sequence, pose_source="refined")
     on, off = CoarseConfig(refine_poses=True), CoarseConfig(refine_poses=False)
@@ -227,7 +233,7 @@ def test_which_poses_are_refined(tube_sequence: Sequence) -> None:
     assert not refines_poses(done, on)
 
 
-def test_held_out_frames_go_along(exact: Sequence) -> None:
+def test_held_out_frames_go_along(exact: EndoscopicSequence) -> None:
     """A bend of the path: what stands beside a training frame moves as it does."""
     assert exact.world_from_camera is not None
     train, poses = exact.train, exact.world_from_camera

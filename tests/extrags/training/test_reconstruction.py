@@ -10,7 +10,7 @@ from extrags.config import CoarseConfig, DensifyConfig, LightConfig
 from extrags.errors import CaptureError, DivergedError
 from extrags.events import Event, Progress, subscribed
 from extrags.scene import Scene
-from extrags.sequence import Sequence, Split
+from extrags.sequence import EndoscopicSequence, Split
 from extrags.training import TrainingResult, reconstruct
 from extrags.training.optimise import optimise
 from extrags.training.reconstruction import coarse_schedule
@@ -19,7 +19,7 @@ from extrags.training.views import View, real_views
 QUIET = DensifyConfig(enabled=False)
 
 
-def psnr_of(scene: Scene, sequence: Sequence, frames: np.ndarray) -> float:
+def psnr_of(scene: Scene, sequence: EndoscopicSequence, frames: np.ndarray) -> float:
     with torch.no_grad():
         rgb = scene.render(sequence.cameras[frames]).rgb
     target = torch.from_numpy(sequence.rgb[frames].astype(np.float32) / 255)
@@ -27,17 +27,19 @@ def psnr_of(scene: Scene, sequence: Sequence, frames: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def result(tube_sequence: Sequence) -> TrainingResult:
+def result(tube_sequence: EndoscopicSequence) -> TrainingResult:
     return reconstruct(tube_sequence, CoarseConfig(iterations=250, max_points=600, densify=QUIET))
 
 
 class TestReconstruct:
-    def test_training_views_are_matched(self, tube_sequence: Sequence, result: TrainingResult) -> None:
+    def test_training_views_are_matched(
+        self, tube_sequence: EndoscopicSequence, result: TrainingResult
+    ) -> None:
         assert psnr_of(result.scene, tube_sequence, tube_sequence.train) > 28
         assert result.history[-1]["loss"] < 0.3 * result.history[0]["loss"]
 
     def test_held_out_views_gain_from_the_light(
-        self, tube_sequence: Sequence, result: TrainingResult
+        self, tube_sequence: EndoscopicSequence, result: TrainingResult
     ) -> None:
         unlit = CoarseConfig(iterations=250, max_points=600, densify=QUIET, light=LightConfig(enabled=False))
         plain = reconstruct(tube_sequence, unlit)
@@ -45,13 +47,13 @@ class TestReconstruct:
         gain = psnr_of(result.scene, tube_sequence, test) - psnr_of(plain.scene, tube_sequence, test)
         assert gain > 0.5
 
-    def test_same_input_same_bits(self, tube_sequence: Sequence) -> None:
+    def test_same_input_same_bits(self, tube_sequence: EndoscopicSequence) -> None:
         config = CoarseConfig(iterations=40, max_points=300)
         first, second = (reconstruct(tube_sequence, config).scene for _ in range(2))
         for name, value in first.gaussians.parameters().items():
             assert torch.equal(value, second.gaussians.parameters()[name]), name
 
-    def test_held_out_frames_change_nothing(self, tube_sequence: Sequence) -> None:
+    def test_held_out_frames_change_nothing(self, tube_sequence: EndoscopicSequence) -> None:
         config = CoarseConfig(iterations=20, max_points=300)
         rgb = tube_sequence.rgb.copy()
         rgb[tube_sequence.test] = 0
@@ -59,7 +61,7 @@ class TestReconstruct:
         second = reconstruct(replace(tube_sequence, rgb=rgb), config).scene.gaussians
         assert torch.equal(first.sh0, second.sh0)
 
-    def test_exposures_are_told_apart(self, tube_sequence: Sequence) -> None:
+    def test_exposures_are_told_apart(self, tube_sequence: EndoscopicSequence) -> None:
         rgb = tube_sequence.rgb.astype(np.float32)
         rgb[tube_sequence.train[0]] *= 0.8
         dimmed = replace(tube_sequence, rgb=rgb.round().astype(np.uint8))
@@ -68,7 +70,7 @@ class TestReconstruct:
             light=LightConfig(exposure_learning_rate=0.02, exposure_prior=0.001),
         )  # fmt: skip
 
-        def first_to_third(sequence: Sequence) -> float:
+        def first_to_third(sequence: EndoscopicSequence) -> float:
             light = reconstruct(sequence, config).scene.light
             assert light is not None
             return float(light.exposure(0) / light.exposure(2))
@@ -76,7 +78,7 @@ class TestReconstruct:
         # Against the undimmed frames: few views leave exposure and albedo some play either way.
         assert first_to_third(dimmed) / first_to_third(tube_sequence) == pytest.approx(0.8, abs=0.08)
 
-    def test_progress_is_told(self, tube_sequence: Sequence) -> None:
+    def test_progress_is_told(self, tube_sequence: EndoscopicSequence) -> None:
         seen: list[Event] = []
         with subscribed(seen.append):
             reconstruct(tube_sequence, CoarseConfig(iterations=60, max_points=100), stage="fold")
@@ -85,12 +87,12 @@ class TestReconstruct:
         assert (last.stage, last.done, last.total) == ("fold", 60, 60)
         assert set(last.values) == {"iteration", "loss", "psnr", "n_gaussians"}
 
-    def test_no_frames(self, tube_sequence: Sequence) -> None:
+    def test_no_frames(self, tube_sequence: EndoscopicSequence) -> None:
         empty = Split("none", np.array([], dtype=np.int64), np.arange(6))
         with pytest.raises(CaptureError, match="no training frames"):
             reconstruct(replace(tube_sequence, split=empty), CoarseConfig())
 
-    def test_a_diverging_loss_names_iteration_and_group(self, tube_sequence: Sequence) -> None:
+    def test_a_diverging_loss_names_iteration_and_group(self, tube_sequence: EndoscopicSequence) -> None:
         result = reconstruct(tube_sequence, CoarseConfig(iterations=1, max_points=100))
         views = real_views(tube_sequence, tube_sequence.train)
         poisoned = replace(views[0], rgb=torch.full_like(views[0].rgb, float("nan")))

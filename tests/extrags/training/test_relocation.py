@@ -8,7 +8,7 @@ import torch
 
 from extrags.config import CoarseConfig, DensifyConfig
 from extrags.raster import SelectiveAdam
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.training import reconstruct
 from extrags.training.relocation import MCMCStrategy, compute_relocation
 from tests.extrags.training.conftest import tube_gaussians
@@ -71,7 +71,7 @@ class TestMCMCStrategy:
         living = {tuple(mean.tolist()) for mean in parameters["means"][10:]}
         assert {tuple(value.tolist()) for value in moved.values()} <= living
         assert bool(decision.keep.all())
-        assert len(decision.born["means"]) == 0
+        assert len(decision.new_gaussians["means"]) == 0
 
     def test_all_dead_is_left_alone(self) -> None:
         parameters = small_ones(5)
@@ -79,7 +79,7 @@ class TestMCMCStrategy:
         assert not strategy().relocate(parameters).changed
 
     def test_growth_stops_at_the_cap(self) -> None:
-        assert len(strategy(max_gaussians=104).grow(small_ones(100)).born["means"]) == 4
+        assert len(strategy(max_gaussians=104).grow(small_ones(100)).new_gaussians["means"]) == 4
         assert not strategy(max_gaussians=100).grow(small_ones(100)).changed
 
     def test_opaque_gaussians_stand_still(self) -> None:
@@ -132,7 +132,7 @@ class TestMCMCStrategy:
         assert len(adam.steps) == 105
         assert float((adam.parameters["means"].detach() - before).norm(dim=1).min()) > 0
 
-    def test_a_scene_trains_with_it(self, tube_sequence: Sequence) -> None:
+    def test_a_scene_trains_with_it(self, tube_sequence: EndoscopicSequence) -> None:
         config = CoarseConfig(
             iterations=200,
             max_points=400,

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 
 from extrags.errors import CaptureError
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.training.starting import depth_from_points, median_depth, starting_gaussians, thin_out
 
 
 class TestStartingGaussians:
-    def test_points_lie_on_the_tube(self, tube_sequence: Sequence) -> None:
+    def test_points_lie_on_the_tube(self, tube_sequence: EndoscopicSequence) -> None:
         gaussians = starting_gaussians(tube_sequence, tube_sequence.train, 500)
         assert 250 < len(gaussians) <= 500
         radius = gaussians.means[:, :2].norm(dim=1).numpy()
         # Averaging in voxels of about 3 mm pulls points off a curved wall by a fraction of that.
         assert np.median(np.abs(radius - 10)) < 1.5
 
-    def test_same_input_same_bits(self, tube_sequence: Sequence) -> None:
+    def test_same_input_same_bits(self, tube_sequence: EndoscopicSequence) -> None:
         first, second = (starting_gaussians(tube_sequence, tube_sequence.train, 300) for _ in range(2))
         for name, value in first.parameters().items():
             np.testing.assert_array_equal(value.numpy(), second.parameters()[name].numpy())
 
-    def test_uses_the_given_frames_only(self, tube_sequence: Sequence) -> None:
+    def test_uses_the_given_frames_only(self, tube_sequence: EndoscopicSequence) -> None:
         depth = tube_sequence.depth_mm
         assert depth is not None
         poisoned = depth.copy()
@@ -33,14 +33,14 @@ class TestStartingGaussians:
         second = starting_gaussians(changed, tube_sequence.train, 300)
         np.testing.assert_array_equal(first.means.numpy(), second.means.numpy())
 
-    def test_nothing_to_start_from(self, tube_sequence: Sequence) -> None:
+    def test_nothing_to_start_from(self, tube_sequence: EndoscopicSequence) -> None:
         bare = replace(tube_sequence, depth_mm=None)
         with pytest.raises(CaptureError, match="neither depth nor sparse points"):
             median_depth(bare, bare.train)
         with pytest.raises(CaptureError, match="no depth and 0 sparse points"):
             starting_gaussians(bare, bare.train, 100)
 
-    def test_sparse_points_give_rough_depth(self, tube_sequence: Sequence) -> None:
+    def test_sparse_points_give_rough_depth(self, tube_sequence: EndoscopicSequence) -> None:
         generator = np.random.default_rng(0)
         angle, along = generator.uniform(0, 2 * np.pi, 400), generator.uniform(8, 45, 400)
         points = np.stack([10 * np.cos(angle), 10 * np.sin(angle), along], axis=1)
@@ -53,7 +53,7 @@ class TestStartingGaussians:
         assert np.median(error) < 0.15
         assert not depth[sparse.test].any()
 
-    def test_points_elsewhere_are_refused(self, tube_sequence: Sequence) -> None:
+    def test_points_elsewhere_are_refused(self, tube_sequence: EndoscopicSequence) -> None:
         behind = np.random.default_rng(0).normal(size=(100, 3)) - np.array([0.0, 0.0, 500.0])
         sparse = replace(tube_sequence, depth_mm=None, points=behind)
         with pytest.raises(CaptureError, match="same frame and scale"):

@@ -13,7 +13,7 @@ from extrags.errors import DivergedError, NonFiniteError
 from extrags.gaussians import Gaussians
 from extrags.raster import native, set_num_threads
 from extrags.scene import Scene
-from extrags.sequence import Sequence
+from extrags.sequence import EndoscopicSequence
 from extrags.training.optimise import optimise
 from extrags.training.reconstruction import coarse_schedule
 from extrags.training.schedule import Schedule
@@ -88,7 +88,7 @@ class TestOneStep:
     @pytest.mark.parametrize("change", [_weighted, _virtual])
     @pytest.mark.parametrize("setting", SETTINGS)
     def test_loss_and_gradients_are_those_of_autograd(
-        self, tube_sequence: Sequence, setting: str, change: Callable[[View], View], lit: bool
+        self, tube_sequence: EndoscopicSequence, setting: str, change: Callable[[View], View], lit: bool
     ) -> None:
         view = change(real_views(tube_sequence, tube_sequence.train)[1])
         schedule = _schedule(densify=SETTINGS[setting], sh_every=5)
@@ -126,7 +126,9 @@ class TestOneStep:
                 assert _relative(exposure, expected.light.log_exposure.grad) < 1e-5
 
     @pytest.mark.parametrize("degree", [0, 1, 3])
-    def test_parameters_after_a_step_are_the_same(self, tube_sequence: Sequence, degree: int) -> None:
+    def test_parameters_after_a_step_are_the_same(
+        self, tube_sequence: EndoscopicSequence, degree: int
+    ) -> None:
         view = real_views(tube_sequence, tube_sequence.train)[0]
         schedule = _schedule(sh_every=1)
         scene = _scene(degree)
@@ -147,7 +149,7 @@ class TestOneStep:
                 steps[0].light.parameters()[name], value.detach(), rtol=1e-4, atol=1e-6
             )  # type: ignore[union-attr]
 
-    def test_depth_weight_zero_leaves_depth_alone(self, tube_sequence: Sequence) -> None:
+    def test_depth_weight_zero_leaves_depth_alone(self, tube_sequence: EndoscopicSequence) -> None:
         view = real_views(tube_sequence, tube_sequence.train)[0]
         schedule = _schedule(depth_weight=0.0)
         density = density_strategy(schedule.densify, 20.0, 30, 900, seed=0)
@@ -159,7 +161,7 @@ class TestOneStep:
 
 
 def _train(
-    sequence: Sequence, make_step: MakeStep, densify: DensifyConfig, iterations: int = 30
+    sequence: EndoscopicSequence, make_step: MakeStep, densify: DensifyConfig, iterations: int = 30
 ) -> tuple[Scene, list[dict[str, float]]]:
     views = real_views(sequence, sequence.train)
     mixed = [*views, _virtual(views[0])]
@@ -174,7 +176,7 @@ DENSIFYING = DensifyConfig(
 
 
 class TestManySteps:
-    def test_stays_close_to_autograd_through_densification(self, tube_sequence: Sequence) -> None:
+    def test_stays_close_to_autograd_through_densification(self, tube_sequence: EndoscopicSequence) -> None:
         own, own_history = _train(tube_sequence, NativeStep, DENSIFYING)
         other, history = _train(tube_sequence, AutogradStep, DENSIFYING)
         assert history[-1]["n_gaussians"] > 900
@@ -185,7 +187,7 @@ class TestManySteps:
         for name, value in other.light.parameters().items():  # type: ignore[union-attr]
             torch.testing.assert_close(own.light.parameters()[name], value, rtol=1e-2, atol=1e-3)  # type: ignore[union-attr]
 
-    def test_mcmc_stays_close_too(self, tube_sequence: Sequence) -> None:
+    def test_mcmc_stays_close_too(self, tube_sequence: EndoscopicSequence) -> None:
         densify = DENSIFYING.model_copy(update={"strategy": "mcmc"})
         _, own = _train(tube_sequence, NativeStep, densify)
         _, other = _train(tube_sequence, AutogradStep, densify)
@@ -194,7 +196,7 @@ class TestManySteps:
 
     @pytest.mark.parametrize("strategy", ["default", "mcmc"])
     def test_same_bits_on_any_number_of_threads(
-        self, tube_sequence: Sequence, strategy: str, threads: None
+        self, tube_sequence: EndoscopicSequence, strategy: str, threads: None
     ) -> None:
         densify = DENSIFYING.model_copy(update={"strategy": strategy})
         results = []
@@ -209,7 +211,7 @@ class TestManySteps:
 
 
 class TestNativeStep:
-    def test_the_scene_given_is_copied(self, tube_sequence: Sequence) -> None:
+    def test_the_scene_given_is_copied(self, tube_sequence: EndoscopicSequence) -> None:
         scene = _scene()
         before = scene.detached()
         view = real_views(tube_sequence, tube_sequence.train)[0]
@@ -219,7 +221,7 @@ class TestNativeStep:
         for name, value in before.light.parameters().items():  # type: ignore[union-attr]
             assert torch.equal(scene.light.parameters()[name], value), name  # type: ignore[union-attr]
 
-    def test_views_that_are_gone_are_forgotten(self, tube_sequence: Sequence) -> None:
+    def test_views_that_are_gone_are_forgotten(self, tube_sequence: EndoscopicSequence) -> None:
         schedule = _schedule()
         step = NativeStep(_scene(), schedule)
         density = density_strategy(schedule.densify, 20.0, 30, 900, seed=0)
@@ -231,7 +233,7 @@ class TestNativeStep:
         gc.collect()
         assert not step._targets
 
-    def test_nonfinite_parameters_are_refused(self, tube_sequence: Sequence) -> None:
+    def test_nonfinite_parameters_are_refused(self, tube_sequence: EndoscopicSequence) -> None:
         scene = _scene()
         scene.gaussians.shN[5, 1, 2] = float("inf")
         view = real_views(tube_sequence, tube_sequence.train)[0]
@@ -246,7 +248,7 @@ class TestNativeStep:
 
 
 @pytest.mark.parametrize("make_step", [NativeStep, AutogradStep])
-def test_torch_threads_are_put_back(tube_sequence: Sequence, make_step: MakeStep) -> None:
+def test_torch_threads_are_put_back(tube_sequence: EndoscopicSequence, make_step: MakeStep) -> None:
     view = real_views(tube_sequence, tube_sequence.train)[0]
     poisoned = replace(view, rgb=torch.full_like(view.rgb, np.nan))
     before = torch.get_num_threads()

@@ -1,0 +1,479 @@
+"""Diagnostics of a sequence that can be read: findings for `data check`.
+
+Every check states in its sentence what was measured and what to do. Thresholds are set so that the sequences
+of the catalogue pass; a source may be right and still be reported, which is why nothing here stops a run.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+from pydantic import BaseModel, ConfigDict
+
+from data_catalog.checks import axis_readings, reading_name
+from data_catalog.images import natural_key
+from data_catalog.matches import match_neighbours, pose_support
+from data_catalog.specular import saturated_mask
+from extrags.cameras import invert_poses, rotation_angle_deg
+from extrags.sequence import EndoscopicSequence
+
+__all__ = ["Finding", "diagnose"]
+
+_MIN_MATCHES = 60
+# Exact poses of the catalogue's sequences explain 87 to 95 % of the matches; shuffled ones up to 30 % as
+# given, and up to 80 % in the best of 48 readings.
+_CONVINCING_SUPPORT = 0.82
+_CLEARLY_LESS = 0.5
+_POOR_SUPPORT = 0.4
+_EXPOSURE_JUMP = 0.5
+_EXPOSURE_DEVIATIONS = 8.0
+_MIN_BASELINE_SHARE = 0.02
+_OFF_CENTRE_SHARE = 0.2
+_JUMP = 8.0
+_CLIPPED_SHARE = 0.02
+_SATURATED_SHARE = 0.6
+_BLACK = 4.0
+
+
+class Finding(BaseModel):
+    """One thing that is wrong with a source, or looks so."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["error", "warning"]
+    """An error stops a run; a warning makes its result worse or questionable."""
+    topic: str
+    """What it is about, in a word or two."""
+    sentence: str
+    """What was found, what was expected, what to do."""
+    file: str | None = None
+    frame: str | None = None
+    field: str | None = None
+
+    def __str__(self) -> str:
+        where = [
+            f"{label} {value}"
+            for label, value in (("file", self.file), ("frame", self.frame), ("field", self.field))
+            if value is not None
+        ]
+        return f"{', '.join(where)}: {self.sentence}" if where else self.sentence
+
+
+def diagnose(sequence: EndoscopicSequence, file: str) -> list[Finding]:
+    """Everything questionable about a sequence.
+
+    Args:
+        sequence: as a reader made it.
+        file: the source, named in findings.
+    """
+    found: list[Finding] = []
+    for check in _CHECKS:
+        found += [finding.model_copy(update={"file": file}) for finding in check(sequence)]
+    return found
+
+
+def _warning(topic: str, sentence: str, *, frame: str | None = None, field: str | None = None) -> Finding:
+    return Finding(kind="warning", topic=topic, sentence=sentence, frame=frame, field=field)
+
+
+def _names(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Frames out of order, and single frames that are missing from a regular numbering."""
+    for members in _recordings(sequence):
+        names = [sequence.frame_name(k) for k in members]
+        keys = [natural_key(name) for name in names]
+        late = next((k for k in range(1, len(keys)) if keys[k] < keys[k - 1]), None)
+        if late is not None:
+            yield _warning(
+                "order of frames",
+                f"listed after {names[late - 1]}, though its name comes before; neighbours in the list are "
+                "taken for neighbours in time. List the frames in the order of recording",
+                frame=names[late],
+                field="frame names",
+            )
+            continue
+        numbers = np.array([_number(name) for name in names])
+        steps = np.diff(numbers)
+        if len(steps) < 6 or (numbers < 0).any():
+            continue
+        usual = int(np.median(steps))
+        gaps = np.flatnonzero(steps != usual)
+        if usual > 0 and 0 < gaps.size <= max(1, len(steps) // 20):
+            gap = int(gaps[0])
+            yield _warning(
+                "missing frame",
+                f"the next frame is {names[gap + 1]}, {int(steps[gap])} on; all others are {usual} apart. "
+                "Frames are missing between the two",
+                frame=names[gap],
+                field="frame names",
+            )
+
+
+def _images(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Duplicates, black frames, swapped channels, overexposure."""
+    seen: dict[bytes, int] = {}
+    for index in range(len(sequence)):
+        digest = hashlib.blake2b(sequence.rgb[index].tobytes(), digest_size=16).digest()
+        if digest in seen:
+            yield _warning(
+                "duplicate frame",
+                f"the same image as frame {sequence.frame_name(seen[digest])}, pixel by pixel; remove one",
+                frame=sequence.frame_name(index),
+                field="rgb",
+            )
+            break
+        seen[digest] = index
+    means = _brightness(sequence)
+    for index in np.flatnonzero(means < _BLACK)[:1]:
+        yield _warning(
+            "black frame",
+            f"mean brightness {means[index]:.1f} of 255 inside the mask; {int((means < _BLACK).sum())} of "
+            f"{len(means)} frames are like that. Leave them out",
+            frame=sequence.frame_name(int(index)),
+            field="rgb",
+        )
+    red, _, blue = (float(sequence.rgb[..., channel][sequence.mask].mean()) for channel in range(3))
+    if blue > 1.15 * red and blue > 20:
+        yield _warning(
+            "colour channels",
+            f"blue ({blue:.0f}) outweighs red ({red:.0f}) on average, which tissue never shows: the channels "
+            "are probably swapped (BGR for RGB)",
+            field="rgb",
+        )
+    share = float(saturated_mask(sequence.rgb)[sequence.mask].mean())
+    if share > _SATURATED_SHARE:
+        yield _warning(
+            "saturation",
+            f"{share:.0%} of the pixels inside the mask are saturated in some channel; their colour is lost "
+            "and does not train. Record darker",
+            field="rgb",
+        )
+
+
+def _exposure(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Sudden changes of brightness between neighbours."""
+    means = np.log(np.maximum(_brightness(sequence), 1.0))
+    steps = [(k, float(means[k] - means[j])) for j, k in _neighbours(sequence)]
+    if len(steps) < 4:
+        return
+    values = np.array([step for _, step in steps])
+    spread = 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    limit = max(_EXPOSURE_JUMP, _EXPOSURE_DEVIATIONS * spread)
+    jumps = [(k, step) for k, step in steps if abs(step) > limit]
+    if jumps:
+        frame, step = jumps[0]
+        yield _warning(
+            "exposure jump",
+            f"{np.exp(step):.2f} times as bright as the frame before ({len(jumps)} such jumps; neighbours "
+            f"usually differ by {np.exp(np.median(np.abs(values))) - 1:.0%}). Fix exposure and gain when "
+            "recording, or keep the exposure per frame switched on (coarse.light.enabled)",
+            frame=sequence.frame_name(frame),
+            field="rgb",
+        )
+
+
+def _masks(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Masks that keep the dark frame and leave the picture out."""
+    inside, outside = sequence.mask, ~sequence.mask
+    share = float(outside.mean())
+    if share < 0.02:
+        return
+    brightness = sequence.rgb.max(axis=-1)
+    lit_inside, lit_outside = (float((brightness[part] > 25).mean()) for part in (inside, outside))
+    if lit_inside < 0.3 and lit_outside > 0.6:
+        yield Finding(
+            kind="error",
+            topic="mask polarity",
+            sentence=f"{1 - lit_inside:.0%} of the pixels that the mask keeps are dark and {lit_outside:.0%} "
+            "of those it leaves out are lit: the mask is inverted. Expected white on tissue",
+            field="mask",
+        )
+        return
+    if sequence.depth_mm is not None:
+        known_inside = float((sequence.depth_mm[inside] > 0).mean())
+        known_outside = float((sequence.depth_mm[outside] > 0).mean())
+        if known_inside < 0.2 and known_outside > 0.8:
+            yield Finding(
+                kind="error",
+                topic="mask polarity",
+                sentence=f"depth is known for {known_inside:.0%} of the pixels that the mask keeps and for "
+                f"{known_outside:.0%} of those it leaves out: the mask is inverted. Expected white on tissue",
+                field="mask",
+            )
+            return
+    kept = sequence.mask.mean(axis=(1, 2))
+    if kept.min() < 0.05:
+        index = int(kept.argmin())
+        yield _warning(
+            "mask",
+            f"the mask keeps {kept[index]:.1%} of the image",
+            frame=sequence.frame_name(index),
+            field="mask",
+        )
+
+
+def _intrinsics(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Intrinsics that are possible but unlikely for images of this size."""
+    width, height = sequence.width, sequence.height
+    for index in range(len(sequence)):
+        K = sequence.K[index]
+        fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+        across, down = 2 * cx / width, 2 * cy / height
+        problem = ""
+        if abs(across - down) < 0.1 and (across > 1.4 or across < 0.7):
+            problem = (
+                f"the principal point ({cx:.1f}, {cy:.1f}) is the centre of an image {across:.2g} times as "
+                f"large as this one of {width} x {height} pixels: K belongs to another size. Divide its "
+                f"first two rows by {across:.2g}"
+            )
+        elif (
+            abs(cx - width / 2) > _OFF_CENTRE_SHARE * width
+            or abs(cy - height / 2) > _OFF_CENTRE_SHARE * height
+        ):
+            problem = (
+                f"the principal point ({cx:.1f}, {cy:.1f}) lies far from the centre of {width} x {height} "
+                "pixels. Was the image cropped, or are cx and cy swapped?"
+            )
+        elif not 1 / 1.15 < fx / fy < 1.15:
+            problem = (
+                f"fx = {fx:.1f} and fy = {fy:.1f} px differ by {abs(fx / fy - 1):.0%}; pixels are nearly "
+                "square in all endoscopes. Was the image squeezed?"
+            )
+        elif (angle := 2 * np.degrees(np.arctan(width / 2 / fx))) > 150 or angle < 15:
+            problem = (
+                f"fx = {fx:.1f} px means a field of view of {angle:.0f} degrees for {width} pixels; "
+                "endoscopes have 40 to 140 as a pinhole. Does fx belong to another image size?"
+            )
+        if problem:
+            yield _warning("intrinsics", problem, frame=sequence.frame_name(index), field="K")
+            return
+
+
+def _poses(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Cameras that stand still, repeat or jump."""
+    if sequence.world_from_camera is None:
+        return
+    cameras = sequence.cameras
+    train = sequence.train
+    reach = float(np.linalg.norm(np.ptp(cameras.centers[train], axis=0)))
+    turn = float(
+        rotation_angle_deg(
+            cameras.world_from_camera[train, :3, :3],
+            cameras.world_from_camera[np.repeat(train[:1], len(train)), :3, :3],
+        ).max()
+    )
+    distance = _scene_distance(sequence)
+    if reach == 0 and turn < 1e-6:
+        yield _warning(
+            "parallax",
+            "all training frames have the same pose: the camera stands still, or the poses are placeholders. "
+            "Nothing can be triangulated; depth alone carries the shape",
+            field="world_from_camera",
+        )
+        return
+    if distance is not None:
+        yield from _parallax(reach, distance)
+    for members in _recordings(sequence):
+        yield from _pose_steps(sequence, members)
+
+
+def _parallax(reach: float, distance: float) -> Iterator[Finding]:
+    if reach < _MIN_BASELINE_SHARE * distance:
+        yield _warning(
+            "parallax",
+            f"the training cameras reach over {reach:.3g}, {reach / distance:.1%} of the distance to the "
+            f"scene ({distance:.3g}); expected at least {_MIN_BASELINE_SHARE:.0%}. Too little parallax to "
+            "triangulate; record more motion sideways, or give depth",
+            field="world_from_camera",
+        )
+
+
+def _pose_steps(sequence: EndoscopicSequence, members: list[int]) -> Iterator[Finding]:
+    centers = sequence.cameras.centers[members]
+    rotations = sequence.cameras.world_from_camera[members, :3, :3]
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    if len(steps) < 4:
+        return
+    usual = float(np.median(steps))
+    for k in range(len(steps)):
+        same = steps[k] == 0 and np.array_equal(rotations[k], rotations[k + 1])
+        if same and usual > 0 and not np.array_equal(sequence.rgb[members[k]], sequence.rgb[members[k + 1]]):
+            yield _warning(
+                "repeated pose",
+                f"the same pose as frame {sequence.frame_name(members[k])}, but another image",
+                frame=sequence.frame_name(members[k + 1]),
+                field="world_from_camera",
+            )
+            return
+    # A frame off the path: there and back is far longer than straight on.
+    straight = np.linalg.norm(centers[2:] - centers[:-2], axis=1)
+    detour = steps[:-1] + steps[1:] - straight
+    worst = int(detour.argmax())
+    if usual > 0 and detour[worst] > _JUMP * max(usual, float(straight[worst])):
+        yield _warning(
+            "pose jump",
+            f"lies {steps[worst]:.3g} from the frame before and {steps[worst + 1]:.3g} from the one after, "
+            f"which are {straight[worst]:.3g} apart (usual step {usual:.3g}); its pose is probably wrong",
+            frame=sequence.frame_name(members[worst + 1]),
+            field="world_from_camera",
+        )
+
+
+def _points(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Sparse points that no camera sees."""
+    if sequence.points is None or sequence.world_from_camera is None or len(sequence.points) < 20:
+        return
+    poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
+    as_given = _seen_share(sequence, poses)
+    if as_given > 0.15:
+        return
+    best, best_name = as_given, ""
+    for axes in axis_readings():
+        turn = np.eye(4)
+        turn[:3, :3] = axes
+        for inverted, base in ((False, poses), (True, invert_poses(poses))):
+            share = _seen_share(sequence, base @ turn)
+            if share > best + 1e-9:
+                best, best_name = share, reading_name(axes, inverted)
+    hint = f", but {best:.0%} when the poses are read as {best_name}" if best > 3 * as_given + 0.1 else ""
+    yield Finding(
+        kind="error",
+        topic="sparse points",
+        sentence=f"on average a camera sees {as_given:.0%} of the sparse points in front of it and inside "
+        f"its image{hint}. Points and poses are of different worlds, or the axes are wrong",
+        field="points",
+    )
+
+
+def _seen_share(sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"]) -> float:
+    """Mean share of the sparse points in front of a camera and inside its image."""
+    if sequence.points is None:
+        return 0.0
+    shares = []
+    for K, viewmat in zip(sequence.K, invert_poses(poses), strict=True):
+        local = sequence.points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        z = np.maximum(local[:, 2], 1e-12)
+        u, v = K[0, 0] * local[:, 0] / z + K[0, 2], K[1, 1] * local[:, 1] / z + K[1, 2]
+        inside = (local[:, 2] > 0) & (u >= 0) & (u < sequence.width) & (v >= 0) & (v < sequence.height)
+        shares.append(float(inside.mean()))
+    return float(np.mean(shares))
+
+
+def _epipolar(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Poses that features contradict; needed where there is no depth to contradict them."""
+    if sequence.world_from_camera is None or sequence.depth_mm is not None:
+        return
+    support = pose_support(sequence, match_neighbours(sequence))
+    if support.matches < _MIN_MATCHES:
+        return
+    if support.best > _CONVINCING_SUPPORT and support.as_given < _CLEARLY_LESS * support.best:
+        yield Finding(
+            kind="error",
+            topic="pose direction" if "inverted" in support.best_name else "axes",
+            sentence=f"the poses explain {support.as_given:.0%} of {support.matches} feature matches between "
+            f"neighbouring frames, but {support.best:.0%} when they are read as {support.best_name}. "
+            "Expected OpenCV axes (x right, y down, z forward), camera to world",
+            field="world_from_camera",
+        )
+    elif support.as_given < _POOR_SUPPORT:
+        yield _warning(
+            "poses",
+            f"the poses explain {support.as_given:.0%} of {support.matches} feature matches between "
+            f"neighbouring frames, and no other reading of the axes does convincingly ({support.best:.0%} at "
+            "best): poses or K are wrong, or frames and poses are not in the same order",
+            field="world_from_camera",
+        )
+    elif sequence.points is None and support.distance > 0:
+        reach = float(np.linalg.norm(np.ptp(sequence.cameras.centers[sequence.train], axis=0)))
+        yield from _parallax(reach, support.distance)
+
+
+def _depth(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Clip values that were not marked as unknown, and maps that hardly know anything."""
+    if sequence.depth_mm is None:
+        return
+    known = sequence.depth_mm > 0
+    largest = float(sequence.depth_mm.max())
+    share = float((sequence.depth_mm == largest).sum() / max(1, known.sum()))
+    steps = np.unique(sequence.depth_mm[0])
+    if share > _CLIPPED_SHARE and len(steps) > 32:
+        yield _warning(
+            "depth clipped",
+            f"{share:.1%} of the known depths are exactly {largest:.6g}, the largest value: a clip value "
+            "that is not marked as unknown. Write 0 there",
+            field="depth_mm",
+        )
+    elif len(steps) <= 32:
+        yield _warning(
+            "depth resolution",
+            f"the first frame has {len(steps)} different depths; expected a continuous map. Was it stored in "
+            "8 bits or as a picture?",
+            frame=sequence.frame_name(0),
+            field="depth_mm",
+        )
+    shares = (known & sequence.mask).sum(axis=(1, 2)) / np.maximum(1, sequence.mask.sum(axis=(1, 2)))
+    if shares.min() < 0.1:
+        index = int(shares.argmin())
+        yield _warning(
+            "depth coverage",
+            f"depth is known for {shares[index]:.1%} of the pixels inside the mask",
+            frame=sequence.frame_name(index),
+            field="depth_mm",
+        )
+
+
+_CHECKS: tuple[Callable[[EndoscopicSequence], Iterator[Finding]], ...] = (
+    _names,
+    _images,
+    _exposure,
+    _masks,
+    _intrinsics,
+    _poses,
+    _points,
+    _epipolar,
+    _depth,
+)
+
+
+def _recordings(sequence: EndoscopicSequence) -> Iterator[list[int]]:
+    recording = np.zeros(len(sequence), dtype=int) if sequence.recording is None else sequence.recording
+    for number in np.unique(recording):
+        yield np.flatnonzero(recording == number).tolist()
+
+
+def _neighbours(sequence: EndoscopicSequence) -> Iterator[tuple[int, int]]:
+    for members in _recordings(sequence):
+        yield from itertools.pairwise(members)
+
+
+def _number(name: str) -> int:
+    """The last number of a name; -1 without any."""
+    numbers = [part for kind, part, _ in natural_key(name) if kind == 1]
+    return numbers[-1] if numbers else -1
+
+
+def _brightness(sequence: EndoscopicSequence) -> Float[np.ndarray, "f"]:
+    """Mean over the mask of the mean of the channels."""
+    grey = sequence.rgb.mean(axis=-1)
+    inside = np.maximum(1, sequence.mask.sum(axis=(1, 2)))
+    return np.asarray((grey * sequence.mask).sum(axis=(1, 2)) / inside)
+
+
+def _scene_distance(sequence: EndoscopicSequence) -> float | None:
+    """Median distance from cameras to what they see; None where neither depth nor points tell."""
+    if sequence.depth_mm is not None:
+        known = sequence.depth_mm > 0
+        return float(np.median(sequence.depth_mm[known])) if known.any() else None
+    if sequence.points is None or not len(sequence.points):
+        return None
+    z = np.concatenate(
+        [
+            (sequence.points @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
+            for viewmat in sequence.cameras.viewmats
+        ]
+    )
+    return float(np.median(z[z > 0])) if (z > 0).any() else None

@@ -1,0 +1,81 @@
+"""The named combinations of settings: `quick`, `balanced` and `paper`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from extrags.config.restorer import EnhanceConfig
+from extrags.config.stages import (
+    CoarseConfig,
+    DensifyConfig,
+    ExploreConfig,
+    FinetuneConfig,
+    OptimiserConfig,
+    PipelineConfig,
+)
+from extrags.errors import ConfigError
+
+__all__ = ["PROFILES", "ProfileName", "profile_config"]
+
+ProfileName = Literal["quick", "balanced", "paper"]
+
+PROFILES: dict[str, PipelineConfig] = {
+    # A look at the scene in about three minutes on two cores.
+    "quick": PipelineConfig(
+        coarse=CoarseConfig(
+            iterations=1500,
+            max_points=8000,
+            sh_every=400,
+            densify=DensifyConfig(max_gaussians=14_000),
+            # A short run has no time for the published rates.
+            optimiser=OptimiserConfig(means=3.2e-4, sh0=5e-3),
+        ),
+        explore=ExploreConfig(trajectories=12, length=10, rotation_deg=20.0, orbit_deg=20.0),
+        enhance=EnhanceConfig(max_views=96),
+        finetune=FinetuneConfig(iterations=1000),
+    ),
+    # The default: minutes to a quarter of an hour on two cores.
+    "balanced": PipelineConfig(
+        coarse=CoarseConfig(
+            iterations=5000, max_points=16_000, sh_every=1000, densify=DensifyConfig(max_gaussians=40_000)
+        ),
+        enhance=EnhanceConfig(
+            folds=3,
+            fold_iterations=600,
+            channels=(48, 96, 160),
+            max_views=240,
+        ),
+        explore=ExploreConfig(rotation_deg=20.0, orbit_deg=20.0),
+        finetune=FinetuneConfig(iterations=4000),
+    ),
+    # The paper's counts.
+    "paper": PipelineConfig(
+        coarse=CoarseConfig(
+            iterations=30_000,
+            max_points=60_000,
+            sh_degree=3,
+            sh_every=1000,
+            densify=DensifyConfig(max_gaussians=400_000, start_share=1 / 60, stop_share=0.5),
+        ),
+        enhance=EnhanceConfig(
+            folds=4,
+            fold_iterations=2000,
+            channels=(48, 96, 160),
+            max_views=320,
+            samples=4,
+        ),
+        finetune=FinetuneConfig(iterations=15_000),
+        explore=ExploreConfig(render_width=160, max_expansions=200),
+    ),
+}
+
+
+def profile_config(name: str) -> PipelineConfig:
+    """Settings of a profile.
+
+    Raises:
+        ConfigError: for an unknown profile.
+    """
+    if name not in PROFILES:
+        raise ConfigError(f"no profile {name!r}; known: {', '.join(PROFILES)}")
+    return PROFILES[name]

@@ -1,0 +1,161 @@
+"""Settings of the restoration: the embedded restorer, those that others trained, and their captions."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from extrags.config.base import StageConfig
+
+__all__ = ["CaptionConfig", "CheckpointConfig", "EnhanceConfig", "PretrainedConfig"]
+
+
+class CaptionConfig(StageConfig):
+    """What pretrained pipelines are told in words about a scene.
+
+    The endpoint's address and key are no settings: they come from EXTRAGS_CAPTION_URL and
+    EXTRAGS_CAPTION_KEY, so that no key can end up in an artefact.
+    """
+
+    source: Literal["constant", "file", "endpoint"] = Field(
+        "constant", description="one text for all, a text per scene, or an OpenAI-compatible endpoint"
+    )
+    text: str = Field(
+        "endoscopic view of the colon mucosa, folds, blood vessels, sharp, well lit",
+        min_length=1,
+        description="the constant text",
+    )
+    negative_text: str = Field(
+        "blurry, noisy, floating blobs, distorted, text, watermark",
+        description="what guidance leads away from",
+    )
+    file: str | None = Field(None, description="YAML or JSON file {name of the sequence: text}")
+    model: str | None = Field(None, description="model the endpoint is asked for")
+    frames: int = Field(6, ge=1, le=32, description="training frames the endpoint is shown")
+    frame_width: int = Field(320, ge=32, le=1024, description="width they are reduced to, in pixels")
+    max_tokens: int = Field(70, ge=8, le=500, description="length of the answer; CLIP reads 77 tokens")
+    timeout_s: float = Field(60.0, gt=0, description="of one request")
+    retries: int = Field(4, ge=0, le=10, description="further tries after a passing fault")
+    retry_wait_s: float = Field(1.0, ge=0, description="before the second try; doubled after each")
+    prompt_price: float = Field(0.0, ge=0, description="of a million tokens sent; the cost is shown in it")
+    completion_price: float = Field(0.0, ge=0, description="of a million tokens received")
+
+
+class PretrainedConfig(StageConfig):
+    """Settings that all diffusers pipelines share; None takes the pipeline's usual value."""
+
+    model: str | None = Field(None, description="folder of a saved pipeline, or a hub id")
+    revision: str | None = Field(None, description="commit, tag or branch of a hub id")
+    local_files_only: bool = Field(True, description="False: a hub id may be downloaded")
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda where there is one")
+    dtype: Literal["auto", "float32", "bfloat16", "float16"] = Field(
+        "auto", description="auto: bfloat16 on cuda, float32 on a processor"
+    )
+    offload: Literal["none", "model", "sequential"] = Field(
+        "none", description="keep idle parts of the pipeline in main memory; needs cuda"
+    )
+    frames: int | None = Field(None, ge=2, description="frames of one window, a real view first")
+    overlap: int = Field(4, ge=0, description="frames two windows share, cross-faded")
+    short_side_px: int | None = Field(None, ge=16, description="shorter side of the images it works on")
+    steps: int | None = Field(None, ge=1, description="denoising steps")
+    strength: float | None = Field(
+        None, gt=0, le=1, description="share of the noise that known pixels start from (not Wan VACE)"
+    )
+    guidance_scale: float | None = Field(None, ge=0, description="weight of the text; 1 and less: none")
+    reference_images: int = Field(2, ge=0, description="real views handed over where a pipeline takes them")
+    mask_threshold: float = Field(0.5, gt=0, le=1, description="pixels known by less than this are made anew")
+    mask_dilation_px: int = Field(3, ge=0, description="and so far around them")
+
+
+class CheckpointConfig(StageConfig):
+    """A DynamiCrafter-type checkpoint, run by the user's own clone of its code."""
+
+    root: str | None = Field(None, description="the clone: folder that holds lvdm/ and utils/")
+    config: str | None = Field(None, description="YAML file of the model, absolute or inside the clone")
+    checkpoint: str | None = Field(None, description="weights: .ckpt, .pt or .safetensors")
+    interface: Literal["enhancer", "dynamicrafter"] = Field(
+        "enhancer",
+        description="enhancer: restores renders, as the paper's; dynamicrafter: the published image-to-video "
+        "model, holes only",
+    )
+    python: str | None = Field(None, description="interpreter with the clone's packages; None: this one")
+    trust_pickle: bool = Field(
+        False, description="load a checkpoint that holds more than tensors; it can run any code"
+    )
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda where there is one")
+    steps: int = Field(50, ge=1, description="DDIM steps")
+    eta: float = Field(1.0, ge=0, le=1, description="of DDIM; 1 is ancestral sampling")
+    guidance_scale: float | None = Field(
+        None, ge=0, description="weight of the text; None: 1 for enhancer, 7.5 for dynamicrafter"
+    )
+    fps: int = Field(5, ge=1, description="frame rate the model is told")
+    frames: int = Field(16, ge=2, description="frames of one window, a real view first")
+    overlap: int = Field(4, ge=0, description="frames two windows share, cross-faded")
+    width: int = Field(512, ge=16, description="image width; images are stretched to it, as the paper does")
+    height: int = Field(320, ge=16, description="image height")
+    timeout_s: float = Field(3600.0, gt=0, description="of one clip, loading included; longer is an error")
+
+
+class EnhanceConfig(StageConfig):
+    """Restoration of the virtual views."""
+
+    backend: Literal[
+        "embedded",
+        "classical",
+        "wan-vace",
+        "stable-video",
+        "ltx",
+        "sd-img2img",
+        "sd-inpaint",
+        "dynamicrafter",
+    ] = Field(
+        "embedded",
+        description="embedded: the conditional diffusion; classical: blend and fill; dynamicrafter: a "
+        "checkpoint run by its own code; the others: pretrained diffusers pipelines",
+    )
+    pretrained_weights: str = Field(
+        "bundled",
+        min_length=1,
+        description="what the embedded backend starts from: bundled (weights of the package), none (the "
+        "scene's own pairs alone), or a path",
+    )
+    folds: int = Field(2, ge=1, description="leave-out reconstructions that make training pairs")
+    fold_iterations: int = Field(300, ge=1, description="optimisation steps of each of them")
+    synthetic_views: int = Field(24, ge=0, description="further pairs from perturbed, unoptimised Gaussians")
+    train_iterations: int = Field(
+        0,
+        ge=0,
+        description="steps of the diffusion's training on the scene's own pairs, kept where validation pairs "
+        "show a gain; 0: none are made. Where it was measured, that gain did not reach the final scene",
+    )
+    judge: bool = Field(
+        True,
+        description="the embedded restorer must not be worse than blending and filling on leave-out pairs of "
+        "the scene, else that serves",
+    )
+    batch: int = Field(4, ge=1, description="crops per step")
+    crop: int = Field(96, ge=32, description="crop size in pixels, a multiple of 8")
+    channels: tuple[int, int, int] = Field(
+        (32, 64, 96), description="widths of the U-Net's levels, where it starts from no weights"
+    )
+    learning_rate: float = Field(8e-4, gt=0, description="of a training from nothing")
+    scene_learning_rate: float = Field(2e-4, gt=0, description="of a training from pretrained weights")
+    steps: int | Literal["auto"] = Field(
+        "auto",
+        description="sampling steps; auto: those of the weights, or, after training on the scene, 1 or 4, as "
+        "its validation pairs decide",
+    )
+    samples: int = Field(
+        1, ge=1, le=16, description="samples per view, averaged; their spread adds to the expected error"
+    )
+    precision: Literal["auto", "float32", "bfloat16"] = Field(
+        "auto", description="of the convolutions; auto: bfloat16 where the processor computes it faster"
+    )
+    references: int = Field(8, ge=1, description="real views blended into the reference")
+    max_views: int = Field(160, ge=1, description="virtual views restored at most")
+    clips_per_batch: int = Field(4, ge=1, description="clips restored by one task")
+    caption: CaptionConfig = CaptionConfig()
+    pretrained: PretrainedConfig = PretrainedConfig()
+    checkpoint: CheckpointConfig = CheckpointConfig()
+    seed: int = Field(0, ge=0)

@@ -1,0 +1,424 @@
+"""Settings of the stages: one frozen model each, and `PipelineConfig` that joins them.
+
+Lengths that depend on the scene are given relative to it (to a depth quantile, say), so that the same
+settings serve a colon in millimetres and a COLMAP model in arbitrary units. Budgets are counted in
+iterations, never in seconds: a result must not depend on how busy the machine was.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from extrags.config.base import StageConfig
+from extrags.config.restorer import EnhanceConfig
+from extrags.errors import ConfigError
+
+__all__ = [
+    "AssessConfig",
+    "CoarseConfig",
+    "DensifyConfig",
+    "EvaluateConfig",
+    "ExploreConfig",
+    "FinetuneConfig",
+    "FreespaceConfig",
+    "IngestConfig",
+    "LightConfig",
+    "OptimiserConfig",
+    "PipelineConfig",
+    "PoseRefinementConfig",
+    "PosesConfig",
+    "ReportConfig",
+    "SurfaceConfig",
+]
+
+
+class IngestConfig(StageConfig):
+    """How a source becomes an `EndoscopicSequence`."""
+
+    width: int | None = Field(
+        None, ge=16, le=4096, description="image width in pixels; None keeps the source's own"
+    )
+    height: int | None = Field(None, ge=16, le=4096, description="image height in pixels")
+    downscale: int | None = Field(
+        None,
+        ge=1,
+        le=16,
+        description="divide the source's size by this; None: the source's usual divisor (sinus 4, "
+        "simcol3d 2, C3VD to a width of 225, others 1); ignored when width is set",
+    )
+    holdout_every: int = Field(
+        8, ge=2, description="hold out every n-th frame where the source defines no split"
+    )
+    max_frames: int | None = Field(None, ge=2, description="read at most so many frames")
+    field_of_view_deg: float | None = Field(
+        None,
+        ge=20,
+        le=150,
+        description="horizontal field of view of the pinhole that distorted sources are resampled to; None: "
+        "the source's usual one (C3VD and C3VDv2 100; others: that of their central resolution)",
+    )
+
+
+class PosesConfig(StageConfig):
+    """Camera poses, for sources without them."""
+
+    n_features: int = Field(6000, ge=100, description="SIFT features per image")
+    peak_threshold: float = Field(
+        0.001, gt=0, description="SIFT peak threshold; COLMAP's default is too high for mucosa"
+    )
+    edge_threshold: float = Field(20.0, gt=0, description="SIFT edge threshold")
+    sequential_overlap: int = Field(12, ge=1, description="frames matched to each side")
+    exhaustive_below: int = Field(
+        60, ge=2, description="match all pairs when there are at most so many frames"
+    )
+    min_tri_angle_deg: float = Field(4.0, gt=0, description="smallest initial triangulation angle")
+    min_registered_share: float = Field(
+        0.5, gt=0, le=1, description="fewer registered training frames are an error"
+    )
+    fallback: Literal["auto", "never", "rgbd"] = Field(
+        "auto",
+        description="auto: where COLMAP fails and depth is there, frames are aligned by colour and depth; "
+        "never: COLMAP alone; rgbd: alignment by colour and depth from the start",
+    )
+    replace_given: bool = Field(
+        False, description="estimate poses although the source has them; theirs become the yardstick"
+    )
+    rgbd_width: int = Field(192, ge=32, description="alignment by colour and depth works at most so wide")
+    rgbd_neighbours: int = Field(6, ge=1, description="frames each frame is aligned with")
+    seed: int = Field(0, ge=0, description="seed of all random sampling")
+
+
+class LightConfig(StageConfig):
+    """Near-field light that rides on the camera (design section 6)."""
+
+    enabled: bool = Field(True, description="False: colours do not depend on the distance")
+    falloff: bool = Field(True, description="learn exponent and softening of the fall-off with distance")
+    spread: bool = Field(True, description="learn how much less the lamp shines to the side")
+    cosine: bool = Field(True, description="learn how much darker a surface is that turns away")
+    response: bool = Field(True, description="learn the shoulder of the camera's response")
+    exposure: bool = Field(True, description="learn a gain per training frame")
+    offset: bool = Field(
+        False, description="learn where the lamp stands beside the lens; did not pay where it was measured"
+    )
+    exponent: float = Field(
+        0.6,
+        gt=0,
+        description="starting exponent e of gain / (c + r^2)^e; about 1 / 2.2 after a display tone curve",
+    )
+    learning_rate: float = Field(0.04, gt=0, description="of the global light parameters")
+    exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
+    exposure_prior: float = Field(
+        1.0, ge=0, description="weight that holds log-exposures near their mean of zero"
+    )
+
+
+class OptimiserConfig(StageConfig):
+    """Learning rates of the Gaussians; positions are relative to the scene's extent."""
+
+    means: float = Field(1.6e-4, gt=0, description="positions at the start, times the extent")
+    means_final: float = Field(1.6e-6, gt=0, description="positions at the end, times the extent")
+    sh0: float = Field(2.5e-3, gt=0)
+    shN: float = Field(1.25e-4, gt=0)
+    opacities: float = Field(0.05, gt=0)
+    scales: float = Field(5e-3, gt=0)
+    quats: float = Field(1e-3, gt=0)
+
+
+class DensifyConfig(StageConfig):
+    """When Gaussians are cloned, split and pruned."""
+
+    enabled: bool = True
+    start_share: float = Field(0.1, ge=0, le=1, description="from this share of the iterations")
+    stop_share: float = Field(0.6, ge=0, le=1, description="until this share of the iterations")
+    every: int = Field(100, ge=1, description="iterations between two rounds")
+    gradient_threshold: float = Field(
+        2e-4, gt=0, description="mean 2D-position gradient (in half image widths) that densifies"
+    )
+    prune_opacity: float = Field(0.005, ge=0, lt=1, description="fainter Gaussians are removed")
+    max_gaussians: int = Field(60_000, ge=100, description="no growth beyond this")
+    split_scale_share: float = Field(
+        0.01, gt=0, description="larger than this share of the extent: split, else clone"
+    )
+    strategy: Literal["default", "mcmc"] = Field(
+        "default", description="default: clone, split, prune; mcmc: relocate dead Gaussians and shake"
+    )
+    absgrad: bool = Field(
+        False,
+        description="sum absolute gradients over pixels (AbsGS); wants a threshold about 4 times higher",
+    )
+    prune_scale_share: float = Field(
+        0.25, gt=0, description="Gaussians larger than this share of the extent are removed"
+    )
+    refine_scale2d_stop_share: float = Field(
+        0.0, ge=0, le=1, description="until this share of the iterations sizes in the image count too"
+    )
+    grow_scale2d: float = Field(
+        0.05, gt=0, description="radius, as a share of the longer image side, that is split"
+    )
+    prune_scale2d: float = Field(
+        0.15, gt=0, description="radius, as a share of the longer image side, that is removed"
+    )
+    reset_every: int = Field(
+        0, ge=0, description="iterations between resets of all opacities; 0: never, see DefaultStrategy"
+    )
+    reset_pause: int = Field(0, ge=0, description="no rounds in so many iterations after a reset")
+    noise: float = Field(5e5, ge=0, description="mcmc: noise, times the position learning rate")
+    opacity_penalty: float = Field(0.01, ge=0, description="mcmc: weight of the mean opacity in the loss")
+    scale_penalty: float = Field(
+        0.01, ge=0, description="mcmc: weight of the mean scale, in extents, in the loss"
+    )
+
+
+class PoseRefinementConfig(StageConfig):
+    """How poses of training frames are corrected while the Gaussians are optimised."""
+
+    start_share: float = Field(
+        0.05, ge=0, lt=1, description="from this share of the iterations; before it Gaussians settle"
+    )
+    learning_rate: float = Field(
+        2e-3, gt=0, description="of the corrections: radians, and lengths in median depths"
+    )
+    learning_rate_final: float = Field(1e-4, gt=0, description="the same at the end; log-linear in between")
+    prior: float = Field(
+        3e-4,
+        ge=0,
+        description="weight of the mean squared correction, in degrees and hundredths of the depth",
+    )
+
+
+class CoarseConfig(StageConfig):
+    """Gaussians from the training views."""
+
+    iterations: int = Field(3000, ge=1, description="optimisation steps, one view each")
+    sh_degree: int = Field(1, ge=0, le=3, description="degree of the spherical harmonics")
+    sh_every: int = Field(500, ge=1, description="iterations between two raises of the degree")
+    dssim_weight: float = Field(0.2, ge=0, le=1, description="lambda of the photometric loss")
+    depth_weight: float = Field(
+        0.1, ge=0, description="weight of the inverse-depth term, relative to the median depth"
+    )
+    depth_weight_final_share: float = Field(
+        0.5, ge=0, le=1, description="the term decays to this share, log-linearly"
+    )
+    max_points: int = Field(12_000, ge=10, description="starting points at most")
+    thickness: float = Field(
+        0.1,
+        gt=0,
+        le=1,
+        description="starting Gaussians are discs on the surface, so thick against their radius; 1: round",
+    )
+    optimiser: OptimiserConfig = OptimiserConfig()
+    densify: DensifyConfig = DensifyConfig()
+    light: LightConfig = LightConfig()
+    refine_poses: bool | Literal["auto"] = Field(
+        False,
+        description="correct the poses of training frames as well; auto: where COLMAP estimated them. Pays "
+        "where poses are off by pixels; where they are good it costs held-out views a few tenths of a dB",
+    )
+    pose_refinement: PoseRefinementConfig = PoseRefinementConfig()
+    seed: int = Field(0, ge=0)
+
+
+class AssessConfig(StageConfig):
+    """What the scene still lacks, and the plan that follows."""
+
+    probe_views: int = Field(24, ge=1, description="views in the fan round the training views")
+    probe_offset: float = Field(0.35, gt=0, description="sideways offset of a probe, in median depths")
+    probe_turn_deg: float = Field(35.0, ge=0, description="turn of a probe")
+    hole_alpha: float = Field(0.5, gt=0, lt=1, description="a pixel below this alpha is a hole")
+    min_hole_share: float = Field(
+        0.002,
+        ge=0,
+        le=1,
+        description="explore only when holes and poorly seen pixels exceed this share",
+    )
+    min_directions: int = Field(
+        2, ge=1, description="a Gaussian seen from fewer direction bins counts as poorly seen"
+    )
+    full_budget_share: float = Field(
+        0.25, gt=0, le=1, description="at this share of lacking pixels the whole budget is spent"
+    )
+    force: bool = Field(False, description="run every stage whatever the measurements say")
+    seed: int = Field(0, ge=0)
+
+
+class SurfaceConfig(StageConfig):
+    """TSDF fusion of rendered depth."""
+
+    voxel_share: float = Field(
+        1 / 96, gt=0, lt=1, description="voxel edge as a share of the 95 % depth quantile"
+    )
+    truncation_voxels: float = Field(5.0, gt=1, description="truncation in voxels")
+    min_alpha: float = Field(0.5, gt=0, lt=1, description="depth counts only above this alpha")
+    depth_quantile: float = Field(0.98, gt=0.5, le=1, description="farther depth is not fused")
+    min_cluster_triangles: int = Field(50, ge=1, description="smaller pieces are removed")
+    max_width: int = Field(320, ge=16, description="wider images are rendered at this width")
+
+
+class FreespaceConfig(StageConfig):
+    """Occupancy and clearance."""
+
+    grid_size: int = Field(64, ge=8, le=256, description="S: voxels per axis")
+    top_views: int = Field(3, ge=1, description="visibility = mean of so many best views")
+    occupied_below: float = Field(0.5, gt=0, lt=1, description="tau of the paper")
+    margin_share: float = Field(
+        0.05, ge=0, description="padding of the bounding volume, as a share of its largest side"
+    )
+    min_alpha: float = Field(
+        0.5, gt=0, lt=1, description="a ray that ends below this alpha hit nothing and proves nothing"
+    )
+    wall_voxels: float = Field(
+        2.0, gt=0, description="unseen voxels this near to the mesh are occupied, farther ones unknown"
+    )
+    render_width: int = Field(160, ge=16, description="width of the renders in pixels")
+
+
+class ExploreConfig(StageConfig):
+    """The search for virtual trajectories."""
+
+    trajectories: int = Field(20, ge=1, description="N_Tr: starts at most")
+    length: int = Field(16, ge=2, description="L: views per trajectory, the start included")
+    directions: int = Field(32, ge=4, le=32, description="D: equal-area direction bins")
+    step_share: float = Field(0.2, gt=0, description="length of a translation, in median rendered depths")
+    rotation_deg: float = Field(10.0, gt=0, le=90)
+    orbit_deg: float = Field(10.0, gt=0, le=90)
+    safety_share: float = Field(0.15, ge=0, description="smallest clearance, in median rendered depths")
+    visible_weight: float = Field(
+        0.02, gt=0, lt=1, description="a Gaussian is seen when its largest T * alpha exceeds this"
+    )
+    max_hole_share: float = Field(
+        0.5, gt=0, le=1, description="a candidate with a larger share of empty pixels is rejected"
+    )
+    max_saturated_share: float = Field(
+        0.2,
+        gt=0,
+        le=1,
+        description="a candidate is rejected when the light that rides on the camera overexposes more",
+    )
+    hole_weight: float = Field(
+        16.0,
+        ge=0,
+        description="gain grows by this times the share of holes in view: missing surface has no Gaussians "
+        "that could be counted as covered; 0 is the paper's rule",
+    )
+    darkness_weight: float = Field(0.5, ge=0, description="lambda_l of the illumination weight")
+    fold_angle_deg: float = Field(25.0, gt=0, description="tau_R, on the rotation over the last three steps")
+    fold_penalty: float = Field(0.6, gt=0, lt=1, description="eta")
+    max_expansions: int = Field(60, ge=1, description="budget of expansions per trajectory")
+    wave: int = Field(5, ge=1, description="branches that grow from one coverage snapshot")
+    min_gain_share: float = Field(
+        0.002,
+        ge=0,
+        description="stop when a trajectory adds less than this share of all pairs",
+    )
+    render_width: int = Field(80, ge=16, description="width of the scoring renders in pixels")
+    seed: int = Field(0, ge=0)
+
+
+class FinetuneConfig(StageConfig):
+    """Real and restored views together."""
+
+    iterations: int = Field(2000, ge=1)
+    densify_share: float = Field(0.6, ge=0, le=1, description="densification ends at this share")
+    pseudo_share: float = Field(
+        0.5, ge=0, lt=1, description="share of virtual views among the steps, at the start"
+    )
+    pseudo_share_final: float = Field(0.0, ge=0, lt=1, description="the same at the end; linear in between")
+    pseudo_weight: float = Field(
+        3.0,
+        gt=0,
+        description="weight of all virtual views: U_img alone is about 0.2 in a tube, which "
+        "would let the real views overrule what the virtual ones add",
+    )
+    pseudo_depth: bool = Field(
+        True, description="restored depth supervises where the scene knows nothing of a pixel"
+    )
+    growth: float = Field(
+        2.0, ge=1, description="room for new Gaussians: times the coarse stage's largest number"
+    )
+    seed_holes: bool = Field(
+        True, description="place new Gaussians where the restored view has surface and none is"
+    )
+    keep_known: bool = Field(
+        True, description="u * restored + (1 - u) * rendered instead of the restored image alone"
+    )
+    confidence_floor: float = Field(
+        0.1, ge=0, le=1, description="smallest pixel-level weight, so that no pixel drifts freely"
+    )
+    seed: int = Field(0, ge=0)
+
+
+class EvaluateConfig(StageConfig):
+    """Held-out views and their metrics."""
+
+    lpips_net: Literal["alex", "squeeze"] = Field("alex", description="backbone of LPIPS")
+    lpips_weights: str | None = Field(
+        None, description="npz file with LPIPS weights; None looks in the usual places"
+    )
+
+
+class ReportConfig(StageConfig):
+    """The HTML page."""
+
+    held_out_views: int = Field(6, ge=1, description="held-out views shown")
+    virtual_views: int = Field(8, ge=1, description="virtual views shown")
+
+
+class PipelineConfig(StageConfig):
+    """All stages of one run."""
+
+    ingest: IngestConfig = IngestConfig()
+    poses: PosesConfig = PosesConfig()
+    coarse: CoarseConfig = CoarseConfig()
+    assess: AssessConfig = AssessConfig()
+    surface: SurfaceConfig = SurfaceConfig()
+    freespace: FreespaceConfig = FreespaceConfig()
+    explore: ExploreConfig = ExploreConfig()
+    enhance: EnhanceConfig = EnhanceConfig()
+    finetune: FinetuneConfig = FinetuneConfig()
+    evaluate: EvaluateConfig = EvaluateConfig()
+    report: ReportConfig = ReportConfig()
+
+    def with_seed(self, seed: int) -> PipelineConfig:
+        """The same settings with every stage's seed set."""
+        seeded = {
+            name: value.model_copy(update={"seed": seed})
+            for name, value in self
+            if "seed" in type(value).model_fields
+        }
+        return self.model_copy(update=seeded)
+
+    def with_overrides(self, overrides: dict[str, Any]) -> PipelineConfig:
+        """Apply `{"coarse.iterations": 500}`-like settings.
+
+        Raises:
+            ConfigError: for an unknown name (with the nearest known one) or a value out of range.
+        """
+        tree = self.model_dump()
+        for path, value in overrides.items():
+            _set_by_path(tree, path, value)
+        try:
+            return PipelineConfig.model_validate(tree)
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(str(part) for part in first["loc"])
+            raise ConfigError(f"setting {where}: {first['msg']} (found {first['input']!r})") from error
+
+
+def _set_by_path(tree: dict[str, Any], path: str, value: Any) -> None:
+    from difflib import get_close_matches
+
+    *parents, leaf = path.split(".")
+    node: Any = tree
+    for done, name in enumerate([*parents, leaf]):
+        if not isinstance(node, dict) or name not in node:
+            known = sorted(node) if isinstance(node, dict) else []
+            near = get_close_matches(name, known, n=1)
+            hint = f"; did you mean {'.'.join([*parents[:done], near[0]])}?" if near else "."
+            raise ConfigError(f"no setting {path}{hint} Known here: {', '.join(known) or 'none'}")
+        if done < len(parents):
+            node = node[name]
+    if isinstance(node[leaf], dict):
+        raise ConfigError(f"{path} is a group of settings; name one of {', '.join(node[leaf])}")
+    node[leaf] = value

@@ -1,0 +1,287 @@
+"""The virtual trajectories of a scene, and the driver that finds them."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from jaxtyping import Int, UInt32
+
+from extrags.cameras import Cameras
+from extrags.config import ExploreConfig
+from extrags.errors import ShapeError
+from extrags.events import MetricRecorded, Progress, emit
+from extrags.exploration.coverage import count_pairs, training_coverage
+from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
+from extrags.exploration.waves import WaveState, start_views
+from extrags.freespace import FreeSpace
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
+from extrags.zarr_io import open_group, read_array, write_array
+
+__all__ = ["Exploration", "explore", "finish", "grow", "start_exploration"]
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Exploration:
+    """Virtual trajectories with what each of them adds.
+
+    Trajectories have at most L views; one that met a dead end has fewer. All views stand one after the
+    other, `trajectory` tells which belong together.
+
+    Args:
+        cameras: all views at the sequence's image size; the first of each trajectory is a real one, [V].
+        trajectory: index of each view's trajectory, rising, [V].
+        anchors: frame of the sequence each trajectory starts from, [T].
+        gains: newly covered (Gaussian, direction) pairs of each trajectory, in order of acceptance, [T].
+        moves: names of the moves of each trajectory.
+        reasons: why each search ended.
+        rejected: why other branches were not accepted.
+        coverage_before: packed coverage by the training views, [N].
+        coverage_after: packed coverage with all trajectories, [N].
+        directions: D.
+        renders: images the search rendered.
+        waves: waves it took.
+
+    Raises:
+        ShapeError: when the arrays do not fit each other.
+    """
+
+    cameras: Cameras
+    trajectory: Int[np.ndarray, "v"]
+    anchors: Int[np.ndarray, "t"]
+    gains: Int[np.ndarray, "t"]
+    moves: tuple[tuple[str, ...], ...]
+    reasons: tuple[str, ...]
+    rejected: tuple[str, ...]
+    coverage_before: UInt32[np.ndarray, "n"]
+    coverage_after: UInt32[np.ndarray, "n"]
+    directions: int
+    renders: int
+    waves: int
+
+    def __post_init__(self) -> None:
+        count = len(self.anchors)
+        if len(self.trajectory) != len(self.cameras):
+            raise ShapeError(f"{len(self.trajectory)} trajectory indices for {len(self.cameras)} cameras")
+        if not len(self.gains) == len(self.moves) == len(self.reasons) == count:
+            raise ShapeError(f"gains, moves and reasons must all have {count} entries")
+
+    def __len__(self) -> int:
+        """Number of trajectories."""
+        return len(self.anchors)
+
+    @property
+    def trajectories(self) -> list[Cameras]:
+        """The views of each trajectory, its real start first."""
+        return [self.cameras[np.flatnonzero(self.trajectory == index)] for index in range(len(self))]
+
+    @property
+    def n_virtual(self) -> int:
+        """Virtual views in all: without the real starts."""
+        return len(self.cameras) - len(self)
+
+    @property
+    def n_pairs(self) -> int:
+        """All (Gaussian, direction) pairs there are: N times D."""
+        return len(self.coverage_before) * self.directions
+
+    @property
+    def coverage_share_before(self) -> float:
+        """Share of all pairs the training views cover."""
+        return float(count_pairs(self.coverage_before)) / max(1, self.n_pairs)
+
+    @property
+    def coverage_share_after(self) -> float:
+        """Share of all pairs covered with the trajectories."""
+        return float(count_pairs(self.coverage_after)) / max(1, self.n_pairs)
+
+    @property
+    def gain_share(self) -> float:
+        """Share of all pairs the trajectories add."""
+        added = int(count_pairs(self.coverage_after & ~self.coverage_before))
+        return added / max(1, self.n_pairs)
+
+    def summary(self) -> dict[str, Any]:
+        """What is worth reading, ready for JSON."""
+        return {
+            "trajectories": [
+                {
+                    "anchor_frame": int(self.anchors[index]),
+                    "views": int((self.trajectory == index).sum()),
+                    "gain": int(self.gains[index]),
+                    "moves": list(self.moves[index]),
+                    "reason": self.reasons[index],
+                }
+                for index in range(len(self))
+            ],
+            "virtual_views": self.n_virtual,
+            "gain": int(self.gains.sum()),
+            "gain_share": self.gain_share,
+            "coverage_share": {"before": self.coverage_share_before, "after": self.coverage_share_after},
+            "pairs": self.n_pairs,
+            "renders": self.renders,
+            "waves": self.waves,
+            "rejected": list(self.rejected),
+        }
+
+    def save(self, directory: Path) -> None:
+        """Write `trajectories/` (zarr v3) and `exploration.json` into a directory."""
+        directory.mkdir(parents=True, exist_ok=True)
+        group = open_group(directory / "trajectories", mode="w")
+        for name in ("trajectory", "anchors", "gains", "coverage_before", "coverage_after"):
+            write_array(group, name, getattr(self, name))
+        write_array(group, "K", self.cameras.K)
+        write_array(group, "world_from_camera", self.cameras.world_from_camera)
+        group.attrs.update(
+            {
+                "width": self.cameras.width,
+                "height": self.cameras.height,
+                "moves": [list(moves) for moves in self.moves],
+                "reasons": list(self.reasons),
+                "rejected": list(self.rejected),
+                "directions": self.directions,
+                "renders": self.renders,
+                "waves": self.waves,
+            }
+        )
+        text = json.dumps(self.summary(), indent=2)
+        (directory / "exploration.json").write_text(text + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, directory: Path) -> Exploration:
+        """Read what `save` wrote."""
+        group = zarr.open_group(str(directory / "trajectories"), mode="r")
+        attributes: dict[str, Any] = dict(group.attrs)
+        arrays = {
+            name: read_array(group, name)
+            for name in ("trajectory", "anchors", "gains", "coverage_before", "coverage_after")
+        }
+        poses = read_array(group, "world_from_camera")
+        return cls(
+            cameras=Cameras(read_array(group, "K"), poses, attributes["width"], attributes["height"]),
+            moves=tuple(tuple(moves) for moves in attributes["moves"]),
+            reasons=tuple(attributes["reasons"]),
+            rejected=tuple(attributes["rejected"]),
+            directions=attributes["directions"],
+            renders=attributes["renders"],
+            waves=attributes["waves"],
+            **arrays,
+        )
+
+
+def start_exploration(context: SearchContext, cameras: Cameras) -> WaveState:
+    """The state before the first wave: coverage by the training views, anchors in line.
+
+    Args:
+        context: from `prepare_search`.
+        cameras: the training views.
+    """
+    config = context.config
+    anchors = start_views(cameras, config.trajectories, context.depth_unit_mm)
+    width = min(config.render_width, cameras.width)
+    small = cameras.resized(width, max(1, round(cameras.height * width / cameras.width)))
+    covered = training_coverage(
+        context.scene, small, visible_weight=config.visible_weight, n_directions=config.directions
+    )
+    pairs = len(covered) * config.directions
+    return WaveState(
+        coverage_before=covered,
+        coverage=covered,
+        waiting=tuple(int(anchor) for anchor in anchors),
+        room=config.trajectories,
+        min_gain=max(1, int(np.ceil(config.min_gain_share * pairs))),
+        wave=config.wave,
+    )
+
+
+def grow(context: SearchContext, cameras: Cameras, coverage: UInt32[np.ndarray, "n"], anchor: int) -> Branch:
+    """Grow the branch of one anchor; what a worker does."""
+    return grow_branch(context, cameras.world_from_camera[anchor], coverage, anchor)
+
+
+def finish(context: SearchContext, state: WaveState, train_frames: Int[np.ndarray, "c"]) -> Exploration:
+    """The exploration from the state after the last wave.
+
+    Args:
+        context: from `prepare_search`.
+        state: after the last wave.
+        train_frames: frame of the sequence that each training view is.
+    """
+    lengths = [len(branch) for branch in state.branches]
+    poses = [branch.poses for branch in state.branches]
+    return Exploration(
+        cameras=context.full_cameras(np.concatenate(poses) if poses else np.zeros((0, 4, 4))),
+        trajectory=np.repeat(np.arange(len(lengths), dtype=np.int64), lengths),
+        anchors=np.array([train_frames[branch.anchor] for branch in state.branches], dtype=np.int64),
+        gains=np.array(state.gains, dtype=np.int64),
+        moves=tuple(branch.moves for branch in state.branches),
+        reasons=tuple(branch.reason for branch in state.branches),
+        rejected=state.rejected,
+        coverage_before=state.coverage_before,
+        coverage_after=state.coverage,
+        directions=context.config.directions,
+        renders=state.renders,
+        waves=state.waves,
+    )
+
+
+def explore(
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    freespace: FreeSpace,
+    config: ExploreConfig,
+    *,
+    map: Callable[..., Iterable[Branch]] = map,
+) -> Exploration:
+    """Find virtual trajectories that see what the training views did not.
+
+    Args:
+        scene: the reconstructed scene.
+        sequence: its frames; the training frames are the starts.
+        freespace: where cameras may go.
+        config: settings; `trajectories` is the budget.
+        map: like the builtin; a pool's `map` grows the branches of a wave in parallel, and what it is
+            called with can be pickled. The result is the same for any number of workers.
+
+    Returns:
+        The trajectories; none when nothing can be gained (see `rejected` for why).
+
+    Raises:
+        CaptureError: when there is no training view or none sees a surface.
+
+    Source: paper, section "Virtual exploration view sampling".
+    """
+    cameras = sequence.cameras[sequence.train]
+    context = prepare_search(scene, cameras, freespace, config)
+    state = start_exploration(context, cameras)
+    while anchors := state.next_wave():
+        branches = list(map(partial(grow, context, cameras, state.coverage), anchors))
+        state = state.merged(branches)
+        emit(
+            Progress(
+                "explore",
+                len(state.branches),
+                config.trajectories,
+                {"gain": float(sum(state.gains)), "renders": float(state.renders)},
+            )
+        )
+    exploration = finish(context, state, sequence.train)
+    emit(MetricRecorded("explore", "gain_share", exploration.gain_share))
+    _log.info(
+        "explore: %d trajectories, %d virtual views, %.2f %% of all pairs added in %d renders",
+        len(exploration),
+        exploration.n_virtual,
+        100 * exploration.gain_share,
+        exploration.renders,
+    )
+    return exploration

@@ -1,0 +1,240 @@
+"""Branches in parallel: waves that grow from one snapshot, and a greedy merge after each.
+
+Which anchors grow together is fixed by the settings alone, every branch sees the same snapshot, and the
+merge looks at all of them at once: the result does not depend on how many workers there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from jaxtyping import Float, Int, UInt32
+
+from extrags.cameras import Cameras, rotation_angle_deg
+from extrags.errors import ConfigError
+from extrags.exploration.coverage import coverage_gain
+from extrags.exploration.search import Branch
+from extrags.zarr_io import open_group, read_array, write_array
+
+__all__ = ["Merge", "WaveState", "merge_wave", "start_views"]
+
+
+def start_views(cameras: Cameras, count: int, depth_unit_mm: float) -> Int[np.ndarray, "t"]:
+    """Training views spread evenly over space, by farthest point sampling.
+
+    Two views are as far apart as their centres in depth units plus their rotation in radians: a turn by
+    one radian moves what is seen as much as a step of one depth. The first is the view nearest to the
+    middle of all, each further one the farthest from those before it; so any number of the first views
+    is spread evenly, too.
+
+    Args:
+        cameras: the training views.
+        count: how many are wanted; all are returned when there are not so many.
+        depth_unit_mm: median rendered depth.
+
+    Returns:
+        Indices into `cameras`, at most `count`, no index twice.
+
+    Raises:
+        ConfigError: when `count` is below one.
+
+    Source: Gonzalez 1985, "Clustering to minimize the maximum intercluster distance".
+    """
+    if count < 1:
+        raise ConfigError(f"the search needs at least one start, found {count}")
+    rotation = cameras.world_from_camera[:, :3, :3]
+
+    def distance_from(index: int) -> Float[np.ndarray, "c"]:
+        apart = np.linalg.norm(cameras.centers - cameras.centers[index], axis=1) / depth_unit_mm
+        turned = rotation_angle_deg(rotation, np.broadcast_to(rotation[index], rotation.shape))
+        return np.asarray(apart + np.radians(turned))
+
+    middle = np.linalg.norm(cameras.centers - cameras.centers.mean(axis=0), axis=1)
+    chosen = [int(np.argmin(middle))]
+    nearest = distance_from(chosen[0])
+    while len(chosen) < min(count, len(cameras)):
+        nearest[chosen] = -1.0
+        chosen.append(int(np.argmax(nearest)))
+        nearest = np.minimum(nearest, distance_from(chosen[-1]))
+    return np.array(chosen, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Merge:
+    """What a merge decided.
+
+    Args:
+        coverage: the shared coverage with the accepted branches added, packed, [N].
+        accepted: positions of the accepted branches in the wave, in the order of acceptance.
+        gains: newly covered pairs each of them added when it was accepted.
+    """
+
+    coverage: UInt32[np.ndarray, "n"]
+    accepted: tuple[int, ...]
+    gains: tuple[int, ...]
+
+
+def merge_wave(
+    coverage: UInt32[np.ndarray, "n"],
+    branches: Sequence[Branch],
+    *,
+    min_gain: int,
+    room: int,
+) -> Merge:
+    """Accept branches greedily by what each still adds to the shared coverage.
+
+    Coverage is submodular, so greedy acceptance is within 1 - 1/e of the best choice (Nemhauser, Wolsey
+    and Fisher 1978), and once the largest marginal gain is below the threshold all others are, too.
+
+    Args:
+        coverage: the snapshot the branches grew from, packed, [N].
+        branches: the wave.
+        min_gain: a branch must add at least so many pairs.
+        room: accept at most so many.
+    """
+    coverage = coverage.copy()
+    left = [index for index, branch in enumerate(branches) if len(branch) >= 2]
+    accepted: list[int] = []
+    gains: list[int] = []
+    while left and len(accepted) < room:
+        marginal = [int(coverage_gain(coverage, branches[index].pairs)) for index in left]
+        # The first of equals, so that the order of the wave decides and nothing else.
+        top = int(np.argmax(marginal))
+        if marginal[top] < max(1, min_gain):
+            break
+        chosen = left.pop(top)
+        coverage |= branches[chosen].pairs
+        accepted.append(chosen)
+        gains.append(marginal[top])
+    return Merge(coverage, tuple(accepted), tuple(gains))
+
+
+@dataclass(frozen=True)
+class WaveState:
+    """How far the exploration is; each wave takes one and leaves the next.
+
+    Args:
+        coverage_before: coverage by the training views, packed, [N].
+        coverage: coverage with all accepted trajectories, packed, [N].
+        waiting: anchors whose turn comes next, first in front.
+        room: trajectories that may still be accepted.
+        min_gain: pairs a trajectory must add.
+        wave: branches per wave.
+        branches: accepted so far.
+        gains: marginal gain of each of them.
+        rejected: why branches were not accepted, one sentence each.
+        waves: waves finished.
+        renders: images rendered by all branches, rejected ones included.
+    """
+
+    coverage_before: UInt32[np.ndarray, "n"]
+    coverage: UInt32[np.ndarray, "n"]
+    waiting: tuple[int, ...]
+    room: int
+    min_gain: int
+    wave: int
+    branches: tuple[Branch, ...] = ()
+    gains: tuple[int, ...] = ()
+    rejected: tuple[str, ...] = ()
+    waves: int = 0
+    renders: int = 0
+
+    def next_wave(self) -> tuple[int, ...]:
+        """Anchors that grow together now; empty when the exploration is finished.
+
+        Always different ones: two branches from one anchor and one snapshot would be the same.
+        """
+        if self.room == 0:
+            return ()
+        return self.waiting[: self.wave]
+
+    def merged(self, branches: Sequence[Branch]) -> WaveState:
+        """The state after a wave.
+
+        Anchors of accepted branches go to the end of the line; they grow another branch when their turn
+        comes again and there is room. So do those whose branch only lost to its neighbours. An anchor
+        whose branch would not have been accepted even alone has nothing left to find and retires. Every
+        wave therefore accepts a branch or retires its anchors, and the exploration ends.
+
+        Args:
+            branches: one per anchor of `next_wave()`, in that order.
+
+        Raises:
+            ConfigError: when the branches belong to other anchors.
+        """
+        anchors = self.next_wave()
+        if tuple(branch.anchor for branch in branches) != anchors:
+            raise ConfigError(
+                f"the wave has the anchors {anchors}, but the branches start from "
+                f"{tuple(branch.anchor for branch in branches)}"
+            )
+        merge = merge_wave(self.coverage, branches, min_gain=self.min_gain, room=self.room)
+        again, rejected = [], []
+        for index, branch in enumerate(branches):
+            alone = int(coverage_gain(self.coverage, branch.pairs))
+            if index not in merge.accepted:
+                left = int(coverage_gain(merge.coverage, branch.pairs))
+                why = f"needs {self.min_gain}" if left < self.min_gain else "there was no room left"
+                rejected.append(
+                    f"from view {branch.anchor}: adds {left} pairs ({alone} alone), {why}; {branch.reason}"
+                )
+            if len(branch) >= 2 and alone >= max(1, self.min_gain):
+                again.append(branch.anchor)
+        return replace(
+            self,
+            coverage=merge.coverage,
+            waiting=(*self.waiting[len(anchors) :], *again),
+            room=self.room - len(merge.accepted),
+            branches=(*self.branches, *(branches[index] for index in merge.accepted)),
+            gains=(*self.gains, *merge.gains),
+            rejected=(*self.rejected, *rejected),
+            waves=self.waves + 1,
+            renders=self.renders + sum(branch.renders for branch in branches),
+        )
+
+    def save(self, path: Path) -> None:
+        """Write a zarr v3 group, accepted branches inside."""
+        group = open_group(path, mode="w")
+        write_array(group, "coverage_before", self.coverage_before)
+        write_array(group, "coverage", self.coverage)
+        group.attrs.update(
+            {
+                "waiting": list(self.waiting),
+                "room": self.room,
+                "min_gain": self.min_gain,
+                "wave": self.wave,
+                "gains": list(self.gains),
+                "rejected": list(self.rejected),
+                "waves": self.waves,
+                "renders": self.renders,
+                "n_branches": len(self.branches),
+            }
+        )
+        for index, branch in enumerate(self.branches):
+            branch.save(path / f"branch_{index:04d}")
+
+    @classmethod
+    def load(cls, path: Path) -> WaveState:
+        """Read what `save` wrote."""
+        group = zarr.open_group(str(path), mode="r")
+        attributes: dict[str, Any] = dict(group.attrs)
+        return cls(
+            coverage_before=read_array(group, "coverage_before"),
+            coverage=read_array(group, "coverage"),
+            waiting=tuple(attributes["waiting"]),
+            room=attributes["room"],
+            min_gain=attributes["min_gain"],
+            wave=attributes["wave"],
+            branches=tuple(
+                Branch.load(path / f"branch_{index:04d}") for index in range(attributes["n_branches"])
+            ),
+            gains=tuple(attributes["gains"]),
+            rejected=tuple(attributes["rejected"]),
+            waves=attributes["waves"],
+            renders=attributes["renders"],
+        )

@@ -1,0 +1,192 @@
+"""What COLMAP saw, frame by frame and pair by pair, and what that means for who holds the camera."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from extrags.cameras import rotation_angle_deg
+from extrags.metrics.pose import relative_pose_error, umeyama
+from extrags.poses.job import PoseJobResult
+from extrags.sequence import EndoscopicSequence
+
+__all__ = [
+    "colmap_report",
+    "errors_against_given",
+    "failure_message",
+    "frames_without_pose",
+    "triangulation_angles_deg",
+]
+
+FEW_FEATURES = 100
+FEW_INLIERS = 30
+FEW_PARTNERS = 4
+"""A point needs three views before it can carry the next frame: pairs alone do not make a map."""
+LITTLE_PARALLAX_DEG = 2.0
+NAMED_FRAMES = 12
+"""More frames than this are counted and not named in a sentence; the report names them all."""
+
+
+def colmap_report(
+    sequence: EndoscopicSequence, result: PoseJobResult, registered: np.ndarray
+) -> dict[str, Any]:
+    """Counts of the job with frames by their names, ready for JSON.
+
+    Args:
+        sequence: what was given.
+        result: what COLMAP found.
+        registered: true for frames with a pose, [F].
+
+    Returns:
+        Besides COLMAP's own counts: `frames` (features, inliers of the best pair, pose found or not),
+        `registered_train/test`, `unregistered_train/test`, `registrations` of held-out frames, and
+        `triangulation_angle_deg`, the median over points of the largest angle between their rays.
+    """
+    report = dict(result.report)
+    report.setdefault("mean_reprojection_px", 0.0)
+    report |= frames_without_pose(sequence, registered)
+    report["registrations"] = {
+        sequence.frame_name(int(frame)): counts for frame, counts in report["registrations"].items()
+    }
+    report["frames"] = {
+        sequence.frame_name(int(frame)): counts | {"registered": bool(registered[int(frame)])}
+        for frame, counts in report.get("frames", {}).items()
+    }
+    angles = triangulation_angles_deg(result)
+    report["triangulation_angle_deg"] = float(np.median(angles)) if len(angles) else 0.0
+    return report
+
+
+def frames_without_pose(sequence: EndoscopicSequence, registered: np.ndarray) -> dict[str, Any]:
+    """`registered_train/test` (counts) and `unregistered_train/test` (names)."""
+    counts: dict[str, Any] = {}
+    for kind, frames in (("train", sequence.train), ("test", sequence.test)):
+        counts[f"n_{kind}"] = len(frames)
+        counts[f"registered_{kind}"] = int(registered[frames].sum())
+        counts[f"unregistered_{kind}"] = [
+            sequence.frame_name(int(frame)) for frame in frames if not registered[frame]
+        ]
+    return counts
+
+
+def triangulation_angles_deg(result: PoseJobResult) -> np.ndarray:
+    """Largest angle between the rays of each point with two or more observations, in degrees."""
+    order = np.argsort(result.observed_point, kind="stable")
+    frames, points = result.observed_frame[order], result.observed_point[order]
+    rays = result.points[points] - result.world_from_camera[frames][:, :3, 3]
+    rays = rays / np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    first = np.flatnonzero(np.diff(points, prepend=-1))
+    cosines = [float((own @ own.T).min()) for own in np.split(rays, first[1:]) if len(own) >= 2]
+    return np.asarray(np.degrees(np.arccos(np.clip(cosines, -1, 1))))
+
+
+def errors_against_given(
+    sequence: EndoscopicSequence, world_from_camera: np.ndarray, *, metric: bool
+) -> dict[str, Any]:
+    """Errors of estimated poses where the source has poses too: a yardstick, never an input.
+
+    The estimate is brought into the source's frame by its training frames alone (rigidly when `metric`, else
+    with a scale); held-out frames are measured where that puts them.
+
+    Args:
+        sequence: with the source's poses.
+        world_from_camera: estimated, [F, 4, 4], NaN for frames without.
+        metric: both have the same unit.
+
+    Returns:
+        `{alignment, train: {...}, test: {...}}` with `frames`, `ate_rmse`, `ate_max`, `rotation_mean_deg`,
+        and for training frames `rpe_translation_rmse` and `rpe_rotation_rmse_deg` from frame to frame; empty
+        without poses to compare with, or with fewer than three training frames.
+    """
+    given = sequence.world_from_camera
+    found = np.isfinite(world_from_camera).all((1, 2))
+    train = sequence.train[found[sequence.train]]
+    if given is None or len(train) < 3:
+        return {}
+    align = umeyama(world_from_camera[train, :3, 3], given[train, :3, 3], with_scale=not metric)
+    errors: dict[str, Any] = {"alignment": "se3" if metric else "sim3"}
+    for kind, frames in (("train", train), ("test", sequence.test[found[sequence.test]])):
+        if len(frames) == 0:
+            continue
+        there = align.apply_to_poses(world_from_camera[frames])
+        distance = np.linalg.norm(there[:, :3, 3] - given[frames, :3, 3], axis=1)
+        angle = rotation_angle_deg(there[:, :3, :3], given[frames, :3, :3])
+        errors[kind] = {
+            "frames": len(frames),
+            "ate_rmse": float(np.sqrt(np.mean(distance**2))),
+            "ate_max": float(distance.max()),
+            "rotation_mean_deg": float(angle.mean()),
+        }
+    drift = relative_pose_error(world_from_camera[train], given[train], alignment="se3" if metric else "sim3")
+    errors["train"] |= {
+        "rpe_translation_rmse": drift.translation_rmse,
+        "rpe_rotation_rmse_deg": drift.rotation_rmse_deg,
+    }
+    return errors
+
+
+def failure_message(name: str, report: dict[str, Any], min_share: float, *, instead: str) -> str:
+    """Why too few training frames have a pose, and what to do, in sentences.
+
+    Args:
+        name: of the sequence.
+        report: from `colmap_report`.
+        min_share: what was expected.
+        instead: why nothing else steps in, as a sentence.
+    """
+    share = report["registered_train"] / max(1, report["n_train"])
+    pairs, verified = report["pairs"], report["pairs_verified"]
+    parts = [
+        f"{name}: COLMAP found poses for {report['registered_train']} of {report['n_train']} training "
+        f"frames ({share:.0%}), expected at least {min_share:.0%}.",
+        f"Features per frame: {report['features_median']:.0f} (median), "
+        f"{report['features_fewest']} at least; pairs matched: {pairs}, verified: {verified}; "
+        f"inliers per verified pair: {report['inliers_median']:.0f} (median); angle between the rays of "
+        f"matched points: {_degrees(report['pair_angle_deg'])}, pairs that differ by a turn alone: "
+        f"{report['pairs_turn_only']} of {report['pairs_examined']}; frames per model: "
+        f"{', '.join(map(str, report['model_sizes'])) or 'none'}.",
+        f"Without a pose: {_named(report['unregistered_train'])}.",
+        _advice(report),
+        instead,
+    ]
+    return " ".join(parts)
+
+
+def _advice(report: dict[str, Any]) -> str:
+    """The first thing that is short, and what would lengthen it."""
+    if report["features_median"] < FEW_FEATURES:
+        return (
+            "There is little texture: lower poses.peak_threshold, give larger images (ingest.downscale) "
+            "or check that the mask does not hide the tissue."
+        )
+    frames = list(report["frames"].values())
+    weak = sum(frame["best_pair_inliers"] < FEW_INLIERS for frame in frames)
+    partners = float(np.median([frame["verified_pairs"] for frame in frames]))
+    if partners < FEW_PARTNERS or report["inliers_median"] < FEW_INLIERS or 4 * weak > len(frames):
+        return (
+            f"Frames share features with too few others ({partners:.0f} in the median; {weak} of "
+            f"{len(frames)} have fewer than {FEW_INLIERS} in common with any): give frames nearer together "
+            "in time, or larger images; blur, instruments and tissue that moves do the same harm."
+        )
+    if report["pair_angle_deg"] < LITTLE_PARALLAX_DEG or (
+        2 * report["pairs_turn_only"] > report["pairs_examined"]
+    ):
+        return (
+            "There is too little parallax: the scope turns or stands where it should move. Give a part of "
+            "the video with sideways motion, or frames farther apart, or lower poses.min_tri_angle_deg."
+        )
+    return (
+        "The pairs are good, but do not join: frames are missing where the models break off, or "
+        "poses.min_tri_angle_deg is too high for the first pair."
+    )
+
+
+def _named(frames: list[str]) -> str:
+    if len(frames) <= NAMED_FRAMES:
+        return ", ".join(frames) or "none"
+    return f"{', '.join(frames[:NAMED_FRAMES])} and {len(frames) - NAMED_FRAMES} more"
+
+
+def _degrees(angle: float) -> str:
+    return f"{angle:.1f} degrees (median)"

@@ -1,0 +1,151 @@
+"""Pseudo-observations: restored virtual views with what is known about them, and their form in zarr."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from jaxtyping import Float, Int
+
+from extrags.cameras import Cameras
+from extrags.errors import ShapeError
+from extrags.zarr_io import open_group, read_array, write_array, write_frames
+
+__all__ = ["PseudoViews"]
+
+_IMAGES = ("rendered", "restored", "target")
+_SHARES = ("alpha", "uncertainty", "pixel_confidence")
+
+
+@dataclass(frozen=True)
+class PseudoViews:
+    """Virtual views after restoration.
+
+    Colours are at the mean exposure of the training frames.
+
+    Args:
+        cameras: the virtual views, [V].
+        rendered: what the coarse scene shows, in [0, 1], [V, H, W, 3].
+        restored: what the enhancer made of it, in [0, 1], [V, H, W, 3].
+        target: `u * restored + (1 - u) * rendered` with the feathered uncertainty u: known texture is
+            kept, [V, H, W, 3].
+        alpha: opacity of the rendering, [V, H, W].
+        depth_mm: rendered z-depth, completed smoothly where `alpha` is low (there it is a guess), in
+            world units, [V, H, W].
+        uncertainty: 1 where the scene knows nothing about the pixel, [V, H, W].
+        pixel_confidence: U_pixel, weight of the colour term of each pixel in [0, 1], [V, H, W].
+        image_confidence: U_img, weight of each view in [0, 1], [V].
+        reference: position among the training frames of the one that sees most of the same surface, [V].
+        clip: index of the clip each view belongs to, [V].
+        provenance: backend, steps, seed, perceptual measure, ...; ready for JSON.
+        expected_error: absolute error of a restored pixel, mean of its channels, as the enhancer expects it;
+            None where it has no idea of it, [V, H, W].
+
+    Raises:
+        ShapeError: when the arrays do not fit each other.
+    """
+
+    cameras: Cameras
+    rendered: Float[np.ndarray, "v h w 3"]
+    restored: Float[np.ndarray, "v h w 3"]
+    target: Float[np.ndarray, "v h w 3"]
+    alpha: Float[np.ndarray, "v h w"]
+    depth_mm: Float[np.ndarray, "v h w"]
+    uncertainty: Float[np.ndarray, "v h w"]
+    pixel_confidence: Float[np.ndarray, "v h w"]
+    image_confidence: Float[np.ndarray, "v"]
+    reference: Int[np.ndarray, "v"]
+    clip: Int[np.ndarray, "v"]
+    provenance: dict[str, Any] = field(default_factory=dict)
+    expected_error: Float[np.ndarray, "v h w"] | None = None
+
+    def __post_init__(self) -> None:
+        views = len(self.cameras)
+        size = (views, self.cameras.height, self.cameras.width)
+        expected: dict[str, tuple[int, ...]] = dict.fromkeys(_IMAGES, (*size, 3))
+        expected.update(dict.fromkeys((*_SHARES, "depth_mm"), size))
+        expected.update(dict.fromkeys(("image_confidence", "reference", "clip"), (views,)))
+        if self.expected_error is not None:
+            expected["expected_error"] = size
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                raise ShapeError(f"{name} has shape {getattr(self, name).shape}, expected {shape}")
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    @property
+    def changed_share(self) -> float:
+        """Share of pixels whose target differs from the rendering by more than 4/255 in any channel."""
+        if len(self) == 0:
+            return 0.0
+        return float((np.abs(self.target - self.rendered).max(axis=-1) > 4 / 255).mean())
+
+    @staticmethod
+    def concatenated(parts: Sequence[PseudoViews]) -> PseudoViews:
+        """Join batches of clips, in the order given; the provenance is the first one's.
+
+        Raises:
+            ShapeError: without any part, or when image sizes differ.
+        """
+        if not parts:
+            raise ShapeError("no pseudo-observations to join")
+        names = (*_IMAGES, *_SHARES, "depth_mm", "image_confidence", "reference", "clip")
+        arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+        errors = [part.expected_error for part in parts if part.expected_error is not None]
+        if len(errors) == len(parts):
+            arrays["expected_error"] = np.concatenate(errors)
+        cameras = Cameras.concatenated([part.cameras for part in parts])
+        return PseudoViews(cameras, **arrays, provenance=dict(parts[0].provenance))
+
+    def save(self, path: Path) -> None:
+        """Write a zarr v3 group: colours and shares in 8 bits, depth in float32, one view per chunk."""
+        group = open_group(path, mode="w")
+        for name in (*_IMAGES, *_SHARES):
+            write_frames(group, name, _as_bytes(getattr(self, name)))
+        if self.expected_error is not None:
+            # Errors are a few of the 255 steps of a byte.
+            write_frames(group, "expected_error", self.expected_error.astype(np.float16))
+        write_frames(group, "depth_mm", self.depth_mm.astype(np.float32))
+        write_array(group, "image_confidence", self.image_confidence.astype(np.float32))
+        write_array(group, "reference", self.reference.astype(np.int64))
+        write_array(group, "clip", self.clip.astype(np.int64))
+        write_array(group, "K", self.cameras.K)
+        write_array(group, "world_from_camera", self.cameras.world_from_camera)
+        group.attrs.update(
+            {
+                "width": self.cameras.width,
+                "height": self.cameras.height,
+                "provenance": self.provenance,
+                "changed_share": self.changed_share,
+            }
+        )
+
+    @classmethod
+    def load(cls, path: Path) -> PseudoViews:
+        """Read what `save` wrote; colours and shares come back in steps of 1/255."""
+        group = zarr.open_group(str(path), mode="r")
+        attributes: Any = dict(group.attrs)
+        arrays: dict[str, Any] = {
+            name: read_array(group, name).astype(np.float32) / np.float32(255)
+            for name in (*_IMAGES, *_SHARES)
+        }
+        if "expected_error" in group:
+            arrays["expected_error"] = read_array(group, "expected_error").astype(np.float32)
+        for name in ("depth_mm", "image_confidence", "reference", "clip"):
+            arrays[name] = read_array(group, name)
+        cameras = Cameras(
+            read_array(group, "K"),
+            read_array(group, "world_from_camera"),
+            int(attributes["width"]),
+            int(attributes["height"]),
+        )
+        return cls(cameras, **arrays, provenance=dict(attributes["provenance"]))
+
+
+def _as_bytes(values: np.ndarray) -> np.ndarray:
+    return np.asarray(np.rint(np.clip(values, 0, 1) * 255), dtype=np.uint8)

@@ -1,0 +1,1 @@
+"""Restorers judged where the truth is known."""

@@ -1,0 +1,304 @@
+"""Restorers beside each other on held-out views: `extrags bench enhance`."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from extrags.config import CoarseConfig, EnhanceConfig, PipelineConfig
+from extrags.errors import CaptureError, ConfigError
+from extrags.events import Progress, emit
+from extrags.metrics.lpips import Lpips
+from extrags.raster.bench import machine
+from extrags.restoration.backends import train_enhancer
+from extrags.restoration.benchmark.evaluation import (
+    AsRendered,
+    RestorerBenchmark,
+    TrueViews,
+    WithoutReferences,
+    held_out_clips,
+)
+from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.protocol import Enhancer
+from extrags.restoration.training_data.pairs import make_pairs
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
+from extrags.training import reconstruct
+from extrags.training.pose_refinement import with_refined_poses
+from extrags.view_synthesis.references import ReferenceViews
+
+__all__ = [
+    "METHODS",
+    "NO_REFERENCES",
+    "RECIPES",
+    "Method",
+    "bench_enhance",
+    "check_methods",
+    "coarse_scene",
+    "compare_methods",
+    "prepared",
+]
+
+NO_REFERENCES = "/no-references"
+"""Suffix of a method's name: the same restorer, not told what real views see."""
+
+SCENE_ITERATIONS = 220
+"""Steps on the scene's own pairs where the profile trains on none."""
+
+logger = logging.getLogger(__name__)
+
+Recipe = Callable[[Scene, EndoscopicSequence, EnhanceConfig, CoarseConfig], Enhancer]
+
+
+def _unrestored(
+    _scene: Scene, _sequence: EndoscopicSequence, _config: EnhanceConfig, _coarse: CoarseConfig
+) -> Enhancer:
+    return AsRendered()
+
+
+def _classical(
+    _scene: Scene, _sequence: EndoscopicSequence, _config: EnhanceConfig, _coarse: CoarseConfig
+) -> Enhancer:
+    return ClassicalEnhancer()
+
+
+def _learning(config: EnhanceConfig) -> EnhanceConfig:
+    """Settings that train on the scene's pairs, whatever the profile says of that."""
+    if config.train_iterations > 0:
+        return config
+    return config.model_copy(update={"train_iterations": SCENE_ITERATIONS})
+
+
+def _embedded(*, learning: bool = False, **changes: Any) -> Recipe:
+    """The embedded restorer with changed settings; with `learning` it trains on the scene's pairs."""
+
+    def recipe(
+        scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
+    ) -> Enhancer:
+        config = _learning(config) if learning else config
+        settings = EnhanceConfig.model_validate({**config.model_dump(), "backend": "embedded", **changes})
+        return train_enhancer(scene, sequence, settings, coarse)
+
+    return recipe
+
+
+def _deterministic(
+    scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
+) -> Enhancer:
+    """The same network from the same pairs, trained as a plain regression from nothing."""
+    pairs = make_pairs(scene, sequence, config, coarse)
+    transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
+    return EmbeddedEnhancer.train(pairs, transfer, _learning(config), deterministic=True)
+
+
+RECIPES: dict[str, Recipe] = {
+    "none": _unrestored,
+    "classical": _classical,
+    "embedded": _embedded(),
+    # Each for itself, also where the judge would have it replaced.
+    "unjudged": _embedded(judge=False),
+    "scene-trained": _embedded(learning=True, judge=False),
+    "scratch": _embedded(learning=True, judge=False, pretrained_weights="none"),
+    "zero-shot": _embedded(judge=False, train_iterations=0),
+    "deterministic": _deterministic,
+}
+"""What is made for a scene. What takes long is made once, however many methods start from it."""
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row of the table.
+
+    Args:
+        recipe: of `RECIPES`.
+        adjust: what is changed about the restorer that comes out; None leaves it.
+    """
+
+    recipe: str
+    adjust: Callable[[Enhancer], Enhancer] | None = None
+
+
+def _in_steps(steps: int) -> Callable[[Enhancer], Enhancer]:
+    def adjust(enhancer: Enhancer) -> Enhancer:
+        if not isinstance(enhancer, EmbeddedEnhancer):
+            raise ConfigError(f"{enhancer.name} has no steps that could be set")
+        return replace(enhancer, steps=steps)
+
+    return adjust
+
+
+METHODS: dict[str, Method] = {
+    "none": Method("none"),
+    "classical": Method("classical"),
+    "embedded": Method("embedded"),
+    "embedded-1": Method("unjudged", _in_steps(1)),
+    "embedded-4": Method("unjudged", _in_steps(4)),
+    "scene-trained": Method("scene-trained"),
+    "scratch": Method("scratch"),
+    "zero-shot": Method("zero-shot"),
+    "deterministic": Method("deterministic"),
+}
+"""By name; each also with the suffix `/no-references`."""
+
+
+def check_methods(names: Iterable[str]) -> list[str]:
+    """The names, each once.
+
+    Raises:
+        ConfigError: for an unknown one, or none at all.
+    """
+    chosen = list(dict.fromkeys(names))
+    unknown = [name for name in chosen if name.removesuffix(NO_REFERENCES) not in METHODS]
+    if unknown or not chosen:
+        raise ConfigError(
+            f"unknown methods {', '.join(unknown) or '(none named)'}; expected {', '.join(METHODS)}, "
+            f"each also with {NO_REFERENCES} behind it"
+        )
+    return chosen
+
+
+def prepared(
+    names: Sequence[str],
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    config: EnhanceConfig,
+    coarse: CoarseConfig,
+) -> Iterator[tuple[str, Enhancer, float]]:
+    """The restorers of a scene, one after the other.
+
+    Args:
+        names: of methods.
+        scene: the coarse scene.
+        sequence: its training frames.
+        config: settings of the restorers.
+        coarse: settings of leave-out reconstructions.
+
+    Yields:
+        Name, restorer, and the seconds its recipe took; equal recipes are followed once, and each of the
+        methods that start from one is charged with all of it.
+
+    Raises:
+        ConfigError: for an unknown method.
+    """
+    made: dict[str, tuple[Enhancer, float]] = {}
+    for name in check_methods(names):
+        method = METHODS[name.removesuffix(NO_REFERENCES)]
+        if method.recipe not in made:
+            begun = time.perf_counter()
+            enhancer = RECIPES[method.recipe](scene, sequence, config, coarse)
+            made[method.recipe] = enhancer, time.perf_counter() - begun
+        enhancer, seconds = made[method.recipe]
+        if method.adjust is not None:
+            enhancer = method.adjust(enhancer)
+        yield name, WithoutReferences(enhancer) if name.endswith(NO_REFERENCES) else enhancer, seconds
+
+
+def coarse_scene(sequence: EndoscopicSequence, config: CoarseConfig) -> tuple[Scene, EndoscopicSequence]:
+    """The coarse scene of a sequence, and the sequence with the poses that the scene belongs to."""
+    result = reconstruct(sequence.training_part(), config)
+    if result.refined is not None:
+        sequence = with_refined_poses(sequence, result.refined.world_from_camera)
+    return result.scene, sequence
+
+
+def compare_methods(
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    config: PipelineConfig,
+    methods: Sequence[str],
+    lpips: Lpips | None,
+) -> list[dict[str, Any]]:
+    """Judge methods on the held-out views of a sequence.
+
+    Args:
+        scene: its coarse scene.
+        sequence: with the held-out frames; restorers are given the training frames alone.
+        config: settings; `enhance` and `coarse` count.
+        methods: names.
+        lpips: the metric; None leaves it out.
+
+    Returns:
+        One case per method: `{sequence, seed, method, steps, psnr, ssim, lpips_alex, well, hole, ...,
+        seconds_per_frame, prepare_seconds, pixel_share, views}`; see `RestorerBenchmark.figures`.
+
+    Raises:
+        CaptureError: without held-out frames, or too few to train on.
+        ConfigError: for an unknown method.
+    """
+    methods = check_methods(methods)
+    training = sequence.training_part()
+    references = ReferenceViews.gather(scene, training, training.train)
+    clips = held_out_clips(
+        scene, references, sequence, np.asarray(sequence.test), count=config.enhance.references
+    )
+    benchmark = RestorerBenchmark(clips, TrueViews.of_sequence(sequence, np.asarray(sequence.test)), lpips)
+    cases = []
+    restorers = prepared(methods, scene, training, config.enhance, config.coarse)
+    for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
+        figures = benchmark.judge(enhancer)
+        cases.append(
+            {
+                "sequence": sequence.name,
+                "seed": config.enhance.seed,
+                "method": name,
+                "steps": _steps(enhancer),
+                **figures,
+                "prepare_seconds": seconds,
+                "pixel_share": benchmark.pixel_share,
+                "views": len(benchmark.truth),
+            }
+        )
+        logger.info("bench enhance: %s %s %.2f dB", sequence.name, name, figures["psnr"] or 0.0)
+        emit(Progress("bench enhance", done, len(methods)))
+    return cases
+
+
+def bench_enhance(
+    sequences: Iterable[EndoscopicSequence],
+    config: PipelineConfig,
+    *,
+    methods: Sequence[str] = ("none", "classical", "embedded"),
+    lpips: Lpips | None = None,
+) -> dict[str, Any]:
+    """Reconstruct each sequence and judge restorers on its held-out views.
+
+    Args:
+        sequences: with poses and held-out frames.
+        config: settings of `coarse` and `enhance`, seeds included.
+        methods: names of `METHODS`, possibly with `/no-references`.
+        lpips: the metric; None leaves it out.
+
+    Returns:
+        `{machine, cases}`; see `compare_methods`. `coarse_seconds` is beside each case.
+
+    Raises:
+        CaptureError: a sequence without poses or held-out frames.
+        ConfigError: for an unknown method.
+    """
+    methods = check_methods(methods)
+    cases = []
+    for sequence in sequences:
+        if sequence.world_from_camera is None:
+            raise CaptureError(
+                f"{sequence.name} has no poses; `extrags run` estimates them, and `extrags export --to "
+                "colmap` writes a folder that has them"
+            )
+        if len(sequence.test) == 0:
+            raise CaptureError(f"{sequence.name}: no held-out frames to judge a restorer on")
+        begun = time.perf_counter()
+        scene, posed = coarse_scene(sequence, config.coarse)
+        seconds = time.perf_counter() - begun
+        found = compare_methods(scene, posed, config, methods, lpips)
+        cases += [{**case, "coarse_seconds": seconds} for case in found]
+    return {"machine": machine(), "cases": cases}
+
+
+def _steps(enhancer: Enhancer) -> int | None:
+    inner = enhancer.enhancer if isinstance(enhancer, WithoutReferences) else enhancer
+    return inner.steps if isinstance(inner, EmbeddedEnhancer) else None

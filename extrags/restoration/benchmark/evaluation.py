@@ -1,0 +1,436 @@
+"""Restorers judged where the truth is known: off-trajectory views of a sequence, restored and compared.
+
+A `RestorerBenchmark` holds one list of clips with what their views really look like; every restorer is
+given the same clips. Figures inside a region are means over the views in which the region is not too small to
+tell, as in `extrags.metrics.protocol`. What cannot be had is None.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from extrags.cameras import Cameras, pixel_rays
+from extrags.errors import CaptureError, ConfigError, ShapeError
+from extrags.metrics.exposure import align_exposure
+from extrags.metrics.image import mean_of_known, means_per_image, psnr, psnr_per_image, ssim_map
+from extrags.metrics.lpips import Lpips
+from extrags.metrics.protocol import COLOR_LEVELS, SMALLEST_PART
+from extrags.restoration.clips import as_images, as_planes, keep_known, render_clips
+from extrags.restoration.protocol import Clip, Enhancer, Restoration
+from extrags.restoration.training_data.augmentation import drop_references
+from extrags.restoration.uncertainty.reliability_diagram import calibration, cell_correlation
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
+from extrags.view_synthesis.conditioning import Layers, observe_views
+from extrags.view_synthesis.references import ReferenceViews
+
+__all__ = [
+    "AsRendered",
+    "RestoredViews",
+    "RestorerBenchmark",
+    "TrueViews",
+    "WithoutReferences",
+    "held_out_clips",
+    "restore_views",
+]
+
+CLIP_VIEWS = 8
+"""Views of a clip: about the length of an explored trajectory."""
+WELL_SEEN_ALPHA, WELL_SEEN_UNCERTAINTY = 0.9, 0.5
+HOLE_ALPHA = 0.5
+CHANGED = 4 / 255
+"""A pixel is changed where a channel differs from the rendering by more than this."""
+SAME_SURFACE = 0.03
+"""Two frames show the same point where their true depths agree to this share."""
+
+
+@dataclass(frozen=True)
+class TrueViews:
+    """What V views really look like.
+
+    Args:
+        rgb: photographs in [0, 1], [V, H, W, 3].
+        mask: which pixels count, [V, H, W].
+        observed: whose surface some training frame saw, [V, H, W]; None where nobody knows.
+        depth_mm: z-depth, 0 where unknown, [V, H, W]; None without depth.
+
+    Raises:
+        ShapeError: when the arrays do not fit each other.
+    """
+
+    rgb: Float[np.ndarray, "v h w 3"]
+    mask: Bool[np.ndarray, "v h w"]
+    observed: Bool[np.ndarray, "v h w"] | None = None
+    depth_mm: Float[np.ndarray, "v h w"] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("mask", "observed", "depth_mm"):
+            array = getattr(self, name)
+            if array is not None and array.shape != self.rgb.shape[:-1]:
+                raise ShapeError(f"{name} has shape {array.shape}, expected {self.rgb.shape[:-1]}")
+
+    def __len__(self) -> int:
+        return int(self.rgb.shape[0])
+
+    @classmethod
+    def of_sequence(cls, sequence: EndoscopicSequence, frames: Int[np.ndarray, "v"]) -> TrueViews:
+        """The truth about held-out frames of a sequence."""
+        return cls(
+            sequence.rgb[frames].astype(np.float32) / 255,
+            np.ascontiguousarray(sequence.mask[frames]),
+            None if sequence.observed is None else sequence.observed[frames],
+            None if sequence.depth_mm is None else sequence.depth_mm[frames].astype(np.float32),
+        )
+
+
+def held_out_clips(
+    scene: Scene,
+    references: ReferenceViews,
+    sequence: EndoscopicSequence,
+    frames: Int[np.ndarray, "v"],
+    *,
+    count: int,
+    length: int = CLIP_VIEWS,
+) -> list[Clip]:
+    """Held-out frames as clips of neighbours, rendered as virtual views are.
+
+    Frames of a recording that was trained on get the exposure interpolated between its training frames,
+    those of any other the mean: the rule of the evaluation.
+
+    Args:
+        scene: the coarse scene.
+        references: its training views.
+        sequence: the whole sequence, with the held-out frames.
+        frames: which of them; clips follow this order and end with a recording.
+        count: references blended per view.
+        length: views per clip at most.
+
+    Raises:
+        CaptureError: without any frame.
+        ConfigError: for clips without a view.
+    """
+    frames = np.asarray(frames, dtype=np.int64)
+    if len(frames) == 0:
+        raise CaptureError(f"{sequence.name}: no held-out frames to judge a restorer on")
+    if length < 1:
+        raise ConfigError(f"clips of {length} views; expected 1 or more")
+    recording = np.zeros(len(sequence), int) if sequence.recording is None else sequence.recording
+    gains = torch.ones(len(frames))
+    if scene.light is not None:
+        gains = scene.light.exposures_of(frames, sequence.train, sequence.recording)
+    clips: list[Clip] = []
+    borders = np.flatnonzero(np.diff(recording[frames])) + 1
+    for run in np.split(np.arange(len(frames)), borders):
+        for part in np.array_split(run, -(-len(run) // length)):
+            cameras = sequence.cameras[frames[part]]
+            (clip,) = render_clips(scene, references, [cameras], count=count, first_index=len(clips))
+            gain = gains[torch.from_numpy(part)]
+            if bool((gain != 1).any()):
+                seen = observe_views(scene, references, cameras, count=count, exposure=gain)
+                clip = replace(clip, layers=seen.layers)
+            clips.append(clip)
+    return clips
+
+
+class AsRendered:
+    """The restorer that restores nothing: what any other must beat."""
+
+    name = "none"
+
+    def restore(self, clip: Clip) -> Restoration:
+        """The rendering itself."""
+        return Restoration(as_images(clip.layers.get("rendered").clamp(0, 1)), None, {"backend": self.name})
+
+    def save(self, path: Path) -> None:
+        """There is nothing to keep.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError(f"{path}: the rendering as it is is no restorer that could be saved")
+
+
+class WithoutReferences:
+    """A restorer that is not told what real views see; for what they are worth.
+
+    Args:
+        enhancer: the restorer.
+    """
+
+    def __init__(self, enhancer: Enhancer) -> None:
+        self.enhancer = enhancer
+        self.name = f"{enhancer.name}/no-references"
+
+    def restore(self, clip: Clip) -> Restoration:
+        """Restore a clip with its references taken away; the clip itself stays as it is."""
+        alone = drop_references(Layers(clip.layers.data.clone()))
+        restoration = self.enhancer.restore(replace(clip, layers=alone))
+        return replace(restoration, provenance={**restoration.provenance, "references": False})
+
+    def save(self, path: Path) -> None:
+        """Save the restorer behind it."""
+        self.enhancer.save(path)
+
+
+@dataclass(frozen=True)
+class RestoredViews:
+    """Clips after restoration, all views in a row.
+
+    Args:
+        rgb: what the restorer made, in [0, 1], [V, H, W, 3].
+        target: the same with known texture kept; what the fine-tuning is given, [V, H, W, 3].
+        predicted_error: `Restoration.expected_error`, [V, H, W]; None where the restorer predicts none.
+        seconds_per_frame: median over the clips.
+        provenance: of the first clip.
+    """
+
+    rgb: Float[np.ndarray, "v h w 3"]
+    target: Float[np.ndarray, "v h w 3"]
+    predicted_error: Float[np.ndarray, "v h w"] | None
+    seconds_per_frame: float
+    provenance: dict[str, Any]
+
+
+def restore_views(enhancer: Enhancer, clips: Sequence[Clip]) -> RestoredViews:
+    """Restore clips, and time it.
+
+    Raises:
+        ShapeError: without any clip.
+    """
+    if not clips:
+        raise ShapeError("no clips to restore")
+    restorations, targets, seconds = [], [], []
+    for clip in clips:
+        begun = time.perf_counter()
+        restoration = enhancer.restore(clip)
+        seconds.append((time.perf_counter() - begun) / len(clip))
+        restorations.append(restoration)
+        rendered = as_images(clip.layers.get("rendered").clamp(0, 1))
+        targets.append(keep_known(rendered, restoration.rgb, as_planes(clip.layers.get("uncertainty")))[0])
+    expected = [item.expected_error for item in restorations if item.expected_error is not None]
+    return RestoredViews(
+        np.concatenate([item.rgb for item in restorations]),
+        np.concatenate(targets),
+        np.concatenate(expected) if len(expected) == len(restorations) else None,
+        float(np.median(seconds)),
+        restorations[0].provenance,
+    )
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Where the pixels of one view lie in the view before it.
+
+    Args:
+        before: index of the view before.
+        view: index of the view.
+        grid: positions as `grid_sample` wants them, [1, H, W, 2].
+        common: pixels that both views see, [H, W].
+    """
+
+    before: int
+    view: int
+    grid: Tensor
+    common: Tensor
+
+
+@dataclass(frozen=True)
+class RestorerBenchmark:
+    """One list of clips with its truth, for any number of restorers.
+
+    Args:
+        clips: rendered views.
+        truth: of the same views in the same order.
+        lpips: the metric; None where its weights are not there.
+
+    Raises:
+        ShapeError: when clips and truth have different numbers of views, or sizes.
+    """
+
+    clips: Sequence[Clip]
+    truth: TrueViews
+    lpips: Lpips | None = None
+
+    def __post_init__(self) -> None:
+        views = sum(len(clip) for clip in self.clips)
+        sizes = {(clip.cameras.height, clip.cameras.width) for clip in self.clips}
+        if views != len(self.truth) or sizes != {tuple(self.truth.mask.shape[1:])}:
+            raise ShapeError(
+                f"{views} views of {sorted(sizes)} px in the clips, truth of {self.truth.mask.shape}"
+            )
+
+    def judge(self, enhancer: Enhancer) -> dict[str, Any]:
+        """Restore all clips and compare; see `figures`."""
+        return self.figures(restore_views(enhancer, self.clips))
+
+    def figures(self, restored: RestoredViews) -> dict[str, Any]:
+        """All figures of restored views, ready for JSON.
+
+        Args:
+            restored: of this benchmark's clips.
+
+        Returns:
+            `{psnr, ssim, lpips_alex, well: {...}, hole: {...}, observed: {...}, unobserved: {...}}` of the
+            raw restoration, its `aligned_psnr` (the best gain of each image divided out: the exposure of
+            another recording cannot be known), the same tree of the target of the fine-tuning in `kept`, and
+            `changed_share` (of the target's pixels inside the mask), `flicker`, `error_flicker`,
+            `seconds_per_frame`, `calibration` (see `calibration`; None without prediction) with
+            `rank_correlation_of`: the rank correlation of the error with what else could predict it.
+
+        Raises:
+            ShapeError: when the views are not those of the benchmark.
+        """
+        if restored.rgb.shape != self.truth.rgb.shape:
+            raise ShapeError(f"{restored.rgb.shape} restored, truth {self.truth.rgb.shape}")
+        rgb = torch.from_numpy(np.ascontiguousarray(restored.rgb, dtype=np.float32)).clamp(0, 1)
+        target = torch.from_numpy(np.ascontiguousarray(restored.target, dtype=np.float32)).clamp(0, 1)
+        mask = self.regions["valid"]
+        changed = (target - self._rendered).abs().amax(dim=-1) > CHANGED
+        error = (rgb - self._truth).abs().mean(dim=-1)
+        found = None
+        if restored.predicted_error is not None:
+            found = calibration(restored.predicted_error, error.numpy(), self.truth.mask)
+        change = (rgb - self._rendered).abs().mean(dim=-1)
+        return {
+            **self._compared(rgb),
+            "aligned_psnr": psnr(align_exposure(rgb, self._truth, mask), self._truth, mask),
+            "kept": self._compared(target),
+            "changed_share": float(changed[mask].float().mean()) if bool(mask.any()) else None,
+            **self._flicker(rgb),
+            "seconds_per_frame": restored.seconds_per_frame,
+            "calibration": found,
+            "rank_correlation_of": {
+                name: cell_correlation(np.asarray(values), error.numpy(), self.truth.mask)
+                for name, values in (("uncertainty", self._layer("uncertainty")), ("change", change))
+            },
+        }
+
+    @cached_property
+    def regions(self) -> dict[str, Bool[Tensor, "v h w"]]:
+        """Pixels that count, by name: all, well seen, holes, and where it is known (un)observed."""
+        mask = torch.from_numpy(np.ascontiguousarray(self.truth.mask))
+        alpha, uncertainty = self._layer("alpha"), self._layer("uncertainty")
+        regions = {
+            "valid": mask,
+            "well": mask & (alpha > WELL_SEEN_ALPHA) & (uncertainty < WELL_SEEN_UNCERTAINTY),
+            "hole": mask & (alpha < HOLE_ALPHA),
+        }
+        if self.truth.observed is not None:
+            seen = torch.from_numpy(np.ascontiguousarray(self.truth.observed))
+            regions |= {"observed": mask & seen, "unobserved": mask & ~seen}
+        return regions
+
+    @cached_property
+    def pixel_share(self) -> dict[str, float]:
+        """Share of the mask that each region has."""
+        total = max(1, int(self.regions["valid"].sum()))
+        return {name: float(region.sum()) / total for name, region in self.regions.items() if name != "valid"}
+
+    @cached_property
+    def _truth(self) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(self.truth.rgb, dtype=np.float32))
+
+    @cached_property
+    def _rendered(self) -> Tensor:
+        parts = [clip.layers.get("rendered").clamp(0, 1) for clip in self.clips]
+        return torch.cat(parts).permute(0, 2, 3, 1).contiguous()
+
+    def _layer(self, name: str) -> Tensor:
+        return torch.cat([clip.layers.get(name)[:, 0] for clip in self.clips])
+
+    def _compared(self, images: Float[Tensor, "v h w 3"]) -> dict[str, Any]:
+        """As the protocol compares: in 8 bits, outside pixels blanked in both images."""
+        inside = self.regions["valid"][..., None].to(images.dtype)
+        render = (images * COLOR_LEVELS).round() / COLOR_LEVELS * inside
+        target = self._truth * inside
+        smallest = SMALLEST_PART * render.shape[1] * render.shape[2]
+        regions = {
+            name: region & (region.sum((1, 2)) >= smallest)[:, None, None]
+            for name, region in self.regions.items()
+        }
+        structure = ssim_map(render, target)
+        distances = None if self.lpips is None else self.lpips.regional_distances(render, target, regions)
+        tree: dict[str, dict[str, float | None]] = {}
+        for name, region in regions.items():
+            tree[name] = {
+                "psnr": mean_of_known(psnr_per_image(render, target, region)),
+                "ssim": mean_of_known(means_per_image(structure, region)),
+                "lpips_alex": None,
+            }
+            if self.lpips is not None and distances is not None:
+                tree[name][self.lpips.name] = mean_of_known(distances[name])
+        nothing: dict[str, float | None] = dict.fromkeys(tree["valid"])
+        for name in ("observed", "unobserved"):
+            tree.setdefault(name, nothing)
+        return {**tree.pop("valid"), **tree}
+
+    def _flicker(self, images: Float[Tensor, "v h w 3"]) -> dict[str, float | None]:
+        r"""Unsteadiness along the surface, mean over the pixels that two neighbouring views share.
+
+        `flicker` is :math:`|r_t - W r_{t-1}|` less the same of the photographs, W the warp by true depth:
+        0 for what is as steady as reality, and below for what is blurred. `error_flicker` is that of the
+        error :math:`r - p`: 0 only for what errs in the same way in both views.
+        """
+        if not self._motions:
+            return {"flicker": None, "error_flicker": None}
+        stacks = {"own": images, "real": self._truth, "error": images - self._truth}
+        totals, count = dict.fromkeys(stacks, 0.0), 0
+        for motion in self._motions:
+            for name, stack in stacks.items():
+                difference = (stack[motion.view] - _carried(stack[motion.before], motion.grid)).abs()
+                totals[name] += float(difference[motion.common].double().mean(dim=-1).sum())
+            count += int(motion.common.sum())
+        if count == 0:
+            return {"flicker": None, "error_flicker": None}
+        return {
+            "flicker": (totals["own"] - totals["real"]) / count,
+            "error_flicker": totals["error"] / count,
+        }
+
+    @cached_property
+    def _motions(self) -> list[_Motion]:
+        if self.truth.depth_mm is None:
+            return []
+        cameras = Cameras.concatenated([clip.cameras for clip in self.clips])
+        owner = np.repeat(np.arange(len(self.clips)), [len(clip) for clip in self.clips])
+        neighbours = np.flatnonzero(owner[1:] == owner[:-1]) + 1
+        return [_motion(cameras, self.truth.depth_mm, self.truth.mask, int(view)) for view in neighbours]
+
+
+def _motion(
+    cameras: Cameras, depth_mm: Float[np.ndarray, "v h w"], mask: Bool[np.ndarray, "v h w"], view: int
+) -> _Motion:
+    here, before = cameras[view], cameras[view - 1]
+    points = here.centers[0] + pixel_rays(here)[0] * depth_mm[view][..., None].astype(np.float64)
+    viewmat, K = before.viewmats[0], before.K[0]
+    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+    z = local[..., 2]
+    ahead = np.where(z > 1e-9, z, 1.0)
+    u = local[..., 0] / ahead * K[0, 0] + K[0, 2]
+    v = local[..., 1] / ahead * K[1, 1] + K[1, 2]
+    width, height = cameras.width, cameras.height
+    # Half a pixel inside the border: nothing is sampled from beyond it.
+    inside = (z > 1e-9) & (u >= 0.5) & (u <= width - 0.5) & (v >= 0.5) & (v <= height - 0.5)
+    row = np.clip(np.floor(v).astype(np.int64), 0, height - 1)
+    column = np.clip(np.floor(u).astype(np.int64), 0, width - 1)
+    there = depth_mm[view - 1][row, column]
+    same = (there > 0) & (depth_mm[view] > 0) & (np.abs(z - there) < SAME_SURFACE * np.maximum(there, 1e-9))
+    common = inside & same & mask[view] & mask[view - 1][row, column]
+    grid = np.stack([2 * u / width - 1, 2 * v / height - 1], axis=-1).clip(-4, 4).astype(np.float32)
+    return _Motion(view - 1, view, torch.from_numpy(grid)[None], torch.from_numpy(common))
+
+
+def _carried(image: Float[Tensor, "h w 3"], grid: Float[Tensor, "1 h w 2"]) -> Float[Tensor, "h w 3"]:
+    stack = image.permute(2, 0, 1)[None]
+    return functional.grid_sample(stack, grid, padding_mode="border", align_corners=False)[0].permute(1, 2, 0)

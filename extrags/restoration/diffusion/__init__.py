@@ -1,0 +1,1 @@
+"""The embedded restorer: a conditional diffusion with weights of its own."""

@@ -1,0 +1,74 @@
+"""Training frames that pretrained models are shown, kept with the restorer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int, UInt8
+
+from extrags.errors import ShapeError
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
+from extrags.zarr_io import open_group, read_array, write_array, write_frames
+
+__all__ = ["RealViews"]
+
+
+@dataclass(frozen=True)
+class RealViews:
+    """The training frames at the scene's mean exposure: the brightness virtual views are rendered at.
+
+    Args:
+        rgb: [R, H, W, 3].
+        world_from_camera: [R, 4, 4].
+    """
+
+    rgb: UInt8[np.ndarray, "r h w 3"]
+    world_from_camera: Float[np.ndarray, "r 4 4"]
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+    def images(self, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n h w 3"]:
+        """Chosen frames in [0, 1]."""
+        return np.asarray(self.rgb[index], dtype=np.float32) / np.float32(255)
+
+    @classmethod
+    def gather(cls, scene: Scene, sequence: EndoscopicSequence) -> RealViews:
+        """The frames a scene was trained on.
+
+        Args:
+            scene: the reconstruction; its light knows each frame's exposure.
+            sequence: posed frames; training frames only are taken.
+
+        Raises:
+            ShapeError: when the light's exposures are not those of the training frames.
+        """
+        frames = sequence.train
+        rgb = sequence.rgb[frames]
+        light = scene.light
+        if light is not None:
+            if len(light.log_exposure) != len(frames):
+                raise ShapeError(
+                    f"the scene's light has {len(light.log_exposure)} exposures for {len(frames)} frames"
+                )
+            gains = light.exposures().detach()[:, None, None, None]
+            signal = light.signal(torch.from_numpy(rgb.astype(np.float32) / 255))
+            balanced = light.apply_response(signal / gains).detach().clamp(0, 1).numpy()
+            rgb = np.rint(balanced * 255).astype(np.uint8)
+        return cls(rgb, sequence.cameras.world_from_camera[frames])
+
+    def save(self, path: Path) -> None:
+        """Write a zarr v3 group, one frame per chunk."""
+        group = open_group(path, mode="w")
+        write_frames(group, "rgb", self.rgb)
+        write_array(group, "world_from_camera", self.world_from_camera)
+
+    @classmethod
+    def load(cls, path: Path) -> RealViews:
+        """Read what `save` wrote."""
+        group = open_group(path, mode="r")
+        return cls(read_array(group, "rgb"), read_array(group, "world_from_camera"))

@@ -1,0 +1,1 @@
+"""Pairs of degraded and true views to train restorers on."""

@@ -1,0 +1,180 @@
+"""Crops for the training: from few pairs, the variety that virtual views will show."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrags.errors import ConfigError
+from extrags.restoration.diffusion.network import SIZE_MULTIPLE
+from extrags.restoration.diffusion.rectified_flow import Batch
+from extrags.restoration.training_data.pairs import Pairs
+from extrags.view_synthesis.conditioning import Layers, condition
+from extrags.view_synthesis.references import LightTransfer
+
+__all__ = ["CropSampler", "MixedSampler", "cut_out", "drop_references"]
+
+PASTED_HOLES = 0.5
+"""Probability of another pair's holes."""
+HALF_PLANE = 0.35
+"""Probability that one side of a line was never seen."""
+REFERENCE_DROPOUT = 0.35
+"""Probability that no real view is there to help."""
+EXPOSURE_JITTER = 0.3
+COLOR_JITTER = 0.1
+"""Deviations of the logarithm of a common and a per-channel gain. Large, because virtual views come
+nearer to the wall than real ones: the restorer shall keep the colour it is given, not the scene's mean."""
+SMALLEST_CROP_PX = 32
+
+
+class CropSampler:
+    """Draws batches of augmented crops, the same sequence for the same seed.
+
+    Args:
+        pairs: what to learn from; validation pairs are left out.
+        transfer: how brightness changes with distance in this scene.
+        batch: crops per batch.
+        crop_px: side of a crop; images smaller than that give smaller crops.
+        seed: of everything random.
+
+    Raises:
+        ConfigError: when the images are too small for any crop, or no pair is left to train on.
+    """
+
+    def __init__(self, pairs: Pairs, transfer: LightTransfer, *, batch: int, crop_px: int, seed: int) -> None:
+        self._pairs = pairs.subset(np.flatnonzero(~pairs.validation))
+        if len(self._pairs) == 0:
+            raise ConfigError("all pairs are kept back for validation; none is left to train on")
+        height, width = pairs.target.shape[-2:]
+        side = min(crop_px, height, width) // SIZE_MULTIPLE * SIZE_MULTIPLE
+        if side < SMALLEST_CROP_PX:
+            raise ConfigError(
+                f"images of {width}x{height} px are too small to train a restorer on; "
+                f"at least {SMALLEST_CROP_PX} px a side are needed"
+            )
+        self._side = side
+        self._transfer = transfer
+        self._batch = batch
+        self._generator = np.random.default_rng([seed, 2])
+        self._order: list[int] = []
+
+    def draw(self) -> Batch:
+        """The next batch."""
+        crops = [self._crop(self._next()) for _ in range(self._batch)]
+        layers, clean, weight, depth = (torch.cat(part) for part in zip(*crops, strict=True))
+        return Batch(condition(Layers(layers), self._transfer), clean, weight, depth)
+
+    def _next(self) -> int:
+        if not self._order:
+            self._order = self._generator.permutation(len(self._pairs)).tolist()
+        return self._order.pop()
+
+    def _crop(self, index: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        generator, pairs = self._generator, self._pairs
+        top, left = self._corner()
+        window = (..., slice(top, top + self._side), slice(left, left + self._side))
+        # Many scenes are kept in half precision; crops are not. The copy is changed below.
+        layers = Layers(pairs.layers.data[index : index + 1][window].clone().float())
+        clean = pairs.target[index : index + 1][window]
+        weight = pairs.weight[index : index + 1][window]
+        depth = pairs.depth_mm[index : index + 1][window]
+        layers, clean = self._relit(layers, clean)
+        if generator.random() < PASTED_HOLES:
+            other = int(generator.integers(len(pairs)))
+            row, column = self._corner()
+            alpha = pairs.layers.get("alpha")[
+                other : other + 1, :, row : row + self._side, column : column + self._side
+            ]
+            # Half of the holes hide from the renderer only; real views may still see the surface.
+            layers = cut_out(layers, _turned(alpha, generator), unseen=generator.random() < 0.5)
+        if generator.random() < HALF_PLANE:
+            layers = cut_out(layers, self._half_plane(), unseen=True)
+        if generator.random() < REFERENCE_DROPOUT:
+            layers = drop_references(layers)
+        everything = _turned(torch.cat([layers.data, clean, weight, depth], dim=1), generator)
+        data, clean, weight, depth = everything.split((layers.data.shape[1], 3, 1, 1), dim=1)
+        return data, clean, weight, depth
+
+    def _corner(self) -> tuple[int, int]:
+        height, width = self._pairs.target.shape[-2:]
+        return (
+            int(self._generator.integers(height - self._side + 1)),
+            int(self._generator.integers(width - self._side + 1)),
+        )
+
+    def _relit(self, layers: Layers, clean: Tensor) -> tuple[Layers, Tensor]:
+        exposure = self._generator.normal(0, EXPOSURE_JITTER)
+        gains = np.exp(exposure + self._generator.normal(0, COLOR_JITTER, 3)).astype(np.float32)
+        gain = torch.from_numpy(gains)[None, :, None, None]
+        for name in ("rendered", "nearest", "blend"):
+            layers.get(name).mul_(gain).clamp_(0, 1)
+        return layers, (clean * gain).clamp(0, 1)
+
+    def _half_plane(self) -> Float[Tensor, "1 1 h w"]:
+        angle = self._generator.uniform(0, 2 * math.pi)
+        offset = self._generator.uniform(-0.1, 0.6) * self._side / 2
+        steps = torch.arange(self._side) + 0.5 - self._side / 2
+        across = math.cos(angle) * steps[None, :] + math.sin(angle) * steps[:, None]
+        softness = self._generator.uniform(0.5, 3)
+        return torch.sigmoid((offset - across) / softness)[None, None]
+
+
+class MixedSampler:
+    """Batches whose crops come from many scenes, each with its own light.
+
+    Args:
+        samplers: one per scene; each gives one crop at a time.
+        batch: crops per batch.
+        seed: of which scene is drawn.
+    """
+
+    def __init__(self, samplers: list[CropSampler], *, batch: int, seed: int) -> None:
+        self._samplers = samplers
+        self._batch = batch
+        self._generator = np.random.default_rng([seed, 6])
+
+    def draw(self) -> Batch:
+        """The next batch."""
+        chosen = self._generator.integers(len(self._samplers), size=self._batch)
+        return Batch.concatenated([self._samplers[int(scene)].draw() for scene in chosen])
+
+
+def cut_out(layers: Layers, kept: Float[Tensor, "1 1 h w"], *, unseen: bool) -> Layers:
+    """Holes as the renderer would show them.
+
+    Args:
+        layers: changed in place.
+        kept: 1 where the view stays as it is, 0 in the hole.
+        unseen: also no real view sees the surface there.
+    """
+    solid = kept.clamp(0, 1)
+    for name in ("rendered", "alpha"):
+        layers.get(name).mul_(solid)
+    layers.get("depth_mm").mul_((solid > 0.02).float())
+    uncertainty = layers.get("uncertainty")
+    uncertainty.copy_(1 - (1 - uncertainty) * solid)
+    if unseen:
+        for name in ("nearest_weight", "blend_weight", "log_ratio"):
+            layers.get(name).mul_((2 * solid - 1).clamp_min(0))
+    return layers
+
+
+def drop_references(layers: Layers) -> Layers:
+    """As if no real view saw anything of it; changed in place."""
+    for name in ("nearest_weight", "blend_weight", "log_ratio"):
+        layers.get(name).zero_()
+    return layers
+
+
+def _turned(images: Tensor, generator: np.random.Generator) -> Tensor:
+    """One of the eight symmetries of the square."""
+    choice = int(generator.integers(8))
+    if choice & 1:
+        images = images.flip(-1)
+    if choice & 2:
+        images = images.flip(-2)
+    return images.transpose(-1, -2) if choice & 4 else images

@@ -1,0 +1,371 @@
+"""Pairs to learn restoration from, made of the scene's own training frames.
+
+*Leave-out pairs*: the scene is reconstructed briefly without some training frames, and those are
+rendered: real artefacts, real targets. Each is rendered a second time with holes torn into the scene.
+*Cheap pairs*: Gaussians straight from the depth of a few frames, perturbed and never optimised, rendered
+in others. Held-out frames are never touched.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from extrags.cameras import pixel_rays
+from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.errors import CaptureError
+from extrags.events import Progress, emit
+from extrags.gaussians import Gaussians
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
+from extrags.training.optimise import optimise
+from extrags.training.reconstruction import coarse_schedule, scene_extent
+from extrags.training.starting import median_depth, starting_gaussians, surface_normals
+from extrags.training.views import epochs, real_views
+from extrags.view_synthesis.conditioning import Layers, observe_views
+from extrags.view_synthesis.references import SATURATED, ReferenceViews
+
+__all__ = ["Pairs", "fold_pairs", "leave_out_folds", "make_pairs", "pair_views", "synthetic_pairs"]
+
+MIN_FRAMES = 4
+"""With fewer training frames there is nothing to leave out."""
+BLOCKS_PER_FOLD = 3
+"""Each fold leaves out so many runs of neighbouring frames: gaps like those of a new trajectory."""
+VALIDATION_EVERY = 5
+"""Every n-th training frame is never a target of the training, only of the validation."""
+TARGETS_PER_SUBSET = 4
+SYNTHETIC_GAUSSIANS = 8000
+FLAT = 0.1
+"""Thickness of synthetic Gaussians, as a share of their radius."""
+MIN_GAIN = 0.05
+"""Darker places are treated as if they received this much light: noise is not albedo."""
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """P degraded views with what they really looked like.
+
+    Args:
+        layers: of the degraded views, [P].
+        target: the real image, in [0, 1], [P, 3, H, W].
+        weight: 1 where the target is valid tissue and not saturated, [P, 1, H, W].
+        depth_mm: true z-depth, 0 where unknown, [P, 1, H, W].
+        frame: frame of the sequence, [P].
+        synthetic: which pairs come from unoptimised or torn Gaussians, [P].
+        validation: which pairs are kept back from the training, [P].
+    """
+
+    layers: Layers
+    target: Float[Tensor, "p 3 h w"]
+    weight: Float[Tensor, "p 1 h w"]
+    depth_mm: Float[Tensor, "p 1 h w"]
+    frame: Int[np.ndarray, "p"]
+    synthetic: Bool[np.ndarray, "p"]
+    validation: Bool[np.ndarray, "p"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def subset(self, chosen: Int[np.ndarray, "m"]) -> Pairs:
+        """Chosen pairs."""
+        index = torch.from_numpy(np.asarray(chosen, dtype=np.int64))
+        return Pairs(
+            self.layers[chosen],
+            self.target[index],
+            self.weight[index],
+            self.depth_mm[index],
+            self.frame[chosen],
+            self.synthetic[chosen],
+            self.validation[chosen],
+        )
+
+    @staticmethod
+    def concatenated(parts: list[Pairs]) -> Pairs:
+        """Join pairs.
+
+        Raises:
+            CaptureError: when there are none.
+        """
+        if not parts:
+            raise CaptureError("no pairs to train the restorer on")
+        return Pairs(
+            Layers(torch.cat([part.layers.data for part in parts])),
+            torch.cat([part.target for part in parts]),
+            torch.cat([part.weight for part in parts]),
+            torch.cat([part.depth_mm for part in parts]),
+            np.concatenate([part.frame for part in parts]),
+            np.concatenate([part.synthetic for part in parts]),
+            np.concatenate([part.validation for part in parts]),
+        )
+
+
+def make_pairs(
+    scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
+) -> Pairs:
+    """All pairs of a scene.
+
+    Args:
+        scene: the coarse scene, trained on `sequence.train`.
+        sequence: posed frames; only training frames are used.
+        config: how many pairs.
+        coarse: settings of the leave-out reconstructions.
+
+    Raises:
+        CaptureError: with fewer than four training frames.
+    """
+    parts = []
+    for fold in range(config.folds):
+        parts.append(fold_pairs(scene, sequence, config, coarse, fold))
+        emit(Progress("enhance-pairs", fold + 1, config.folds + 1))
+    if config.synthetic_views > 0:
+        parts.append(synthetic_pairs(scene, sequence, config))
+    emit(Progress("enhance-pairs", config.folds + 1, config.folds + 1))
+    return Pairs.concatenated(parts)
+
+
+def leave_out_folds(
+    frames: Int[np.ndarray, "n"], folds: int
+) -> list[tuple[Int[np.ndarray, "kept"], Int[np.ndarray, "left"]]]:
+    """Kept and left-out frames of each fold; every frame is left out exactly once, in runs.
+
+    With one fold a third of the frames is left out.
+
+    Raises:
+        CaptureError: with fewer than four frames.
+    """
+    if len(frames) < MIN_FRAMES:
+        raise CaptureError(
+            f"{len(frames)} training frames are too few to train a restorer on (at least {MIN_FRAMES} "
+            "are needed); set enhance.backend to classical"
+        )
+    parts = max(folds, 2) if folds != 1 else 3
+    blocks = min(BLOCKS_PER_FOLD * parts, len(frames))
+    owner = np.arange(len(frames)) * blocks // len(frames) % parts
+    return [(frames[owner != fold], frames[owner == fold]) for fold in range(folds)]
+
+
+def fold_pairs(
+    scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig, fold: int
+) -> Pairs:
+    """Reconstruct without the frames of a fold, and render them: as it is, and torn.
+
+    Args:
+        scene: the coarse scene; its light tells the exposure of the left-out frames.
+        sequence: posed frames.
+        config: folds, iterations, seed.
+        coarse: settings of the reconstruction.
+        fold: which fold, from 0.
+
+    Raises:
+        CaptureError: with fewer than four training frames.
+    """
+    train = np.asarray(sequence.train, dtype=np.int64)
+    kept, left = leave_out_folds(train, config.folds)[fold]
+    partial = _partial_scene(scene, sequence, config, coarse, kept, fold)
+    references = ReferenceViews.gather(partial, sequence, kept)
+    # In the partial scene the mean over the kept frames is one.
+    gain = (_log_exposures(scene, sequence, left) - _log_exposures(scene, sequence, kept).mean()).exp()
+    generator = np.random.default_rng([config.seed, 4, fold])
+    torn = _torn(partial, generator)
+    parts = []
+    for degraded, views in ((partial, references), (torn, references.of_scene(torn))):
+        observation = observe_views(
+            degraded, views, sequence.cameras[left], count=config.references, exposure=gain
+        )
+        parts.append(pair_views(sequence, observation.layers, left, synthetic=degraded is torn))
+    return Pairs.concatenated(parts)
+
+
+def _partial_scene(
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    config: EnhanceConfig,
+    coarse: CoarseConfig,
+    kept: Int[np.ndarray, "k"],
+    fold: int,
+) -> Scene:
+    """A brief reconstruction from the kept frames, under the coarse scene's light.
+
+    The light takes longer to learn than a fold has; started anew it would teach the restorer errors of
+    brightness that the coarse scene does not have.
+    """
+    light = scene.light
+    if light is not None:
+        light = replace(light, log_exposure=_log_exposures(scene, sequence, kept))
+    brief = coarse.model_copy(
+        update={
+            "iterations": config.fold_iterations,
+            "sh_every": max(1, config.fold_iterations // 3),
+            "seed": config.seed + fold,
+        }
+    )
+    start = starting_gaussians(
+        sequence,
+        kept,
+        brief.max_points,
+        light=light,
+        sh_degree=brief.sh_degree,
+        seed=brief.seed,
+        thickness=brief.thickness,
+    )
+    views = real_views(sequence, kept)
+    order = epochs(len(views), np.random.default_rng(brief.seed))
+    schedule = coarse_schedule(
+        brief, scene_extent(sequence, kept), median_depth(sequence, kept), "enhance-pairs"
+    )
+    return optimise(Scene(start, light), lambda _: views[next(order)], schedule).scene
+
+
+def _torn(scene: Scene, generator: np.random.Generator) -> Scene:
+    """The scene with holes torn into it and its Gaussians shaken: what lies farther off the path."""
+    means = scene.gaussians.means.numpy()
+    keep = generator.random(len(means)) > generator.uniform(0, 0.3)
+    keep &= _outside_random_balls(means, float(np.ptp(means, axis=0).min()), generator)
+    gaussians = scene.gaussians.subset(torch.from_numpy(keep))
+    size = gaussians.scales.exp().numpy()
+    shift = generator.normal(0, generator.uniform(0, 1), size.shape) * size
+    grown = generator.normal(0.1, 0.2, (len(size), 1))
+    return Scene(
+        replace(
+            gaussians,
+            means=gaussians.means + torch.from_numpy(shift.astype(np.float32)),
+            scales=gaussians.scales + torch.from_numpy(grown.astype(np.float32)),
+        ),
+        scene.light,
+    )
+
+
+def _outside_random_balls(
+    points: Float[np.ndarray, "n 3"], scale: float, generator: np.random.Generator
+) -> Bool[np.ndarray, "n"]:
+    """False inside up to four balls round random points; true everywhere when nothing would be left."""
+    outside = np.ones(len(points), dtype=bool)
+    for _ in range(int(generator.integers(0, 5))):
+        center = points[generator.integers(len(points))]
+        outside &= np.linalg.norm(points - center, axis=1) > generator.uniform(0.05, 0.35) * scale
+    return outside if outside.any() else np.ones(len(points), dtype=bool)
+
+
+def _log_exposures(
+    scene: Scene, sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]
+) -> Float[Tensor, "m"]:
+    """Log-exposures of training frames in the coarse scene."""
+    if scene.light is None:
+        return torch.zeros(len(frames))
+    position = {int(frame): index for index, frame in enumerate(sequence.train)}
+    return scene.light.log_exposure[torch.tensor([position[int(frame)] for frame in frames])]
+
+
+def synthetic_pairs(scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig) -> Pairs:
+    """Gaussians from the depth of a few frames, perturbed, rendered in other frames.
+
+    Args:
+        scene: the coarse scene; gives light, exposures and depth where none was measured.
+        sequence: posed frames.
+        config: number of views and seed.
+
+    Raises:
+        CaptureError: with fewer than four training frames.
+    """
+    train = np.asarray(sequence.train, dtype=np.int64)
+    if len(train) < MIN_FRAMES:
+        leave_out_folds(train, config.folds)
+    everything = ReferenceViews.gather(scene, sequence, train)
+    generator = np.random.default_rng([config.seed, 1])
+    centers = sequence.cameras[train].centers
+    parts = []
+    remaining = config.synthetic_views
+    while remaining > 0:
+        size = int(generator.integers(2, max(3, len(train) // 3 + 1)))
+        start = int(generator.integers(len(train)))
+        nearest = np.argsort(np.linalg.norm(centers - centers[start], axis=1), kind="stable")
+        subset = np.sort(generator.choice(nearest[: min(len(train) - 1, 2 * size)], size, replace=False))
+        others = np.array([i for i in nearest if i not in subset])
+        count = min(TARGETS_PER_SUBSET, remaining, len(others))
+        targets = generator.choice(others[: max(count, len(others) // 2)], count, replace=False)
+        views = everything.subset(subset)
+        crude = Scene(_crude_gaussians(views, generator), scene.light)
+        views = views.of_scene(crude)
+        gain = everything.exposure[torch.from_numpy(targets)]
+        observation = observe_views(
+            crude, views, sequence.cameras[train[targets]], count=config.references, exposure=gain
+        )
+        parts.append(pair_views(sequence, observation.layers, train[targets], synthetic=True))
+        remaining -= count
+    return Pairs.concatenated(parts)
+
+
+def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> Gaussians:
+    """Unoptimised Gaussians on the views' surface: noisy depth, torn holes, floaters."""
+    rays = pixel_rays(views.cameras).reshape(-1, 3)
+    packed = views.packed.permute(0, 2, 3, 1).reshape(-1, 6).numpy().astype(np.float64)
+    usable = np.flatnonzero((packed[:, 5] > 0) & (packed[:, 3] > 0))
+    if len(usable) == 0:
+        raise CaptureError(f"no usable depth in frames {views.frames.tolist()}")
+    count = min(SYNTHETIC_GAUSSIANS, len(usable))
+    chosen = np.sort(generator.choice(usable, count, replace=False))
+    view = chosen // (views.cameras.width * views.cameras.height)
+    depth = 1 / packed[chosen, 4]
+    offsets = rays[chosen] * depth[:, None]
+    distance = np.linalg.norm(offsets, axis=1)
+    # Flat on the surface, as a scene's Gaussians are: the light darkens what is turned away from it.
+    normals = surface_normals(views.cameras.centers[view] + offsets)
+    facing = (normals * offsets).sum(axis=1) / distance
+    seen = tuple(
+        torch.from_numpy(values.astype(np.float32)) for values in (distance, depth / distance, facing)
+    )
+    falloff = views.transfer.falloff(*seen).numpy()
+    signal = views.transfer.signal(torch.from_numpy(packed[chosen, :3])).numpy()
+    albedo = signal / np.maximum(falloff, MIN_GAIN)[:, None]
+    albedo = albedo / views.exposure.numpy()[view, None]
+    # Without a light the colour of a distance cannot be divided out twice: it stays as it was seen.
+    colors = albedo if views.transfer.light is not None else packed[chosen, :3]
+    # The area each point stands for, as the deviation of a Gaussian.
+    pitch = np.sqrt(len(usable) / count) / views.cameras.K[view, 0, 0]
+    radius = 0.6 * depth * pitch * np.exp(generator.normal(0, 0.25, count))
+    noise = generator.normal(0, generator.uniform(0.003, 0.04), count)
+    points = views.cameras.centers[view] + offsets * (1 + noise)[:, None]
+    floats = generator.random(count) < generator.uniform(0, 0.02)
+    inward = generator.uniform(0.3, 0.95, count)
+    points = np.where(floats[:, None], views.cameras.centers[view] + offsets * inward[:, None], points)
+    colors = np.where(floats[:, None], generator.uniform(0, 1.2, (count, 3)), colors)
+    # What floats near the lens must not look larger than what it was taken from.
+    radius = np.where(floats, radius * inward, radius)
+    keep = _outside_random_balls(points, float(np.median(depth)), generator)
+    opacity = float(generator.uniform(0.4, 0.95))
+    return Gaussians.from_points(
+        points[keep],
+        colors[keep].clip(0, None),
+        radius[keep],
+        opacity=opacity,
+        normals=normals[keep],
+        thickness=FLAT,
+    )
+
+
+def pair_views(
+    sequence: EndoscopicSequence, layers: Layers, frames: Int[np.ndarray, "m"], *, synthetic: bool
+) -> Pairs:
+    """Layers of frames with what the frames really show; every fifth training frame validates."""
+    rgb = sequence.rgb[frames]
+    valid = sequence.mask[frames] & (rgb.max(axis=-1) < SATURATED)
+    if sequence.specular is not None:
+        valid &= ~sequence.specular[frames]
+    depth = np.zeros(valid.shape, dtype=np.float32)
+    if sequence.depth_mm is not None:
+        depth = np.where(sequence.mask[frames], sequence.depth_mm[frames], 0).astype(np.float32)
+    train = np.asarray(sequence.train, dtype=np.int64)
+    position = np.searchsorted(np.sort(train), frames)
+    return Pairs(
+        layers,
+        torch.from_numpy(rgb.astype(np.float32) / 255).permute(0, 3, 1, 2).contiguous(),
+        torch.from_numpy(valid.astype(np.float32))[:, None],
+        torch.from_numpy(depth)[:, None],
+        frames,
+        np.full(len(frames), synthetic),
+        position % VALIDATION_EVERY == VALIDATION_EVERY // 2,
+    )

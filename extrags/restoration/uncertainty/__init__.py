@@ -1,0 +1,1 @@
+"""The error a restorer makes: expected, calibrated, and shown."""

@@ -1,0 +1,98 @@
+"""How well errors were predicted: a table of predicted against true ones, and how well they are ranked."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Shaped
+
+from extrags.errors import ConfigError, ShapeError
+from extrags.restoration.uncertainty.calibration import cell_means
+
+__all__ = ["calibration", "cell_correlation", "rank_correlation"]
+
+CALIBRATION_BINS = 10
+
+
+def calibration(
+    predicted: Shaped[np.ndarray, "v h w"],
+    error: Shaped[np.ndarray, "v h w"],
+    mask: Bool[np.ndarray, "v h w"],
+    *,
+    bins: int = CALIBRATION_BINS,
+) -> dict[str, Any]:
+    """How well an error was predicted, on means over cells of 8 x 8 pixels.
+
+    Args:
+        predicted: what the restorer expects its error to be.
+        error: the true absolute error, mean of the channels.
+        mask: which pixels count; a cell counts with at least half of its pixels.
+        bins: of equal numbers of cells, by prediction.
+
+    Returns:
+        `{rank_correlation, calibration_error, cells, bins: [{predicted, error, low, high, cells}]}`:
+        Spearman's; the mean distance of the bins from the diagonal; in each bin the means, and the
+        quartiles of the true error.
+
+    Raises:
+        ShapeError: when the shapes differ.
+        ConfigError: without any bin.
+    """
+    if not predicted.shape == error.shape == mask.shape:
+        raise ShapeError(f"predicted {predicted.shape}, error {error.shape} and mask {mask.shape} differ")
+    if bins < 1:
+        raise ConfigError(f"{bins} calibration bins; expected 1 or more")
+    expected, found = _cells(predicted, mask), _cells(error, mask)
+    order = np.argsort(expected, kind="stable")
+    table = []
+    for chosen in np.array_split(order, bins):
+        if len(chosen) == 0:
+            continue
+        low, high = np.quantile(found[chosen], [0.25, 0.75])
+        table.append(
+            {
+                "predicted": float(expected[chosen].mean()),
+                "error": float(found[chosen].mean()),
+                "low": float(low),
+                "high": float(high),
+                "cells": len(chosen),
+            }
+        )
+    off = [abs(row["predicted"] - row["error"]) * row["cells"] for row in table]
+    return {
+        "rank_correlation": rank_correlation(expected, found),
+        "calibration_error": sum(off) / len(order) if len(order) else None,
+        "cells": len(order),
+        "bins": table,
+    }
+
+
+def rank_correlation(first: Shaped[np.ndarray, "n"], second: Shaped[np.ndarray, "n"]) -> float | None:
+    """Spearman's rank correlation, ties at their mean rank; None where either does not vary."""
+    from scipy.stats import rankdata
+
+    if len(first) < 2:
+        return None
+    ranks = rankdata(np.stack([first, second]), axis=1)
+    centered = ranks - ranks.mean(axis=1, keepdims=True)
+    norms = np.sqrt((centered**2).sum(axis=1))
+    if norms.min() == 0:
+        return None
+    return float((centered[0] * centered[1]).sum() / (norms[0] * norms[1]))
+
+
+def cell_correlation(
+    values: Shaped[np.ndarray, "v h w"], error: Shaped[np.ndarray, "v h w"], mask: Bool[np.ndarray, "v h w"]
+) -> float | None:
+    """Rank correlation of any map with the error, on the same cells."""
+    return rank_correlation(_cells(values, mask), _cells(error, mask))
+
+
+def _cells(values: np.ndarray, mask: np.ndarray) -> Float[np.ndarray, "n"]:
+    """Means over cells that lie wholly in the image and at least half in the mask."""
+    # `where` and not a product: what stands outside the mask must not leak in, be it NaN.
+    inside = torch.from_numpy(np.where(mask, values, 0).astype(np.float32))[:, None]
+    means, share = cell_means(inside, torch.from_numpy(mask.astype(np.float32))[:, None])
+    return means[share >= 0.5].astype(np.float64)

@@ -1,0 +1,310 @@
+"""What the restorer is told about a virtual view, and the image it starts from.
+
+`Layers` are the raw observations of a view: what the scene renders there, how far it can be trusted, and
+what real views say. They are what pairs keep and what augmentation cuts holes into. `condition` turns
+them into the network's channels and its base image.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from extrags.cameras import Cameras, pixel_rays
+from extrags.errors import ShapeError
+from extrags.metrics.filters import filter_separable, gaussian_weights
+from extrags.raster import rasterize
+from extrags.scene import Scene
+from extrags.view_synthesis.filling import completed_depth, push_pull
+from extrags.view_synthesis.references import SEEN_WEIGHT, LightTransfer, ReferenceViews
+from extrags.view_synthesis.warp import warp_references
+
+__all__ = [
+    "CONDITION_CHANNELS",
+    "LAYER_CHANNELS",
+    "Conditioning",
+    "Layers",
+    "condition",
+    "observe_views",
+]
+
+_SLICES = {
+    "rendered": slice(0, 3),
+    "alpha": slice(3, 4),
+    "depth_mm": slice(4, 5),
+    "spread": slice(5, 6),
+    "uncertainty": slice(6, 7),
+    "nearest": slice(7, 10),
+    "nearest_weight": slice(10, 11),
+    "blend": slice(11, 14),
+    "blend_weight": slice(14, 15),
+    "log_ratio": slice(15, 16),
+    "ray_length": slice(16, 17),
+}
+LAYER_CHANNELS = 17
+CONDITION_CHANNELS = 20
+
+COLOR_CENTER = 0.35
+COLOR_SCALE = 0.45
+"""Colours reach the network as (colour - center) / scale: near zero mean and unit deviation."""
+
+SPREAD_LIMIT = 0.3
+"""Relative depth spread within a pixel at which nothing of its colour is trusted."""
+NEW_ANGLE_RAD = 0.9
+"""Angle to the nearest training ray at which a Gaussian's colour is worth 1/e."""
+FALLOFF_LIMIT = 20.0
+"""Filled colours are not brightened or darkened beyond this factor of the light's reference."""
+
+
+@dataclass(frozen=True)
+class Layers:
+    """Raw observations of V virtual views.
+
+    Args:
+        data: [V, 17, H, W]: `rendered` (3; black behind), `alpha`, `depth_mm` (0 where nothing was hit),
+            `spread` (relative deviation of depth within a pixel), `uncertainty`, `nearest` (3) and its
+            weight, `blend` (3) and its weight, `log_ratio` of distances, `ray_length` (distance per
+            z-depth).
+
+    Raises:
+        ShapeError: for another number of channels.
+    """
+
+    data: Float[Tensor, "v c h w"]
+
+    def __post_init__(self) -> None:
+        if self.data.ndim != 4 or self.data.shape[1] != LAYER_CHANNELS:
+            raise ShapeError(f"layers need [V, {LAYER_CHANNELS}, H, W], found {tuple(self.data.shape)}")
+
+    def __len__(self) -> int:
+        return int(self.data.shape[0])
+
+    def __getitem__(self, index: int | slice | list[int] | Int[np.ndarray, "n"]) -> Layers:
+        """Select views; an integer keeps the batch axis."""
+        chosen = np.atleast_1d(np.arange(len(self))[index])
+        return Layers(self.data[torch.from_numpy(chosen)])
+
+    def get(self, name: str) -> Float[Tensor, "v c h w"]:
+        """A layer by name, as a view into the data."""
+        return self.data[:, _SLICES[name]]
+
+    @staticmethod
+    def of(**layers: Tensor) -> Layers:
+        """Layers from named parts.
+
+        Raises:
+            ShapeError: when a part is missing.
+        """
+        missing = sorted(set(_SLICES) - set(layers))
+        if missing:
+            raise ShapeError(f"layers miss {', '.join(missing)}")
+        return Layers(torch.cat([layers[name] for name in _SLICES], dim=1))
+
+
+@dataclass(frozen=True)
+class Conditioning:
+    """Network input and starting image of V views.
+
+    Args:
+        channels: [V, 20, H, W].
+        base: blend of real views where they see the surface, else the rendering, holes filled; in
+            [0, 1], [V, 3, H, W].
+        depth_mm: z-depth without gaps, [V, 1, H, W].
+    """
+
+    channels: Float[Tensor, "v c h w"]
+    base: Float[Tensor, "v 3 h w"]
+    depth_mm: Float[Tensor, "v 1 h w"]
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Layers of views together with the references they were given.
+
+    Args:
+        layers: raw observations.
+        reference: index (among the references) of the view that sees most of the same surface, [V].
+        seen: which Gaussians each view sees, [V, N].
+    """
+
+    layers: Layers
+    reference: Int[Tensor, "v"]
+    seen: Tensor
+
+
+def observe_views(
+    scene: Scene,
+    references: ReferenceViews,
+    cameras: Cameras,
+    *,
+    count: int,
+    exposure: Float[Tensor, "v"] | None = None,
+) -> Observation:
+    """Render virtual views and carry real ones into them.
+
+    Two rasterisations per view: colour with depth, then what is known about each Gaussian from this
+    direction and distance together with the square of its depth.
+
+    Args:
+        scene: the reconstruction.
+        references: real views of this scene.
+        cameras: the virtual views.
+        count: references blended per view.
+        exposure: gain of each view; None is 1.
+    """
+    parts = [
+        _observe_one(scene, references, cameras[view], count, None if exposure is None else exposure[[view]])
+        for view in range(len(cameras))
+    ]
+    return Observation(
+        Layers(torch.cat([part.layers.data for part in parts])),
+        torch.cat([part.reference for part in parts]),
+        torch.cat([part.seen for part in parts]),
+    )
+
+
+def _observe_one(
+    scene: Scene,
+    references: ReferenceViews,
+    camera: Cameras,
+    count: int,
+    exposure: Float[Tensor, "1"] | None,
+) -> Observation:
+    scale = references.transfer.scale_mm
+    with torch.no_grad():
+        rendering = scene.render(camera, exposure=exposure, visibility=True, median_depth=True)
+        if rendering.visibility_max is None or rendering.median_depth is None:
+            raise ShapeError("the rasteriser returned neither visibility nor median depth")
+        alpha = rendering.alpha[:, None]
+        expected = rendering.depth[:, None]
+        median = rendering.median_depth[:, None]
+        # The expected depth floats between a fold and what is behind it, the median sits on one of them.
+        depth = torch.where((median > 0) & (alpha > 0.5), median, expected)
+        depth = torch.where(alpha > 0.02, depth, torch.zeros(()))
+        complete = completed_depth(depth, alpha, scale)
+        warped = warp_references(references, camera, complete, count=count, exposure=exposure)
+        known, spread = _known_and_spread(scene, references, camera, warped.chosen[0], alpha, expected)
+        ray_length = torch.from_numpy(np.linalg.norm(pixel_rays(camera), axis=-1).astype(np.float32)[:, None])
+    layers = Layers.of(
+        rendered=rendering.rgb.permute(0, 3, 1, 2).clamp(0, 1),
+        alpha=alpha,
+        depth_mm=depth,
+        spread=spread,
+        uncertainty=(1 - known * (1 - spread / SPREAD_LIMIT).clamp_min(0)).clamp(0, 1),
+        nearest=warped.nearest,
+        nearest_weight=warped.nearest_weight,
+        blend=warped.blend * (warped.blend_weight > 0),
+        blend_weight=_feathered(warped.blend_weight),
+        log_ratio=warped.log_ratio * (warped.blend_weight > 0),
+        ray_length=ray_length,
+    )
+    return Observation(layers, warped.reference, rendering.visibility_max > SEEN_WEIGHT)
+
+
+def _known_and_spread(
+    scene: Scene,
+    references: ReferenceViews,
+    camera: Cameras,
+    chosen: Int[Tensor, "k"],
+    alpha: Float[Tensor, "1 1 h w"],
+    expected: Float[Tensor, "1 1 h w"],
+) -> tuple[Float[Tensor, "1 1 h w"], Float[Tensor, "1 1 h w"]]:
+    r"""How much of each pixel the real views have confirmed, and how far its depths scatter.
+
+    A Gaussian is known from a virtual view as far as some reference saw it from a near direction and from
+    no farther away: :math:`\max_r s_{rn} \, e^{-(\theta / \theta_0)^2} \min(1, d_v / d_r)`. Blended like a
+    colour this gives a share of the pixel that also falls with its opacity.
+    """
+    means = scene.gaussians.means
+    center = torch.from_numpy(camera.centers[0].astype(np.float32))
+    towards = means - center
+    distance = towards.norm(dim=-1).clamp_min(1e-9)
+    away = means[None] - references.centers[chosen][:, None]
+    seen_from = away.norm(dim=-1).clamp_min(1e-9)
+    cosine = torch.einsum("kni,ni->kn", away, towards) / (seen_from * distance)
+    angle = torch.arccos(cosine.clamp(-1, 1))
+    worth = torch.exp(-(angle / NEW_ANGLE_RAD).square()) * (distance / seen_from).clamp(max=1)
+    known = (worth * references.seen[chosen]).max(dim=0).values
+    viewmat = torch.from_numpy(camera.viewmats[0].astype(np.float32))
+    scale = references.transfer.scale_mm
+    z = (means @ viewmat[2, :3] + viewmat[2, 3]) / scale
+    attributes = torch.stack([known, z.square(), torch.zeros_like(z)], dim=-1)
+    gaussians = scene.gaussians
+    blended = rasterize(
+        means,
+        gaussians.quats,
+        gaussians.scales.exp(),
+        gaussians.opacities.sigmoid(),
+        None,
+        viewmat[None],
+        torch.from_numpy(camera.K.astype(np.float32)),
+        camera.width,
+        camera.height,
+        colors=attributes,
+    ).rgb[:, None]
+    share = blended[..., 0].clamp(0, 1)
+    mean = expected / scale
+    second = blended[..., 1] / alpha.clamp_min(1e-6)
+    variance = (second - mean.square()).clamp_min(0)
+    spread = variance.sqrt() / mean.clamp_min(1e-6)
+    return share, torch.where(alpha > 0.02, spread, torch.zeros(())).clamp(0, 1)
+
+
+def condition(layers: Layers, transfer: LightTransfer) -> Conditioning:
+    """Channels and base image from raw layers.
+
+    Gaps are filled with the light divided out, so that a filled surface gets darker with its distance as
+    its surroundings do.
+
+    Args:
+        layers: raw observations, possibly with holes cut into them.
+        transfer: how brightness changes with distance.
+    """
+    alpha = layers.get("alpha")
+    depth = completed_depth(layers.get("depth_mm"), alpha, transfer.scale_mm)
+    falloff = transfer.falloff(depth * layers.get("ray_length"), 1 / layers.get("ray_length"))
+    falloff = falloff.clamp(1 / FALLOFF_LIMIT, FALLOFF_LIMIT)
+    weight = layers.get("blend_weight")
+    color = weight * layers.get("blend") + (1 - weight) * layers.get("rendered")
+    known = weight + (1 - weight) * alpha
+    solid = _within_range(color / known.clamp_min(1e-3))
+    base = _within_range(
+        transfer.apply_response(push_pull(transfer.signal(solid) / falloff, known) * falloff)
+    )
+    channels = torch.cat(
+        [
+            _normalised(layers.get("rendered")),
+            alpha,
+            (depth / transfer.scale_mm).log(),
+            layers.get("spread") / SPREAD_LIMIT,
+            layers.get("uncertainty"),
+            _normalised(layers.get("nearest")) * layers.get("nearest_weight"),
+            layers.get("nearest_weight"),
+            _normalised(layers.get("blend")) * weight,
+            weight,
+            layers.get("log_ratio"),
+            falloff.log(),
+            _normalised(base),
+        ],
+        dim=1,
+    )
+    return Conditioning(channels, base, depth)
+
+
+def _within_range(color: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
+    """Too bright colours darkened with their hue kept; clipping each channel would bleach them."""
+    return color.clamp_min(0) / color.amax(dim=1, keepdim=True).clamp_min(1)
+
+
+def _feathered(weight: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h w"]:
+    """Weight that falls smoothly towards its gaps, and never exceeds what it was."""
+    window = gaussian_weights(1.0, 3)
+    return torch.minimum(weight, filter_separable(weight, window, window).clamp_min(0))
+
+
+def _normalised(color: Tensor) -> Tensor:
+    return (color - COLOR_CENTER) / COLOR_SCALE

@@ -1,0 +1,314 @@
+"""Real views carried into virtual ones: by geometry, with the light's fall-off compensated.
+
+The light rides on the camera, so a surface is darker from far away. What a real view saw of a point
+tells the virtual view's colour only after the brightness ratio of the two distances is applied;
+without it, references do more harm than good.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from extrags.cameras import Cameras, pixel_rays
+from extrags.metrics.filters import filter_separable, gaussian_weights
+from extrags.view_synthesis.references import LightTransfer, ReferenceViews
+
+__all__ = ["Warped", "covisibility", "depth_normals", "fit_falloff_exponent", "warp_references"]
+
+AGREEMENT = 0.05
+"""Relative depth difference at which a real view's word counts 1/e."""
+LATTICE_PX = 8
+"""Co-visibility is judged on one pixel in this many, along each axis."""
+DISTANCE_TOLERANCE = 0.2
+"""Logarithm of a distance ratio at which a reference is worth 1/e."""
+ANGLE_TOLERANCE_RAD = 0.3
+"""Angle between two viewing rays at which a reference is worth 1/e."""
+GOOD_QUALITY = 0.02
+"""Reference quality from which the blend replaces the rendering completely."""
+HIGHLIGHT_STEP = 0.12
+"""A sample brighter than the others by this is taken for a highlight and counts 1/e."""
+BRIGHTNESS_LIMIT = 8.0
+"""Larger brightness ratios amplify noise more than they inform."""
+EXPONENT_RANGE = (0.0, 3.0)
+NORMAL_SIGMA_PX = 1.5
+NORMAL_RADIUS_PX = 4
+"""Depth is smoothed so much before normals are taken from it."""
+
+
+@dataclass(frozen=True)
+class Warped:
+    """Real views as seen from V virtual ones.
+
+    Args:
+        nearest: the single best reference, compensated, zero where it says nothing, [V, 3, H, W].
+        nearest_weight: how far it can be trusted, [V, 1, H, W].
+        blend: weighted mean of the best references, zero where none says anything, [V, 3, H, W].
+        blend_weight: feathered trust in the blend, [V, 1, H, W].
+        log_ratio: log of (distance from the references / distance from the virtual view), [V, 1, H, W].
+        reference: index of the best reference among the `ReferenceViews`, [V].
+        chosen: indices of the blended references, best first, [V, K].
+    """
+
+    nearest: Float[Tensor, "v 3 h w"]
+    nearest_weight: Float[Tensor, "v 1 h w"]
+    blend: Float[Tensor, "v 3 h w"]
+    blend_weight: Float[Tensor, "v 1 h w"]
+    log_ratio: Float[Tensor, "v 1 h w"]
+    reference: Int[Tensor, "v"]
+    chosen: Int[Tensor, "v k"]
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """World points looked up in K references."""
+
+    rgb: Float[Tensor, "k 3 p"]
+    weight: Float[Tensor, "k p"]
+    quality: Float[Tensor, "k p"]
+    distance: Float[Tensor, "k p"]
+    axis_cosine: Float[Tensor, "k p"]
+    facing_cosine: Float[Tensor, "k p"]
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """World points of a view's pixels with their normals, and how the lens sees them."""
+
+    points: Float[Tensor, "p 3"]
+    distance: Float[Tensor, "p"]
+    direction: Float[Tensor, "p 3"]
+    axis_cosine: Float[Tensor, "p"]
+    normal: Float[Tensor, "p 3"]
+
+
+def warp_references(
+    references: ReferenceViews,
+    cameras: Cameras,
+    depth_mm: Float[Tensor, "v 1 h w"],
+    *,
+    count: int,
+    exposure: Float[Tensor, "v"] | None = None,
+) -> Warped:
+    """Carry the `count` most co-visible references into each virtual view.
+
+    Args:
+        references: real views with depth, exposure and the scene's light.
+        cameras: the virtual views.
+        depth_mm: their z-depth without gaps.
+        count: references blended per view.
+        exposure: gain of each virtual view; None is 1, the mean of the training frames.
+    """
+    scores = covisibility(references, cameras, depth_mm)
+    chosen = torch.argsort(scores, dim=1, descending=True, stable=True)[:, : min(count, len(references))]
+    gain = torch.ones(len(cameras)) if exposure is None else exposure
+    parts = [
+        _warp_one(references, cameras[view], depth_mm[view], chosen[view], gain[view])
+        for view in range(len(cameras))
+    ]
+    nearest, nearest_weight, blend, blend_weight, log_ratio = (
+        torch.stack(group) for group in zip(*parts, strict=True)
+    )
+    return Warped(nearest, nearest_weight, blend, blend_weight, log_ratio, chosen[:, 0], chosen)
+
+
+def covisibility(
+    references: ReferenceViews, cameras: Cameras, depth_mm: Float[Tensor, "v 1 h w"]
+) -> Float[Tensor, "v r"]:
+    """How much of each virtual view each reference has seen well, in [0, 1].
+
+    The mean over a lattice of pixels of depth agreement, inside-the-image trust, and likeness of
+    distance and direction.
+    """
+    everything = torch.arange(len(references))
+    rows = []
+    for view in range(len(cameras)):
+        seen = _look_up(references, everything, _surface(cameras[view], depth_mm[view], LATTICE_PX))
+        rows.append((seen.weight * seen.quality).mean(dim=1))
+    return torch.stack(rows)
+
+
+def _warp_one(
+    references: ReferenceViews,
+    camera: Cameras,
+    depth_mm: Float[Tensor, "1 h w"],
+    chosen: Int[Tensor, "k"],
+    gain: Float[Tensor, ""],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    size = depth_mm.shape[-2:]
+    here = _surface(camera, depth_mm, 1)
+    seen = _look_up(references, chosen, here)
+    transfer = references.transfer
+    facing = (here.normal * here.direction).sum(dim=-1)
+    ratio = transfer.falloff(here.distance, here.axis_cosine, facing)[None] / transfer.falloff(
+        seen.distance, seen.axis_cosine, seen.facing_cosine
+    )
+    ratio = ratio * (gain / references.exposure[chosen])[:, None]
+    ratio = ratio.clamp(1 / BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
+    rgb = transfer.apply_response(transfer.signal(seen.rgb) * ratio[:, None])
+    # Too bright for the sensor: darkened as a whole, so that the hue stays.
+    rgb = rgb / rgb.amax(dim=1, keepdim=True).clamp_min(1)
+    trust = seen.weight * (seen.quality / GOOD_QUALITY).clamp(max=1)
+    # Squared, because the mean of many views is blurred: the good ones shall dominate.
+    votes = (seen.weight * seen.quality).square()
+    luminance = rgb.mean(dim=1)
+    first = _weighted(luminance, votes)
+    votes = votes * torch.exp(-((luminance - first).clamp_min(0) / HIGHLIGHT_STEP).square())
+    blend = _weighted(rgb, votes[:, None])
+    log_ratio = _weighted((seen.distance / here.distance).log(), votes)
+    shaped = (
+        rgb[0] * (trust[:1] > 0),
+        trust[:1],
+        blend,
+        trust.max(dim=0, keepdim=True).values,
+        log_ratio[None],
+    )
+    nearest, nearest_weight, blended, blend_weight, ratios = (part.reshape(-1, *size) for part in shaped)
+    return nearest, nearest_weight, blended, blend_weight, ratios
+
+
+def _weighted(values: Tensor, votes: Tensor) -> Tensor:
+    return (values * votes).sum(dim=0) / votes.sum(dim=0).clamp_min(1e-12)
+
+
+def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> _Surface:
+    offset = stride // 2
+    rays = torch.from_numpy(pixel_rays(camera)[0, offset::stride, offset::stride].astype(np.float32))
+    offsets = (rays * depth_mm[0, offset::stride, offset::stride, None]).reshape(-1, 3)
+    distance = offsets.norm(dim=-1).clamp_min(1e-9)
+    center = torch.from_numpy(camera.centers[0].astype(np.float32))
+    cosine = 1 / rays.norm(dim=-1).reshape(-1)
+    normal = depth_normals(_camera_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
+    return _Surface(center + offsets, distance, offsets / distance[:, None], cosine, normal)
+
+
+def depth_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]) -> Float[Tensor, "h w 3"]:
+    """Unit normals of the surface that a depth map without gaps describes, in the rays' frame.
+
+    Differences over a few pixels: what a lamp shades is the wall, not the roughness of a rendered depth.
+
+    Args:
+        rays: of each pixel, at unit z-depth.
+        depth_mm: z-depth.
+    """
+    window = gaussian_weights(NORMAL_SIGMA_PX, NORMAL_RADIUS_PX)
+    smooth = 1 / filter_separable(1 / depth_mm[None].clamp_min(1e-9), window, window)[0, 0]
+    points = rays * smooth[..., None]
+    along = points.roll(-1, 1) - points.roll(1, 1)
+    down = points.roll(-1, 0) - points.roll(1, 0)
+    along[:, 0], along[:, -1] = along[:, 1], along[:, -2]
+    down[0], down[-1] = down[1], down[-2]
+    normal = torch.linalg.cross(along, down)
+    unit: Tensor = normal / normal.norm(dim=-1, keepdim=True).clamp_min(1e-20)
+    return unit
+
+
+def _camera_rays(camera: Cameras) -> Float[Tensor, "h w 3"]:
+    """Rays of a single camera in the world's frame, at unit z-depth."""
+    return torch.from_numpy(pixel_rays(camera)[0].astype(np.float32))
+
+
+def _look_up(
+    references: ReferenceViews,
+    chosen: Int[Tensor, "k"],
+    surface: _Surface,
+) -> _Seen:
+    """Colour and trust of a surface in the chosen references."""
+    points = surface.points
+    index = chosen.numpy()
+    viewmats = references.viewmats[chosen]
+    K = references.K[chosen]
+    local = torch.einsum("kij,pj->kpi", viewmats[:, :3, :3], points) + viewmats[:, None, :3, 3]
+    z = local[..., 2]
+    in_front = z > 1e-6
+    safe = torch.where(in_front, z, torch.ones(()))
+    u = local[..., 0] / safe * K[:, 0, 0, None] + K[:, 0, 2, None]
+    v = local[..., 1] / safe * K[:, 1, 1, None] + K[:, 1, 2, None]
+    width, height = references.cameras.width, references.cameras.height
+    # Pixel centres at +0.5 and align_corners=False are the same convention.
+    grid = torch.stack([2 * u / width - 1, 2 * v / height - 1], dim=-1)[:, None].clamp(-4, 4)
+    image = references.packed if len(index) == len(references) else references.packed[chosen]
+    sampled = functional.grid_sample(image, grid, mode="bilinear", align_corners=False)[:, :, 0]
+    # The inverse depth is linear across a plane; between a fold and what it hides it agrees with neither.
+    known = sampled[:, 5] > 0.999
+    inverse = torch.where(known, sampled[:, 4], torch.ones(()))
+    difference = (z * inverse - 1).abs()
+    agreement = torch.exp(-(difference / AGREEMENT).square())
+    agreement = ((agreement - 0.05) / 0.95).clamp_min(0)
+    weight = torch.where(in_front & known, agreement * sampled[:, 3], torch.zeros(()))
+    away = points - references.centers[chosen][:, None]
+    seen_from = away.norm(dim=-1).clamp_min(1e-9)
+    cosine = ((away / seen_from[..., None]) * surface.direction).sum(dim=-1).clamp(-1, 1)
+    quality = torch.exp(
+        -(seen_from / surface.distance).log().abs() / DISTANCE_TOLERANCE
+        - (torch.arccos(cosine) / ANGLE_TOLERANCE_RAD).square()
+    )
+    facing = (away / seen_from[..., None] * surface.normal).sum(dim=-1)
+    return _Seen(sampled[:, :3], weight, quality, seen_from, z / seen_from, facing)
+
+
+def fit_falloff_exponent(references: ReferenceViews, *, pairs: int = 24) -> float:
+    """Exponent a of `brightness ~ distance^-a` from co-visible pixels of the real views themselves.
+
+    For scenes without a light model. A robust line through log-brightness ratio against log-distance
+    ratio: iteratively reweighted least squares with Huber's weights, each pair of views with an offset of
+    its own for its exposure.
+
+    Args:
+        references: real views; their `transfer` is not used.
+        pairs: how many neighbouring pairs are looked at.
+
+    Returns:
+        The exponent, within 0 and 3; 0 when the views show no common surface at different distances.
+    """
+    count = len(references)
+    if count < 2:
+        return 0.0
+    slopes: list[Tensor] = []
+    for first in np.unique(np.linspace(0, count - 2, min(pairs, count - 1)).round().astype(int)):
+        seconds = [s for s in (first + 1, first + 3) if s < count]
+        camera = references.cameras[[int(first)]]
+        inverse = references.packed[first, 4:5]
+        depth = torch.where(inverse > 0, 1 / inverse.clamp_min(1e-12), torch.zeros(()))
+        surface = _surface(camera, depth, 3)
+        own = references.packed[first, :3, 1::3, 1::3].reshape(3, -1).mean(dim=0)
+        trusted = references.packed[first, 3, 1::3, 1::3].reshape(-1)
+        for second in seconds:
+            seen = _look_up(references, torch.tensor([second]), surface)
+            other = seen.rgb[0].mean(dim=0)
+            good = _informative(own, other, trusted * seen.weight[0])
+            if int(good.sum()) < 30:
+                continue
+            x = (seen.distance[0][good] / surface.distance[good]).log()
+            y = (own[good] / other[good]).log()
+            slopes.append(torch.stack([x - x.median(), y - y.median()]))
+    if not slopes:
+        return 0.0
+    x, y = torch.cat(slopes, dim=1).double()
+    if float(x.square().mean()) < 1e-5:
+        return 0.0
+    weight = torch.ones_like(x)
+    slope = torch.zeros((), dtype=torch.float64)
+    for _ in range(20):
+        slope = (weight * x * y).sum() / (weight * x * x).sum().clamp_min(1e-12)
+        residual = (y - slope * x).abs()
+        threshold = 1.5 * residual.median().clamp_min(1e-6)
+        weight = (threshold / residual.clamp_min(1e-12)).clamp(max=1)
+    return float(slope.clamp(*EXPONENT_RANGE))
+
+
+def _informative(own: Tensor, other: Tensor, trust: Tensor) -> Bool[Tensor, "p"]:
+    """Pixels that are neither dark (noise) nor bright (highlights, saturation) in either view."""
+    well_lit = (own > 0.08) & (own < 0.9) & (other > 0.08) & (other < 0.9)
+    return well_lit & (trust > 0.3)
+
+
+def with_fitted_transfer(references: ReferenceViews) -> ReferenceViews:
+    """References whose brightness ratio is fitted to them, for scenes without a light model."""
+    exponent = fit_falloff_exponent(references)
+    return references.with_transfer(LightTransfer(None, exponent, references.transfer.scale_mm))

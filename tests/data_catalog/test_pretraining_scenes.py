@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from data_catalog.phantom import pretraining
+from data_catalog.phantom.config import PhantomConfig
+from data_catalog.phantom.pretraining import (
+    FIRST_PRETRAINING_SCENE,
+    pretraining_scene_config,
+    pretraining_sequence,
+)
+from data_catalog.phantom.variation import Variation, vary
+from extrags.sequence import EndoscopicSequence
+
+
+def test_without_variation_a_scene_is_the_standard_colon() -> None:
+    assert vary(PhantomConfig(scene=3)) == Variation()
+
+
+def test_variation_grows_from_the_standard_and_differs_from_scene_to_scene() -> None:
+    standard = Variation()
+    little, much = (vary(PhantomConfig(scene=7, variation=share)) for share in (1e-6, 1.0))
+    assert little.gamma == pytest.approx(standard.gamma, rel=1e-5)
+    assert little.tint == pytest.approx(standard.tint, rel=1e-5)
+    others = [vary(PhantomConfig(scene=scene, variation=1.0)) for scene in range(7, 12)]
+    assert len({other.gamma for other in others}) == 5
+    assert much == others[0]
+    # The bends never get tighter than those that keep the wall from folding over itself.
+    assert all(other.curvature <= 1 for other in others)
+
+
+def test_pretraining_scenes_are_none_of_the_catalogue() -> None:
+    configs = [pretraining_scene_config(index) for index in range(40)]
+    assert min(config.scene for config in configs) == FIRST_PRETRAINING_SCENE
+    assert len({config.scene for config in configs}) == 40
+    assert len({config.field_of_view_deg for config in configs}) == 40
+    assert configs[5] == pretraining_scene_config(5)
+
+
+@pytest.fixture(scope="module")
+def small() -> EndoscopicSequence:
+    ordinary = pretraining_scene_config(2)
+    reduced = ordinary.model_copy(update={"width": 48, "height": 40, "supersample": 1, "train_every": 50})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(pretraining, "pretraining_scene_config", lambda index: reduced)
+        return pretraining_sequence(2)
+
+
+def test_what_is_to_be_restored_is_not_trained_on(small: EndoscopicSequence) -> None:
+    assert len(small.train) == 4
+    assert len(small.test) == 48
+    assert small.depth_mm is not None
+    assert (small.depth_mm[small.test] > 0).all()
+    assert small.rgb[small.test].mean() > 20
+    cameras = small.cameras
+    distance = np.linalg.norm(
+        cameras.centers[small.test][:, None] - cameras.centers[small.train][None], axis=2
+    )
+    assert np.median(distance.min(axis=1)) > 2
+
+
+def test_depth_noise_stays_small_and_spares_the_views_to_restore(small: EndoscopicSequence) -> None:
+    from data_catalog.phantom.recording import Phantom
+
+    phantom = Phantom(PhantomConfig(**small.truth["phantom"]))
+    assert small.depth_mm is not None
+    for frame in (int(small.train[1]), int(small.test[3])):
+        exact = phantom.z_depth(small.cameras[frame])
+        relative = np.abs(small.depth_mm[frame] / exact - 1)
+        assert relative.max() < (0.2 if frame in small.train else 1e-6)

@@ -1,0 +1,120 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from extrags.cameras import look_at
+from extrags.errors import ConfigError
+from extrags.exploration.coverage import (
+    bin_centers,
+    coverage_gain,
+    direction_bin,
+    direction_counts,
+    rendered_pairs,
+    training_coverage,
+)
+
+from .tube import SEEN, scene_of_points, small_tube, square_camera
+
+WORDS = arrays(np.uint32, 12, elements=st.integers(0, 2**32 - 1))
+
+
+def as_bits(words: np.ndarray) -> np.ndarray:
+    return np.array([[(int(word) >> k) & 1 for k in range(32)] for word in words], dtype=bool)
+
+
+class TestDirectionBins:
+    @pytest.mark.parametrize("n", [2, 3, 4, 7, 12, 20, 31, 32])
+    def test_all_cells_have_the_same_area(self, n):
+        # Stratified points of exactly equal area: rings of equal height, evenly spread.
+        z = (np.arange(600) + 0.5) / 300 - 1
+        turn = (np.arange(600) + 0.5) / 600 * 2 * np.pi
+        z, turn = (a.ravel() for a in np.meshgrid(z, turn, indexing="ij"))
+        ring = np.sqrt(1 - z**2)
+        index = direction_bin(np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1), n)
+        share = np.bincount(index, minlength=n) / len(index)
+        assert len(share) == n
+        np.testing.assert_allclose(share, 1 / n, rtol=0.02)
+
+    @pytest.mark.parametrize("n", [4, 17, 32])
+    def test_each_centre_is_in_its_own_cell(self, n):
+        centers = bin_centers(n)
+        np.testing.assert_allclose(np.linalg.norm(centers, axis=1), 1)
+        np.testing.assert_array_equal(direction_bin(centers, n), np.arange(n))
+
+    def test_no_direction_is_far_from_its_cell(self):
+        unit = np.random.default_rng(0).normal(size=(20_000, 3))
+        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        centers = bin_centers(32)[direction_bin(unit, 32)]
+        angle = np.degrees(np.arccos(np.clip((unit * centers).sum(axis=1), -1, 1)))
+        assert angle.max() < 35
+        assert angle.mean() < 17
+
+    def test_axes_and_seams_have_a_cell(self):
+        edges = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [1, -0.0, 0], [0, -1, 0]], float)
+        index = direction_bin(edges, 32)
+        assert ((index >= 0) & (index < 32)).all()
+
+    @pytest.mark.parametrize("n", [1, 33])
+    def test_more_bins_than_bits_are_refused(self, n):
+        with pytest.raises(ConfigError, match="2 to 32"):
+            direction_bin(np.array([[0.0, 0.0, 1.0]]), n)
+
+
+class TestGain:
+    @settings(max_examples=60, deadline=None)
+    @given(covered=WORDS, pairs=WORDS)
+    def test_is_the_number_of_new_pairs(self, covered, pairs):
+        brute = int((as_bits(pairs) & ~as_bits(covered)).sum())
+        assert coverage_gain(covered, pairs) == brute >= 0
+
+    @settings(max_examples=60, deadline=None)
+    @given(small=WORDS, more=WORDS, pairs=WORDS)
+    def test_is_submodular(self, small, more, pairs):
+        assert coverage_gain(small | more, pairs) <= coverage_gain(small, pairs)
+
+    @settings(max_examples=30, deadline=None)
+    @given(covered=WORDS, pairs=WORDS)
+    def test_is_nothing_the_second_time(self, covered, pairs):
+        assert coverage_gain(covered | pairs, pairs) == 0
+
+    def test_works_on_a_batch(self):
+        words = np.random.default_rng(0).integers(0, 2**32, (5, 40), dtype=np.uint32)
+        covered = words[0] & words[1]
+        np.testing.assert_array_equal(
+            coverage_gain(covered, words), [coverage_gain(covered, row) for row in words]
+        )
+
+
+class TestViewPairs:
+    def test_a_hidden_gaussian_is_not_seen(self):
+        x, y = (a.ravel() for a in np.meshgrid(np.linspace(-4, 4, 15), np.linspace(-4, 4, 15)))
+        wall = np.stack([x, y, np.full_like(x, 5.0)], axis=1)
+        points = np.concatenate([wall, [[0.0, 0.0, 9.0]]])
+        scene = scene_of_points(points)
+        front = square_camera()
+        back = square_camera(look_at(np.array([0, 0, 14.0]), np.zeros(3), np.array([0, -1.0, 0])))
+        rendering, seen = rendered_pairs(scene, front, **SEEN)
+        assert rendering.visible[0, -1], "inside the frustum"
+        assert seen[0, -1] == 0, "but behind the wall"
+        assert np.bitwise_count(seen).max() == 1
+        _, from_behind = rendered_pairs(scene, back, **SEEN)
+        assert from_behind[0, -1] != 0
+
+    def test_the_direction_points_from_the_gaussian_to_the_camera(self):
+        scene = scene_of_points(np.array([[0.0, 0.0, 5.0]]))
+        _, seen = rendered_pairs(scene, square_camera(), **SEEN)
+        expected = direction_bin(np.array([[0.0, 0.0, -1.0]]), 32)[0]
+        assert seen[0, 0] == np.uint32(1) << np.uint32(expected)
+
+    def test_training_coverage_is_the_union_of_its_views(self):
+        tube = small_tube()
+        options = {"visible_weight": 0.02, "n_directions": 16}
+        whole = training_coverage(tube.scene, tube.cameras, **options)
+        parts = [training_coverage(tube.scene, tube.cameras[i], **options) for i in range(len(tube.cameras))]
+        np.testing.assert_array_equal(whole, np.bitwise_or.reduce(parts))
+        assert whole.max() < 2**16
+        assert 1 <= direction_counts(whole).max() <= len(tube.cameras)

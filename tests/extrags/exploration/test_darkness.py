@@ -1,0 +1,132 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.cameras import Cameras, look_at, pixel_rays
+from extrags.config import LightConfig
+from extrags.exploration.darkness import dark_direction, illumination_weight, lit_luminance
+from extrags.illumination import NearFieldLight
+
+from .tube import make_tube
+
+WIDTH, HEIGHT = 80, 64
+PLAIN = LightConfig(exponent=0.8, spread=False, cosine=False, response=False)
+CAMERA = Cameras(np.array([[[40.0, 0, 40], [0, 40.0, 32], [0, 0, 1]]]), np.eye(4)[None], WIDTH, HEIGHT)
+ROWS, COLUMNS = np.meshgrid(np.arange(HEIGHT), np.arange(WIDTH), indexing="ij")
+DISTANCE_PER_DEPTH = np.linalg.norm(pixel_rays(CAMERA)[0], axis=-1)
+
+
+def pixel_of(ray: np.ndarray, camera: Cameras = CAMERA) -> tuple[float, float]:
+    local = camera.world_from_camera[0, :3, :3].T @ ray
+    projected = camera.K[0] @ (local / local[2])
+    return float(projected[0]), float(projected[1])
+
+
+def disc(column: float, row: float, radius: float) -> np.ndarray:
+    return np.hypot(COLUMNS - column, ROWS - row) < radius
+
+
+def grey(values: np.ndarray) -> np.ndarray:
+    return np.repeat(values[..., None], 3, axis=2).astype(np.float32)
+
+
+class TestDarkDirection:
+    @pytest.mark.parametrize("centre", [(25, 40), (60, 15), (40, 32)])
+    def test_hits_a_dark_lumen(self, centre):
+        noise = np.random.default_rng(0).normal(0, 0.02, (HEIGHT, WIDTH))
+        image = np.where(disc(*centre, 8), 0.15, 0.5) + noise
+        ray = dark_direction(CAMERA, grey(image), np.ones_like(image), np.full_like(image, 30.0), None)
+        column, row = pixel_of(ray)
+        assert np.hypot(column - centre[0], row - centre[1]) < 4
+
+    def test_hits_the_unlit_end_of_a_rendered_tube(self):
+        tube = make_tube(width=WIDTH, height=HEIGHT, n_views=1, view_arc=(0.9, 0.9), light=True)
+        gaussians = tube.scene.gaussians
+        # The far end was never lit: its albedo is learned too dark.
+        at_end = torch.atan2(gaussians.means[:, 1], gaussians.means[:, 0]) > 1.7
+        gaussians.sh0[at_end] = (0.08 - 0.5) / 0.28209479177387814
+        rendering = tube.scene.render(tube.cameras)
+        ray = dark_direction(
+            tube.cameras,
+            rendering.rgb[0].numpy(),
+            rendering.alpha[0].numpy(),
+            rendering.depth[0].numpy(),
+            tube.scene.light,
+        )
+        center = tube.cameras.centers[0]
+        toward = gaussians.means[at_end].numpy().mean(axis=0) - center
+        assert ray @ (toward / np.linalg.norm(toward)) > np.cos(np.radians(20))
+
+    def test_a_border_is_not_dark(self):
+        rng = np.random.default_rng(1)
+        hits = []
+        for _ in range(200):
+            image = 0.5 + rng.normal(0, 0.3, (HEIGHT, WIDTH))
+            ray = dark_direction(CAMERA, grey(image), np.ones_like(image), np.full_like(image, 30.0), None)
+            if ray.any():
+                hits.append(pixel_of(ray))
+        assert not any(c < 4 or c > WIDTH - 4 or r < 4 or r > HEIGHT - 4 for c, r in hits)
+
+    def test_a_hole_is_not_dark(self):
+        hole = disc(20, 20, 10)
+        image = np.where(hole, 0.0, np.where(disc(58, 40, 8), 0.2, 0.5))
+        ray = dark_direction(CAMERA, grey(image), np.where(hole, 0.1, 1.0), np.full_like(image, 30.0), None)
+        column, row = pixel_of(ray)
+        assert np.hypot(column - 58, row - 40) < 4
+
+    @pytest.mark.parametrize("with_light", [True, False])
+    def test_far_is_not_dark(self, with_light):
+        light = NearFieldLight.initial(1, 30.0, PLAIN) if with_light else None
+        depth = np.where(COLUMNS < 40, 20.0, 80.0)
+        # Everything of one albedo, seen through inverse-square light, but for one spot.
+        falloff = NearFieldLight.initial(1, 30.0, PLAIN)
+        lit = falloff.falloff(torch.from_numpy(depth * DISTANCE_PER_DEPTH)).numpy()
+        image = 0.5 * lit * np.where(disc(20, 30, 8), 0.3, 1.0)
+        assert image[30, 20] > image[30, 60], "the spot is near and still brighter than what is far"
+        ray = dark_direction(CAMERA, grey(image), np.ones_like(image), depth, light)
+        column, row = pixel_of(ray)
+        assert np.hypot(column - 20, row - 30) < 5
+
+    def test_an_even_view_favours_nothing(self):
+        image = np.full((HEIGHT, WIDTH), 0.5)
+        ray = dark_direction(CAMERA, grey(image), np.ones_like(image), np.full_like(image, 30.0), None)
+        np.testing.assert_array_equal(ray, 0)
+
+    def test_an_empty_view_favours_nothing(self):
+        empty = np.zeros((HEIGHT, WIDTH))
+        np.testing.assert_array_equal(dark_direction(CAMERA, grey(empty), empty, empty, None), 0)
+
+    def test_a_light_is_divided_out_exactly(self):
+        light = NearFieldLight.initial(1, 30.0, PLAIN)
+        depth = np.linspace(10, 90, WIDTH)[None].repeat(HEIGHT, axis=0)
+        image = 0.4 * light.falloff(torch.from_numpy(depth * DISTANCE_PER_DEPTH)).numpy()
+        lit = lit_luminance(CAMERA, grey(image).astype(np.float64), depth, depth > 0, light)
+        np.testing.assert_allclose(lit, 0.4, rtol=1e-5)
+
+
+class TestIlluminationWeight:
+    def test_is_the_papers_formula_for_displacements(self):
+        current = look_at(np.array([1.0, 2, 3]), np.array([4.0, 0, 1]), np.array([0.0, 1, 0]))
+        dark = np.array([0.6, 0.0, 0.8])
+        candidates = np.stack([current, current, current])
+        candidates[0, :3, 3] += 2.0 * dark
+        candidates[1, :3, 3] -= 2.0 * dark
+        candidates[2, :3, 3] += [0.0, 0.0, 3.0]
+        weight = illumination_weight(dark, current, candidates, 0.5)
+        np.testing.assert_allclose(weight, [1.5, 1.0, 1.4])
+
+    def test_turning_towards_the_dark_counts(self):
+        from extrags.exploration.primitives import PRIMITIVES, apply_primitives, primitive_motions
+
+        candidates = apply_primitives(np.eye(4), primitive_motions(1.0, 10.0, 10.0, 5.0))
+        dark = np.array([0.6, 0.0, 0.8])
+        weight = dict(zip(PRIMITIVES, illumination_weight(dark, np.eye(4), candidates, 0.5), strict=True))
+        assert weight["turn_right"] > 1.2
+        assert weight["turn_left"] == pytest.approx(1.0)
+
+    def test_no_dark_direction_weighs_nothing(self):
+        candidates = np.stack([np.eye(4)] * 3)
+        candidates[1, 0, 3] = 1
+        np.testing.assert_array_equal(illumination_weight(np.zeros(3), np.eye(4), candidates, 0.5), 1)

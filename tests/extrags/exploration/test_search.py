@@ -1,0 +1,231 @@
+from __future__ import annotations
+
+import pickle
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from extrags.cameras import rotation_angle_deg
+from extrags.errors import CaptureError, ShapeError
+from extrags.exploration.coverage import coverage_gain, rendered_pairs, training_coverage
+from extrags.exploration.darkness import luminance
+from extrags.exploration.primitives import apply_primitives, primitive_motions
+from extrags.exploration.search import Branch, SearchContext, fold_weight, grow_branch, prepare_search
+from extrags.freespace import FREE, OCCUPIED, FreeSpace
+from extrags.scene import Scene
+
+from .tube import SEEN, scene_of_points, small_config, small_freespace, small_tube, square_camera
+
+START = 5
+
+
+def context_in(freespace: FreeSpace, **changes: object) -> SearchContext:
+    tube = small_tube()
+    return prepare_search(tube.scene, tube.cameras, freespace, small_config(**changes))
+
+
+def context(**changes: object) -> SearchContext:
+    return context_in(small_freespace(), **changes)
+
+
+@cache
+def known() -> np.ndarray:
+    tube = small_tube()
+    return training_coverage(tube.scene, tube.cameras.resized(32, 24), **SEEN)
+
+
+def branch_of(ready: SearchContext) -> Branch:
+    return grow_branch(ready, small_tube().cameras.world_from_camera[START], known(), START)
+
+
+@cache
+def branch(**changes: object) -> Branch:
+    return branch_of(context(**changes))
+
+
+class TestGrowBranch:
+    def test_reaches_its_length_and_gains(self):
+        found = branch()
+        assert len(found) == 5
+        assert found.reason == "reached 5 views"
+        assert found.anchor == START
+        assert len(found.moves) == len(found.gains) == 4
+        np.testing.assert_array_equal(found.poses[0], small_tube().cameras.world_from_camera[START])
+
+    def test_its_gains_are_what_its_views_add(self):
+        found, ready = branch(), context()
+        covered = known().copy()
+        for pose, gain in zip(found.poses[1:], found.gains, strict=True):
+            _, pairs = rendered_pairs(ready.scene, ready.scoring_cameras(pose[None]), **SEEN)
+            assert coverage_gain(covered, pairs[0]) == gain
+            covered |= pairs[0]
+        assert coverage_gain(known(), found.pairs) == sum(found.gains) > 0
+
+    def test_the_first_move_is_the_best_of_all(self):
+        # With neither light nor folds the score is the gain alone.
+        plain = branch(darkness_weight=0.0, fold_angle_deg=179.0)
+        assert plain.gains[0] >= branch().gains[0]
+
+    def test_stays_in_free_space_with_its_margin(self):
+        space, ready = small_freespace(), context()
+        for start in (0, 2, 5, 7):
+            found = grow_branch(ready, small_tube().cameras.world_from_camera[start], known(), start)
+            centers = found.poses[:, :3, 3]
+            assert (space.lookup(centers) == FREE).all()
+            assert space.segment_is_free(centers[:-1], centers[1:]).all()
+            needed = min(ready.margin_mm, float(space.clearance_at(centers[0])))
+            assert (space.clearance_at(centers[1:]) >= needed).all()
+            assert (small_tube().distance_from_wall(centers) > 0).all()
+
+    def test_keeps_the_light_from_whiting_out_the_image(self):
+        def brightest(limit: float) -> tuple[float, float]:
+            ready = context(max_saturated_share=limit, length=8, max_expansions=20)
+            start = small_tube().cameras.world_from_camera[START]
+            found = grow_branch(ready, start, known(), START)
+            rgb = ready.scene.render(ready.scoring_cameras(found.poses), sh_degree=0).rgb.numpy()
+            share = (luminance(rgb) >= 1.0).mean(axis=(1, 2))
+            return float(share[0]), float(share[1:].max())
+
+        assert brightest(1.0)[1] > 0.1
+        start, reached = brightest(0.05)
+        assert reached <= max(0.05, start)
+
+    def test_every_pose_is_a_rigid_motion_seen_only_once(self):
+        poses = branch(length=8, max_expansions=30).poses
+        rotation = poses[:, :3, :3]
+        np.testing.assert_allclose(
+            rotation @ rotation.transpose(0, 2, 1), np.broadcast_to(np.eye(3), rotation.shape), atol=1e-12
+        )
+        np.testing.assert_allclose(np.linalg.det(rotation), 1)
+        for i in range(len(poses)):
+            for j in range(i):
+                apart = np.linalg.norm(poses[i, :3, 3] - poses[j, :3, 3])
+                turned = rotation_angle_deg(rotation[i], rotation[j])
+                assert apart > 0.25 * context().step_mm or turned > 2.4
+
+    def test_is_a_pure_function(self):
+        first, second = branch(), branch_of(context())
+        np.testing.assert_array_equal(first.poses, second.poses)
+        np.testing.assert_array_equal(first.pairs, second.pairs)
+        assert (first.moves, first.gains, first.renders) == (second.moves, second.gains, second.renders)
+
+    def test_survives_pickling_of_its_inputs(self):
+        found = branch_of(pickle.loads(pickle.dumps(context())))
+        np.testing.assert_array_equal(found.poses, branch().poses)
+
+    def test_a_dead_end_resumes_from_the_queue(self):
+        # A disc that hardly fills the view, seen from a place too small to leave: one turn to any side
+        # is allowed, a second one sees too little. So each of the four turns is a dead end.
+        x, y = (a.ravel() for a in np.meshgrid(np.linspace(-9, 9, 25), np.linspace(-9, 9, 25)))
+        points = np.stack([x, y, np.full_like(x, 10.0)], axis=1)[np.hypot(x, y) <= 9]
+        scene = scene_of_points(points)
+        occupancy = np.full((8, 8, 8), OCCUPIED, np.uint8)
+        occupancy[3:5, 3:5, 3:5] = FREE
+        space = FreeSpace(occupancy, np.full(3, -4.0), np.eye(3), 1.0, np.ones((8, 8, 8), np.float32))
+        turns = apply_primitives(np.eye(4), primitive_motions(1.2, 15.0, 15.0, 10.0))[6:10]
+        seen = [
+            float((scene.render(square_camera(pose)).alpha >= 0.5).float().mean())
+            for pose in (*turns, *(turns[i] @ turns[j] for i in range(4) for j in range(4) if i != j ^ 1))
+        ]
+        assert min(seen[:4]) > max(seen[4:])
+        ready = prepare_search(
+            scene,
+            square_camera(),
+            space,
+            small_config(
+                length=9,
+                max_expansions=99,
+                step_share=0.12,
+                safety_share=0.01,
+                rotation_deg=15.0,
+                orbit_deg=15.0,
+                max_hole_share=1 - (min(seen[:4]) + max(seen[4:])) / 2,
+            ),
+        )
+        found = grow_branch(ready, np.eye(4), np.zeros(len(points), np.uint32))
+        assert found.reason == "no further move is possible after 2 views"
+        assert found.expansions == 5
+        assert found.moves[0].startswith("turn")
+        # The best of the four dead ends is kept.
+        alone = [rendered_pairs(scene, ready.scoring_cameras(pose[None]), **SEEN)[1] for pose in turns]
+        start = found.pairs & 0
+        start |= rendered_pairs(scene, ready.scoring_cameras(np.eye(4)[None]), **SEEN)[1][0]
+        assert found.gains[0] == max(int(coverage_gain(start, pairs[0])) for pairs in alone)
+
+    def test_a_spent_budget_keeps_the_best_path(self):
+        found = branch(length=16, max_expansions=3)
+        assert found.expansions == 3
+        assert len(found) == 4
+        assert found.reason == "budget of 3 expansions spent, 4 views"
+
+    def test_no_way_out_is_told(self):
+        space = small_freespace()
+        closed = replace(space, occupancy=np.full_like(space.occupancy, OCCUPIED))
+        found = branch_of(context_in(closed))
+        assert len(found) == 1
+        assert found.reason == "no further move is possible after 1 views"
+
+    def test_round_trip_on_disk(self, tmp_path):
+        found = branch()
+        found.save(tmp_path / "branch")
+        loaded = Branch.load(tmp_path / "branch")
+        np.testing.assert_array_equal(loaded.poses, found.poses)
+        np.testing.assert_array_equal(loaded.pairs, found.pairs)
+        for name in ("anchor", "moves", "gains", "expansions", "renders", "reason"):
+            assert getattr(loaded, name) == getattr(found, name)
+
+    def test_coverage_of_another_scene_is_refused(self):
+        with pytest.raises(ShapeError, match="coverage of 3 Gaussians"):
+            grow_branch(context(), np.eye(4), np.zeros(3, np.uint32))
+
+
+class TestPrepareSearch:
+    def test_lengths_follow_the_scene(self):
+        tube = small_tube()
+        ready = context()
+        bigger = replace(
+            tube.scene.gaussians,
+            means=tube.scene.gaussians.means * 3,
+            scales=tube.scene.gaussians.scales + float(np.log(3)),
+        )
+        poses = tube.cameras.world_from_camera.copy()
+        poses[:, :3, 3] *= 3
+        cameras = replace(tube.cameras, world_from_camera=poses)
+        other = prepare_search(Scene(bigger), cameras, small_freespace(), small_config())
+        assert other.depth_unit_mm == pytest.approx(3 * ready.depth_unit_mm, rel=1e-3)
+        assert ready.step_mm == pytest.approx(0.2 * ready.depth_unit_mm)
+
+    def test_views_that_see_nothing_are_refused(self):
+        tube = small_tube()
+        away = tube.cameras.world_from_camera.copy()
+        away[:, :3, 3] += 1e4
+        cameras = replace(tube.cameras, world_from_camera=away)
+        with pytest.raises(CaptureError, match="none of the 8 training views sees a surface"):
+            prepare_search(tube.scene, cameras, small_freespace(), small_config())
+
+
+class TestFoldWeight:
+    def test_fires_on_the_third_turn_in_a_row(self):
+        config = small_config()
+        assert fold_weight(np.array([10.0]), config) == 1.0
+        assert fold_weight(np.array([10.0, 10.0]), config) == 1.0
+        assert fold_weight(np.array([10.0, 10.0, 10.0]), config) == 0.6
+        assert fold_weight(np.array([10.0, 0.0, 10.0]), config) == 1.0
+
+    def test_changes_what_the_search_does(self):
+        tube, covered = small_tube(), known()
+
+        def most_turns(**changes: object) -> int:
+            ready = context(length=12, max_expansions=12, **changes)
+            runs = 0
+            for start in (0, 5):
+                moves = grow_branch(ready, tube.cameras.world_from_camera[start], covered, start).moves
+                still = [move.startswith("move") for move in moves]
+                runs += sum(not any(still[i : i + 3]) for i in range(len(still) - 2))
+            return runs
+
+        free, held = most_turns(fold_angle_deg=179.0), most_turns(fold_penalty=0.05)
+        assert free > 0
+        assert held < free

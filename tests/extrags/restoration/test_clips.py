@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from jaxtyping import TypeCheckError
+
+from extrags.confidence import PerceptualDifference
+from extrags.errors import ConfigError, ShapeError
+from extrags.pseudo_views import PseudoViews
+from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.clips import choose_views, keep_known, make_pseudo_observations
+from tests.extrags.restoration.conftest import Tube, tube_cameras
+
+
+@pytest.fixture(scope="module")
+def pseudo(tube: Tube) -> PseudoViews:
+    trajectories = [tube_cameras(3, offset_mm=4.0), tube_cameras(2, offset_mm=6.0, turn=0.5)]
+    return make_pseudo_observations(
+        tube.scene,
+        tube.references,
+        trajectories,
+        ClassicalEnhancer(),
+        PerceptualDifference(None, "test"),
+        count=4,
+        first_index=7,
+    )
+
+
+class TestPseudoObservations:
+    def test_contents(self, tube: Tube, pseudo: PseudoViews) -> None:
+        assert len(pseudo) == 5
+        assert pseudo.clip.tolist() == [7, 7, 7, 8, 8]
+        assert set(pseudo.reference) <= set(tube.sequence.train)
+        assert pseudo.provenance["pixel_confidence"] == "perceptual_map"
+        for name in ("rendered", "restored", "target", "uncertainty", "pixel_confidence", "image_confidence"):
+            values = getattr(pseudo, name)
+            assert np.isfinite(values).all()
+            assert values.min() >= 0
+            assert values.max() <= 1
+        assert pseudo.depth_mm.min() > 0
+        assert 0 < pseudo.changed_share < 1
+
+    def test_holes_take_the_restored_colour(self, pseudo: PseudoViews) -> None:
+        hole = pseudo.alpha < 0.05
+        assert hole.any()
+        assert np.abs(pseudo.target - pseudo.restored)[hole].max() < 0.05
+
+    def test_batches_do_not_change_the_result(self, tube: Tube, pseudo: PseudoViews) -> None:
+        alone = make_pseudo_observations(
+            tube.scene,
+            tube.references,
+            [tube_cameras(2, offset_mm=6.0, turn=0.5)],
+            ClassicalEnhancer(),
+            PerceptualDifference(None, "test"),
+            count=4,
+            first_index=8,
+        )
+        assert np.array_equal(alone.target, pseudo.target[3:])
+        assert np.array_equal(alone.pixel_confidence, pseudo.pixel_confidence[3:])
+
+    def test_save_and_load(self, pseudo: PseudoViews, tmp_path) -> None:
+        pseudo.save(tmp_path / "pseudo")
+        loaded = PseudoViews.load(tmp_path / "pseudo")
+        for name in ("rendered", "restored", "target", "alpha", "uncertainty", "pixel_confidence"):
+            assert np.abs(getattr(loaded, name) - getattr(pseudo, name)).max() <= 0.5 / 255 + 1e-6
+        assert np.array_equal(loaded.depth_mm, pseudo.depth_mm)
+        assert np.array_equal(loaded.cameras.world_from_camera, pseudo.cameras.world_from_camera)
+        assert np.array_equal(loaded.image_confidence, pseudo.image_confidence)
+        assert np.array_equal(loaded.reference, pseudo.reference)
+        assert loaded.provenance == pseudo.provenance
+        loaded.save(tmp_path / "again")
+        twice = PseudoViews.load(tmp_path / "again")
+        assert np.array_equal(twice.target, loaded.target)
+
+    def test_sizes_are_checked(self, pseudo: PseudoViews) -> None:
+        with pytest.raises((ShapeError, TypeCheckError), match="alpha"):
+            replace(pseudo, alpha=pseudo.alpha[:, :-1])
+        with pytest.raises(ShapeError):
+            PseudoViews.concatenated([])
+
+
+class TestKeepKnown:
+    def test_known_pixels_stay_and_unknown_ones_are_restored(self) -> None:
+        rendered = np.zeros((1, 32, 32, 3), np.float32)
+        restored = np.ones((1, 32, 32, 3), np.float32)
+        uncertainty = np.zeros((1, 32, 32), np.float32)
+        uncertainty[:, 12:20, 12:20] = 1
+        target, feathered = keep_known(rendered, restored, uncertainty)
+        assert target[0, 12:20, 12:20].min() == 1
+        assert target[0, :4].max() < 1e-3
+        steps = np.abs(np.diff(target[0, 16, :, 0]))
+        assert 0 < steps.max() < 0.35
+        assert (feathered >= uncertainty).all()
+
+    def test_sizes_must_fit(self) -> None:
+        image = np.zeros((1, 8, 8, 3), np.float32)
+        with pytest.raises((ShapeError, TypeCheckError)):
+            keep_known(image, image, np.zeros((1, 8, 9), np.float32))
+
+
+class TestChooseViews:
+    @given(
+        lengths=st.lists(st.integers(0, 30), min_size=1, max_size=20),
+        spare=st.integers(0, 200),
+    )
+    def test_within_budget_without_starts_and_with_ends(self, lengths: list[int], spare: int) -> None:
+        longer = sum(length > 1 for length in lengths)
+        chosen = choose_views(lengths, longer + spare + 1)
+        assert sum(map(len, chosen)) <= longer + spare + 1
+        for length, views in zip(lengths, chosen, strict=True):
+            if length > 1:
+                assert views[-1] == length - 1
+                assert views[0] >= 1
+                assert (np.diff(views) > 0).all()
+            else:
+                assert len(views) == 0
+
+    def test_all_views_fit(self) -> None:
+        assert [v.tolist() for v in choose_views([4, 3], 100)] == [[1, 2, 3], [1, 2]]
+
+    def test_less_than_one_view_each_is_refused(self) -> None:
+        with pytest.raises(ConfigError, match="max_views"):
+            choose_views([5, 5, 5], 2)

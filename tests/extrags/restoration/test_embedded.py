@@ -1,0 +1,301 @@
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.config import CoarseConfig
+from extrags.errors import ConfigError, DivergedError, WeightsError
+from extrags.restoration.backends import judged, load_enhancer, train_enhancer
+from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.clips import render_clips
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.network import build_network
+from extrags.restoration.diffusion.rectified_flow import (
+    Batch,
+    Predicted,
+    TrainingSettings,
+    restoration_loss,
+    sample,
+    train_network,
+)
+from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.training_data.pairs import Pairs
+from extrags.restoration.uncertainty.calibration import Calibration
+from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Conditioning
+from extrags.view_synthesis.gamut import Gamut
+from tests.extrags.restoration.conftest import SMALL, Tube, tube_cameras
+
+WIDTHS = (16, 24, 32)
+PLAIN = TrainingSettings(1, 1e-3, False)
+
+
+def _conditioning(n: int, height: int, width: int, seed: int = 0) -> Conditioning:
+    generator = torch.Generator().manual_seed(seed)
+    channels = torch.randn(n, CONDITION_CHANNELS, height, width, generator=generator)
+    depth = 10 + 20 * torch.rand(n, 1, height, width, generator=generator)
+    return Conditioning(channels, torch.rand(n, 3, height, width, generator=generator), depth)
+
+
+class TestNetwork:
+    def test_untrained_it_returns_the_base(self) -> None:
+        network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
+        conditioning = _conditioning(2, 40, 24)
+        noise = torch.randn(2, 3, 40, 24, generator=torch.Generator().manual_seed(2))
+        restored = sample(network, conditioning, noise, steps=1, half_precision=False)
+        torch.testing.assert_close(restored.rgb, conditioning.base, atol=1e-5, rtol=0)
+        torch.testing.assert_close(restored.depth_mm, conditioning.depth_mm, atol=0, rtol=1e-5)
+
+    @pytest.mark.parametrize(("height", "width"), [(32, 32), (33, 47)])
+    def test_any_size(self, height: int, width: int) -> None:
+        network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
+        torch.nn.init.normal_(network.exit.weight, std=0.1, generator=torch.Generator().manual_seed(3))
+        noise = torch.zeros(1, 3, height, width)
+        restored = sample(network, _conditioning(1, height, width), noise, steps=2, half_precision=False)
+        assert restored.rgb.shape == (1, 3, height, width)
+        assert restored.rgb.min() >= 0
+        assert restored.rgb.max() <= 1
+        assert restored.depth_mm.shape == restored.error.shape == (1, 1, height, width)
+
+    def test_weights_come_from_the_generator_alone(self) -> None:
+        torch.manual_seed(11)
+        before = torch.random.get_rng_state()
+        first = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(7))
+        assert torch.equal(before, torch.random.get_rng_state())
+        second = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(7))
+        for one, two in zip(first.state_dict().values(), second.state_dict().values(), strict=True):
+            assert torch.equal(one, two)
+
+
+class TestTraining:
+    def test_overfits_three_pairs(self) -> None:
+        conditioning = _conditioning(3, 32, 32)
+        clean = torch.rand(3, 3, 4, 4, generator=torch.Generator().manual_seed(5))
+        clean = torch.nn.functional.interpolate(clean, size=(32, 32), mode="bilinear")
+        far = torch.full((3, 1, 32, 32), 30.0)
+        batch = Batch(conditioning, clean, torch.ones(3, 1, 32, 32), far)
+        network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
+        noise = torch.randn(3, 3, 32, 32, generator=torch.Generator().manual_seed(9))
+
+        def errors() -> tuple[float, float, float]:
+            restored = sample(network, conditioning, noise, steps=1, half_precision=False)
+            color = (restored.rgb - clean).abs().mean()
+            depth = (restored.depth_mm.log() - far.log()).abs().mean()
+            return float(color), float(depth), float((restored.error.mean() / color).log().abs())
+
+        before = errors()
+        generator = torch.Generator().manual_seed(2)
+        train_network(network, lambda: batch, TrainingSettings(150, 4e-3, False), generator)
+        color, depth, predicted_error = errors()
+        assert color < 0.4 * before[0]
+        assert depth < 0.85 * before[1]
+        # The expected error follows the true one down.
+        assert predicted_error < 0.7 < before[2]
+
+    def test_a_diverging_loss_is_named(self) -> None:
+        conditioning = _conditioning(1, 32, 32)
+        broken = Conditioning(conditioning.channels, conditioning.base * torch.nan, conditioning.depth_mm)
+        batch = Batch(broken, conditioning.base, torch.ones(1, 1, 32, 32), conditioning.depth_mm)
+        network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
+        with pytest.raises(DivergedError, match="iteration 0"):
+            train_network(network, lambda: batch, TrainingSettings(3, 1e-3, False), torch.Generator())
+
+    def test_pixels_without_weight_do_not_count(self) -> None:
+        clean = torch.full((1, 3, 16, 16), 0.5)
+        wrong = clean.clone()
+        wrong[..., :4] = 1
+        weight = torch.ones(1, 1, 16, 16)
+        weight[..., :10] = 0
+        depth = torch.full((1, 1, 16, 16), 20.0)
+        batch = Batch(_conditioning(1, 16, 16), clean, weight, depth)
+        predicted = Predicted(wrong, depth.log(), torch.zeros(1, 1, 16, 16))
+        assert restoration_loss(predicted, batch, PLAIN) < 1e-2
+
+    def test_unknown_depth_does_not_count(self) -> None:
+        clean = torch.full((1, 3, 16, 16), 0.5)
+        depth = torch.full((1, 1, 16, 16), 20.0)
+        depth[..., :8] = 0
+        wrong = torch.full((1, 1, 16, 16), 20.0)
+        wrong[..., :8] = 1e3
+        batch = Batch(_conditioning(1, 16, 16), clean, torch.ones(1, 1, 16, 16), depth)
+        predicted_error = torch.zeros(1, 1, 16, 16)
+        assert restoration_loss(Predicted(clean, wrong.log(), predicted_error), batch, PLAIN) < 1e-2
+        assert restoration_loss(Predicted(clean, wrong.log() + 0.5, predicted_error), batch, PLAIN) > 0.02
+
+    def test_the_expected_error_is_cheapest_when_true(self) -> None:
+        clean = torch.full((1, 3, 16, 16), 0.5)
+        batch = Batch(_conditioning(1, 16, 16), clean, torch.ones(1, 1, 16, 16), torch.zeros(1, 1, 16, 16))
+        costs = [
+            float(
+                restoration_loss(
+                    Predicted(
+                        clean + 0.1, torch.zeros(1, 1, 16, 16), torch.full((1, 1, 16, 16), expected).log()
+                    ),
+                    batch,
+                    PLAIN,
+                )
+            )
+            for expected in (0.05, 0.08, 0.1, 0.125, 0.2)
+        ]
+        assert int(np.argmin(costs)) == 2
+
+
+@pytest.fixture(scope="module")
+def trained(tube: Tube, tube_pairs: Pairs) -> EmbeddedEnhancer:
+    return EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL)
+
+
+@pytest.fixture(scope="module")
+def clip(tube: Tube) -> Clip:
+    return render_clips(tube.scene, tube.references, [tube_cameras(3, offset_mm=4.0)], count=4)[0]
+
+
+class TestEmbedded:
+    def test_one_step_beats_no_restoration(self, trained: EmbeddedEnhancer) -> None:
+        scores = trained.record["validation"]
+        assert scores["embedded_1"]["psnr"] > scores["none"]["psnr"] + 2
+
+    def test_the_better_number_of_steps_is_chosen(self, trained: EmbeddedEnhancer) -> None:
+        scores = trained.record["validation"]
+        best = max((1, 4), key=lambda steps: scores[f"embedded_{steps}"]["psnr"])
+        assert trained.steps == best
+
+    def test_training_twice_gives_the_same_bits(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
+    ) -> None:
+        again = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL)
+        for one, two in zip(
+            again.network.state_dict().values(), trained.network.state_dict().values(), strict=True
+        ):
+            assert torch.equal(one, two)
+
+    def test_saved_and_loaded_it_restores_the_same(
+        self, trained: EmbeddedEnhancer, clip: Clip, tmp_path
+    ) -> None:
+        trained.save(tmp_path / "restorer")
+        loaded = load_enhancer(tmp_path / "restorer")
+        assert isinstance(loaded, EmbeddedEnhancer)
+        assert isinstance(loaded, Enhancer)
+        assert np.array_equal(loaded.restore(clip).rgb, trained.restore(clip).rgb)
+        assert loaded.restore(clip).provenance == trained.restore(clip).provenance
+
+    def test_samples_add_to_the_expected_error(self, trained: EmbeddedEnhancer, clip: Clip) -> None:
+        plain = replace(trained, steps=4, calibration=Calibration())
+        one, several = plain.restore(clip), replace(plain, samples=3).restore(clip)
+        assert one.expected_error is not None
+        assert several.expected_error is not None
+        assert several.expected_error.shape == several.rgb.shape[:3]
+        assert several.expected_error.mean() > 0
+        assert np.abs(several.expected_error - one.expected_error).max() > 0
+        assert several.depth_mm is not None
+        assert (several.depth_mm > 0).all()
+
+    def test_training_that_does_not_help_is_not_kept(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
+    ) -> None:
+        harmful = SMALL.model_copy(update={"scene_learning_rate": 0.5, "train_iterations": 3})
+        kept = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, harmful, trained)
+        assert kept.record["scene_training_kept"] is False
+        for one, two in zip(
+            kept.network.state_dict().values(), trained.network.state_dict().values(), strict=True
+        ):
+            assert torch.equal(one, two)
+
+    def test_training_that_helps_is_kept(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
+    ) -> None:
+        crude = EmbeddedEnhancer.train(
+            tube_pairs, tube.references.transfer, SMALL.model_copy(update={"train_iterations": 4})
+        )
+        more = SMALL.model_copy(update={"scene_learning_rate": 2e-3})
+        kept = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, more, crude)
+        scores = kept.record["validation"]
+        assert kept.record["scene_training_kept"] is True
+        assert scores["embedded_1"]["psnr"] > scores["untrained_embedded_1"]["psnr"]
+
+    def test_without_iterations_the_pretrained_restorer_serves(
+        self, tube: Tube, trained: EmbeddedEnhancer, clip: Clip, tmp_path
+    ) -> None:
+        trained.save(tmp_path, half=True)
+        config = SMALL.model_copy(
+            update={"train_iterations": 0, "pretrained_weights": str(tmp_path), "judge": False}
+        )
+        served = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+        assert isinstance(served, EmbeddedEnhancer)
+        difference = np.abs(served.restore(clip).rgb - trained.restore(clip).rgb)
+        assert difference.mean() < 0.01
+        with pytest.raises(ConfigError, match="nothing would restore"):
+            train_enhancer(
+                tube.scene,
+                tube.sequence,
+                SMALL.model_copy(update={"train_iterations": 0}),
+                CoarseConfig(),
+            )
+
+    def test_what_does_harm_gives_way_to_blending_and_filling(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, clip: Clip, tmp_path, caplog
+    ) -> None:
+        transfer = tube.references.transfer
+        kept = judged(trained, tube_pairs, transfer)
+        assert isinstance(kept, EmbeddedEnhancer)
+        assert f"embedded_{trained.steps}" in kept.provenance["validation"]
+        network = copy.deepcopy(trained.network)
+        torch.nn.init.normal_(network.exit.weight, std=0.3, generator=torch.Generator().manual_seed(3))
+        served = judged(replace(trained, network=network), tube_pairs, transfer)
+        assert isinstance(served, ClassicalEnhancer)
+        assert "restored by blending and filling" in caplog.text
+        served.save(tmp_path)
+        loaded = load_enhancer(tmp_path)
+        assert "on leave-out pairs of this scene" in loaded.restore(clip).provenance["reason"]
+
+    def test_a_plain_regression_needs_no_noise(self, tube: Tube, tube_pairs: Pairs, clip: Clip) -> None:
+        plain = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL, deterministic=True)
+        assert plain.steps == 1
+        assert plain.record["validation"].keys() == {"none", "classical", "embedded_1"}
+        assert np.array_equal(plain.restore(clip).rgb, replace(plain, seed=5).restore(clip).rgb)
+
+    def test_without_weights_it_says_what_to_do(self, tmp_path) -> None:
+        with pytest.raises(WeightsError, match="train the restorer"):
+            load_enhancer(tmp_path)
+        with pytest.raises(WeightsError, match="train the restorer"):
+            EmbeddedEnhancer.load(tmp_path)
+
+    def test_foreign_weights_are_refused(self, trained: EmbeddedEnhancer, tmp_path) -> None:
+        from safetensors.torch import save_file
+
+        trained.save(tmp_path)
+        save_file({"something": torch.zeros(1)}, str(tmp_path / "restorer.safetensors"))
+        with pytest.raises(WeightsError, match="not the weights"):
+            load_enhancer(tmp_path)
+
+
+class TestGamut:
+    def test_real_colours_stay_and_foreign_hues_do_not(self) -> None:
+        generator = torch.Generator().manual_seed(3)
+        shade = torch.rand(2, 1, 24, 24, generator=generator) * 0.6 + 0.3
+        tissue = shade * torch.tensor([1.0, 0.6, 0.5])[None, :, None, None]
+        gamut = Gamut.of_images(tissue, torch.ones(2, 1, 24, 24))
+        torch.testing.assert_close(gamut.bounded(tissue), tissue, atol=2e-3, rtol=0)
+        green = tissue[:, [1, 0, 2]]
+        bounded = gamut.bounded(green)
+        assert (bounded[:, 0] > bounded[:, 1]).all()
+        torch.testing.assert_close(bounded.mean(dim=1), green.mean(dim=1), atol=0.02, rtol=0)
+
+    def test_dark_frames_set_no_bounds(self) -> None:
+        dark = torch.zeros(1, 3, 8, 8)
+        image = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
+        gamut = Gamut.of_images(dark, torch.ones(1, 1, 8, 8))
+        torch.testing.assert_close(gamut.bounded(image), image, atol=2e-3, rtol=0)
+
+
+def test_classical_backend_needs_no_training(tube: Tube, clip: Clip, tmp_path) -> None:
+    config = SMALL.model_copy(update={"backend": "classical"})
+    enhancer = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
+    enhancer.save(tmp_path)
+    loaded = load_enhancer(tmp_path)
+    assert isinstance(loaded, ClassicalEnhancer)
+    assert isinstance(loaded, Enhancer)
+    assert np.array_equal(loaded.restore(clip).rgb, enhancer.restore(clip).rgb)

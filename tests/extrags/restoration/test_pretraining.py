@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.config import CoarseConfig
+from extrags.errors import ConfigError, WeightsError
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.pretraining import PretrainingConfig, pretrain
+from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, make_pretraining_scene
+from extrags.view_synthesis.references import LightTransfer
+from tests.extrags.restoration.conftest import SMALL, Tube
+
+TINY = PretrainingConfig(
+    scenes=3,
+    validation_scenes=1,
+    iterations=12,
+    batch=3,
+    crop=32,
+    channels=(8, 16, 16),
+    learning_rate=2e-3,
+    perceptual=False,
+)
+
+
+@pytest.fixture(scope="module")
+def scene(tube: Tube) -> PretrainingScene:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("extrags.restoration.training_data.pretraining_scenes.ITERATIONS", (10, 20))
+        return make_pretraining_scene(tube.sequence, SMALL, CoarseConfig(max_points=800), 3)
+
+
+@pytest.fixture(scope="module")
+def files(scene: PretrainingScene, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    folder = tmp_path_factory.mktemp("pretraining")
+    paths = [folder / f"{index:04d}.safetensors" for index in range(3)]
+    for path in paths:
+        scene.save(path)
+    return paths
+
+
+class TestPretrainingScene:
+    def test_pairs_are_the_views_off_the_path(self, tube: Tube, scene: PretrainingScene) -> None:
+        assert scene.pairs.frame.tolist() == tube.sequence.test.tolist()
+        assert not scene.pairs.validation.any()
+        truth = torch.from_numpy(tube.sequence.rgb[tube.sequence.test].astype(np.float32) / 255)
+        torch.testing.assert_close(scene.pairs.target, truth.permute(0, 3, 1, 2))
+        assert scene.transfer.light is not None
+
+    def test_saved_and_loaded_it_is_the_same_to_half_precision(
+        self, scene: PretrainingScene, files: list[Path]
+    ) -> None:
+        loaded = PretrainingScene.load(files[0])
+        torch.testing.assert_close(loaded.pairs.layers.data, scene.pairs.layers.data, rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(loaded.pairs.target, scene.pairs.target, rtol=0, atol=1e-6)
+        torch.testing.assert_close(loaded.pairs.depth_mm, scene.pairs.depth_mm, rtol=1e-3, atol=1e-3)
+        assert loaded.transfer.scale_mm == scene.transfer.scale_mm
+        light, kept = loaded.transfer.light, scene.transfer.light
+        assert light is not None
+        assert kept is not None
+        assert all(torch.equal(light.parameters()[k], v) for k, v in kept.parameters().items())
+
+    def test_a_scene_without_light_keeps_its_exponent(self, scene: PretrainingScene, tmp_path: Path) -> None:
+        replace(scene, transfer=LightTransfer(None, 0.7, 12.0)).save(tmp_path / "dark.safetensors")
+        assert PretrainingScene.load(tmp_path / "dark.safetensors").transfer == LightTransfer(None, 0.7, 12.0)
+
+    def test_a_foreign_file_is_named(self, tmp_path: Path) -> None:
+        (tmp_path / "x.safetensors").write_bytes(b"nothing")
+        with pytest.raises(WeightsError, match=r"x\.safetensors: not the pairs"):
+            PretrainingScene.load(tmp_path / "x.safetensors")
+
+
+class TestPretraining:
+    def test_it_learns_and_says_how_well(self, files: list[Path], tmp_path: Path) -> None:
+        enhancer = pretrain(files, TINY.model_copy(update={"iterations": 60}))
+        scores = enhancer.record["validation_scores"]
+        assert scores["embedded_1"]["psnr"] > scores["none"]["psnr"]
+        enhancer.save(tmp_path, half=True)
+        loaded = EmbeddedEnhancer.load(tmp_path / "restorer.safetensors")
+        assert loaded.record["pretraining"]["iterations"] == 60
+        for one, two in zip(
+            loaded.network.state_dict().values(), enhancer.network.state_dict().values(), strict=True
+        ):
+            torch.testing.assert_close(one, two, rtol=2e-3, atol=1e-4)
+
+    def test_twice_gives_the_same_bits(self, files: list[Path]) -> None:
+        first, second = (pretrain(files, TINY).network.state_dict() for _ in range(2))
+        assert all(torch.equal(first[name], second[name]) for name in first)
+
+    def test_a_perceptual_distance_changes_what_is_learned(
+        self, files: list[Path], shared_data: Path
+    ) -> None:
+        plain, seen = (
+            pretrain(files, TINY.model_copy(update={"perceptual": perceptual, "iterations": 2}))
+            for perceptual in (False, True)
+        )
+        assert not torch.equal(plain.network.exit.weight, seen.network.exit.weight)
+
+    def test_the_number_of_scenes_is_checked(self, files: list[Path]) -> None:
+        with pytest.raises(ConfigError, match="2 pretraining scenes, 3 were announced"):
+            pretrain(files[:2], TINY)

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.errors import CaptureError, ShapeError
+from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.clips import render_clips
+from extrags.restoration.training_data.augmentation import cut_out, drop_references
+from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, condition, observe_views
+from extrags.view_synthesis.references import ReferenceViews
+from tests.extrags.restoration.conftest import HEIGHT, WIDTH, Tube, cast_tube, tube_cameras
+
+
+@pytest.fixture(scope="module")
+def layers(tube: Tube) -> Layers:
+    return observe_views(tube.scene, tube.references, tube_cameras(4, offset_mm=4.0), count=4).layers
+
+
+class TestObservation:
+    def test_a_training_view_is_known_and_a_gap_is_not(self, tube: Tube) -> None:
+        own = observe_views(tube.scene, tube.references, tube.sequence.cameras[[3]], count=4).layers
+        alpha, uncertainty = own.get("alpha"), own.get("uncertainty")
+        assert uncertainty[alpha > 0.98].median() < 0.25
+        assert (alpha < 0.1).any()
+        assert uncertainty[alpha < 0.1].min() > 0.85
+
+    def test_uncertainty_grows_with_the_angle(self, tube: Tube) -> None:
+        medians = []
+        for offset in (2.0, 9.0):
+            seen = observe_views(tube.scene, tube.references, tube_cameras(4, offset_mm=offset), count=4)
+            solid = seen.layers.get("alpha") > 0.95
+            medians.append(float(seen.layers.get("uncertainty")[solid].median()))
+        assert medians[1] > medians[0] + 0.05
+
+    def test_everything_is_finite_and_in_range(self, layers: Layers) -> None:
+        assert torch.isfinite(layers.data).all()
+        for name in ("alpha", "uncertainty", "nearest_weight", "blend_weight", "blend", "nearest", "spread"):
+            assert layers.get(name).min() >= 0, name
+            assert layers.get(name).max() <= 1 + 1e-5, name
+
+    def test_layers_refuse_another_number_of_channels(self) -> None:
+        with pytest.raises(ShapeError):
+            Layers(torch.zeros(1, 3, 8, 8))
+
+    def test_no_real_view_is_an_error(self, tube: Tube) -> None:
+        with pytest.raises(CaptureError):
+            ReferenceViews.gather(tube.scene, tube.sequence, np.zeros(0, np.int64))
+
+    def test_exposures_must_belong_to_the_frames(self, tube: Tube) -> None:
+        with pytest.raises(ShapeError, match="exposures"):
+            ReferenceViews.gather(tube.scene, tube.sequence, np.array([0, 1]))
+
+
+class TestCondition:
+    def test_shapes(self, tube: Tube, layers: Layers) -> None:
+        conditioning = condition(layers, tube.references.transfer)
+        assert conditioning.channels.shape == (4, CONDITION_CHANNELS, HEIGHT, WIDTH)
+        assert torch.isfinite(conditioning.channels).all()
+        assert conditioning.depth_mm.min() > 0
+
+    def test_dropped_references_leave_no_trace(self, tube: Tube, layers: Layers) -> None:
+        dropped = drop_references(Layers(layers.data.clone()))
+        dark = Layers(dropped.data.clone())
+        dark.get("blend").zero_()
+        dark.get("nearest").zero_()
+        transfer = tube.references.transfer
+        assert torch.equal(condition(dropped, transfer).channels, condition(dark, transfer).channels)
+
+    def test_a_cut_out_hole_is_filled_from_its_surroundings(self, tube: Tube, layers: Layers) -> None:
+        kept = torch.ones(1, 1, HEIGHT, WIDTH)
+        kept[..., 10:25, 20:35] = 0
+        cut = cut_out(Layers(layers.data.clone()), kept, unseen=True)
+        assert cut.get("alpha")[..., 10:25, 20:35].max() == 0
+        assert cut.get("uncertainty")[..., 10:25, 20:35].min() == 1
+        base = condition(cut, tube.references.transfer).base
+        assert base[..., 10:25, 20:35].min() > 0.01
+
+
+class TestClassical:
+    def test_leaves_no_holes_and_beats_the_rendering(self, tube: Tube) -> None:
+        cameras = tube_cameras(4, offset_mm=4.0, start_mm=3.0)
+        target, _ = cast_tube(cameras, tube.references.transfer.light)
+        clip = render_clips(tube.scene, tube.references, [cameras], count=4)[0]
+        restored = ClassicalEnhancer().restore(clip).rgb
+        rendered = clip.layers.get("rendered").permute(0, 2, 3, 1).numpy()
+        hole = clip.layers.get("alpha")[:, 0].numpy() < 0.3
+        assert hole.any()
+        assert restored[hole].min() > 0.01
+
+        def psnr(image: np.ndarray) -> float:
+            return float(-10 * np.log10(np.square(image - target).mean()))
+
+        assert psnr(restored) > psnr(rendered) + 2

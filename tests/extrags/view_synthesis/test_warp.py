@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.cameras import pixel_rays
+from extrags.view_synthesis.references import LightTransfer
+from extrags.view_synthesis.warp import covisibility, depth_normals, fit_falloff_exponent, warp_references
+from tests.extrags.restoration.conftest import cast_tube, exact_references, tube_cameras, tube_light
+
+
+def _target() -> tuple:
+    light = tube_light(1)
+    cameras = tube_cameras(3, offset_mm=4.0, start_mm=6.0, turn=0.15)
+    rgb, depth = cast_tube(cameras, light)
+    target = torch.from_numpy(rgb.astype(np.float32)).permute(0, 3, 1, 2)
+    return light, cameras, target, torch.from_numpy(depth.astype(np.float32))[:, None]
+
+
+def _error(warped, target: torch.Tensor) -> float:
+    trusted = (warped.blend_weight > 0.5).expand_as(target)
+    assert trusted.float().mean() > 0.5
+    return float((warped.blend - target).abs()[trusted].mean())
+
+
+def test_compensated_warp_reproduces_an_exactly_lit_scene() -> None:
+    light, cameras, target, depth = _target()
+    warped = warp_references(exact_references(tube_cameras(8), light), cameras, depth, count=4)
+    assert _error(warped, target) < 5e-3
+    near = (warped.nearest_weight > 0.5).expand_as(target)
+    assert (warped.nearest - target).abs()[near].mean() < 5e-3
+
+
+def test_without_compensation_it_does_not() -> None:
+    light, cameras, target, depth = _target()
+    references = exact_references(tube_cameras(8), light).with_transfer(LightTransfer(None, 0.0, 20.0))
+    assert _error(warp_references(references, cameras, depth, count=4), target) > 0.02
+
+
+def test_exposures_are_compensated() -> None:
+    light, cameras, target, depth = _target()
+    references = exact_references(tube_cameras(8), light)
+    references.packed[:, :3] *= 0.8
+    references.exposure.fill_(0.8)
+    gain = torch.full((3,), 0.9)
+    warped = warp_references(references, cameras, depth, count=4, exposure=gain)
+    assert _error(warped, target * 0.9) < 5e-3
+
+
+def test_surface_hidden_from_a_reference_is_not_borrowed() -> None:
+    light, cameras, _, depth = _target()
+    references = exact_references(tube_cameras(8), light)
+    references.packed[:, 4] *= 2  # something stands at half the distance in every reference
+    warped = warp_references(references, cameras, depth, count=4)
+    assert warped.blend_weight.max() == 0
+    assert warped.blend.abs().max() == 0
+
+
+def test_the_best_reference_is_the_view_itself() -> None:
+    light = tube_light(1)
+    cameras = tube_cameras(8)
+    _, depth = cast_tube(cameras, light)
+    scores = covisibility(
+        exact_references(cameras, light), cameras, torch.from_numpy(depth.astype(np.float32))[:, None]
+    )
+    assert torch.equal(scores.argmax(dim=1), torch.arange(8))
+    assert scores.min() >= 0
+    assert scores.max() <= 1
+
+
+@pytest.mark.parametrize("exponent", [0.5, 1.3])
+def test_the_falloff_exponent_is_found_from_the_images(exponent: float) -> None:
+    light = tube_light(1)
+    references = exact_references(tube_cameras(10), None)
+    _, depth = cast_tube(references.cameras, light)
+    from extrags.cameras import pixel_rays
+
+    distance = depth * np.linalg.norm(pixel_rays(references.cameras), axis=-1)
+    fall = torch.from_numpy(((distance / 20) ** -exponent).astype(np.float32))
+    references.packed[:, :3] *= fall[:, None]
+    assert abs(fit_falloff_exponent(references) - exponent) < 0.12
+
+
+def test_the_angle_to_the_wall_is_compensated() -> None:
+    """A lamp that darkens slanted walls: carried into another view, the wall has the right brightness."""
+    light = replace(tube_light(6), cosine=torch.tensor(0.9))
+    cameras = tube_cameras(8)
+    colors = []
+    for camera in range(len(cameras)):
+        view = cameras[camera]
+        rgb, depth = cast_tube(view, tube_light(6))
+        rays = torch.from_numpy(pixel_rays(view)[0].astype(np.float32))
+        normals = depth_normals(rays, torch.from_numpy(depth.astype(np.float32)))
+        points = view.centers[:, None, None] + depth[..., None] * pixel_rays(view)
+        radial = np.concatenate([points[..., :2], np.zeros_like(points[..., :1])], axis=-1)
+        exact = (radial / np.linalg.norm(radial, axis=-1, keepdims=True))[0]
+        facing = (pixel_rays(view)[0] * exact).sum(-1) / np.linalg.norm(pixel_rays(view)[0], axis=-1)
+        near = depth[0] < 60
+        agreement = np.abs((normals.numpy() * exact).sum(-1))[near]
+        assert np.median(agreement) > 0.995
+        turned = torch.from_numpy(facing)
+        near_lens = torch.ones_like(turned)
+        darker = light.falloff(near_lens, None, turned) / light.falloff(near_lens)
+        colors.append(rgb * darker.numpy()[None, ..., None])
+    references = exact_references(cameras[list(range(6))], light)
+    packed = references.packed.clone()
+    packed[:, :3] = torch.from_numpy(np.concatenate(colors[:6]).astype(np.float32)).permute(0, 3, 1, 2)
+    references = replace(references, packed=packed)
+    _, depth = cast_tube(cameras[[7]], light)
+    depth_mm = torch.from_numpy(depth.astype(np.float32))[:, None]
+    truth = torch.from_numpy(colors[7].astype(np.float32)).permute(0, 3, 1, 2)
+    blind = references.with_transfer(
+        replace(references.transfer, light=replace(light, cosine=torch.tensor(0.0)))
+    )
+    errors = []
+    for views in (references, blind):
+        warped = warp_references(views, cameras[[7]], depth_mm, count=4)
+        sure = (warped.blend_weight > 0.5).expand(-1, 3, -1, -1)
+        errors.append(float((warped.blend - truth).abs()[sure].mean()))
+    assert errors[0] < 0.6 * errors[1]
