@@ -33,7 +33,7 @@ from extrags.restoration.uncertainty.reliability_diagram import calibration, ran
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, LAYER_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
-from tests.extrags.restoration.conftest import Tube, cast_tube, tube_cameras
+from tests.extrags.lit_tube import Tube, cast_tube, tube_cameras
 
 SIZE = (48, 16)
 

@@ -13,7 +13,7 @@ from extrags.errors import ConfigError, ShapeError
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import choose_views, keep_known, make_pseudo_observations
-from tests.extrags.restoration.conftest import Tube, tube_cameras
+from tests.extrags.lit_tube import Tube, tube_cameras
 
 
 @pytest.fixture(scope="module")

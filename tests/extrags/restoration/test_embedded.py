@@ -27,7 +27,8 @@ from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Conditioning
 from extrags.view_synthesis.gamut import Gamut
-from tests.extrags.restoration.conftest import SMALL, Tube, tube_cameras
+from tests.extrags.lit_tube import Tube, tube_cameras
+from tests.extrags.restoration.conftest import SMALL
 
 WIDTHS = (16, 24, 32)
 PLAIN = TrainingSettings(1, 1e-3, False)

@@ -13,7 +13,8 @@ from extrags.errors import CaptureError, ConfigError
 from extrags.restoration.training_data.augmentation import CropSampler
 from extrags.restoration.training_data.pairs import Pairs, fold_pairs, leave_out_folds, synthetic_pairs
 from extrags.sequence import Split
-from tests.extrags.restoration.conftest import SMALL, Tube
+from tests.extrags.lit_tube import Tube
+from tests.extrags.restoration.conftest import SMALL
 
 
 class TestFolds:

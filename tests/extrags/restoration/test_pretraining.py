@@ -13,7 +13,8 @@ from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.pretraining import PretrainingConfig, pretrain
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, make_pretraining_scene
 from extrags.view_synthesis.references import LightTransfer
-from tests.extrags.restoration.conftest import SMALL, Tube
+from tests.extrags.lit_tube import Tube
+from tests.extrags.restoration.conftest import SMALL
 
 TINY = PretrainingConfig(
     scenes=3,

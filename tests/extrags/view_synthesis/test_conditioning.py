@@ -10,7 +10,7 @@ from extrags.restoration.clips import render_clips
 from extrags.restoration.training_data.augmentation import cut_out, drop_references
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, condition, observe_views
 from extrags.view_synthesis.references import ReferenceViews
-from tests.extrags.restoration.conftest import HEIGHT, WIDTH, Tube, cast_tube, tube_cameras
+from tests.extrags.lit_tube import HEIGHT, WIDTH, Tube, cast_tube, tube_cameras
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import torch
 from extrags.cameras import pixel_rays
 from extrags.view_synthesis.references import LightTransfer
 from extrags.view_synthesis.warp import covisibility, depth_normals, fit_falloff_exponent, warp_references
-from tests.extrags.restoration.conftest import cast_tube, exact_references, tube_cameras, tube_light
+from tests.extrags.lit_tube import cast_tube, exact_references, tube_cameras, tube_light
 
 
 def _target() -> tuple:

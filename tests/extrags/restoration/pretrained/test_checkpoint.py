@@ -23,7 +23,7 @@ from extrags.restoration.pretrained.checkpoint import (
 from extrags.restoration.pretrained.inputs import clip_inputs
 from extrags.restoration.pretrained.real_views import RealViews
 from extrags.restoration.protocol import Clip
-from tests.extrags.restoration.conftest import HEIGHT, WIDTH, Tube, tube_cameras
+from tests.extrags.lit_tube import HEIGHT, WIDTH, Tube, tube_cameras
 from tests.extrags.restoration.pretrained.fake_clone import tiny_state, write_clone
 
 

@@ -25,7 +25,7 @@ from extrags.restoration.pretrained.inputs import clip_inputs, ranked_references
 from extrags.restoration.pretrained.model import find_model, require_diffusers
 from extrags.restoration.pretrained.real_views import RealViews
 from extrags.restoration.protocol import Clip
-from tests.extrags.restoration.conftest import HEIGHT, WIDTH, Tube, tube_cameras
+from tests.extrags.lit_tube import HEIGHT, WIDTH, Tube, tube_cameras
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning"),
