@@ -7,7 +7,7 @@ STORE ?= .extrags/demo
 # OpenMP threads that spin while they wait starve each other on small machines.
 export OMP_WAIT_POLICY := passive
 
-.PHONY: help setup system demo test test-slow lint bench clean
+.PHONY: help setup system demo test test-slow lint same-results bench clean
 
 help: ## Show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*##/\t/' | sort
@@ -44,6 +44,9 @@ lint: setup ## Format, lint, types, import layers, spelling
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/codespell
+
+same-results: setup ## Record the code behind each stage: its version was raised, or results are the same
+	$(BIN)/python -m tests.stage_inventory
 
 bench: setup ## Benchmarks of the kernels (JSON on standard output)
 	$(BIN)/extrags bench raster --json -

@@ -1,11 +1,40 @@
-"""Endoscopic scenes as 3D Gaussians: reconstructed, explored, restored, evaluated.
+"""Endoscopic scenes as 3D Gaussians: reconstructed, explored, restored, fine-tuned and evaluated.
 
-The library half of extrags: it knows no Prefect and no Dask. Modules are imported on demand, so that
+The front door of the library: what most programs need is here, and loaded when it is first used, so that
 `import extrags` stays fast.
+
+    import extrags
+
+    sequence = extrags.read("phantom/0@sparse")
+    result = extrags.run_pipeline(sequence, extrags.PROFILES["quick"])
+    print(result.evaluations["final"].metrics["psnr"])
+    result.scene.gaussians.write_ply("scene.ply")
+
+The stages can be called one by one: `read`, `estimate_poses`, `reconstruct`, `assess`, `fuse_surface`,
+`carve`, `explore`, `restore`, `finetune`, `evaluate`; `extrags.pipeline` says how they follow each other.
+All names are listed in `extrags.api`.
 """
 
 from __future__ import annotations
 
-__all__ = ["__version__"]
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from extrags.api import *  # noqa: F403
 
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    # The import system asks for modules and for names of its own before it looks elsewhere: not for us.
+    if not name.startswith("_") and find_spec(f"{__name__}.{name}") is None:
+        api = import_module(f"{__name__}.api")
+        if name in api.__all__:
+            return getattr(api, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *import_module(f"{__name__}.api").__all__})

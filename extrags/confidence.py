@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from extrags.config import EvaluateConfig
 from extrags.errors import ShapeError, WeightsError
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.perceptual import perceptual_map
@@ -76,19 +77,20 @@ class PerceptualDifference:
     reason: str = ""
 
     @classmethod
-    def available(cls, weights: str | None = None) -> PerceptualDifference:
-        """LPIPS (AlexNet) when its weights can be found.
+    def available(cls, config: EvaluateConfig | None = None) -> PerceptualDifference:
+        """LPIPS when its weights can be found.
 
         Args:
-            weights: npz file; None looks in the usual places.
+            config: the network, and the file of its weights where one is named; None takes the defaults.
 
         Raises:
             WeightsError: when a file was named and cannot be used.
         """
+        config = EvaluateConfig() if config is None else config
         try:
-            return cls(Lpips.load(weights, "alex"))
+            return cls(Lpips.load(config.lpips_weights, config.lpips_net))
         except WeightsError as error:
-            if weights is not None:
+            if config.lpips_weights is not None:
                 raise
             return cls(None, str(error))
 

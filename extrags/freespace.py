@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from extrags.config import FreespaceConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
 from extrags.scene import Scene
+from extrags.store.storable import Storable
 from extrags.surface import Mesh
 from extrags.zarr_io import open_group, read_array, write_array
 
@@ -36,7 +37,7 @@ LENS_VOXELS = 1.5
 
 
 @dataclass(frozen=True)
-class FreeSpace:
+class FreeSpace(Storable):
     """Occupancy on S x S x S cubic voxels, and the distance to what is occupied.
 
     Voxel (i, j, k) has its centre at `origin_mm + ((i, j, k) + 0.5) * voxel_mm @ axes`.
@@ -52,6 +53,8 @@ class FreeSpace:
     Raises:
         ShapeError: when the arrays do not fit each other.
     """
+
+    stored_as: ClassVar[str] = "freespace"
 
     occupancy: UInt8[np.ndarray, "s _ _"]
     origin_mm: Float[np.ndarray, "3"]
@@ -170,7 +173,7 @@ class FreeSpace:
         return np.where(inside, state, UNKNOWN).astype(np.uint8)
 
 
-def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig) -> FreeSpace:
+def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | None = None) -> FreeSpace:
     """Occupancy and clearance from what the training views see through.
 
     The visibility of a voxel is the mean of its `top_views` largest transmittances over the training
@@ -193,6 +196,7 @@ def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig) -
 
     Source: paper, section "Scene initialization and feasible region estimation".
     """
+    config = FreespaceConfig() if config is None else config
     from scipy.ndimage import distance_transform_edt
 
     size = config.grid_size

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import zarr
@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
+from extrags.store.storable import Storable
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
 __all__ = ["PseudoViews"]
@@ -22,7 +23,7 @@ _SHARES = ("alpha", "uncertainty", "pixel_confidence")
 
 
 @dataclass(frozen=True)
-class PseudoViews:
+class PseudoViews(Storable):
     """Virtual views after restoration.
 
     Colours are at the mean exposure of the training frames.
@@ -48,6 +49,8 @@ class PseudoViews:
     Raises:
         ShapeError: when the arrays do not fit each other.
     """
+
+    stored_as: ClassVar[str] = "pseudo"
 
     cameras: Cameras
     rendered: Float[np.ndarray, "v h w 3"]

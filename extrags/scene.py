@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -15,13 +15,16 @@ from extrags.cameras import Cameras
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.raster import CameraLight, Rendering, rasterize
+from extrags.store.storable import Storable
 
 __all__ = ["Scene"]
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Storable):
     """Gaussians, and the near-field light if the scene was reconstructed with one."""
+
+    stored_as: ClassVar[str] = "scene"
 
     gaussians: Gaussians
     light: NearFieldLight | None = None

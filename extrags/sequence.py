@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
 import zarr
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
+from extrags.store.storable import Storable
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
 __all__ = ["EndoscopicSequence", "PoseSource", "Split"]
@@ -39,7 +40,7 @@ class Split:
 
 
 @dataclass(frozen=True)
-class EndoscopicSequence:
+class EndoscopicSequence(Storable):
     """Frames of one scene: colour, and depth, poses and ground truth where they exist.
 
     Frames of all recordings of the scene stand one after the other in one world frame.
@@ -67,6 +68,8 @@ class EndoscopicSequence:
     Raises:
         ShapeError: when sizes do not fit each other.
     """
+
+    stored_as: ClassVar[str] = "sequence"
 
     name: str
     rgb: UInt8[np.ndarray, "f h w 3"]
@@ -134,6 +137,15 @@ class EndoscopicSequence:
     def test(self) -> Int[np.ndarray, "n_test"]:
         """Indices of held-out frames."""
         return self.split.test
+
+    @property
+    def training_cameras(self) -> Cameras:
+        """Cameras of the training frames.
+
+        Raises:
+            PoseError: as `cameras`.
+        """
+        return self.cameras[self.train]
 
     def frame_name(self, index: int) -> str:
         """Name of a frame for messages."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
+from typing import ClassVar, cast
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
 from extrags.scene import Scene
+from extrags.store.storable import Storable
 from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["Mesh", "fuse_depth", "fuse_surface", "rendered_depth"]
@@ -28,7 +29,7 @@ VIEWS_PER_BATCH = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Mesh:
+class Mesh(Storable):
     """A triangle mesh.
 
     Args:
@@ -38,6 +39,8 @@ class Mesh:
     Raises:
         ShapeError: when a triangle names a vertex that is not there.
     """
+
+    stored_as: ClassVar[str] = "mesh"
 
     vertices: Float[np.ndarray, "v 3"]
     triangles: Int[np.ndarray, "t 3"]
@@ -74,7 +77,7 @@ class Mesh:
         PlyData(elements, byte_order="<").write(str(path))
 
 
-def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig) -> Mesh:
+def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig | None = None) -> Mesh:
     """Mesh of what the views see, from the scene's own median depth.
 
     Voxel size and truncation follow the depth quantiles of all views: an endoscope looks along a
@@ -91,6 +94,7 @@ def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig) -> Mesh:
     Raises:
         CaptureError: when the views see no surface.
     """
+    config = SurfaceConfig() if config is None else config
     views, depth = rendered_depth(scene, cameras, config)
     return fuse_depth(views, depth, config)
 

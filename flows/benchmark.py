@@ -10,6 +10,7 @@ from prefect import flow
 from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
+from extrags.config import ProfileName
 from extrags.errors import ConfigError
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
@@ -17,9 +18,10 @@ from flows.pages import benchmark_page
 from flows.preflight import preflight
 from flows.runners import PrefectRunner, Runner
 from flows.sequence import artifact_key, open_store
-from flows.settings import DEFAULT_STORE, ProfileName
+from flows.settings import DEFAULT_STORE
 from flows.tables import benchmark_markdown
 from flows.wiring import run_sequence
+from tasks.evaluate import METRICS_FILE
 
 __all__ = ["Case", "benchmark", "case_of", "check_methods", "run_method"]
 
@@ -194,7 +196,7 @@ def case_of(case: Case) -> dict[str, Any]:
     peaks = [row.peak_mib for row in rows if row.peak_mib is not None]
     name, _, setting = outcome.name.partition("@")
     failed = next((row for row in outcome.stages if row.state == "failed"), None)
-    measured = outcome.artefacts.get("metrics_final", outcome.artefacts.get("metrics_coarse"))
+    measured = outcome.final_metrics
     return {
         "method": case.method,
         "profile": case.profile,
@@ -204,7 +206,7 @@ def case_of(case: Case) -> dict[str, Any]:
         "seconds": round(sum(row.made_seconds for row in rows), 3),
         "peak_mib": max(peaks) if peaks else None,
         "metrics": outcome.metrics["final"] if failed is None else None,
-        "evaluation": None if measured is None else f"{measured}/metrics.json",
+        "evaluation": None if measured is None else f"{measured.uri}/{METRICS_FILE}",
         "error": "" if failed is None else f"{failed.stage}: {failed.reason}",
     }
 

@@ -12,13 +12,15 @@ from prefect.artifacts import create_markdown_artifact
 from prefect.client.schemas.objects import State
 from pydantic import Field
 
+from extrags.config import ProfileName
+from extrags.pipeline import StageName
 from flows.methods import METHODS, MethodName, method_config, profile_label, refuse_pinned
 from flows.outcome import DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
 from flows.preflight import preflight
 from flows.runners import PrefectRunner
 from flows.sequence import artifact_key, open_store, reconstruct_sequence
-from flows.settings import DEFAULT_STORE, ProfileName, StageName, task_runner
+from flows.settings import DEFAULT_STORE, task_runner
 from flows.tables import dataset_markdown
 
 __all__ = ["reconstruct_dataset"]

@@ -6,8 +6,33 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from extrags.errors import ExtragsError
+from extrags.store import Ref
 
-__all__ = ["DatasetOutcome", "SequenceFailedError", "SequenceOutcome", "StageRow", "StageState"]
+__all__ = ["DatasetOutcome", "Part", "SequenceFailedError", "SequenceOutcome", "StageRow", "StageState"]
+
+Part = Literal[
+    "ingest",
+    "poses",
+    "sequence",
+    "training",
+    "coarse",
+    "assess",
+    "plan",
+    "surface",
+    "freespace",
+    "waves",
+    "explore",
+    "restorer",
+    "enhance",
+    "finetune",
+    "renders_coarse",
+    "renders_final",
+    "metrics_coarse",
+    "metrics_final",
+    "report",
+]
+"""What a run makes of a sequence. `sequence` is the frames with the latest poses, `training` their training
+part, `waves` the state of the exploration, `restorer` what restores this scene."""
 
 StageState = Literal["ran", "cached", "skipped", "failed"]
 
@@ -54,13 +79,31 @@ class SequenceOutcome:
     seconds: float = 0.0
     report: str | None = None
     """Where `report.html` stands."""
-    artefacts: dict[str, str] = field(default_factory=dict)
-    """URI of each stage's artefact."""
-    digests: dict[str, str] = field(default_factory=dict)
-    """Content digest of each stage's artefact: equal digests, equal bytes."""
+    refs: dict[Part, Ref] = field(default_factory=dict)
+    """What was made."""
     plan: dict[str, Any] | None = None
     error: Exception | None = None
     """The exception of a failed stage, for those in the same process."""
+
+    @property
+    def artefacts(self) -> dict[str, str]:
+        """URI of each artefact."""
+        return {part: ref.uri for part, ref in self.refs.items()}
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """Content digest of each artefact: equal digests, equal bytes."""
+        return {part: ref.digest for part, ref in self.refs.items()}
+
+    @property
+    def final_metrics(self) -> Ref | None:
+        """Figures of the final scene; where nothing was fine-tuned, of the coarse one."""
+        return self.refs.get("metrics_final", self.refs.get("metrics_coarse"))
+
+    @property
+    def final_renders(self) -> Ref | None:
+        """Held-out views of the final scene; where nothing was fine-tuned, of the coarse one."""
+        return self.refs.get("renders_final", self.refs.get("renders_coarse"))
 
     def row(self, stage: str) -> StageRow | None:
         """The row of a stage, if it has one."""

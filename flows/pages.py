@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from extrags.store import Ref
-from flows.outcome import SequenceOutcome
+from flows.outcome import Part, SequenceOutcome
 from flows.runners import Call, Runner
 from tasks.benchmark import benchmark_report
 from tasks.report import PAGE, dataset_report
@@ -32,11 +31,12 @@ def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, r
     Raises:
         NotInStoreError: from a runner that only looks.
     """
+    parts: dict[str, Part] = {"coarse": "metrics_coarse", "final": "metrics_final"}
     metrics = {
-        f"{outcome.name} {which}": _ref(outcome, f"metrics_{which}")
+        f"{outcome.name} {which}": outcome.refs[part]
         for outcome in outcomes
-        for which in ("coarse", "final")
-        if f"metrics_{which}" in outcome.artefacts
+        for which, part in parts.items()
+        if part in outcome.refs
     }
     failures = {
         outcome.name: next(
@@ -91,14 +91,14 @@ def benchmark_page(
         "methods": dict(methods),
         "runs": [{key: case[key] for key in keys} for case in cases],
         "metrics": {
-            str(index): _final(outcome, "metrics")
+            str(index): outcome.final_metrics
             for index, (outcome, case) in enumerate(zip(outcomes, cases, strict=True))
             if case["metrics"] is not None
         },
         "failures": {str(index): case["error"] for index, case in enumerate(cases) if case["error"]},
         "pictures": pictures,
-        "sequences": {index: _ref(outcomes[int(index)], "sequence") for index in shown},
-        "renders": {index: _final(outcomes[int(index)], "renders") for index in shown},
+        "sequences": {index: outcomes[int(index)].refs["sequence"] for index in shown},
+        "renders": {index: outcomes[int(index)].final_renders for index in shown},
         "views": COMPARED_VIEWS,
         "rows": [{key: case[key] for key in ("seconds", "peak_mib")} for case in cases],
     }
@@ -121,12 +121,3 @@ def _pairs(cases: Sequence[Mapping[str, Any]], baseline: str, contender: str) ->
             label = f"profile {key[2]}, seed {key[3]}"
             pairs.setdefault(key[:2], {"baseline": index, "contender": other, "label": label})
     return list(pairs.values())
-
-
-def _final(outcome: SequenceOutcome, kind: str) -> Ref:
-    """Metrics or renders of the final scene; where nothing was fine-tuned, of the coarse one."""
-    return _ref(outcome, f"{kind}_final" if f"{kind}_final" in outcome.artefacts else f"{kind}_coarse")
-
-
-def _ref(outcome: SequenceOutcome, name: str) -> Ref:
-    return Ref(uri=outcome.artefacts[name], digest=outcome.digests[name])

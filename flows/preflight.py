@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from extrags.config import PipelineConfig
-from flows.settings import STAGES
+from extrags.pipeline import STAGES
 
 __all__ = ["preflight"]
 

@@ -10,12 +10,14 @@ from prefect import flow
 from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
+from extrags.config import ProfileName
+from extrags.pipeline import StageName
 from extrags.store import Store
 from flows.methods import METHODS, MethodName, method_config, profile_label, refuse_pinned
 from flows.outcome import SequenceFailedError, SequenceOutcome
 from flows.preflight import preflight
 from flows.runners import PrefectRunner
-from flows.settings import DEFAULT_STORE, ProfileName, StageName
+from flows.settings import DEFAULT_STORE
 from flows.tables import sequence_markdown
 from flows.wiring import run_sequence
 from tasks.locks import sweep_locks

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import os
-from typing import Any, Literal, get_args
+from typing import Any
 
-from extrags.config import PipelineConfig, ProfileName, profile_config
+from extrags.config import PipelineConfig, profile_config
 from extrags.errors import ConfigError
 
 __all__ = [
     "DEFAULT_STORE",
-    "STAGES",
-    "ProfileName",
-    "StageName",
     "default_store",
     "pipeline_config",
     "task_runner",
@@ -20,23 +17,6 @@ __all__ = [
 ]
 
 DEFAULT_STORE = ".extrags"
-
-StageName = Literal[
-    "ingest",
-    "poses",
-    "coarse",
-    "assess",
-    "surface",
-    "freespace",
-    "explore",
-    "enhance",
-    "finetune",
-    "evaluate",
-    "report",
-]
-
-STAGES: tuple[str, ...] = get_args(StageName)
-"""All stages, in the order they run."""
 
 
 def default_store() -> str:

@@ -2,41 +2,34 @@
 
 from __future__ import annotations
 
-from extrags.config import AssessConfig, PipelineConfig
+from extrags.config import AssessConfig, CoverageConfig, PipelineConfig
 from extrags.store import Ref, Slot
 from tasks.stage import stage
 
 __all__ = ["assess", "plan"]
 
-PLAN = "plan.json"
+MEASUREMENTS = "measurements.json"
 
 
-@stage("assess", version=1)
-def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig) -> None:
-    """Measure the scene; writes `plan.json` for the default budgets.
+@stage("assess", version=2)
+def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig, coverage: CoverageConfig) -> None:
+    """Measure the scene; writes `measurements.json`.
 
-    The measurement depends on the scene and on its own settings alone, so that another budget of
-    exploration does not measure again; `plan` turns its numbers into decisions.
+    Budgets play no part, so that another budget of exploration does not measure again; `plan` turns the
+    numbers into decisions.
     """
-    from extrags.assess import assess as measure
+    from extrags.assessment import measure
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
-    found = measure(
-        Scene.load(slot.open(scene) / "scene"),
-        EndoscopicSequence.load(slot.open(sequence) / "sequence"),
-        PipelineConfig(assess=config),
-    )
-    (slot.path / PLAN).write_text(found.model_dump_json(indent=1))
-    slot.counts["lacking_share"] = found.measurements["lacking_share"]
+    found = measure(slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence), config, coverage)
+    slot.save_json(MEASUREMENTS, found, indent=1)
+    slot.counts["lacking_share"] = found["lacking_share"]
 
 
-@stage("plan", version=1)
+@stage("plan", version=2)
 def plan(slot: Slot, measured: Ref, config: PipelineConfig) -> None:
     """Decide on the measured numbers with the run's own budgets; writes `plan.json`."""
-    from extrags.assess import ScenePlan, decide
+    from extrags.assessment import decide
 
-    found = ScenePlan.model_validate_json((slot.open(measured) / PLAN).read_bytes())
-    decisions = decide(found.measurements["lacking_share"], config)
-    decided = ScenePlan(measurements=found.measurements, decisions=decisions)
-    (slot.path / PLAN).write_text(decided.model_dump_json(indent=1))
+    slot.save(decide(slot.load_json(MEASUREMENTS, measured), config))

@@ -56,9 +56,7 @@ def benchmark_report(
     from extrags.report.comparison import RenderedMethod
     from extrags.sequence import EndoscopicSequence
 
-    found = {
-        index: json.loads((slot.open(ref) / METRICS_FILE).read_bytes()) for index, ref in metrics.items()
-    }
+    found = {index: slot.load_json(METRICS_FILE, ref) for index, ref in metrics.items()}
     every = [
         {
             **run,
@@ -72,7 +70,7 @@ def benchmark_report(
     def rendered(index: str) -> RenderedMethod:
         return RenderedMethod(
             str(runs[int(index)]["method"]),
-            RenderedViews.load(slot.open(renders[index]) / "renders").rgb,
+            slot.load(RenderedViews, renders[index]).rgb,
             found[index]["per_view"],
         )
 
@@ -84,7 +82,7 @@ def benchmark_report(
             methods=methods,
             pictures=[
                 ComparedViews(
-                    EndoscopicSequence.load(slot.open(sequences[pair["baseline"]]) / "sequence"),
+                    slot.load(EndoscopicSequence, sequences[pair["baseline"]]),
                     pair["label"],
                     rendered(pair["baseline"]),
                     rendered(pair["contender"]),

@@ -10,9 +10,11 @@ from tasks.weights import Weights, restorer_digest
 
 __all__ = ["assemble", "restore", "train"]
 
+RESTORER = "restorer"
+
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=3)
+@stage("enhance-train", version=4)
 def train(
     slot: Slot,
     scene: Ref,
@@ -31,13 +33,8 @@ def train(
             f"the model of enhance.backend={config.backend} is not the one this run began with: it changed "
             "meanwhile, or this worker sees other files; run again"
         )
-    enhancer = train_enhancer(
-        Scene.load(slot.open(scene) / "scene"),
-        EndoscopicSequence.load(slot.open(sequence) / "sequence"),
-        config,
-        coarse,
-    )
-    enhancer.save(slot.path / "restorer")
+    frames = slot.load(EndoscopicSequence, sequence)
+    train_enhancer(slot.load(Scene, scene), frames, config, coarse).save(slot.path / RESTORER)
 
 
 # The weights' digest is in the key; where their file lies is not.
@@ -54,33 +51,23 @@ def restore(
     weights: Weights,
 ) -> None:
     """Render, restore and weigh one batch of trajectories; writes `pseudo/`."""
-    from extrags.confidence import PerceptualDifference
     from extrags.exploration import Exploration
-    from extrags.metrics.lpips import Lpips
     from extrags.restoration.backends import load_enhancer
-    from extrags.restoration.clips import choose_views, make_pseudo_observations
+    from extrags.restoration.trajectories import restore_batch
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
-    from extrags.view_synthesis.references import ReferenceViews
 
-    coarse = Scene.load(slot.open(scene) / "scene")
-    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
-    trajectories = Exploration.load(slot.open(explore)).trajectories
-    views = choose_views([len(cameras) for cameras in trajectories], config.max_views)
-    first = batch * config.clips_per_batch
-    chosen = range(first, min(first + config.clips_per_batch, len(trajectories)))
-    lpips = None if weights.path is None else Lpips.load(weights.path, net=weights.net)
-    observations = make_pseudo_observations(
-        coarse,
-        ReferenceViews.gather(coarse, posed, posed.train),
-        [trajectories[index][views[index]] for index in chosen],
-        load_enhancer(slot.open(restorer) / "restorer"),
-        PerceptualDifference(lpips, weights.reason),
-        count=config.references,
-        first_index=first,
+    views = restore_batch(
+        slot.load(Scene, scene),
+        slot.load(EndoscopicSequence, sequence),
+        slot.load(Exploration, explore).trajectories,
+        load_enhancer(slot.open(restorer) / RESTORER),
+        config,
+        batch,
+        weights.perceptual_difference(),
     )
-    observations.save(slot.path / "pseudo")
-    slot.counts["views"] = len(observations)
+    slot.save(views)
+    slot.counts["views"] = len(views)
 
 
 @stage("enhance", version=2)
@@ -88,6 +75,6 @@ def assemble(slot: Slot, parts: list[Ref]) -> None:
     """Join the batches; writes `pseudo/`."""
     from extrags.pseudo_views import PseudoViews
 
-    observations = PseudoViews.concatenated([PseudoViews.load(slot.open(part) / "pseudo") for part in parts])
-    observations.save(slot.path / "pseudo")
-    slot.counts.update(views=len(observations), changed_share=round(observations.changed_share, 4))
+    views = PseudoViews.concatenated([slot.load(PseudoViews, part) for part in parts])
+    slot.save(views)
+    slot.counts.update(views=len(views), changed_share=round(views.changed_share, 4))

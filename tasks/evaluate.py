@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 from extrags.store import Ref, Slot
 from tasks.stage import stage
 from tasks.weights import Weights
@@ -20,38 +18,21 @@ def render(slot: Slot, scene: Ref, sequence: Ref) -> None:
 
     Writes `renders/`; and `mesh/` where there is a true surface to hold it against.
     """
-    import numpy as np
-    import torch
-
-    from extrags.events import Progress, emit
-    from extrags.metrics.protocol import RenderedViews
+    from extrags import evaluation
     from extrags.metrics.surface import scene_surface
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
-    shown = Scene.load(slot.open(scene) / "scene")
-    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
-    gains = None
-    if shown.light is not None:
-        gains = shown.light.exposures_of(posed.test, posed.train, posed.recording)
-    rgb, alpha, depth = [], [], []
-    with torch.no_grad():
-        for done, frame in enumerate(posed.test, start=1):
-            exposure = None if gains is None else gains[done - 1 : done]
-            rendering = shown.render(posed.cameras[int(frame)], exposure=exposure)
-            rgb.append(rendering.rgb[0].numpy())
-            alpha.append(rendering.alpha[0].numpy())
-            depth.append(rendering.depth[0].numpy())
-            emit(Progress("render", done, len(posed.test)))
-    views = RenderedViews(np.stack(rgb), np.stack(alpha), np.stack(depth), len(shown.gaussians))
-    views.save(slot.path / "renders")
+    shown, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
+    views = evaluation.render(shown, frames)
+    slot.save(views)
     slot.counts.update(views=len(views), n_gaussians=views.n_gaussians)
     # Without true depth there is no true surface either: nothing to fuse for.
-    if posed.depth_mm is None:
+    if frames.depth_mm is None:
         return
-    mesh = scene_surface(shown, posed)
+    mesh = scene_surface(shown, frames)
     if mesh is not None:
-        mesh.save(slot.path / "mesh")
+        slot.save(mesh)
     slot.counts["triangles"] = 0 if mesh is None else len(mesh.triangles)
 
 
@@ -72,30 +53,22 @@ def measure(
 ) -> None:
     """Metrics of rendered views and of the surface; writes `metrics.json`."""
     from data_catalog.true_surface import true_surface
-    from extrags.metrics.lpips import Lpips
-    from extrags.metrics.protocol import RenderedViews, evaluate_views
-    from extrags.metrics.surface import evaluate_surface
+    from extrags.evaluation import evaluate_renders
+    from extrags.metrics.protocol import RenderedViews
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 
-    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
-    place = slot.open(renders)
-    lpips = None if weights.path is None else Lpips.load(weights.path, net=weights.net)
-    truth = None if posed.depth_mm is None else true_surface(posed)
-    surface = None
-    if truth is not None:
-        mesh = Mesh.load(place / "mesh") if (place / "mesh").exists() else None
-        surface = evaluate_surface(mesh, truth, posed)
-    result = evaluate_views(
-        RenderedViews.load(place / "renders"),
-        posed,
-        posed.test,
-        lpips,
-        lpips_reason=weights.reason,
-        surface=surface,
-        surface_reason="the sequence has no true depth",
+    frames = slot.load(EndoscopicSequence, sequence)
+    difference = weights.perceptual_difference()
+    result = evaluate_renders(
+        slot.load(RenderedViews, renders),
+        frames,
+        mesh=slot.load(Mesh, renders) if (slot.open(renders) / Mesh.stored_as).exists() else None,
+        true_surface=None if frames.depth_mm is None else true_surface(frames),
+        lpips=difference.lpips,
+        lpips_reason=difference.reason,
     )
-    (slot.path / METRICS_FILE).write_text(json.dumps(result.to_json(), indent=1))
+    slot.save_json(METRICS_FILE, result.to_json(), indent=1)
     for name in ("psnr", "ssim", "lpips_alex"):
         slot.counts[name] = result.metrics.get(name)
     slot.counts["fscore"] = result.metrics["surface"]["fscore"]

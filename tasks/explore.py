@@ -7,7 +7,6 @@ tells the flow which anchors grow next, so that it need not open arrays.
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 from extrags.config import ExploreConfig
@@ -15,7 +14,6 @@ from extrags.store import Ref, Slot
 from tasks.stage import stage
 
 if TYPE_CHECKING:
-    from extrags.cameras import Cameras
     from extrags.exploration import SearchContext, WaveState
     from extrags.sequence import EndoscopicSequence
 
@@ -29,8 +27,8 @@ def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: Explore
     """Choose the anchors; writes `state/` and `next.json`."""
     from extrags.exploration import start_exploration
 
-    context, cameras, _ = _prepared(slot, scene, sequence, freespace, config)
-    _write_state(slot, start_exploration(context, cameras))
+    context, frames = _prepared(slot, scene, sequence, freespace, config)
+    _write_state(slot, start_exploration(context, frames.training_cameras))
 
 
 @stage("explore-branch", version=2)
@@ -40,9 +38,9 @@ def branch(
     """Grow the branch of one anchor; writes `branch/`."""
     from extrags.exploration import WaveState, grow
 
-    context, cameras, _ = _prepared(slot, scene, sequence, freespace, config)
-    grown = grow(context, cameras, WaveState.load(slot.open(state) / "state").coverage, anchor)
-    grown.save(slot.path / "branch")
+    context, frames = _prepared(slot, scene, sequence, freespace, config)
+    grown = grow(context, frames.training_cameras, slot.load(WaveState, state).coverage, anchor)
+    slot.save(grown)
     slot.counts.update(views=len(grown), renders=grown.renders)
 
 
@@ -51,8 +49,8 @@ def merge(slot: Slot, state: Ref, branches: list[Ref]) -> None:
     """Accept the branches of a wave; writes the next `state/` and `next.json`."""
     from extrags.exploration import Branch, WaveState
 
-    before = WaveState.load(slot.open(state) / "state")
-    _write_state(slot, before.merged([Branch.load(slot.open(ref) / "branch") for ref in branches]))
+    before = slot.load(WaveState, state)
+    _write_state(slot, before.merged([slot.load(Branch, ref) for ref in branches]))
 
 
 @stage("explore", version=1)
@@ -60,9 +58,9 @@ def explore(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, c
     """Collect the accepted trajectories; writes `trajectories/` and `exploration.json`."""
     from extrags.exploration import WaveState, finish
 
-    context, _, posed = _prepared(slot, scene, sequence, freespace, config)
-    exploration = finish(context, WaveState.load(slot.open(state) / "state"), posed.train)
-    exploration.save(slot.path)
+    context, frames = _prepared(slot, scene, sequence, freespace, config)
+    exploration = finish(context, slot.load(WaveState, state), frames.train)
+    slot.save(exploration)
     slot.counts.update(
         trajectories=len(exploration),
         virtual_views=exploration.n_virtual,
@@ -73,24 +71,17 @@ def explore(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, c
 
 def _prepared(
     slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig
-) -> tuple[SearchContext, Cameras, EndoscopicSequence]:
+) -> tuple[SearchContext, EndoscopicSequence]:
     from extrags.exploration import prepare_search
     from extrags.freespace import FreeSpace
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
-    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
-    cameras = posed.cameras[posed.train]
-    context = prepare_search(
-        Scene.load(slot.open(scene) / "scene"),
-        cameras,
-        FreeSpace.load(slot.open(freespace) / "freespace"),
-        config,
-    )
-    return context, cameras, posed
+    frames = slot.load(EndoscopicSequence, sequence)
+    space = slot.load(FreeSpace, freespace)
+    return prepare_search(slot.load(Scene, scene), frames.training_cameras, space, config), frames
 
 
 def _write_state(slot: Slot, state: WaveState) -> None:
-    state.save(slot.path / "state")
-    anchors = list(state.next_wave())
-    (slot.path / NEXT).write_text(json.dumps({"anchors": anchors, "accepted": len(state.branches)}))
+    slot.save(state)
+    slot.save_json(NEXT, {"anchors": list(state.next_wave()), "accepted": len(state.branches)})

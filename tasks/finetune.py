@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
 from extrags.config import CoarseConfig, FinetuneConfig
 from extrags.store import Ref, Slot
+from tasks.coarse import HISTORY
 from tasks.divergence import keeping_last_good
 from tasks.stage import stage
 
@@ -23,22 +22,17 @@ def finetune(
 ) -> None:
     """Fine-tune the coarse scene; writes `scene/` and `history.json`.
 
-    Without pseudo-observations only the real views count: the control of a comparison.
+    Without pseudo-views only the real views count: the control of a comparison.
     """
+    from extrags import training
     from extrags.pseudo_views import PseudoViews
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
-    from extrags.training import finetune as optimise_further
 
-    observations = None if pseudo is None else PseudoViews.load(slot.open(pseudo) / "pseudo")
+    views = None if pseudo is None else slot.load(PseudoViews, pseudo)
+    start, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
     with keeping_last_good(slot):
-        result = optimise_further(
-            Scene.load(slot.open(scene) / "scene"),
-            EndoscopicSequence.load(slot.open(sequence) / "sequence"),
-            observations,
-            config,
-            coarse,
-        )
-    result.scene.save(slot.path / "scene")
-    (slot.path / "history.json").write_text(json.dumps(result.history))
+        result = training.finetune(start, frames, views, config, coarse)
+    slot.save(result.scene)
+    slot.save_json(HISTORY, result.history)
     slot.counts["n_gaussians"] = len(result.scene.gaussians)

@@ -17,12 +17,7 @@ def freespace(slot: Slot, scene: Ref, surface: Ref, sequence: Ref, config: Frees
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 
-    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
-    space = carve(
-        Scene.load(slot.open(scene) / "scene"),
-        Mesh.load(slot.open(surface) / "mesh"),
-        posed.cameras[posed.train],
-        config,
-    )
-    space.save(slot.path / "freespace")
+    cameras = slot.load(EndoscopicSequence, sequence).training_cameras
+    space = carve(slot.load(Scene, scene), slot.load(Mesh, surface), cameras, config)
+    slot.save(space)
     slot.counts.update(grid_size=space.grid_size, free_share=round(space.free_share, 4))

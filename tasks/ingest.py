@@ -20,7 +20,7 @@ def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: Inge
     from data_catalog.specular import saturated_mask, with_specular
 
     sequence = with_specular(read(source, config))
-    sequence.save(slot.path / "sequence")
+    slot.save(sequence)
     inside = max(1, int(sequence.mask.sum()))
     slot.counts.update(
         frames=len(sequence),
@@ -41,6 +41,6 @@ def training_frames(slot: Slot, sequence: Ref) -> None:
     """Take the held-out frames away; writes `sequence/`."""
     from extrags.sequence import EndoscopicSequence
 
-    part = EndoscopicSequence.load(slot.open(sequence) / "sequence").training_part()
-    part.save(slot.path / "sequence")
+    part = slot.load(EndoscopicSequence, sequence).training_part()
+    slot.save(part)
     slot.counts.update(frames=len(part))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 from extrags.config import PosesConfig
 from extrags.store import Ref, Slot
 from tasks.stage import stage
@@ -18,23 +16,14 @@ def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
     Where the source has poses as well, they are not looked at until the estimate stands; its errors against
     them are in `poses.json` under `against_given`.
     """
-    from extrags.poses import errors_against_given, estimate_poses, with_estimated_poses
+    from extrags.poses import estimate_poses, with_estimated_poses
     from extrags.sequence import EndoscopicSequence
 
-    unposed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
+    unposed = slot.load(EndoscopicSequence, sequence)
     estimate = estimate_poses(unposed, config)
     posed = with_estimated_poses(unposed, estimate)
-    posed.save(slot.path / "sequence")
-    metric = estimate.metric and unposed.metric
-    report = {
-        "method": estimate.method,
-        "summary": estimate.summary,
-        "registered": [bool(found) for found in estimate.registered],
-        "mean_reprojection_px": estimate.mean_reprojection_px,
-        "against_given": errors_against_given(unposed, estimate.world_from_camera, metric=metric),
-        **estimate.report,
-    }
-    (slot.path / "poses.json").write_text(json.dumps(report, indent=1))
+    slot.save(posed)
+    slot.save_json("poses.json", estimate.to_json(unposed), indent=1)
     slot.counts.update(
         frames=len(posed),
         train=len(posed.train),

@@ -2,22 +2,43 @@
 
 from __future__ import annotations
 
-import json
 import platform
-from typing import Any
+from typing import Any, Literal, TypeVar, get_args
 
 from extrags.config import PipelineConfig
-from extrags.store import Ref, Slot, Store
+from extrags.store import Ref, Slot, Storable, Store
+from tasks.coarse import HISTORY
+from tasks.evaluate import METRICS_FILE
 from tasks.stage import stage
 
-__all__ = ["PAGE", "dataset_report", "report"]
+__all__ = ["PAGE", "REPORT_PARTS", "dataset_report", "report"]
 
 PAGE = "report.html"
+
+S = TypeVar("S", bound=Storable)
+
+
+ReportPart = Literal[
+    "sequence",
+    "coarse",
+    "plan",
+    "surface",
+    "freespace",
+    "explore",
+    "enhance",
+    "finetune",
+    "renders_coarse",
+    "renders_final",
+    "metrics_coarse",
+    "metrics_final",
+]
+REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
+"""What a page shows of a run, by the names of `flows.outcome.Part`; all but `sequence` may be missing."""
 
 
 # `rows` says how long the stages took in this run. The page shows it, but other times are no reason to
 # build another page.
-@stage("report", version=2, ignore=("rows",))
+@stage("report", version=3, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
@@ -30,14 +51,13 @@ def report(
 
     Args:
         slot: where it goes.
-        parts: the artefacts to show: `sequence`, `coarse`, `plan`, `surface`, `freespace`, `explore`,
-            `enhance`, `finetune`, `renders_coarse`, `renders_final`, `metrics_coarse`, `metrics_final`;
-            all but `sequence` may be missing.
+        parts: the artefacts to show, of `REPORT_PARTS`.
         skipped: why stages were skipped, by name.
         config: settings of the run, the plan's budgets included.
         profile: name of the profile they started from.
         rows: `{stage, state, seconds, reason, made_seconds}` of each stage.
     """
+    from extrags.assessment import ScenePlan
     from extrags.exploration import Exploration
     from extrags.freespace import FreeSpace
     from extrags.metrics.protocol import RenderedViews
@@ -47,38 +67,31 @@ def report(
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 
-    places = {name: slot.open(ref) for name, ref in parts.items()}
+    def part(kind: type[S], name: str) -> S | None:
+        return slot.load(kind, parts[name]) if name in parts else None
 
-    def text(name: str, file: str) -> Any:
-        return json.loads((places[name] / file).read_bytes()) if name in places else None
+    def figures(name: str, file: str) -> Any:
+        return slot.load_json(file, parts[name]) if name in parts else None
 
-    sequence = EndoscopicSequence.load(places["sequence"] / "sequence")
-    exploration = Exploration.load(places["explore"]) if "explore" in places else None
-    coarse, final = (
-        RenderedViews.load(places[name] / "renders") if name in places else None
-        for name in ("renders_coarse", "renders_final")
-    )
+    sequence = slot.load(EndoscopicSequence, parts["sequence"])
+    exploration, plan = part(Exploration, "explore"), part(ScenePlan, "plan")
+    trajectories = [] if exploration is None else exploration.trajectories
+    curves = {stage: figures(stage, HISTORY) for stage in ("coarse", "finetune")}
     inputs = ReportInputs(
         name=sequence.name,
         sequence=sequence,
-        coarse=coarse,
-        final=final,
-        coarse_metrics=text("metrics_coarse", "metrics.json"),
-        final_metrics=text("metrics_final", "metrics.json"),
-        pseudo=PseudoViews.load(places["enhance"] / "pseudo") if "enhance" in places else None,
-        trajectories=[]
-        if exploration is None
-        else [cameras.world_from_camera for cameras in exploration.trajectories],
+        coarse=part(RenderedViews, "renders_coarse"),
+        final=part(RenderedViews, "renders_final"),
+        coarse_metrics=figures("metrics_coarse", METRICS_FILE),
+        final_metrics=figures("metrics_final", METRICS_FILE),
+        pseudo=part(PseudoViews, "enhance"),
+        trajectories=[cameras.world_from_camera for cameras in trajectories],
         exploration=None if exploration is None else exploration.summary(),
-        grid=FreeSpace.load(places["freespace"] / "freespace") if "freespace" in places else None,
-        mesh=Mesh.load(places["surface"] / "mesh") if "surface" in places else None,
-        plan=text("plan", "plan.json"),
+        grid=part(FreeSpace, "freespace"),
+        mesh=part(Mesh, "surface"),
+        plan=None if plan is None else plan.model_dump(mode="json"),
         stages=rows,
-        history={
-            name: history
-            for name in ("coarse", "finetune")
-            if (history := text(name, "history.json")) is not None
-        },
+        history={stage: curve for stage, curve in curves.items() if curve is not None},
         environment=_environment(slot.store, parts),
         config=config,
         profile=profile,
@@ -135,7 +148,7 @@ def dataset_report(
 
     def figures(sequence: str, which: str) -> Any:
         ref = metrics.get(f"{sequence} {which}")
-        return None if ref is None else json.loads((slot.open(ref) / "metrics.json").read_bytes())["metrics"]
+        return None if ref is None else slot.load_json(METRICS_FILE, ref)["metrics"]
 
     page = build_dataset_report(
         [

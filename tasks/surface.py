@@ -16,8 +16,8 @@ def surface(slot: Slot, scene: Ref, sequence: Ref, config: SurfaceConfig) -> Non
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import fuse_surface
 
-    posed = EndoscopicSequence.load(slot.open(sequence) / "sequence")
-    mesh = fuse_surface(Scene.load(slot.open(scene) / "scene"), posed.cameras[posed.train], config)
-    mesh.save(slot.path / "mesh")
+    cameras = slot.load(EndoscopicSequence, sequence).training_cameras
+    mesh = fuse_surface(slot.load(Scene, scene), cameras, config)
+    slot.save(mesh)
     mesh.write_ply(slot.path / "mesh.ply")
     slot.counts.update(vertices=len(mesh.vertices), triangles=len(mesh.triangles))

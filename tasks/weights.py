@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict
 
 from extrags.config import EnhanceConfig, EvaluateConfig
 from extrags.errors import WeightsError
+
+if TYPE_CHECKING:
+    from extrags.confidence import PerceptualDifference
 
 __all__ = ["Weights", "lpips_weights", "restorer_digest"]
 
@@ -22,6 +25,14 @@ class Weights(BaseModel):
     path: str | None = None
     digest: str | None = None
     reason: str = ""
+
+    def perceptual_difference(self) -> PerceptualDifference:
+        """LPIPS with these weights, else the weight-free map and why."""
+        from extrags.confidence import PerceptualDifference
+        from extrags.metrics.lpips import Lpips
+
+        lpips = None if self.path is None else Lpips.load(self.path, net=self.net)
+        return PerceptualDifference(lpips, self.reason)
 
 
 def lpips_weights(config: EvaluateConfig) -> Weights:

@@ -6,6 +6,7 @@ from extrags.config.restorer import CaptionConfig, CheckpointConfig, EnhanceConf
 from extrags.config.stages import (
     AssessConfig,
     CoarseConfig,
+    CoverageConfig,
     DensifyConfig,
     EvaluateConfig,
     ExploreConfig,
@@ -27,6 +28,7 @@ __all__ = [
     "CaptionConfig",
     "CheckpointConfig",
     "CoarseConfig",
+    "CoverageConfig",
     "DensifyConfig",
     "EnhanceConfig",
     "EvaluateConfig",

@@ -159,3 +159,7 @@ class EnhanceConfig(StageConfig):
     pretrained: PretrainedConfig = PretrainedConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
     seed: int = Field(0, ge=0)
+
+    def batches(self, trajectories: int) -> int:
+        """Number of batches that so many trajectories are restored in."""
+        return -(-trajectories // self.clips_per_batch)

@@ -18,6 +18,7 @@ from extrags.errors import ConfigError
 __all__ = [
     "AssessConfig",
     "CoarseConfig",
+    "CoverageConfig",
     "DensifyConfig",
     "EvaluateConfig",
     "ExploreConfig",
@@ -274,6 +275,16 @@ class FreespaceConfig(StageConfig):
     render_width: int = Field(160, ge=16, description="width of the renders in pixels")
 
 
+class CoverageConfig(StageConfig):
+    """How it is counted which Gaussian was seen from which direction."""
+
+    directions: int = Field(32, ge=4, le=32, description="D: equal-area direction bins")
+    visible_weight: float = Field(
+        0.02, gt=0, lt=1, description="a Gaussian is seen when its largest T * alpha exceeds this"
+    )
+    render_width: int = Field(80, ge=16, description="width of the renders in pixels")
+
+
 class ExploreConfig(StageConfig):
     """The search for virtual trajectories."""
 
@@ -313,7 +324,13 @@ class ExploreConfig(StageConfig):
         description="stop when a trajectory adds less than this share of all pairs",
     )
     render_width: int = Field(80, ge=16, description="width of the scoring renders in pixels")
-    seed: int = Field(0, ge=0)
+
+    @property
+    def coverage(self) -> CoverageConfig:
+        """The settings that say what counts as seen; `assess` measures by them too."""
+        return CoverageConfig(
+            directions=self.directions, visible_weight=self.visible_weight, render_width=self.render_width
+        )
 
 
 class FinetuneConfig(StageConfig):

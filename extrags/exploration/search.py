@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from extrags.exploration.darkness import dark_direction, illumination_weight, lu
 from extrags.exploration.primitives import PRIMITIVES, apply_primitives, primitive_motions
 from extrags.freespace import FREE, FreeSpace
 from extrags.scene import Scene
+from extrags.store.storable import Storable
 from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["Branch", "SearchContext", "fold_weight", "grow_branch", "prepare_search"]
@@ -79,7 +80,7 @@ class SearchContext:
 
 
 @dataclass(frozen=True)
-class Branch:
+class Branch(Storable):
     """What one search found.
 
     Args:
@@ -92,6 +93,8 @@ class Branch:
         renders: images rendered.
         reason: why the search ended.
     """
+
+    stored_as: ClassVar[str] = "branch"
 
     anchor: int
     poses: Float[np.ndarray, "l 4 4"]

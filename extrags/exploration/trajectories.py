@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import zarr
@@ -21,9 +21,11 @@ from extrags.events import MetricRecorded, Progress, emit
 from extrags.exploration.coverage import count_pairs, training_coverage
 from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
 from extrags.exploration.waves import WaveState, start_views
-from extrags.freespace import FreeSpace
+from extrags.freespace import FreeSpace, carve
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.store.storable import Storable
+from extrags.surface import fuse_surface
 from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["Exploration", "explore", "finish", "grow", "start_exploration"]
@@ -32,7 +34,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Exploration:
+class Exploration(Storable):
     """Virtual trajectories with what each of them adds.
 
     Trajectories have at most L views; one that met a dead end has fewer. All views stand one after the
@@ -55,6 +57,8 @@ class Exploration:
     Raises:
         ShapeError: when the arrays do not fit each other.
     """
+
+    stored_as: ClassVar[str] = "."
 
     cameras: Cameras
     trajectory: Int[np.ndarray, "v"]
@@ -238,9 +242,9 @@ def finish(context: SearchContext, state: WaveState, train_frames: Int[np.ndarra
 def explore(
     scene: Scene,
     sequence: EndoscopicSequence,
-    freespace: FreeSpace,
-    config: ExploreConfig,
+    config: ExploreConfig | None = None,
     *,
+    freespace: FreeSpace | None = None,
     map: Callable[..., Iterable[Branch]] = map,
 ) -> Exploration:
     """Find virtual trajectories that see what the training views did not.
@@ -248,8 +252,8 @@ def explore(
     Args:
         scene: the reconstructed scene.
         sequence: its frames; the training frames are the starts.
-        freespace: where cameras may go.
-        config: settings; `trajectories` is the budget.
+        config: settings; `trajectories` is the budget. None takes the defaults.
+        freespace: where cameras may go; None carves it from the scene with default settings.
         map: like the builtin; a pool's `map` grows the branches of a wave in parallel, and what it is
             called with can be pickled. The result is the same for any number of workers.
 
@@ -261,7 +265,10 @@ def explore(
 
     Source: paper, section "Virtual exploration view sampling".
     """
-    cameras = sequence.cameras[sequence.train]
+    config = ExploreConfig() if config is None else config
+    cameras = sequence.training_cameras
+    if freespace is None:
+        freespace = carve(scene, fuse_surface(scene, cameras), cameras)
     context = prepare_search(scene, cameras, freespace, config)
     state = start_exploration(context, cameras)
     while anchors := state.next_wave():

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import zarr
@@ -19,6 +19,7 @@ from extrags.cameras import Cameras, rotation_angle_deg
 from extrags.errors import ConfigError
 from extrags.exploration.coverage import coverage_gain
 from extrags.exploration.search import Branch
+from extrags.store.storable import Storable
 from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["Merge", "WaveState", "merge_wave", "start_views"]
@@ -115,7 +116,7 @@ def merge_wave(
 
 
 @dataclass(frozen=True)
-class WaveState:
+class WaveState(Storable):
     """How far the exploration is; each wave takes one and leaves the next.
 
     Args:
@@ -131,6 +132,8 @@ class WaveState:
         waves: waves finished.
         renders: images rendered by all branches, rejected ones included.
     """
+
+    stored_as: ClassVar[str] = "state"
 
     coverage_before: UInt32[np.ndarray, "n"]
     coverage: UInt32[np.ndarray, "n"]

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ from extrags.metrics.image import mean_of_known, means_per_image, psnr_per_image
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
 from extrags.sequence import EndoscopicSequence
+from extrags.store.storable import Storable
 from extrags.zarr_io import open_group, read_array, write_frames
 
 __all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
@@ -54,7 +55,7 @@ _NO_SURFACE: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class RenderedViews:
+class RenderedViews(Storable):
     """Held-out views as rendered once; every metric starts from these.
 
     Args:
@@ -66,6 +67,8 @@ class RenderedViews:
     Raises:
         ShapeError: when sizes do not fit each other.
     """
+
+    stored_as: ClassVar[str] = "renders"
 
     rgb: Float[np.ndarray, "v h w 3"]
     alpha: Float[np.ndarray, "v h w"]

@@ -20,7 +20,12 @@ from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
 from extrags.poses.job import PoseJob, PoseJobResult
-from extrags.poses.registration_report import colmap_report, failure_message, frames_without_pose
+from extrags.poses.registration_report import (
+    colmap_report,
+    errors_against_given,
+    failure_message,
+    frames_without_pose,
+)
 from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import depth_scale
 from extrags.sequence import EndoscopicSequence, Split
@@ -68,6 +73,23 @@ class PoseEstimate:
             f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
             f"{why}, {found['registered_test']} of {found['n_test']} held-out frames"
         )
+
+    def to_json(self, given: EndoscopicSequence) -> dict[str, Any]:
+        """Counts and errors as plain JSON.
+
+        Args:
+            given: the sequence as it came; where it has poses, `against_given` holds the errors against
+                them, which are not looked at before.
+        """
+        errors = errors_against_given(given, self.world_from_camera, metric=self.metric and given.metric)
+        return {
+            "method": self.method,
+            "summary": self.summary,
+            "registered": [bool(found) for found in self.registered],
+            "mean_reprojection_px": self.mean_reprojection_px,
+            "against_given": errors,
+            **self.report,
+        }
 
 
 def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig) -> PoseEstimate:

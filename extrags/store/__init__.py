@@ -5,12 +5,14 @@ from __future__ import annotations
 from extrags.store.artefacts import Slot, Store
 from extrags.store.canonical import Ref, canonical, digest_of
 from extrags.store.manifest import MANIFEST, Manifest, content_digest
+from extrags.store.storable import Storable
 
 __all__ = [
     "MANIFEST",
     "Manifest",
     "Ref",
     "Slot",
+    "Storable",
     "Store",
     "canonical",
     "content_digest",

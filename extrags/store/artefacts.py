@@ -11,17 +11,21 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from extrags.errors import StoreError
 from extrags.store.canonical import Ref
 from extrags.store.directory import DirectoryBackend, private_directory
 from extrags.store.manifest import Manifest, content_digest, software_versions
+from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
 
 __all__ = ["Slot", "Store"]
 
 log = logging.getLogger(__name__)
+
+
+S = TypeVar("S", bound=Storable)
 
 
 class Slot:
@@ -42,6 +46,22 @@ class Slot:
     def open(self, ref: Ref) -> Path:
         """Files of an input artefact."""
         return self.store.open(ref)
+
+    def load(self, kind: type[S], ref: Ref) -> S:
+        """An object from an input artefact, as `Store.load`."""
+        return self.store.load(kind, ref)
+
+    def load_json(self, file: str, ref: Ref) -> Any:
+        """Plain JSON from an input artefact, as `Store.load_json`."""
+        return self.store.load_json(file, ref)
+
+    def save(self, value: Storable) -> None:
+        """Write an object to where `load` looks for it."""
+        value.save(self.path / value.stored_as)
+
+    def save_json(self, file: str, value: Any, *, indent: int | None = None) -> None:
+        """Write plain JSON beside the arrays."""
+        (self.path / file).write_text(json.dumps(value, indent=indent), encoding="utf-8")
 
     @property
     def debug(self) -> Path:
@@ -134,6 +154,26 @@ class Store:
             StoreError: when it is gone, replaced, or (remote) damaged.
         """
         return self.backend.path(ref, self.manifest(ref))
+
+    def load(self, kind: type[S], ref: Ref) -> S:
+        """An object from an artefact.
+
+        Args:
+            kind: its class, e.g. `extrags.scene.Scene`.
+            ref: an artefact that holds one.
+
+        Raises:
+            StoreError: as `open`.
+        """
+        return kind.load(self.open(ref) / kind.stored_as)
+
+    def load_json(self, file: str, ref: Ref) -> Any:
+        """What `Slot.save_json` wrote.
+
+        Raises:
+            StoreError: as `open`.
+        """
+        return json.loads((self.open(ref) / file).read_bytes())
 
     def verify(self, ref: Ref) -> bool:
         """Whether the files still have the digest they were stored with; reads all of them."""

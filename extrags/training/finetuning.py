@@ -18,7 +18,7 @@ from extrags.training.reconstruction import coarse_schedule, scene_extent
 from extrags.training.starting import median_depth, surface_normals, thin_out
 from extrags.training.views import View, epochs, real_views
 
-__all__ = ["finetune", "hole_gaussians", "virtual_views"]
+__all__ = ["finetune", "hole_gaussians", "virtual_steps", "virtual_views"]
 
 HOLE_ALPHA = 0.5
 """A virtual pixel below this alpha shows a hole that new Gaussians may fill."""
@@ -43,8 +43,8 @@ def finetune(
     scene: Scene,
     sequence: EndoscopicSequence,
     pseudo: PseudoViews | None,
-    config: FinetuneConfig,
-    coarse: CoarseConfig,
+    config: FinetuneConfig | None = None,
+    coarse: CoarseConfig | None = None,
 ) -> TrainingResult:
     r"""Fine-tune a scene on real and virtual views together.
 
@@ -59,14 +59,16 @@ def finetune(
         scene: the coarse scene.
         sequence: posed frames; only training frames are used.
         pseudo: restored virtual views with confidences, or None.
-        config: budgets and shares.
-        coarse: rates and weights, shared with the coarse stage.
+        config: budgets and shares; None takes the defaults.
+        coarse: rates and weights, those the coarse scene was made with; None takes the defaults.
 
     Raises:
         DivergedError: when the optimisation does not stay finite.
 
     Source: paper equations 10 (training views) and 11 (virtual views); their depth term is our own.
     """
+    config = FinetuneConfig() if config is None else config
+    coarse = CoarseConfig() if coarse is None else coarse
     frames = sequence.train
     depth = median_depth(sequence, frames)
     start = scene
@@ -80,7 +82,7 @@ def finetune(
     virtual = [] if pseudo is None else virtual_views(pseudo, config)
     generator = np.random.default_rng(config.seed)
     next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
-    pattern = _virtual_steps(config, bool(virtual))
+    pattern = virtual_steps(config, any_virtual=bool(virtual))
 
     def draw(iteration: int) -> View:
         return virtual[next(next_virtual)] if pattern[iteration] else real[next(next_real)]
@@ -97,8 +99,13 @@ def finetune(
     return optimise(start, draw, schedule.resumed(seed=config.seed))
 
 
-def _virtual_steps(config: FinetuneConfig, any_virtual: bool) -> Bool[np.ndarray, "i"]:
-    """Which iterations draw a virtual view: evenly spread, with a share that falls linearly."""
+def virtual_steps(config: FinetuneConfig, *, any_virtual: bool = True) -> Bool[np.ndarray, "i"]:
+    """Which iterations draw a virtual view: evenly spread, with a share that falls linearly.
+
+    Args:
+        config: number of iterations, and the share of virtual views at the start and at the end.
+        any_virtual: False where there is no virtual view to draw.
+    """
     if not any_virtual:
         return np.zeros(config.iterations, dtype=bool)
     share = np.linspace(config.pseudo_share, config.pseudo_share_final, config.iterations)

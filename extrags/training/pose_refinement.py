@@ -11,8 +11,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
+import zarr
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -20,7 +23,9 @@ from extrags.cameras import Cameras, invert_poses
 from extrags.config import PoseRefinementConfig
 from extrags.errors import ShapeError
 from extrags.sequence import EndoscopicSequence
+from extrags.store.storable import Storable
 from extrags.training.starting import median_depth
+from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["PoseRefinement", "RefinedPoses", "with_refined_poses"]
 
@@ -34,7 +39,7 @@ NEIGHBOURHOOD = 0.3
 
 
 @dataclass(frozen=True)
-class RefinedPoses:
+class RefinedPoses(Storable):
     """Poses after refinement.
 
     Args:
@@ -43,9 +48,24 @@ class RefinedPoses:
         mean_turn_deg: mean angle of the corrections of the rotations.
     """
 
+    stored_as: ClassVar[str] = "refined_poses"
+
     world_from_camera: Float[np.ndarray, "m 4 4"]
     mean_shift: float
     mean_turn_deg: float
+
+    def save(self, path: Path) -> None:
+        """Write a zarr v3 group."""
+        group = open_group(path, mode="w")
+        write_array(group, "world_from_camera", self.world_from_camera)
+        group.attrs.update({"mean_shift": self.mean_shift, "mean_turn_deg": self.mean_turn_deg})
+
+    @classmethod
+    def load(cls, path: Path) -> RefinedPoses:
+        """Read what `save` wrote."""
+        group = zarr.open_group(str(path), mode="r")
+        attributes: dict[str, Any] = dict(group.attrs)
+        return cls(read_array(group, "world_from_camera"), **attributes)
 
 
 class PoseRefinement:

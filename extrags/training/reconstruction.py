@@ -21,7 +21,7 @@ __all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent"]
 
 def reconstruct(
     sequence: EndoscopicSequence,
-    config: CoarseConfig,
+    config: CoarseConfig | None = None,
     *,
     frames: Int[np.ndarray, "m"] | None = None,
     stage: str = "coarse",
@@ -30,7 +30,7 @@ def reconstruct(
 
     Args:
         sequence: posed frames.
-        config: budgets, rates and weights.
+        config: budgets, rates and weights; None takes the defaults.
         frames: which frames to use; default: the split's training frames.
         stage: named in progress events.
 
@@ -44,6 +44,7 @@ def reconstruct(
 
     Source: 3DGS loss (paper equation 2) inside the mask, with inverse depth where it is known.
     """
+    config = CoarseConfig() if config is None else config
     chosen = sequence.train if frames is None else np.asarray(frames)
     if len(chosen) == 0:
         raise CaptureError(f"{sequence.name}: no training frames")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +52,7 @@ def _renders(given: argparse.Namespace, config: Any, root: str) -> dict[str, Any
     outcome = run.run("ingest")
     if outcome.error is not None:
         raise outcome.error
-    sequence = EndoscopicSequence.load(run.store.open(run.refs["sequence"]) / "sequence")
+    sequence = run.store.load(EndoscopicSequence, run.refs["sequence"])
     views = read_renders(
         Path(given.renders),
         sequence,
@@ -94,10 +93,10 @@ def _finished(given: argparse.Namespace, config: Any, root: str) -> dict[str, An
         ) from error
     if outcome.error is not None:
         raise outcome.error
-    ref = run.refs.get("metrics_final", run.refs.get("metrics_coarse"))
+    ref = outcome.final_metrics
     if ref is None:
         raise ConfigError(f"{outcome.name} has no held-out frames to evaluate on")
-    found: dict[str, Any] = json.loads((run.store.open(ref) / METRICS_FILE).read_bytes())
+    found: dict[str, Any] = run.store.load_json(METRICS_FILE, ref)
     return found
 
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, StoreError
+from extrags.pipeline import StageName
 from extrags.store import Store
 from flows.commands.common import parsed_settings, set_up_logging, store_root
 from flows.environment import prepare
 from flows.methods import METHODS, method_config, refuse_pinned
-from flows.settings import StageName
 
 if TYPE_CHECKING:
     from flows.wiring import SequenceRun
@@ -32,7 +32,7 @@ def _scene(given: argparse.Namespace) -> int:
     run = _from_store(given, "coarse" if given.scene == "coarse" else "finetune")
     # Where the plan left fine-tuning out, the coarse scene is the final one.
     ref = run.refs.get("finetune", run.refs["coarse"])
-    scene = Scene.load(run.store.open(ref) / "scene")
+    scene = run.store.load(Scene, ref)
     target = Path(given.output)
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -56,7 +56,7 @@ def _sequence(given: argparse.Namespace) -> int:
     if sequence.world_from_camera is None:
         # Poses of a source that has none come from its run.
         run = _from_store(given, "poses")
-        sequence = EndoscopicSequence.load(run.store.open(run.refs["poses"]) / "sequence")
+        sequence = run.store.load(EndoscopicSequence, run.refs["poses"])
     found = points_of(sequence)
     points, points_rgb = found if found is not None else (None, None)
     try:

@@ -12,13 +12,13 @@ from typing import Any
 from data_catalog.catalog import resolve
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, ExtragsError, StoreError, UnknownSequenceError
+from extrags.pipeline import StageName, check_stage
 from extrags.store import Store
 from flows.commands.common import parsed_settings, set_up_logging, store_root, write_json
 from flows.environment import prepare, without_heartbeat
 from flows.methods import METHODS, method_config, profile_label, refuse_pinned
 from flows.outcome import DatasetOutcome
 from flows.preflight import preflight
-from flows.settings import STAGES, StageName
 
 __all__ = ["execute", "plan", "report", "run"]
 
@@ -27,8 +27,7 @@ def run(given: argparse.Namespace) -> int:
     """`extrags run`."""
     if given.at_once < 1:
         raise ConfigError(f"--at-once is {given.at_once}; expected 1 or more")
-    if given.until not in STAGES:
-        raise ConfigError(f"no stage {given.until!r}; known: {', '.join(STAGES)}")
+    check_stage(given.until)
     begun = time.monotonic()
     outcome = execute(
         given.sequences,
@@ -66,6 +65,7 @@ def report(given: argparse.Namespace) -> int:
     prepare(Store(root).state, debug=given.debug)
     from flows.runners import DirectRunner, NotInStoreError, StoreRunner
     from flows.wiring import SequenceRun
+    from tasks.report import PAGE
 
     _check_names([given.sequence])
     sequence = SequenceRun(
@@ -86,7 +86,7 @@ def report(given: argparse.Namespace) -> int:
         raise outcome.error or ExtragsError(f"{outcome.name} failed")
     sequence.runner = DirectRunner(root, refresh=True)
     sequence.report()
-    page = sequence.store.open(sequence.refs["report"]) / "report.html"
+    page = sequence.store.open(sequence.refs["report"]) / PAGE
     if given.output:
         try:
             shutil.copyfile(page, given.output)

@@ -34,15 +34,14 @@ from scipy.ndimage import gaussian_filter
 
 from data_catalog.catalog import read, resolve
 from data_catalog.content import content_circle
-from extrags.assess import assess
 from extrags.cameras import Cameras, pixel_rays
 from extrags.confidence import PerceptualDifference
 from extrags.config import PipelineConfig
-from extrags.exploration import Exploration, explore
-from extrags.freespace import carve
+from extrags.evaluation import render
 from extrags.metrics.image import mean_of_known, psnr
 from extrags.metrics.lpips import Lpips
-from extrags.metrics.protocol import RenderedViews, evaluate_views
+from extrags.metrics.protocol import evaluate_views
+from extrags.pipeline import InMemoryPipeline
 from extrags.raster import set_num_threads
 from extrags.raster.bench import machine
 from extrags.restoration.backends import load_enhancer
@@ -64,9 +63,8 @@ from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.protocol import Clip, Enhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.surface import fuse_surface
 from extrags.training import finetune
-from extrags.training.finetuning import _virtual_steps
+from extrags.training.finetuning import virtual_steps
 from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
@@ -214,26 +212,6 @@ def timed(seconds: dict[str, float], part: str) -> Iterator[None]:
     seconds[part] = time.perf_counter() - begun
 
 
-def explored(
-    scene: Scene, training: EndoscopicSequence, config: PipelineConfig, seconds: dict[str, float]
-) -> tuple[Exploration, PipelineConfig]:
-    """Trajectories as the pipeline's stages make them, and the settings with the plan's budgets."""
-    cameras = training.cameras[training.train]
-    with timed(seconds, "assess"):
-        plan = assess(scene, training, config)
-    config = plan.applied_to(config)
-    if not plan.decision("explore").run:
-        raise SystemExit(
-            f"{training.name}: {plan.decision('explore').reason}; --set assess.force=true explores"
-        )
-    with timed(seconds, "surface"):
-        mesh = fuse_surface(scene, cameras, config.surface)
-    with timed(seconds, "freespace"):
-        space = carve(scene, mesh, cameras, config.freespace)
-    with timed(seconds, "explore"):
-        return explore(scene, training, space, config.explore), config
-
-
 def downstream(names: list[str], arms: list[str], configs: list[PipelineConfig], sink: Sink) -> list[Case]:
     cases: list[Case] = []
     for name in names:
@@ -245,18 +223,22 @@ def downstream(names: list[str], arms: list[str], configs: list[PipelineConfig],
 
 
 def _arms(sequence: EndoscopicSequence, arms: list[str], config: PipelineConfig) -> Iterator[Case]:
-    shared: dict[str, float] = {}
-    with timed(shared, "coarse"):
-        scene, posed = coarse_scene(sequence, config.coarse)
+    pipeline = InMemoryPipeline(sequence, config)
+    pipeline.run_stages("explore")
+    found, config = pipeline.result, pipeline.config
+    if found.exploration is None:
+        raise SystemExit(
+            f"{sequence.name}: {found.skipped['explore']}; --set assess.force=true explores nevertheless"
+        )
+    scene, posed, shared = found.coarse, found.sequence, found.seconds
     training = posed.training_part()
-    exploration, config = explored(scene, training, config, shared)
-    trajectories = exploration.trajectories
+    exploration, trajectories = found.exploration, found.exploration.trajectories
     chosen = choose_views([len(cameras) for cameras in trajectories], config.enhance.max_views)
     virtual = [cameras[views] for cameras, views in zip(trajectories, chosen, strict=True)]
     lpips = perceptual(config)
     references = ReferenceViews.gather(scene, training, training.train)
     before = [value.clone() for value in _contents(scene)]
-    pattern = _virtual_steps(config.finetune, True)
+    pattern = virtual_steps(config.finetune)
     real_steps = int((~pattern).sum())
     about = {
         "sequence": posed.name,
@@ -302,29 +284,12 @@ def _contents(scene: Scene) -> list[torch.Tensor]:
     return contents if scene.light is None else [*contents, *scene.light.parameters().values()]
 
 
-def rendered(scene: Scene, sequence: EndoscopicSequence, frames: np.ndarray) -> RenderedViews:
-    gains = None
-    if scene.light is not None:
-        gains = scene.light.exposures_of(frames, sequence.train, sequence.recording)
-    parts = []
-    for position, frame in enumerate(frames):
-        with torch.no_grad():
-            exposure = None if gains is None else gains[position : position + 1]
-            parts.append(scene.render(sequence.cameras[int(frame)], exposure=exposure))
-    return RenderedViews(
-        np.concatenate([part.rgb.numpy() for part in parts]),
-        np.concatenate([part.alpha.numpy() for part in parts]),
-        np.concatenate([part.depth.numpy() for part in parts]),
-        len(scene.gaussians),
-    )
-
-
 def held_out_figures(scene: Scene, sequence: EndoscopicSequence, lpips: Lpips | None) -> Case:
     """Metrics of the protocol on held-out views, and the PSNR of the training views."""
     frames = np.asarray(sequence.test)
-    metrics = evaluate_views(rendered(scene, sequence, frames), sequence, frames, lpips).metrics
+    metrics = evaluate_views(render(scene, sequence, frames), sequence, frames, lpips).metrics
     train = np.asarray(sequence.train)
-    shown = torch.from_numpy(rendered(scene, sequence, train).rgb).clamp(0, 1)
+    shown = torch.from_numpy(render(scene, sequence, train).rgb).clamp(0, 1)
     truth = torch.from_numpy(sequence.rgb[train].astype(np.float32) / 255)
     return {**metrics, "train_psnr": psnr(shown, truth, torch.from_numpy(sequence.mask[train]))}
 

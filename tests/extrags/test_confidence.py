@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
 from extrags.confidence import PerceptualDifference, gaussian_iou, image_confidence, pixel_confidence
+from extrags.config import EvaluateConfig
 from extrags.errors import ShapeError, WeightsError
 
 
@@ -62,13 +63,13 @@ class TestPixelConfidence:
 
     def test_lpips(self, shared_data: Path) -> None:
         weights = next((shared_data / "lpips_weights").glob("*alex*.npz"))
-        measure = PerceptualDifference.available(str(weights))
+        measure = PerceptualDifference.available(EvaluateConfig(lpips_weights=str(weights)))
         assert measure.name == "lpips_alex"
         self._check(measure)
 
     def test_a_named_file_must_work(self, tmp_path: Path) -> None:
         with pytest.raises(WeightsError):
-            PerceptualDifference.available(str(tmp_path / "none.npz"))
+            PerceptualDifference.available(EvaluateConfig(lpips_weights=str(tmp_path / "none.npz")))
 
     def test_without_weights_it_says_why(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def refuse(*_: object) -> None:

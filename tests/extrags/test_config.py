@@ -54,7 +54,7 @@ class TestConfig:
 
     def test_seed_reaches_every_stage_that_has_one(self) -> None:
         config = PipelineConfig().with_seed(7)
-        assert config.coarse.seed == config.explore.seed == config.enhance.seed == 7
+        assert config.coarse.seed == config.assess.seed == config.enhance.seed == 7
 
     def test_unknown_profile(self) -> None:
         with pytest.raises(ConfigError, match="quick"):

@@ -15,7 +15,7 @@ from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.surface import Mesh
 
-from .explore.tube import scene_of_points, small_freespace, small_mesh, small_tube, square_camera
+from .exploration.tube import scene_of_points, small_freespace, small_mesh, small_tube, square_camera
 
 AXES = rotation_about(np.array([1.0, 2.0, -1.0]), 0.7)
 

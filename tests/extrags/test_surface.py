@@ -12,7 +12,7 @@ from extrags.errors import CaptureError, ShapeError
 from extrags.surface import Mesh, fuse_depth, fuse_surface, rendered_depth
 from extrags.zarr_io import open_group, read_array, write_array
 
-from .explore.tube import centre_line, small_mesh, small_tube
+from .exploration.tube import centre_line, small_mesh, small_tube
 
 RADIUS = 10.0
 

@@ -11,11 +11,12 @@ from prefect.artifacts import Artifact
 from prefect.flows import Flow, load_flow_from_entrypoint
 
 from extrags.errors import ConfigError, StoreError
+from extrags.pipeline import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
 from flows.outcome import SequenceFailedError, SequenceOutcome
 from flows.sequence import artifact_key, reconstruct_sequence
-from flows.settings import STAGES, pipeline_config, task_runner
+from flows.settings import pipeline_config, task_runner
 from tests.flows.tiny import SEQUENCE, TINY, without_report
 
 REPOSITORY = Path(__file__).parents[2]
@@ -101,7 +102,7 @@ class TestDataset:
 class TestParameters:
     def test_seed_reaches_every_stage(self) -> None:
         config = pipeline_config("quick", None, 7)
-        assert (config.coarse.seed, config.explore.seed, config.enhance.seed) == (7, 7, 7)
+        assert (config.coarse.seed, config.assess.seed, config.enhance.seed) == (7, 7, 7)
 
     def test_an_override_beats_the_seed(self) -> None:
         assert pipeline_config("quick", {"coarse.seed": 3}, 7).coarse.seed == 3

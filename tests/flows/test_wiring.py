@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from extrags.errors import WeightsError
+from extrags.pipeline import STAGES
 from extrags.store import Store
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner
-from flows.settings import STAGES
 from flows.wiring import run_sequence
 from tasks.evaluate import PROTOCOL_VERSION
 from tests.flows.tiny import SEQUENCE, tiny_config, without_report

@@ -158,7 +158,7 @@ class TestWaveState:
 @cache
 def explored(**changes: object) -> Exploration:
     tube = small_tube()
-    return explore(tube.scene, tube.sequence, small_freespace(), small_config(**changes))
+    return explore(tube.scene, tube.sequence, small_config(**changes), freespace=small_freespace())
 
 
 class TestExplore:
@@ -179,7 +179,9 @@ class TestExplore:
         tube = small_tube()
         alone = explored()
         with ThreadPoolExecutor(3) as pool:
-            together = explore(tube.scene, tube.sequence, small_freespace(), small_config(), map=pool.map)
+            together = explore(
+                tube.scene, tube.sequence, small_config(), freespace=small_freespace(), map=pool.map
+            )
         alone.save(tmp_path / "alone")
         together.save(tmp_path / "together")
         files = sorted(
@@ -210,7 +212,7 @@ class TestExplore:
     def test_few_training_views_work(self, n_views):
         tube = small_tube()
         sequence = replace(tube.sequence, split=replace(tube.sequence.split, train=np.arange(n_views) + 3))
-        found = explore(tube.scene, sequence, small_freespace(), small_config(trajectories=3))
+        found = explore(tube.scene, sequence, small_config(trajectories=3), freespace=small_freespace())
         # A start may be used again once the coverage has changed.
         assert len(found) == 3
         assert set(found.anchors.tolist()) <= set(range(3, 3 + n_views))

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.assess import ScenePlan, assess, probe_views
+from extrags.assessment import ScenePlan, assess, probe_views
 from extrags.cameras import rotation_angle_deg
 from extrags.config import AssessConfig, ExploreConfig, PipelineConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.scene import Scene
 
-from .explore.tube import Tube, make_ball, make_tube, small_tube
+from .exploration.tube import Tube, make_ball, make_tube, small_tube
 
 STAGES = ("surface", "freespace", "explore", "enhance", "finetune")
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from pydantic import Field
 
 from extrags.cameras import Cameras, rotation_about
-from extrags.config import AssessConfig, PipelineConfig, StageConfig
+from extrags.config import AssessConfig, CoverageConfig, PipelineConfig, StageConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, emit
 from extrags.exploration.coverage import direction_counts, training_coverage
@@ -19,8 +21,9 @@ from extrags.exploration.waves import start_views
 from extrags.raster import rasterize
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.store.storable import Storable
 
-__all__ = ["Decision", "ScenePlan", "assess", "decide", "probe_views"]
+__all__ = ["Decision", "ScenePlan", "assess", "decide", "measure", "probe_views"]
 
 _log = logging.getLogger(__name__)
 
@@ -43,8 +46,10 @@ class Decision(StageConfig):
     threshold: float = Field(description="what it was compared with")
 
 
-class ScenePlan(StageConfig):
+class ScenePlan(StageConfig, Storable):
     """Which later stages run, with what budget, and why."""
+
+    stored_as: ClassVar[str] = "plan.json"
 
     measurements: dict[str, float] = Field(description="what was measured, by name")
     decisions: tuple[Decision, ...] = Field(description="one per stage, in the order they run")
@@ -62,6 +67,15 @@ class ScenePlan(StageConfig):
             f"the plan has no line for {stage!r}; it has {', '.join(line.stage for line in self.decisions)}"
         )
 
+    def save(self, path: Path) -> None:
+        """Write as JSON."""
+        path.write_text(self.model_dump_json(indent=1))
+
+    @classmethod
+    def load(cls, path: Path) -> ScenePlan:
+        """Read what `save` wrote."""
+        return cls.model_validate_json(path.read_bytes())
+
     def applied_to(self, config: PipelineConfig) -> PipelineConfig:
         """The settings with the plan's budgets in place."""
         overrides: dict[str, Any] = {
@@ -71,38 +85,56 @@ class ScenePlan(StageConfig):
 
 
 def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig) -> ScenePlan:
-    """Measure what the scene lacks in a fan of nearby views and decide what to do about it.
-
-    A pixel of the fan lacks something when it is a hole (alpha too low) or is mostly made of Gaussians
-    that the training views saw from too few directions. The share of such pixels decides whether
-    anything is explored, and scales the number of trajectories: the whole budget from
-    `assess.full_budget_share` on.
+    """`measure` what the scene lacks, and `decide` what to do about it.
 
     Args:
         scene: the coarse reconstruction.
         sequence: its frames.
-        config: settings of all stages; `assess`, and what the budgets are made from.
+        config: settings of all stages; `assess` and `explore`, and what the budgets are made from.
 
     Returns:
         The plan, with every number it rests on.
 
     Raises:
+        CaptureError: as `measure`.
+    """
+    return decide(measure(scene, sequence, config.assess, config.explore.coverage), config)
+
+
+def measure(
+    scene: Scene, sequence: EndoscopicSequence, settings: AssessConfig, coverage: CoverageConfig
+) -> dict[str, float]:
+    """Measure what the scene lacks in a fan of nearby views.
+
+    A pixel of the fan lacks something when it is a hole (alpha too low) or is mostly made of Gaussians
+    that the training views saw from too few directions. Budgets play no part: `decide` turns the numbers
+    into a plan.
+
+    Args:
+        scene: the coarse reconstruction.
+        sequence: its frames.
+        settings: the fan, and what counts as lacking.
+        coverage: what counts as seen, as the exploration counts it.
+
+    Returns:
+        Measurements by name; shares are of all pixels of the fan, or of all Gaussians.
+
+    Raises:
         CaptureError: when there are no Gaussians, or no training view sees any.
     """
-    settings = config.assess
     cameras = sequence.cameras[sequence.train]
     if len(scene.gaussians) == 0 or len(cameras) == 0:
         raise CaptureError(
             f"{sequence.name}: nothing to assess with {len(scene.gaussians)} Gaussians "
             f"and {len(cameras)} training views"
         )
-    small = _small(cameras, config.explore.render_width)
+    small = _small(cameras, coverage.render_width)
     depth_unit_mm, training_holes = _training_view_measurements(scene, small, settings)
     covered = training_coverage(
         scene,
         small,
-        visible_weight=config.explore.visible_weight,
-        n_directions=config.explore.directions,
+        visible_weight=coverage.visible_weight,
+        n_directions=coverage.directions,
     )
     directions = direction_counts(covered)
     probes = probe_views(scene, small, depth_unit_mm, settings)
@@ -120,19 +152,18 @@ def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig) -
         "gaussians_poorly_seen_share": float((directions < settings.min_directions).mean()),
         "directions_mean": float(directions[seen].mean()) if seen.any() else 0.0,
         "directions_median": float(np.median(directions[seen])) if seen.any() else 0.0,
-        "coverage_share": float(directions.mean()) / config.explore.directions,
+        "coverage_share": float(directions.mean()) / coverage.directions,
         "depth_unit_mm": depth_unit_mm,
         "training_views": float(len(cameras)),
         "probe_views": float(len(probes)),
     }
-    plan = ScenePlan(measurements=measurements, decisions=decide(lacking, config))
     _log.info(
         "assess: %.1f %% of probe pixels lack something (%.1f %% holes, %.1f %% poorly seen)",
         100 * lacking,
         100 * measurements["hole_share"],
         100 * measurements["poor_share"],
     )
-    return plan
+    return measurements
 
 
 def probe_views(scene: Scene, cameras: Cameras, depth_unit_mm: float, config: AssessConfig) -> Cameras:
@@ -226,18 +257,25 @@ def _lacking_pixels(
     return np.concatenate(holes), np.concatenate(poor)
 
 
-def decide(lacking_share: float, config: PipelineConfig) -> tuple[Decision, ...]:
+def decide(measurements: Mapping[str, float], config: PipelineConfig) -> ScenePlan:
     """What the measured share of lacking pixels means for each later stage.
 
+    That share decides whether anything is explored, and scales the number of trajectories: the whole
+    budget from `assess.full_budget_share` on.
+
     Args:
-        lacking_share: `measurements["lacking_share"]` of a plan.
+        measurements: from `measure`.
         config: thresholds in `assess`, and the full budgets of the stages.
 
     Returns:
-        One line per stage: surface, freespace, explore, enhance, finetune.
+        The plan, one line per stage: surface, freespace, explore, enhance, finetune.
     """
+    decisions = _decisions(measurements["lacking_share"], config)
+    return ScenePlan(measurements=dict(measurements), decisions=decisions)
+
+
+def _decisions(lacking: float, config: PipelineConfig) -> tuple[Decision, ...]:
     settings = config.assess
-    lacking = lacking_share
     needed = lacking > settings.min_hole_share
     run = needed or settings.force
     share = f"{100 * lacking:.2f} % of the pixels of nearby views are holes or poorly seen"

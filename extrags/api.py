@@ -1,0 +1,89 @@
+"""What `import extrags` offers, in one list; loaded as a whole when the first of it is used.
+
+Reading belongs to the catalogue, a layer above the library: no other module of the library imports it.
+"""
+
+from __future__ import annotations
+
+from data_catalog.catalog import read
+from extrags.assessment import ScenePlan, assess
+from extrags.cameras import Cameras
+from extrags.config import (
+    PROFILES,
+    AssessConfig,
+    CoarseConfig,
+    EnhanceConfig,
+    EvaluateConfig,
+    ExploreConfig,
+    FinetuneConfig,
+    FreespaceConfig,
+    IngestConfig,
+    PipelineConfig,
+    PosesConfig,
+    ReportConfig,
+    SurfaceConfig,
+    profile_config,
+)
+from extrags.evaluation import evaluate, render
+from extrags.exploration import Exploration, explore
+from extrags.freespace import FreeSpace, carve
+from extrags.gaussians import Gaussians
+from extrags.illumination import NearFieldLight
+from extrags.metrics import EvaluationResult, RenderedViews
+from extrags.pipeline import STAGES, Result, run_pipeline
+from extrags.poses import estimate_poses, with_estimated_poses
+from extrags.pseudo_views import PseudoViews
+from extrags.raster import Rendering, rasterize
+from extrags.restoration.trajectories import restore
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence, Split
+from extrags.surface import Mesh, fuse_surface
+from extrags.training import TrainingResult, finetune, reconstruct
+
+__all__ = [
+    "PROFILES",
+    "STAGES",
+    "AssessConfig",
+    "Cameras",
+    "CoarseConfig",
+    "EndoscopicSequence",
+    "EnhanceConfig",
+    "EvaluateConfig",
+    "EvaluationResult",
+    "Exploration",
+    "ExploreConfig",
+    "FinetuneConfig",
+    "FreeSpace",
+    "FreespaceConfig",
+    "Gaussians",
+    "IngestConfig",
+    "Mesh",
+    "NearFieldLight",
+    "PipelineConfig",
+    "PosesConfig",
+    "PseudoViews",
+    "RenderedViews",
+    "Rendering",
+    "ReportConfig",
+    "Result",
+    "Scene",
+    "ScenePlan",
+    "Split",
+    "SurfaceConfig",
+    "TrainingResult",
+    "assess",
+    "carve",
+    "estimate_poses",
+    "evaluate",
+    "explore",
+    "finetune",
+    "fuse_surface",
+    "profile_config",
+    "rasterize",
+    "read",
+    "reconstruct",
+    "render",
+    "restore",
+    "run_pipeline",
+    "with_estimated_poses",
+]

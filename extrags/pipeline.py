@@ -1,0 +1,466 @@
+"""The stages of a sequence: their order, which of them run, and the whole job as plain calls.
+
+`Pipeline` is the one place that knows the order of the stages and the rules by which one is skipped. It is
+subclassed twice: `InMemoryPipeline`, behind `run_pipeline`, makes each stage's product by calling the library
+and keeps it in memory; `flows.wiring.SequenceRun` makes the same products as cached tasks, by the same
+functions of the library.
+
+This module loads nothing heavy by itself, so that flows and the command line can read the list of stages.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, get_args
+
+from extrags.config import PipelineConfig
+from extrags.errors import CaptureError, ConfigError
+
+if TYPE_CHECKING:
+    from extrags.assessment import Decision, ScenePlan
+    from extrags.confidence import PerceptualDifference
+    from extrags.exploration import Exploration
+    from extrags.freespace import FreeSpace
+    from extrags.metrics import EvaluationResult, RenderedViews, TrueSurface
+    from extrags.pseudo_views import PseudoViews
+    from extrags.scene import Scene
+    from extrags.sequence import EndoscopicSequence
+    from extrags.surface import Mesh
+    from extrags.training import TrainingResult
+
+__all__ = ["STAGES", "InMemoryPipeline", "Pipeline", "Result", "StageName", "check_stage", "run_pipeline"]
+
+log = logging.getLogger(__name__)
+
+StageName = Literal[
+    "ingest",
+    "poses",
+    "coarse",
+    "assess",
+    "surface",
+    "freespace",
+    "explore",
+    "enhance",
+    "finetune",
+    "evaluate",
+    "report",
+]
+
+STAGES: tuple[StageName, ...] = get_args(StageName)
+"""All stages, in the order they run."""
+
+
+class Pipeline(ABC):
+    """The stages of one sequence in their order, and the rules by which one is skipped.
+
+    A subclass makes each stage's product in a method of the stage's name, and answers what the rules ask.
+
+    Args:
+        config: settings of all stages; the plan's budgets are put into them after `assess`.
+        leave_out: stages to leave out whatever the plan says, with the reason.
+
+    Raises:
+        ConfigError: for a stage that does not exist.
+    """
+
+    def __init__(self, config: PipelineConfig, leave_out: Mapping[str, str] | None = None) -> None:
+        self.config = config
+        self.leave_out = dict(leave_out or {})
+        self.plan: ScenePlan | None = None
+        for stage in self.leave_out:
+            check_stage(stage)
+
+    def run_stages(self, until: StageName = "report") -> None:
+        """Take the sequence through all stages up to one.
+
+        Raises:
+            ConfigError: for a stage that does not exist.
+        """
+        check_stage(until)
+        make: dict[StageName, Callable[[], None]] = {
+            "ingest": self.ingest,
+            "poses": self.poses,
+            "coarse": self.coarse,
+            "assess": self.assess,
+            "surface": self.surface,
+            "freespace": self.freespace,
+            "explore": self.explore,
+            "enhance": self.enhance,
+            "finetune": self.finetune,
+            "evaluate": self.evaluate,
+            "report": self.report,
+        }
+        for stage in STAGES[: STAGES.index(until) + 1]:
+            reason = self.reason_to_skip(stage)
+            if reason is None:
+                make[stage]()
+            else:
+                self.skip(stage, reason)
+            if stage == "assess" and self.plan is not None:
+                self.config = self.plan.applied_to(self.config)
+
+    def reason_to_skip(self, stage: StageName) -> str | None:
+        """Why a stage is not run, or None; asked when its turn has come."""
+        if stage in self.leave_out:
+            return self.leave_out[stage]
+        planned = self.planned(stage)
+        # Who leaves stages out compares methods: the others then run whatever the plan would save, so that
+        # all methods are compared on the same terms.
+        if planned is not None and not planned.run and not self.leave_out:
+            return planned.reason
+        if stage == "poses" and self.has_poses() and not self.config.poses.replace_given:
+            return "the source has poses"
+        if stage == "enhance" and self.virtual_views() == 0:
+            return "exploration found no view that adds anything"
+        # Fine-tuning without `enhance` among the stages is a control on real views alone.
+        if stage == "finetune" and not self.has_pseudo_views() and "enhance" not in self.leave_out:
+            return "there are no virtual views"
+        if stage == "evaluate" and self.held_out_frames() == 0:
+            return "the sequence has no held-out frames"
+        return None
+
+    def planned(self, stage: str) -> Decision | None:
+        """The plan's line on a stage; None for stages that are not planned."""
+        lines = () if self.plan is None else self.plan.decisions
+        return next((line for line in lines if line.stage == stage), None)
+
+    @abstractmethod
+    def skip(self, stage: StageName, reason: str) -> None:
+        """Take note of a stage that is skipped."""
+
+    @abstractmethod
+    def has_poses(self) -> bool:
+        """Whether the sequence has camera poses."""
+
+    @abstractmethod
+    def held_out_frames(self) -> int:
+        """Number of held-out frames."""
+
+    @abstractmethod
+    def virtual_views(self) -> int:
+        """Number of virtual views the exploration found."""
+
+    @abstractmethod
+    def has_pseudo_views(self) -> bool:
+        """Whether virtual views were restored."""
+
+    @abstractmethod
+    def ingest(self) -> None:
+        """Read the source into an `EndoscopicSequence`."""
+
+    @abstractmethod
+    def poses(self) -> None:
+        """Estimate camera poses."""
+
+    @abstractmethod
+    def coarse(self) -> None:
+        """Reconstruct the scene from the training frames."""
+
+    @abstractmethod
+    def assess(self) -> None:
+        """Measure what the scene lacks and set `plan`."""
+
+    @abstractmethod
+    def surface(self) -> None:
+        """Fuse a mesh from rendered depth."""
+
+    @abstractmethod
+    def freespace(self) -> None:
+        """Carve the space virtual cameras may enter."""
+
+    @abstractmethod
+    def explore(self) -> None:
+        """Search virtual trajectories."""
+
+    @abstractmethod
+    def enhance(self) -> None:
+        """Restore the virtual views."""
+
+    @abstractmethod
+    def finetune(self) -> None:
+        """Fine-tune the scene on real and restored views."""
+
+    @abstractmethod
+    def evaluate(self) -> None:
+        """Measure coarse and final scene on the held-out frames."""
+
+    @abstractmethod
+    def report(self) -> None:
+        """Write the page of the run."""
+
+
+def check_stage(stage: str) -> None:
+    """Refuse a name that is no stage.
+
+    Raises:
+        ConfigError: names the stages there are.
+    """
+    if stage not in STAGES:
+        raise ConfigError(f"no stage {stage!r}; known: {', '.join(STAGES)}")
+
+
+@dataclass
+class Result:
+    """What `run_pipeline` made of a sequence; None for what was skipped.
+
+    Args:
+        sequence: all frames, with the poses the scene belongs to.
+        reconstruction: the coarse scene and its training history.
+        plan: what the scene lacked, and which stages that called for.
+        mesh: the surface.
+        freespace: where virtual cameras may go.
+        exploration: the virtual trajectories.
+        pseudo_views: restored virtual views.
+        finetuning: the fine-tuned scene and its training history.
+        renders: held-out views by scene, `coarse` and `final`.
+        evaluations: their figures, by the same names; without fine-tuning `coarse` alone.
+        skipped: why stages were skipped, by name.
+        seconds: wall-clock time by stage.
+    """
+
+    sequence: EndoscopicSequence
+    reconstruction: TrainingResult | None = None
+    plan: ScenePlan | None = None
+    mesh: Mesh | None = None
+    freespace: FreeSpace | None = None
+    exploration: Exploration | None = None
+    pseudo_views: PseudoViews | None = None
+    finetuning: TrainingResult | None = None
+    renders: dict[str, RenderedViews] = field(default_factory=dict)
+    evaluations: dict[str, EvaluationResult] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def coarse(self) -> Scene:
+        """The coarse scene.
+
+        Raises:
+            CaptureError: when the run ended before it was reconstructed.
+        """
+        if self.reconstruction is None:
+            raise CaptureError(f"{self.sequence.name}: the run ended before the scene was reconstructed")
+        return self.reconstruction.scene
+
+    @property
+    def scene(self) -> Scene:
+        """The final scene: fine-tuned, or the coarse one where nothing was fine-tuned.
+
+        Raises:
+            CaptureError: as `coarse`.
+        """
+        return self.coarse if self.finetuning is None else self.finetuning.scene
+
+
+class InMemoryPipeline(Pipeline):
+    """The stages as plain calls of the library; their products are kept in `result`.
+
+    Args:
+        sequence: the frames, as `data_catalog.read` gives them.
+        config: settings of all stages.
+        leave_out: see `Pipeline`.
+        true_surface: what the evaluation holds the surface against; None leaves its figures out.
+    """
+
+    def __init__(
+        self,
+        sequence: EndoscopicSequence,
+        config: PipelineConfig,
+        leave_out: Mapping[str, str] | None = None,
+        *,
+        true_surface: TrueSurface | None = None,
+    ) -> None:
+        super().__init__(config, leave_out)
+        self.result = Result(sequence)
+        self.true_surface = true_surface
+        self._training = sequence
+        """What the reconstruction may see: from `coarse` on, the training frames alone."""
+
+    def skip(self, stage: StageName, reason: str) -> None:
+        """Write the reason down."""
+        log.info("%s: %s skipped: %s", self.result.sequence.name, stage, reason)
+        self.result.skipped[stage] = reason
+
+    def has_poses(self) -> bool:
+        """Whether the sequence has camera poses."""
+        return self.result.sequence.world_from_camera is not None
+
+    def held_out_frames(self) -> int:
+        """Number of held-out frames."""
+        return len(self.result.sequence.test)
+
+    def virtual_views(self) -> int:
+        """Number of virtual views the exploration found."""
+        return 0 if self.result.exploration is None else self.result.exploration.n_virtual
+
+    def has_pseudo_views(self) -> bool:
+        """Whether virtual views were restored."""
+        return self.result.pseudo_views is not None
+
+    def ingest(self) -> None:
+        """The sequence was read by the caller."""
+
+    def poses(self) -> None:
+        """`extrags.poses.estimate_poses`; frames that do not register are left out."""
+        from extrags.poses import estimate_poses, with_estimated_poses
+
+        with self._timed("poses"):
+            sequence = self.result.sequence
+            estimate = estimate_poses(sequence, self.config.poses)
+            self.result.sequence = with_estimated_poses(sequence, estimate)
+
+    def coarse(self) -> None:
+        """`extrags.training.reconstruct` on the training frames alone."""
+        from extrags.training import reconstruct
+        from extrags.training.pose_refinement import with_refined_poses
+
+        with self._timed("coarse"):
+            self._training = self.result.sequence.training_part()
+            found = reconstruct(self._training, self.config.coarse)
+            if found.refined is not None:
+                # The scene belongs to the corrected poses: all that follows takes those.
+                refined = with_refined_poses(self.result.sequence, found.refined.world_from_camera)
+                self.result.sequence, self._training = refined, refined.training_part()
+            self.result.reconstruction = found
+
+    def assess(self) -> None:
+        """`extrags.assessment.assess`."""
+        from extrags.assessment import assess
+
+        with self._timed("assess"):
+            self.plan = self.result.plan = assess(self.result.coarse, self._training, self.config)
+
+    def surface(self) -> None:
+        """`extrags.surface.fuse_surface`."""
+        from extrags.surface import fuse_surface
+
+        with self._timed("surface"):
+            self.result.mesh = fuse_surface(
+                self.result.coarse, self._training.training_cameras, self.config.surface
+            )
+
+    def freespace(self) -> None:
+        """`extrags.freespace.carve`."""
+        from extrags.freespace import carve
+
+        if self.result.mesh is None:
+            raise ConfigError("the stage freespace needs the mesh of the stage surface, which was left out")
+        with self._timed("freespace"):
+            self.result.freespace = carve(
+                self.result.coarse, self.result.mesh, self._training.training_cameras, self.config.freespace
+            )
+
+    def explore(self) -> None:
+        """`extrags.exploration.explore`."""
+        from extrags.exploration import explore
+
+        with self._timed("explore"):
+            self.result.exploration = explore(
+                self.result.coarse, self._training, self.config.explore, freespace=self.result.freespace
+            )
+
+    def enhance(self) -> None:
+        """`extrags.restoration.trajectories.restore`."""
+        from extrags.restoration.trajectories import restore
+
+        if self.result.exploration is None:
+            raise ConfigError("the stage enhance needs the trajectories of the stage explore")
+        with self._timed("enhance"):
+            self.result.pseudo_views = restore(
+                self.result.coarse,
+                self._training,
+                self.result.exploration.trajectories,
+                self.config.enhance,
+                self.config.coarse,
+                measure=self._perceptual_difference(),
+            )
+
+    def finetune(self) -> None:
+        """`extrags.training.finetune`."""
+        from extrags.training import finetune
+
+        with self._timed("finetune"):
+            self.result.finetuning = finetune(
+                self.result.coarse,
+                self._training,
+                self.result.pseudo_views,
+                self.config.finetune,
+                self.config.coarse,
+            )
+
+    def evaluate(self) -> None:
+        """`extrags.evaluation` of the coarse and the final scene."""
+        from extrags.evaluation import evaluate_renders, render
+        from extrags.metrics.surface import scene_surface
+
+        scenes = {"coarse": self.result.coarse}
+        if self.result.finetuning is not None:
+            scenes["final"] = self.result.finetuning.scene
+        measure = self._perceptual_difference()
+        sequence = self.result.sequence
+        with self._timed("evaluate"):
+            for which, scene in scenes.items():
+                self.result.renders[which] = render(scene, sequence)
+                self.result.evaluations[which] = evaluate_renders(
+                    self.result.renders[which],
+                    sequence,
+                    mesh=None if self.true_surface is None else scene_surface(scene, sequence),
+                    true_surface=self.true_surface,
+                    lpips=measure.lpips,
+                    lpips_reason=measure.reason,
+                )
+
+    def report(self) -> None:
+        """The page of a run belongs to its artefacts; a `Result` has none."""
+
+    def _perceptual_difference(self) -> PerceptualDifference:
+        from extrags.confidence import PerceptualDifference
+
+        return PerceptualDifference.available(self.config.evaluate)
+
+    @contextmanager
+    def _timed(self, stage: StageName) -> Iterator[None]:
+        begun = time.perf_counter()
+        yield
+        self.result.seconds[stage] = time.perf_counter() - begun
+
+
+def run_pipeline(
+    sequence: EndoscopicSequence,
+    config: PipelineConfig | None = None,
+    *,
+    until: StageName = "evaluate",
+    leave_out: Mapping[str, str] | None = None,
+    true_surface: TrueSurface | None = None,
+) -> Result:
+    """Reconstruct, explore, restore, fine-tune and evaluate a sequence, in memory.
+
+    Nothing is cached; `extrags run` and the flows make the same products as cached artefacts. Progress goes
+    to `extrags.events.subscribed`.
+
+    Args:
+        sequence: the frames, as `extrags.read` gives them.
+        config: settings of all stages, e.g. `extrags.PROFILES["quick"]`; None takes the defaults.
+        until: last stage to run.
+        leave_out: stages to leave out whatever the plan says, with the reason.
+        true_surface: what the surface is held against (`data_catalog.true_surface`); None leaves it out.
+
+    Returns:
+        Everything that was made.
+
+    Raises:
+        CaptureError: when the frames do not suffice.
+        DivergedError: when an optimisation does not stay finite.
+        WeightsError: when a model that the settings name is not there.
+        ConfigError: when settings do not fit each other.
+    """
+    pipeline = InMemoryPipeline(
+        sequence, PipelineConfig() if config is None else config, leave_out, true_surface=true_surface
+    )
+    pipeline.run_stages(until)
+    return pipeline.result
