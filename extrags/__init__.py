@@ -29,11 +29,17 @@ __version__ = "0.1.0"
 
 def __getattr__(name: str) -> Any:
     # The import system asks for modules and for names of its own before it looks elsewhere: not for us.
-    if not name.startswith("_") and find_spec(f"{__name__}.{name}") is None:
+    if not name.startswith("_") and not _is_module(name):
         api = import_module(f"{__name__}.api")
         if name in api.__all__:
             return getattr(api, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def _is_module(name: str) -> bool:
+    found = find_spec(f"{__name__}.{name}")
+    # A folder without code, which an older checkout may have left, has no origin.
+    return found is not None and found.origin is not None
 
 
 def __dir__() -> list[str]:

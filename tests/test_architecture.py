@@ -38,6 +38,6 @@ def test_root_holds_only_what_belongs_there() -> None:
     ).stdout.split("\n")
     roots = {name.split("/")[0] for name in tracked if name and not name.startswith(".")}
     assert roots <= {
-        "extrags", "tasks", "flows", "data_catalog", "tests", "docs", "pyproject.toml", "README.md",
-        "LICENSE", "Makefile", "CMakeLists.txt", "prefect.yaml", "requirements.lock",
+        "extrags", "tasks", "flows", "data_catalog", "tests", "docs", "examples",
+        "pyproject.toml", "README.md", "LICENSE", "Makefile", "CMakeLists.txt", "prefect.yaml", "requirements.lock",
     }  # fmt: skip

@@ -17,14 +17,15 @@ from extrags.config import ExploreConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
 from extrags.exploration.coverage import coverage_gain, rendered_pairs
-from extrags.exploration.darkness import dark_direction, illumination_weight, luminance
+from extrags.exploration.darkness import dark_direction, luminance
 from extrags.exploration.primitives import PRIMITIVES, apply_primitives, primitive_motions
+from extrags.exploration.score import Candidates, score
 from extrags.freespace import FREE, FreeSpace
 from extrags.scene import Scene
 from extrags.store.storable import Storable
 from extrags.zarr_io import open_group, read_array, write_array
 
-__all__ = ["Branch", "SearchContext", "fold_weight", "grow_branch", "prepare_search"]
+__all__ = ["Branch", "SearchContext", "grow_branch", "prepare_search"]
 
 HOLE_ALPHA = 0.5
 """A pixel below this alpha is a hole."""
@@ -227,17 +228,6 @@ def prepare_search(
     )
 
 
-def fold_weight(turns_deg: Float[np.ndarray, "*b k"], config: ExploreConfig) -> Float[np.ndarray, "*b"]:
-    """Factor eta where the rotation of the last steps together exceeds tau_R, else one.
-
-    A single primitive turns by 10 degrees: a threshold on one step alone would never be passed. So
-    the turns of the last three steps, the candidate's own included, are added up.
-
-    Source: paper, section "Fold-aware pose variation control".
-    """
-    return np.where(turns_deg.sum(axis=-1) > config.fold_angle_deg, config.fold_penalty, 1.0)
-
-
 def grow_branch(
     context: SearchContext,
     start: Float[np.ndarray, "4 4"],
@@ -338,16 +328,24 @@ def _expand(
     for earlier in state.path():
         known[earlier.index] |= earlier.pairs
     candidates = _observe(context, poses[kept], known, clearance[kept], state, [PRIMITIVES[i] for i in kept])
-    light = illumination_weight(state.dark, state.pose, poses[kept], config.darkness_weight)
     recent = [earlier.turn_deg for earlier in state.path()[1:]][-(FOLD_STEPS - 1) :]
-    scored = []
-    for weight, candidate in zip(light, candidates, strict=True):
-        if candidate.rejected:
-            continue
-        fold = fold_weight(np.array([*recent, candidate.turn_deg]), config)
-        missing = 1 + config.hole_weight * candidate.hole_share
-        scored.append((float(candidate.gain * weight * fold * missing), candidate))
-        visited.poses.append(candidate.pose)
+    scores = score(
+        Candidates(
+            gain=np.array([candidate.gain for candidate in candidates]),
+            hole_share=np.array([candidate.hole_share for candidate in candidates]),
+            poses=poses[kept],
+            start=state.pose,
+            dark=state.dark,
+            turns_deg=np.array([[*recent, candidate.turn_deg] for candidate in candidates]),
+        ),
+        config,
+    )
+    scored = [
+        (value, candidate)
+        for value, candidate in zip(scores.tolist(), candidates, strict=True)
+        if not candidate.rejected
+    ]
+    visited.poses += [candidate.pose for _, candidate in scored]
     # Stable: equal scores keep the order of the primitives.
     return sorted(scored, key=lambda item: -item[0]), len(kept)
 

@@ -165,7 +165,8 @@ class Store:
         Raises:
             StoreError: as `open`.
         """
-        return kind.load(self.open(ref) / kind.stored_as)
+        found: S = kind.load(self.open(ref) / kind.stored_as)
+        return found
 
     def load_json(self, file: str, ref: Ref) -> Any:
         """What `Slot.save_json` wrote.

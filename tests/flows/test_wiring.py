@@ -70,9 +70,17 @@ def test_second_run_is_all_cached_and_the_same(finished: tuple[str, SequenceOutc
     assert second.metrics == first.metrics
 
 
+def test_what_counts_as_seen_is_measured_again(finished: tuple[str, SequenceOutcome]) -> None:
+    store, _ = finished
+    changed = tiny_config(explore__directions=16)
+    outcome = run_sequence(SEQUENCE, changed, store, DirectRunner(store), until="assess")
+    assert states(outcome)["coarse"] == "cached"
+    assert states(outcome)["assess"] == "ran"
+
+
 def test_exploration_settings_leave_everything_before_cached(finished: tuple[str, SequenceOutcome]) -> None:
     store, _ = finished
-    changed = tiny_config(explore__step_share=0.15, explore__trajectories=3, explore__directions=16)
+    changed = tiny_config(explore__step_share=0.15, explore__trajectories=3)
     outcome = run_sequence(SEQUENCE, changed, store, DirectRunner(store), until="explore")
     before = STAGES[: STAGES.index("explore")]
     assert {stage: states(outcome)[stage] for stage in before} == {

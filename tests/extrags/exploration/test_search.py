@@ -12,7 +12,8 @@ from extrags.errors import CaptureError, ShapeError
 from extrags.exploration.coverage import coverage_gain, rendered_pairs, training_coverage
 from extrags.exploration.darkness import luminance
 from extrags.exploration.primitives import apply_primitives, primitive_motions
-from extrags.exploration.search import Branch, SearchContext, fold_weight, grow_branch, prepare_search
+from extrags.exploration.score import fold_weight
+from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
 from extrags.freespace import FREE, OCCUPIED, FreeSpace
 from extrags.scene import Scene
 

@@ -1,0 +1,53 @@
+"""From one's own frames to a fly-through: images or a video become a scene, and a GIF from inside.
+
+    python examples/frames_to_flythrough.py my_video.mp4 flythrough.gif
+
+Without poses in the source, COLMAP estimates them first. Everything that `extrags data list` and the page on
+sources name is read.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+import extrags
+from extrags.cameras import interpolate_poses
+
+
+def reconstructed(source: str, config: extrags.PipelineConfig) -> tuple[extrags.Scene, extrags.Cameras]:
+    """The coarse scene of a source, and the cameras of its training frames."""
+    sequence = extrags.read(source, config.ingest)
+    if sequence.world_from_camera is None:
+        estimate = extrags.estimate_poses(sequence, config.poses)
+        sequence = extrags.with_estimated_poses(sequence, estimate)
+    return extrags.reconstruct(sequence, config.coarse).scene, sequence.training_cameras
+
+
+def flythrough(
+    scene: extrags.Scene, cameras: extrags.Cameras, gif: Path, *, views_between: int = 5
+) -> list[Image.Image]:
+    """Render the way along the cameras, with views between them, and write it as a GIF."""
+    poses = cameras.world_from_camera
+    path = [
+        interpolate_poses(first, second, step / views_between)
+        for first, second in itertools.pairwise(poses)
+        for step in range(views_between)
+    ]
+    frames = []
+    for pose in path:
+        camera = extrags.Cameras(cameras.K[:1], pose[None], cameras.width, cameras.height)
+        with torch.no_grad():
+            rgb = scene.render(camera).rgb[0].clamp(0, 1).numpy()
+        frames.append(Image.fromarray(np.rint(rgb * 255).astype(np.uint8)))
+    frames[0].save(gif, save_all=True, append_images=frames[1:], duration=80, loop=0)
+    return frames
+
+
+if __name__ == "__main__":
+    flythrough(*reconstructed(sys.argv[1], extrags.PROFILES["quick"]), Path(sys.argv[2]))

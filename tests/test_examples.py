@@ -1,0 +1,73 @@
+"""Every program in `examples/` runs, on a phantom so small that it takes seconds."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from PIL import Image
+
+import extrags
+from extrags.events import Event, subscribed
+from tests.flows.tiny import SEQUENCE, tiny_config
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def example(name: str) -> ModuleType:
+    specification = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert specification is not None
+    assert specification.loader is not None
+    module = importlib.util.module_from_spec(specification)
+    specification.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[extrags.Result, Path]:
+    """The whole job, once for all tests."""
+    ply = tmp_path_factory.mktemp("examples") / "scene.ply"
+    return example("whole_job").whole_job(SEQUENCE, ply, tiny_config()), ply
+
+
+def test_every_example_is_tested() -> None:
+    tested = Path(__file__).read_text(encoding="utf-8")
+    for file in EXAMPLES.glob("*.py"):
+        assert f'example("{file.stem}")' in tested, f"{file.name} has no test"
+
+
+class TestWholeJob:
+    def test_every_stage_has_its_product(self, finished: tuple[extrags.Result, Path]) -> None:
+        result, ply = finished
+        assert result.skipped == {"poses": "the source has poses"}
+        assert result.pseudo_views is not None
+        assert result.finetuning is not None
+        assert set(result.evaluations) == {"coarse", "final"}
+        assert len(extrags.Gaussians.read_ply(ply)) == len(result.scene.gaussians)
+
+    def test_progress_can_be_followed(self) -> None:
+        seen: list[Event] = []
+        sequence = extrags.read(SEQUENCE, tiny_config().ingest)
+        with subscribed(seen.append):
+            extrags.run_pipeline(sequence, tiny_config(), until="coarse")
+        assert {event.stage for event in seen} == {"coarse"}
+
+
+def test_frames_to_flythrough(tmp_path: Path) -> None:
+    module = example("frames_to_flythrough")
+    scene, cameras = module.reconstructed(SEQUENCE, tiny_config())
+    frames = module.flythrough(scene, cameras[:3], tmp_path / "way.gif", views_between=2)
+    assert len(frames) == 4
+    with Image.open(tmp_path / "way.gif") as image:
+        assert image.size == (48, 40)
+        assert image.n_frames == 4
+
+
+def test_explore_a_ply(finished: tuple[extrags.Result, Path], tmp_path: Path) -> None:
+    _, ply = finished
+    module = example("explore_a_ply")
+    found = module.explore_ply(ply, SEQUENCE, tmp_path / "views", tiny_config())
+    assert len(found) > 0
+    assert len(list((tmp_path / "views").glob("*.png"))) == len(found)
