@@ -39,5 +39,6 @@ def test_root_holds_only_what_belongs_there() -> None:
     roots = {name.split("/")[0] for name in tracked if name and not name.startswith(".")}
     assert roots <= {
         "extrags", "tasks", "flows", "data_catalog", "tests", "docs", "examples",
-        "pyproject.toml", "README.md", "LICENSE", "Makefile", "CMakeLists.txt", "prefect.yaml", "requirements.lock",
+        "pyproject.toml", "README.md", "LICENSE", "Makefile", "CMakeLists.txt", "prefect.yaml",
+        "requirements.lock",
     }  # fmt: skip
