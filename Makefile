@@ -29,6 +29,9 @@ NATIVE := $(wildcard CMakeLists.txt extrags/raster/kernels/*)
 		--no-build-isolation --editable .
 	@touch $@
 
+# Weights of LPIPS, for its figure in the demo; empty where there are none.
+EXTRAGS_LPIPS_WEIGHTS ?= $(abspath $(wildcard ../shared/data/lpips_weights))
+demo: export EXTRAGS_LPIPS_WEIGHTS := $(EXTRAGS_LPIPS_WEIGHTS)
 demo: setup ## Reconstruct, explore, restore and evaluate the phantom, both settings
 	$(BIN)/extrags run phantom/0@sparse phantom/0@distanced --profile quick --store $(STORE)
 

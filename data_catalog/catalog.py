@@ -5,15 +5,14 @@ what lies in it. `phantom/N@sparse` and `phantom/N@distanced` exist for every N 
 C3VD and C3VDv2 are made of several videos, one folder each: `c3vdv2/c1_cecum_t1@sparse` finds them below a
 data root, `FOLDER/c1_cecum_t1@sparse` in a folder that holds them.
 
-Named sets on disk are looked for in `$EXTRAGS_DATA`, then in `../shared/data` beside the working directory
-and beside the checkout.
+Named sets on disk are looked for in `$EXTRAGS_DATA`, then in the user's data and cache directories
+(`extrags.data_directories`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import re
 from difflib import get_close_matches
 from pathlib import Path
@@ -25,6 +24,7 @@ from data_catalog.c3vd.datasets import Recording, RecordingPair, datasets, find,
 from data_catalog.formats import FolderFormat, folder_formats
 from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig, Setting
 from extrags.config import IngestConfig
+from extrags.data_directories import DATA_VARIABLE, data_roots
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError, UnknownSequenceError
 from extrags.sequence import EndoscopicSequence
 
@@ -41,7 +41,6 @@ __all__ = [
 
 logger = logging.getLogger(__name__)
 
-DATA_ROOT_VARIABLE = "EXTRAGS_DATA"
 _PHANTOM = re.compile(r"phantom/(?P<scene>\d+)(?:@(?P<setting>\w+))?")
 _LISTED_SCENES = 4
 
@@ -199,14 +198,14 @@ def resolve(name_or_path: str | Path) -> Source:
             if folder is None:
                 raise SourceNotFoundError(
                     f"{descriptor.name} is not on this machine: no folder {descriptor.folder} in "
-                    f"{', '.join(str(root) for root in _data_roots())}. Put it there, set "
-                    f"{DATA_ROOT_VARIABLE} to the folder that holds it, or give its path",
+                    f"{', '.join(str(root) for root in data_roots())}. Put it there, set "
+                    f"{DATA_VARIABLE} to the folder that holds it, or give its path",
                     file=descriptor.folder,
                 )
             return Source(name=descriptor.name, format=descriptor.format, path=str(folder))
     videos = find(text)
     if videos is not None:
-        return _resolve_videos(videos, _data_roots())
+        return _resolve_videos(videos, data_roots())
     scene_there = find_scene(path.name) if len(path.parts) > 1 and path.parent.is_dir() else None
     if scene_there is not None:
         return _resolve_videos(scene_there, [path.parent])
@@ -394,7 +393,7 @@ def _describe_videos(item: Recording | RecordingPair) -> Descriptor:
         texture=used[0].texture,
         videos=tuple(video.video for video in used),
         folder=None if folder is None else f"{dataset.folders[0]}/{folder}",
-        available=all(_find_video(video, _data_roots()) is not None for video in used),
+        available=all(_find_video(video, data_roots()) is not None for video in used),
     )
 
 
@@ -411,7 +410,7 @@ def _resolve_videos(item: Recording | RecordingPair, roots: list[Path]) -> Sourc
             wanted = datasets()[video.dataset].folder_names(video)[0]
             raise SourceNotFoundError(
                 f"{item.name} is not on this machine: no folder {wanted} in "
-                f"{', '.join(str(root) for root in roots)}. Put it there, set {DATA_ROOT_VARIABLE} to the "
+                f"{', '.join(str(root) for root in roots)}. Put it there, set {DATA_VARIABLE} to the "
                 f"folder that holds it, or give FOLDER/{item.name.partition('/')[2]} with the folder that "
                 "the videos lie in",
                 file=wanted,
@@ -427,19 +426,8 @@ def _with_availability(descriptor: Descriptor) -> Descriptor:
     return descriptor.model_copy(update={"available": found})
 
 
-def _data_roots() -> list[Path]:
-    roots = [
-        Path.cwd().parent / "shared" / "data",
-        Path(__file__).resolve().parents[2] / "shared" / "data",
-    ]
-    chosen = os.environ.get(DATA_ROOT_VARIABLE)
-    if chosen:
-        roots.insert(0, Path(chosen).expanduser())
-    return list(dict.fromkeys(roots))
-
-
 def _find_folder(folder: str) -> Path | None:
-    return next((root / folder for root in _data_roots() if (root / folder).is_dir()), None)
+    return next((root / folder for root in data_roots() if (root / folder).is_dir()), None)
 
 
 def _resolve_folder(path: Path) -> Source:

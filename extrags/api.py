@@ -29,7 +29,9 @@ from extrags.exploration import Exploration, explore
 from extrags.freespace import FreeSpace, carve
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
-from extrags.metrics import EvaluationResult, RenderedViews
+from extrags.metrics.image import means_in_regions
+from extrags.metrics.protocol import EvaluationResult, RenderedViews
+from extrags.metrics.registry import Metric, register_metric
 from extrags.pipeline import STAGES, Result, run_pipeline
 from extrags.poses import estimate_poses, with_estimated_poses
 from extrags.pseudo_views import PseudoViews
@@ -58,6 +60,7 @@ __all__ = [
     "Gaussians",
     "IngestConfig",
     "Mesh",
+    "Metric",
     "NearFieldLight",
     "PipelineConfig",
     "PosesConfig",
@@ -78,10 +81,12 @@ __all__ = [
     "explore",
     "finetune",
     "fuse_surface",
+    "means_in_regions",
     "profile_config",
     "rasterize",
     "read",
     "reconstruct",
+    "register_metric",
     "render",
     "restore",
     "run_pipeline",

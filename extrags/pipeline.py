@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from extrags.confidence import PerceptualDifference
     from extrags.exploration import Exploration
     from extrags.freespace import FreeSpace
-    from extrags.metrics import EvaluationResult, RenderedViews, TrueSurface
+    from extrags.metrics.protocol import EvaluationResult, RenderedViews
+    from extrags.metrics.surface import TrueSurface
     from extrags.pseudo_views import PseudoViews
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence

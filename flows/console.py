@@ -20,7 +20,7 @@ from rich.progress import (
 from rich.table import Table
 
 from flows.outcome import DatasetOutcome, SequenceOutcome
-from flows.tables import METRICS, figure
+from flows.tables import figure, tabled
 from flows.terminal import console
 from tasks.progress import StageProgress, observed
 
@@ -94,7 +94,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("sequence", "status", "stages"):
         table.add_column(column)
-    for name in METRICS[:4]:
+    for name in tabled()[:4]:
         table.add_column(name, justify="right")
     for outcome in run.sequences:
         states = [row.state for row in outcome.stages]
@@ -109,7 +109,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
             outcome.name,
             f"[{colour}]{outcome.status}[/]",
             counts,
-            *(_change(name, coarse.get(name), final.get(name)) for name in METRICS[:4]),
+            *(_change(name, coarse.get(name), final.get(name)) for name in tabled()[:4]),
         )
     out.print(table)
     for outcome in run.sequences:

@@ -5,28 +5,35 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from extrags.metrics.registry import figures, metric_named
 from flows.outcome import SequenceOutcome
 
 __all__ = [
-    "DIFFERENCES",
-    "METRICS",
     "benchmark_markdown",
     "dataset_markdown",
     "difference_text",
+    "differences",
     "figure",
     "markdown_table",
     "sequence_markdown",
     "spread_text",
+    "tabled",
 ]
 
-METRICS = ("psnr", "ssim", "lpips_alex", "flip", "depth_absrel")
-DIFFERENCES = ("psnr", "observed.psnr", "observed.aligned.psnr", "ssim", "lpips_alex", "depth_absrel")
-_DIGITS = {"psnr": 2}
+
+def tabled() -> list[str]:
+    """Names of the figures in tables of runs; narrow tables show the first few."""
+    return [shown.name for shown in figures("tables")]
+
+
+def differences() -> list[str]:
+    """Names of the figures whose differences between methods are shown."""
+    return [shown.name for shown in figures("differences")]
 
 
 def figure(name: str, value: float | None) -> str:
     """A metric with the digits it deserves; a dash where it cannot be had."""
-    return "–" if value is None else f"{value:.{_DIGITS.get(name, 4)}f}"  # noqa: RUF001
+    return "–" if value is None else f"{value:.{_digits(name)}f}"  # noqa: RUF001
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
@@ -49,9 +56,9 @@ def sequence_markdown(outcome: SequenceOutcome) -> str:
         ],
     )
     metrics = markdown_table(
-        ["scene", *METRICS, "Gaussians"],
+        ["scene", *tabled(), "Gaussians"],
         [
-            [which, *(figure(name, tree.get(name)) for name in METRICS), tree.get("n_gaussians", "")]
+            [which, *(figure(name, tree.get(name)) for name in tabled()), tree.get("n_gaussians", "")]
             for which, tree in outcome.metrics.items()
             if tree is not None
         ],
@@ -73,12 +80,12 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
                 f"{outcome.seconds:.1f}",
                 *(
                     f"{figure(name, coarse.get(name))} → {figure(name, final.get(name))}"
-                    for name in METRICS[:3]
+                    for name in tabled()[:3]
                 ),
                 "" if failed is None else f"{failed.stage}: {failed.reason}",
             ]
         )
-    return markdown_table(["sequence", "status", "seconds", *METRICS[:3], "problem"], rows)
+    return markdown_table(["sequence", "status", "seconds", *tabled()[:3], "problem"], rows)
 
 
 def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
@@ -87,20 +94,20 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
 
     comparison = compare_runs(cases, baseline)
     paired = markdown_table(
-        ["dataset", "profile", "method", "sequences", *DIFFERENCES],
+        ["dataset", "profile", "method", "sequences", *differences()],
         [
             [
                 row["dataset"],
                 row["profile"],
                 row["method"],
                 row["n_sequences"],
-                *(difference_text(name, row["figures"].get(name)) for name in DIFFERENCES),
+                *(difference_text(name, row["figures"].get(name)) for name in differences()),
             ]
             for row in comparison["paired_datasets"]
         ],
     )
     spread = markdown_table(
-        ["sequence", "setting", "profile", "method", "seeds", *METRICS],
+        ["sequence", "setting", "profile", "method", "seeds", *tabled()],
         [
             [
                 row["sequence"],
@@ -108,13 +115,13 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
                 row["profile"],
                 row["method"],
                 row["n_seeds"],
-                *(spread_text(name, row["figures"].get(name)) for name in METRICS),
+                *(spread_text(name, row["figures"].get(name)) for name in tabled()),
             ]
             for row in comparison["sequences"]
         ],
     )
     runs = markdown_table(
-        ["sequence", "setting", "profile", "method", "seed", "seconds", "MiB", *METRICS, "problem"],
+        ["sequence", "setting", "profile", "method", "seed", "seconds", "MiB", *tabled(), "problem"],
         [
             [
                 case["sequence"],
@@ -124,7 +131,7 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
                 case["seed"],
                 f"{case['seconds']:.1f}",
                 "" if case["peak_mib"] is None else f"{case['peak_mib']:.0f}",
-                *(figure(name, (case["metrics"] or {}).get(name)) for name in METRICS),
+                *(figure(name, (case["metrics"] or {}).get(name)) for name in tabled()),
                 case["error"],
             ]
             for case in cases
@@ -140,7 +147,7 @@ def difference_text(name: str, found: dict[str, Any] | None) -> str:
     """A mean difference with its sign, and the interval if there is one."""
     if found is None:
         return figure(name, None)
-    digits = _DIGITS.get(name.rpartition(".")[2], 4)
+    digits = _digits(name)
     text = f"{found['mean']:+.{digits}f}"
     return (
         text if found["low"] is None else f"{text} [{found['low']:+.{digits}f}, {found['high']:+.{digits}f}]"
@@ -152,3 +159,7 @@ def spread_text(name: str, found: dict[str, Any] | None) -> str:
     if found is None or found["deviation"] is None:
         return figure(name, None if found is None else found["mean"])
     return f"{figure(name, found['mean'])} ± {figure(name, found['deviation'])}"
+
+
+def _digits(name: str) -> int:
+    return metric_named(name.rpartition(".")[2]).table_digits

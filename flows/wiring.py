@@ -11,6 +11,7 @@ from typing import Any
 from data_catalog.catalog import resolve, source_fingerprint
 from extrags.config import PipelineConfig
 from extrags.errors import ExtragsError
+from extrags.metrics.registry import added_metrics
 from extrags.pipeline import STAGES, Pipeline, StageName
 from extrags.store import Manifest, Ref, Store
 from flows.outcome import Part, SequenceOutcome, StageRow
@@ -261,7 +262,12 @@ class SequenceRun(Pipeline):
                 scenes.append(self.refs["finetune"])
             renders = self._all(row, [Call(render, {"scene": ref, "sequence": sequence}) for ref in scenes])
             weights = self._weights()
-            settings = {"net": weights.net, "weights_digest": weights.digest, "weights": weights}
+            settings = {
+                "net": weights.net,
+                "weights_digest": weights.digest,
+                "weights": weights,
+                "added": added_metrics(),
+            }
             figures = self._all(
                 row, [Call(measure, {"renders": ref, "sequence": sequence, **settings}) for ref in renders]
             )

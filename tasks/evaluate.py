@@ -50,14 +50,27 @@ def measure(
     net: str,
     weights_digest: str | None,
     weights: Weights,
+    added: list[str],
 ) -> None:
-    """Metrics of rendered views and of the surface; writes `metrics.json`."""
+    """Metrics of rendered views and of the surface; writes `metrics.json`.
+
+    `added` names the metrics that a program has registered beside the protocol's
+    (`extrags.metrics.registry.added_metrics`).
+    """
     from data_catalog.true_surface import true_surface
+    from extrags.errors import ConfigError
     from extrags.evaluation import evaluate_renders
+    from extrags.metrics.comparison import figure_of
     from extrags.metrics.protocol import RenderedViews
+    from extrags.metrics.registry import added_metrics, figures
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 
+    if added != added_metrics():
+        raise ConfigError(
+            f"metrics to be measured beside the protocol's: {', '.join(added) or 'none'}; registered in this "
+            f"process: {', '.join(added_metrics()) or 'none'}. Register them in every process of the run"
+        )
     frames = slot.load(EndoscopicSequence, sequence)
     difference = weights.perceptual_difference()
     result = evaluate_renders(
@@ -69,6 +82,5 @@ def measure(
         lpips_reason=difference.reason,
     )
     slot.save_json(METRICS_FILE, result.to_json(), indent=1)
-    for name in ("psnr", "ssim", "lpips_alex"):
-        slot.counts[name] = result.metrics.get(name)
-    slot.counts["fscore"] = result.metrics["surface"]["fscore"]
+    for figure in figures("counts"):
+        slot.counts[figure.key] = figure_of(result.metrics, figure.name)

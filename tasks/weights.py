@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
-from extrags.config import EnhanceConfig, EvaluateConfig
+from extrags.config import EnhanceConfig, EvaluateConfig, LpipsNet
 from extrags.errors import WeightsError
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ class Weights(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    net: Literal["alex", "squeeze"]
+    net: LpipsNet
     path: str | None = None
     digest: str | None = None
     reason: str = ""

@@ -13,6 +13,10 @@ import pytest
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+# The library itself never looks beside a checkout.
+if SHARED_DATA.is_dir():
+    os.environ["EXTRAGS_DATA"] = str(SHARED_DATA)
+    os.environ["EXTRAGS_LPIPS_WEIGHTS"] = str(SHARED_DATA / "lpips_weights")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -366,10 +366,14 @@ class FinetuneConfig(StageConfig):
     seed: int = Field(0, ge=0)
 
 
+LpipsNet = Literal["alex", "squeeze"]
+"""Backbones of LPIPS."""
+
+
 class EvaluateConfig(StageConfig):
     """Held-out views and their metrics."""
 
-    lpips_net: Literal["alex", "squeeze"] = Field("alex", description="backbone of LPIPS")
+    lpips_net: LpipsNet = Field("alex", description="backbone of LPIPS")
     lpips_weights: str | None = Field(
         None, description="npz file with LPIPS weights; None looks in the usual places"
     )

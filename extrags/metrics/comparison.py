@@ -16,57 +16,11 @@ from typing import Any
 import numpy as np
 
 from extrags.errors import ConfigError
+from extrags.metrics.registry import Figure, figures
 
-__all__ = ["FIGURES", "Figure", "Spread", "compare_runs", "dataset_of", "figure_of", "paired", "spread"]
+__all__ = ["Spread", "compare_runs", "dataset_of", "figure_of", "paired", "spread"]
 
 Run = Mapping[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class Figure:
-    """A figure of the metrics tree that runs are compared by.
-
-    Args:
-        name: dotted path in the tree.
-        higher_is_better: the direction.
-    """
-
-    name: str
-    higher_is_better: bool
-
-
-_PHOTOMETRIC = (
-    ("psnr", True),
-    ("ssim", True),
-    ("lpips_alex", False),
-    ("lpips_squeeze", False),
-    ("flip", False),
-)
-_DEPTH = (("depth_absrel", False), ("depth_rmse", False), ("depth_delta125", True), ("depth_coverage", True))
-_SURFACE = (
-    ("accuracy_mm", False),
-    ("completeness_mm", False),
-    ("precision", True),
-    ("recall", True),
-    ("fscore", True),
-)
-
-FIGURES: tuple[Figure, ...] = tuple(
-    Figure(f"{prefix}{name}", higher)
-    for prefix, names in (
-        ("", (*_PHOTOMETRIC, *_DEPTH)),
-        ("aligned.", _PHOTOMETRIC),
-        ("observed.", (*_PHOTOMETRIC, *_DEPTH)),
-        ("observed.aligned.", _PHOTOMETRIC),
-        ("unobserved.", (*_PHOTOMETRIC, *_DEPTH)),
-        ("unobserved.aligned.", _PHOTOMETRIC),
-        ("whole.", _PHOTOMETRIC),
-        ("surface.", (*_SURFACE, ("coverage", True))),
-        ("surface.unobserved.", _SURFACE),
-    )
-    for name, higher in names
-)
-"""All figures that have a direction."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,18 +132,18 @@ def compare_runs(runs: Sequence[Run], baseline: str) -> dict[str, Any]:
             raise ConfigError(f"the run {key} is there twice")
         seen.add(key)
     measured = [run for run in runs if run["metrics"] is not None]
-    figures = [
+    known = [
         figure
-        for figure in FIGURES
+        for figure in figures()
         if any(figure_of(run["metrics"], figure.name) is not None for run in measured)
     ]
     rivals = [method for method in methods if method != baseline]
     return {
         "baseline": baseline,
-        "sequences": _grouped(measured, figures, _by_sequence),
-        "datasets": _grouped(measured, figures, _by_dataset),
-        "paired_sequences": _paired(measured, figures, rivals, baseline, _by_sequence),
-        "paired_datasets": _paired(measured, figures, rivals, baseline, _by_dataset),
+        "sequences": _grouped(measured, known, _by_sequence),
+        "datasets": _grouped(measured, known, _by_dataset),
+        "paired_sequences": _paired(measured, known, rivals, baseline, _by_sequence),
+        "paired_datasets": _paired(measured, known, rivals, baseline, _by_dataset),
     }
 
 
@@ -207,13 +161,13 @@ def _by_dataset(run: Run) -> dict[str, Any]:
 
 def _grouped(
     runs: Sequence[Run],
-    figures: Sequence[Figure],
+    known: Sequence[Figure],
     about: Callable[[Run], dict[str, Any]],
 ) -> list[dict[str, Any]]:
     rows = []
     for group, members in _groups(runs, lambda run: {**about(run), "method": run["method"]}):
         found = {}
-        for figure in figures:
+        for figure in known:
             values = [
                 (run, value)
                 for run in members
@@ -228,7 +182,7 @@ def _grouped(
 
 def _paired(
     runs: Sequence[Run],
-    figures: Sequence[Figure],
+    known: Sequence[Figure],
     methods: Sequence[str],
     baseline: str,
     about: Callable[[Run], dict[str, Any]],
@@ -238,7 +192,7 @@ def _paired(
         for group, members in _groups(runs, about):
             found: dict[str, Any] = {}
             partners: dict[int, Run] = {}
-            for figure in figures:
+            for figure in known:
                 differences = paired(members, method, baseline, figure.name)
                 partners |= {id(run): run for run, _ in differences}
                 sample = _sample(differences, about)

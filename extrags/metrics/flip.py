@@ -16,9 +16,9 @@ from torch import Tensor
 
 from extrags.errors import ConfigError, ShapeError
 from extrags.metrics.filters import filter_separable, gaussian_weights
-from extrags.metrics.image import mean_of_known, means_per_image
+from extrags.metrics.image import mean_of_known, means_in_regions, means_per_image
 
-__all__ = ["PIXELS_PER_DEGREE", "flip", "flip_map"]
+__all__ = ["PIXELS_PER_DEGREE", "flip", "flip_in_regions", "flip_map"]
 
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * math.pi / 180
 """The paper's default viewer: 0.7 m from a 0.7 m wide display of 3840 pixels, 67 px per degree."""
@@ -88,6 +88,10 @@ def flip_map(
     feature = _feature_difference(first[:, 0], second[:, 0], pixels_per_degree)
     # Section 4.3; 0 ** 0 is 1 in torch, but equal colours are no error whatever the features say.
     return torch.where(color > 0, color ** (1 - feature), 0.0).reshape(batch)
+
+
+flip_in_regions = means_in_regions(flip_map)
+"""FLIP of each image inside each region; see `flip`."""
 
 
 def _color_difference(

@@ -7,6 +7,7 @@ values per image. An image without a single pixel in its mask has no value, and 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,10 +21,13 @@ __all__ = [
     "SSIM_SIGMA_PX",
     "SSIM_WINDOW_PX",
     "mean_of_known",
+    "means_in_regions",
     "means_per_image",
     "psnr",
+    "psnr_in_regions",
     "psnr_per_image",
     "ssim",
+    "ssim_in_regions",
     "ssim_map",
 ]
 
@@ -72,6 +76,15 @@ def psnr_per_image(
         None if error is None else -10 * math.log10(max(error, smallest))
         for error in means_per_image(squared, mask)
     ]
+
+
+def psnr_in_regions(
+    render: Float[Tensor, "n h w 3"],
+    target: Float[Tensor, "n h w 3"],
+    regions: dict[str, Bool[Tensor, "n h w"]],
+) -> dict[str, list[float | None]]:
+    """PSNR in dB of each image inside each region; see `psnr`."""
+    return {name: psnr_per_image(render, target, region) for name, region in regions.items()}
 
 
 def ssim(
@@ -144,6 +157,26 @@ def means_per_image(
     return [float(total / count) if count > 0 else None for total, count in zip(sums, counts, strict=True)]
 
 
+def means_in_regions(
+    map_of: Callable[[Tensor, Tensor], Float[Tensor, "n h w"]],
+) -> Callable[[Tensor, Tensor, dict[str, Tensor]], dict[str, list[float | None]]]:
+    """The metric whose value is the mean of a map over the pixels.
+
+    Args:
+        map_of: from render and target, [n, h, w, 3] in [0, 1], the metric of each pixel.
+
+    Returns:
+        A function of render, target and regions by name, [n, h, w]: one value per image and region, None
+        where the region is empty. The map is made once for all regions.
+    """
+
+    def measure(render: Tensor, target: Tensor, regions: dict[str, Tensor]) -> dict[str, list[float | None]]:
+        values = map_of(render, target)
+        return {name: means_per_image(values, region) for name, region in regions.items()}
+
+    return measure
+
+
 def mean_of_known(values: list[float | None]) -> float | None:
     """Mean of the values that are there, or None when none is."""
     known = [value for value in values if value is not None]
@@ -161,3 +194,7 @@ def _check_pair(render: Tensor, target: Tensor, mask: Tensor | None) -> None:
         raise ShapeError(f"render {tuple(render.shape)} and target {tuple(target.shape)} differ in shape")
     if mask is not None and mask.shape != render.shape[:-1]:
         raise ShapeError(f"mask {tuple(mask.shape)} does not fit images {tuple(render.shape)}")
+
+
+ssim_in_regions = means_in_regions(ssim_map)
+"""SSIM of each image inside each region; see `ssim`."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import torch
@@ -20,11 +19,12 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from extrags.config import LpipsNet
+from extrags.data_directories import weights_roots
 from extrags.errors import ConfigError, ShapeError, WeightsError
 
-__all__ = ["WEIGHTS_VARIABLE", "Lpips", "LpipsNet", "find_weights"]
+__all__ = ["WEIGHTS_VARIABLE", "Lpips", "find_weights"]
 
-LpipsNet = Literal["alex", "squeeze"]
 WEIGHTS_VARIABLE = "EXTRAGS_LPIPS_WEIGHTS"
 """Environment variable: an npz file, or a folder that holds `lpips_<net>_v0.1.npz`."""
 
@@ -273,9 +273,9 @@ def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> Path:
     """The npz file with LPIPS weights of a backbone.
 
     Looks, in this order, at the explicit path, at the environment variable `EXTRAGS_LPIPS_WEIGHTS`
-    (each a file, or a folder that holds `lpips_<net>_v0.1.npz`), at `../shared/data/lpips_weights`
-    beside the working directory and beside the checkout, and at `extrags/lpips` in the user's cache.
-    A path that was named and does not exist is an error; the search does not go on behind it.
+    (each a file, or a folder that holds `lpips_<net>_v0.1.npz`), and at `extrags/lpips` in the user's
+    data and cache directories (`extrags.data_directories`). A path that was named and does not exist is an
+    error; the search does not go on behind it.
 
     Args:
         explicit: path the user named, or None.
@@ -290,24 +290,20 @@ def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> Path:
     filename = f"lpips_{net}_v0.1.npz"
     for origin, text in (("the setting", explicit), (WEIGHTS_VARIABLE, os.environ.get(WEIGHTS_VARIABLE))):
         if text:
-            file = Path(text) / filename if Path(text).is_dir() else Path(text)
+            file = Path(text).expanduser()
+            file = file / filename if file.is_dir() else file
             if not file.is_file():
                 raise WeightsError(f"LPIPS weights: {origin} names {file}, which does not exist")
             return file
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folders = [
-        Path.cwd().parent / "shared" / "data" / "lpips_weights",
-        Path(__file__).resolve().parents[3] / "shared" / "data" / "lpips_weights",
-        cache / "extrags" / "lpips",
-    ]
+    folders = weights_roots("lpips")
     for folder in folders:
         if (folder / filename).is_file():
             return folder / filename
-    searched = ", ".join(str(folder) for folder in dict.fromkeys(folders))
+    searched = " and no ".join(str(folder / filename) for folder in folders)
     raise WeightsError(
-        f"no LPIPS weights for {net}: {filename} is in none of {searched}. Convert the published LPIPS v0.1 "
-        f"weights to npz (features.N.weight, features.N.bias, lin0, lin1, ...) and put the file there, or "
-        f"name it in {WEIGHTS_VARIABLE} or evaluate.lpips_weights"
+        f"no LPIPS weights for {net}: there is no {searched}. Convert the published LPIPS v0.1 weights to "
+        "npz (features.N.weight, features.N.bias, lin0, lin1, ...) and put the file there, or name it, or "
+        f"the folder that holds it, in {WEIGHTS_VARIABLE} or evaluate.lpips_weights"
     )
 
 

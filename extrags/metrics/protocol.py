@@ -23,9 +23,10 @@ from extrags.errors import NonFiniteError, ShapeError, SourceNotFoundError
 from extrags.events import Progress, emit
 from extrags.metrics.depth import depth_errors
 from extrags.metrics.exposure import align_exposure, exposure_gain
-from extrags.metrics.flip import flip_map
-from extrags.metrics.image import mean_of_known, means_per_image, psnr_per_image, ssim_map
+from extrags.metrics.image import mean_of_known
 from extrags.metrics.lpips import Lpips
+from extrags.metrics.photometric import photometric_values
+from extrags.metrics.registry import metrics as registered_metrics
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
 from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
@@ -43,7 +44,6 @@ COLOR_LEVELS = 255
 """Renders are measured as 8-bit images, so that PNGs of them have the same figures."""
 _PIXELS_AT_ONCE = 400_000
 
-_DEPTH_KEYS = ("depth_absrel", "depth_rmse", "depth_delta125", "depth_coverage")
 _NO_ERRORS: dict[str, Any] = {item.name: None for item in fields(SurfaceErrors)}
 _NO_SURFACE: dict[str, Any] = {
     **_NO_ERRORS,
@@ -273,22 +273,11 @@ def _photometric(
     lpips: Lpips | None,
 ) -> dict[str, list[dict[str, Any]]]:
     """Photometric figures of each image inside each region."""
-    structure, error = ssim_map(render, target), flip_map(render, target)
-    distances = None if lpips is None else lpips.regional_distances(render, target, regions)
-    found: dict[str, list[dict[str, Any]]] = {}
-    for name, region in regions.items():
-        columns: dict[str, list[float | None]] = {
-            "psnr": psnr_per_image(render, target, region),
-            "ssim": means_per_image(structure, region),
-            "lpips_alex": [None] * len(region),
-            "flip": means_per_image(error, region),
-        }
-        if lpips is not None and distances is not None:
-            columns[lpips.name] = distances[name]
-        found[name] = [
-            {key: values[index] for key, values in columns.items()} for index in range(len(region))
-        ]
-    return found
+    found = photometric_values(render, target, regions, registered_metrics("photometric"), lpips)
+    return {
+        name: [{key: values[index] for key, values in columns.items()} for index in range(len(render))]
+        for name, columns in found.items()
+    }
 
 
 def _depth_metrics(
@@ -297,10 +286,10 @@ def _depth_metrics(
     errors = None
     if sequence.depth_mm is not None:
         errors = depth_errors(depth, sequence.depth_mm[frame], region.numpy())
+    keys = [metric.key for metric in registered_metrics("depth")]
     if errors is None:
-        return dict.fromkeys(_DEPTH_KEYS)
-    values = (errors.absrel, errors.rmse, errors.delta125, errors.coverage)
-    return dict(zip(_DEPTH_KEYS, values, strict=True))
+        return dict.fromkeys(keys)
+    return {key: getattr(errors, key.removeprefix("depth_")) for key in keys}
 
 
 def _mean_tree(views: list[dict[str, Any]]) -> dict[str, Any]:
@@ -322,8 +311,13 @@ def _reasons(
     reasons = {}
     if metrics["psnr"] is None:
         reasons["psnr"] = "the validity masks of all views are empty"
-    if metrics["lpips_alex"] is None and metrics["psnr"] is not None:
-        reasons["lpips_alex"] = lpips_reason if lpips is None else f"LPIPS was taken with {lpips.net}"
+    else:
+        for metric in registered_metrics("photometric"):
+            if metric.optional or metrics[metric.key] is not None:
+                continue
+            reasons[metric.key] = "no view has a value"
+            if metric.lpips_net is not None:
+                reasons[metric.key] = lpips_reason if lpips is None else f"LPIPS was taken with {lpips.net}"
     if metrics["n_gaussians"] is None:
         reasons["n_gaussians"] = "the renders were made elsewhere"
     if metrics["depth_absrel"] is None:

@@ -7,46 +7,18 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from extrags.metrics.comparison import compare_runs, figure_of
+from extrags.metrics.registry import Figure, figures
 from extrags.report.charts import method_colors, methods_chart, pairs_chart
 from extrags.report.comparison import RenderedMethod, compared_rows
 from extrags.report.encode import DataImage
 from extrags.report.page import rendered_page
-from extrags.report.wording import count, duration, lpips_networks, number
+from extrags.report.wording import count, described_metrics, duration, number
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["BenchmarkInputs", "ComparedViews", "build_benchmark_report"]
 
 LARGEST_PAGE_BYTES = 5_000_000
 """The share of the pictures; numbers and charts come on top."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Column:
-    name: str
-    label: str
-    unit: str
-    higher_is_better: bool
-    digits: int
-
-
-COLUMNS = (
-    _Column("psnr", "PSNR", "dB", True, 2),
-    _Column("aligned.psnr", "PSNR, aligned", "dB", True, 2),
-    _Column("observed.psnr", "PSNR, observed", "dB", True, 2),
-    _Column("observed.aligned.psnr", "PSNR, observed, aligned", "dB", True, 2),
-    _Column("unobserved.psnr", "PSNR, never observed", "dB", True, 2),
-    _Column("ssim", "SSIM", "", True, 3),
-    _Column("lpips_alex", "LPIPS (AlexNet)", "", False, 3),
-    _Column("lpips_squeeze", "LPIPS (SqueezeNet)", "", False, 3),
-    _Column("flip", "FLIP", "", False, 3),
-    _Column("depth_absrel", "Depth AbsRel", "", False, 3),
-    _Column("surface.accuracy_mm", "Surface accuracy", "mm", False, 2),
-    _Column("surface.completeness_mm", "Completeness", "mm", False, 2),
-    _Column("surface.fscore", "F-score", "", True, 3),
-    _Column("surface.coverage", "Coverage", "", True, 3),
-)
-"""What the tables show; the JSON has every figure."""
-PANELS = ("observed.psnr", "observed.aligned.psnr", "lpips_alex", "depth_absrel")
 
 
 @dataclass(frozen=True)
@@ -100,7 +72,7 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
     measured = [run for run in inputs.runs if run["metrics"] is not None]
     columns = [
         column
-        for column in COLUMNS
+        for column in figures("columns")
         if any(figure_of(run["metrics"], column.name) is not None for run in measured)
     ]
     images = sum(5 * min(inputs.views, len(pair.sequence.test)) for pair in inputs.pictures)
@@ -137,7 +109,7 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
             )
             for pair in inputs.pictures
         ],
-        protocol={"version": None, "lpips": lpips_networks(*(run["metrics"] for run in measured))},
+        protocol={"version": None, "metrics": described_metrics(*(run["metrics"] for run in measured))},
     )
 
 
@@ -160,7 +132,7 @@ def _summary(comparison: Mapping[str, Any], inputs: BenchmarkInputs) -> str:
 
 
 def _rows(
-    rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], *, signed: bool = False
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[Figure], *, signed: bool = False
 ) -> list[dict[str, Any]]:
     return [
         {
@@ -174,7 +146,7 @@ def _rows(
     ]
 
 
-def _cell(figure: Mapping[str, Any] | None, column: _Column, signed: bool) -> dict[str, str]:
+def _cell(figure: Mapping[str, Any] | None, column: Figure, signed: bool) -> dict[str, str]:
     if figure is None:
         return {"value": "–", "verdict": "", "note": "", "better": ""}  # noqa: RUF001
     value = number(figure["mean"], column.digits, signed=signed)
@@ -213,16 +185,16 @@ def _sizes(row: Mapping[str, Any]) -> str:
 
 
 def _difference_chart(
-    rows: Sequence[Mapping[str, Any]], columns: Sequence[_Column], baseline: str
+    rows: Sequence[Mapping[str, Any]], columns: Sequence[Figure], baseline: str
 ) -> tuple[DataImage, str] | None:
-    panels = [column for column in columns if column.name in PANELS]
+    panels = [column for column in columns if column in figures("charts")]
     if not rows or not panels:
         return None
     several = len({row["method"] for row in rows}) > 1
     lines = []
     for row in rows:
-        figures = [row["figures"].get(panel.name) for panel in panels]
-        cells = [None if found is None else (found["mean"], found["low"], found["high"]) for found in figures]
+        given = [row["figures"].get(panel.name) for panel in panels]
+        cells = [None if found is None else (found["mean"], found["low"], found["high"]) for found in given]
         lines.append((f"{row['method']}, {_label(row)}" if several else _label(row), cells))
     titles = [
         (f"{panel.label} ({panel.unit})" if panel.unit else panel.label, panel.higher_is_better)
@@ -233,11 +205,12 @@ def _difference_chart(
 
 
 def _figure_charts(
-    runs: Sequence[Mapping[str, Any]], columns: Sequence[_Column], inputs: BenchmarkInputs
+    runs: Sequence[Mapping[str, Any]], columns: Sequence[Figure], inputs: BenchmarkInputs
 ) -> list[tuple[DataImage, str]]:
     known = {column.name: column for column in columns}
     # Whole-mask figures only where the source cannot tell what was observed.
-    names = [name for name in PANELS[:2] if name in known] or [name for name in ("psnr",) if name in known]
+    drawn = [figure.name for figure in figures("charts")[:2]]
+    names = [name for name in drawn if name in known] or [name for name in ("psnr",) if name in known]
     groups = list(dict.fromkeys(_label(run) for run in runs))
     charts = []
     for name in names:

@@ -9,17 +9,17 @@ import numpy as np
 from pydantic import BaseModel
 
 from extrags.config import PipelineConfig, ReportConfig
+from extrags.metrics.registry import metrics
 from extrags.report.charts import gain_chart, history_chart, views_chart
 from extrags.report.inputs import ReportInputs
 from extrags.report.page import rendered_page
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
 from extrags.report.views import depth_rows, held_out_rows, virtual_rows
 from extrags.report.wording import (
-    METRICS,
     compare,
     count,
+    described_metrics,
     duration,
-    lpips_networks,
     metric_of,
     number,
     shown_metrics,
@@ -101,7 +101,6 @@ def _facts(inputs: ReportInputs) -> list[tuple[str, str]]:
 
 def _summary(inputs: ReportInputs) -> str:
     """The result in two sentences."""
-    psnr = METRICS[0]
     coarse, final = _metrics(inputs.coarse_metrics), _metrics(inputs.final_metrics)
     before, after = metric_of(coarse, "psnr"), metric_of(final, "psnr")
     views = f"On {len(inputs.frames)} held-out views"
@@ -114,22 +113,22 @@ def _summary(inputs: ReportInputs) -> str:
         )
     text = f"{views} the final scene reaches {number(after, 2)} dB PSNR"
     if before is not None:
-        text += f", {_against(psnr.digits, before, after)} the coarse reconstruction"
+        text += f", {_against(before, after)} the coarse reconstruction"
     unseen = metric_of(final, "unobserved", "psnr")
     if unseen is None:
         return text + "."
     text += f". On surface that no training frame saw it reaches {number(unseen, 2)} dB"
     unseen_before = metric_of(coarse, "unobserved", "psnr")
     if unseen_before is not None:
-        text += f", {_against(psnr.digits, unseen_before, unseen)} the coarse one"
+        text += f", {_against(unseen_before, unseen)} the coarse one"
     return text + "."
 
 
-def _against(digits: int, before: float, after: float) -> str:
-    change = round(after - before, digits)
+def _against(before: float, after: float) -> str:
+    change = round(after - before, 2)
     if change == 0:
         return "level with"
-    return f"{number(abs(change), digits)} dB {'above' if change > 0 else 'below'}"
+    return f"{number(abs(change), 2)} dB {'above' if change > 0 else 'below'}"
 
 
 def _tiles(inputs: ReportInputs) -> list[dict[str, Any]]:
@@ -186,7 +185,7 @@ def _regions(inputs: ReportInputs) -> list[dict[str, Any]]:
 
 
 def _missing_reasons(inputs: ReportInputs) -> list[tuple[str, str]]:
-    labels = {metric.key: metric.label for metric in METRICS}
+    labels = {metric.key: metric.label for metric in metrics()}
     found: dict[str, str] = {}
     for result in (inputs.coarse_metrics, inputs.final_metrics):
         for key, reason in (result or {}).get("reasons", {}).items():
@@ -362,7 +361,7 @@ def _spent(inputs: ReportInputs) -> float:
 def _protocol(inputs: ReportInputs) -> dict[str, Any]:
     result = inputs.final_metrics or inputs.coarse_metrics or {}
     trees = (_metrics(inputs.coarse_metrics), _metrics(inputs.final_metrics))
-    return {"version": result.get("protocol"), "lpips": lpips_networks(*trees)}
+    return {"version": result.get("protocol"), "metrics": described_metrics(*trees)}
 
 
 def _settings(config: PipelineConfig | None) -> list[dict[str, Any]]:

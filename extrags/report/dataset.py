@@ -9,15 +9,14 @@ from typing import Any, Literal
 
 import numpy as np
 
+from extrags.metrics.registry import Metric, metric_named
 from extrags.report.charts import sequences_chart
 from extrags.report.page import rendered_page
 from extrags.report.wording import (
-    METRICS,
-    Metric,
     compare,
     count,
+    described_metrics,
     duration,
-    lpips_networks,
     metric_of,
     number,
     shown_metrics,
@@ -72,7 +71,8 @@ def build_dataset_report(
         made: when, in words; nothing is said when empty.
         profile: of the settings.
     """
-    metrics = shown_metrics(*(tree for row in rows for tree in (row.coarse, row.final)))
+    trees = [tree for row in rows for tree in (row.coarse, row.final)]
+    metrics, psnr = shown_metrics(*trees), metric_named("psnr")
     measured = [row for row in rows if metric_of(row.final or row.coarse, "psnr") is not None]
     chart = None
     if measured:
@@ -101,18 +101,16 @@ def build_dataset_report(
         rows=[_table_row(row, metrics) for row in rows],
         means=[_mean_cell(metric, rows, ()) for metric in metrics],
         unobserved=[_mean_cell(metric, rows, ("unobserved",)) for metric in metrics],
-        compared=sum(_both(row, METRICS[0], ()) is not None for row in rows),
+        compared=sum(_both(row, psnr, ()) is not None for row in rows),
         seeds=_seed_rows(rows, metrics),
         chart=chart,
-        protocol={
-            "version": None,
-            "lpips": lpips_networks(*(tree for row in rows for tree in (row.coarse, row.final))),
-        },
+        protocol={"version": None, "metrics": described_metrics(*trees)},
     )
 
 
 def _summary(rows: Sequence[DatasetRow]) -> str:
-    pairs = [pair for row in rows if (pair := _both(row, METRICS[0], ())) is not None]
+    psnr = metric_named("psnr")
+    pairs = [pair for row in rows if (pair := _both(row, psnr, ())) is not None]
     completed = sum(row.status == "completed" for row in rows)
     text = f"{completed} of {len(rows)} sequences completed."
     if not pairs:

@@ -23,7 +23,7 @@ from extrags.report.image_table import (
     scale_end,
 )
 from extrags.report.inputs import PseudoLike, RendersLike, ReportInputs
-from extrags.report.wording import METRICS, metric_of, number
+from extrags.report.wording import metric_of, number, shown_metrics
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["depth_rows", "held_out_rows", "virtual_rows"]
@@ -185,7 +185,7 @@ def _view_note(inputs: ReportInputs, index: int) -> str:
         for result in (inputs.coarse_metrics, inputs.final_metrics)
     ]
     said = []
-    for metric in METRICS[:2]:
+    for metric in shown_metrics(*views)[:2]:
         values = [metric_of(view, metric.key) for view in views]
         known = [number(value, metric.digits) for value in values if value is not None]
         if known:

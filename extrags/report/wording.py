@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from extrags.metrics.registry import Metric, metrics
+
 __all__ = [
-    "METRICS",
     "Comparison",
-    "Metric",
     "compare",
     "count",
+    "described_metrics",
     "duration",
-    "lpips_networks",
     "metric_of",
     "number",
     "shown_metrics",
@@ -23,30 +23,6 @@ __all__ = [
 MINUS = "\N{MINUS SIGN}"
 MISSING = "\N{EN DASH}"
 Verdict = Literal["better", "worse", "equal", ""]
-
-
-@dataclass(frozen=True, slots=True)
-class Metric:
-    """A figure of the evaluation and how it is written."""
-
-    key: str
-    label: str
-    unit: str
-    higher_is_better: bool
-    digits: int
-
-
-METRICS = (
-    Metric("psnr", "PSNR", "dB", True, 2),
-    Metric("ssim", "SSIM", "", True, 3),
-    Metric("lpips_alex", "LPIPS (AlexNet)", "", False, 3),
-    Metric("lpips_squeeze", "LPIPS (SqueezeNet)", "", False, 3),
-    Metric("flip", "FLIP", "", False, 3),
-    Metric("depth_absrel", "Depth AbsRel", "", False, 3),
-)
-
-
-_LPIPS_NETWORKS = {"lpips_alex": "AlexNet", "lpips_squeeze": "SqueezeNet"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,24 +97,33 @@ def compare(
     )
 
 
-def lpips_networks(*trees: Mapping[str, Any] | None) -> list[str]:
-    """Names of the networks for which there is an LPIPS figure."""
-    return [
-        network
-        for key, network in _LPIPS_NETWORKS.items()
-        if any(metric_of(tree, key) is not None for tree in trees)
-    ]
-
-
 def shown_metrics(*trees: Mapping[str, Any] | None) -> list[Metric]:
     """The metrics a page has columns for: all but an LPIPS whose network was not used."""
-    used = [
-        metric
-        for metric in METRICS
-        if not metric.key.startswith("lpips")
-        or any(metric_of(tree, metric.key) is not None for tree in trees)
-    ]
-    if not any(metric.key.startswith("lpips") for metric in used):
-        # Its absence is worth a column of its own, with the reason.
-        used.insert(2, METRICS[2])
-    return used
+    shown = [metric for metric in metrics() if metric.shown.get("tiles")]
+    lpips = [metric for metric in shown if metric.lpips_net is not None]
+    # Where there is none at all, its absence is worth a column of its own, with the reason.
+    kept = _measured(lpips, trees) or lpips[:1]
+    return [metric for metric in shown if metric not in lpips or metric in kept]
+
+
+def described_metrics(*trees: Mapping[str, Any] | None) -> dict[str, str]:
+    """What the metrics of a page are, in words, by their label; all networks of LPIPS together."""
+    found = {}
+    shown = shown_metrics(*trees)
+    networks = " and ".join(metric.network for metric in _measured(shown, trees) if metric.network)
+    for metric in shown:
+        if metric.lpips_net is None:
+            found[metric.label] = metric.description
+            continue
+        found["LPIPS"] = (
+            f"Version 0.1, on the network {networks}. Figures of another network cannot be compared with "
+            "these."
+            if networks
+            else "Not measured in this run; the reason stands below the table of numbers. Where it is "
+            "measured, its network is named."
+        )
+    return found
+
+
+def _measured(candidates: Sequence[Metric], trees: Sequence[Mapping[str, Any] | None]) -> list[Metric]:
+    return [metric for metric in candidates if any(metric_of(tree, metric.key) is not None for tree in trees)]

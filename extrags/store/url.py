@@ -16,6 +16,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from extrags.data_directories import cache_directory
 from extrags.errors import MissingDependencyError, StoreError
 from extrags.store.canonical import Ref, digest_of
 from extrags.store.directory import private_directory, sweep_directories
@@ -31,7 +32,7 @@ def default_cache_directory() -> Path:
     chosen = os.environ.get("EXTRAGS_CACHE")
     if chosen:
         return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "extrags"
+    return cache_directory()
 
 
 class UrlBackend:

@@ -12,6 +12,7 @@ from typing import Any
 from rich.table import Table
 
 from extrags.errors import ConfigError
+from extrags.metrics.registry import figures
 from flows.commands.common import parsed_settings, set_up_logging, write_json
 from flows.terminal import console
 
@@ -171,8 +172,10 @@ def _print_kernels(cases: list[dict[str, Any]]) -> None:
 
 def _print_restorers(cases: list[dict[str, Any]]) -> None:
     """A table per sequence; what is kept of known texture is what fine-tuning is given."""
-    header = ["method", "PSNR", "SSIM", "LPIPS", "well", "hole", "observed", "unobserved", "kept PSNR"]
-    header += ["kept well", "changed", "flicker", "rank corr.", "s/frame", "prepared in s"]
+    measured = [figure for figure in figures("restoration") if any(figure.key in case for case in cases)]
+    header = ["method", *(figure.label for figure in measured)]
+    header += ["well", "hole", "observed", "unobserved", "kept PSNR", "kept well"]
+    header += ["changed", "flicker", "rank corr.", "s/frame", "prepared in s"]
     for sequence in dict.fromkeys(case["sequence"] for case in cases):
         chosen = [case for case in cases if case["sequence"] == sequence]
         shares = ", ".join(f"{name} {share:.0%}" for name, share in chosen[0]["pixel_share"].items())
@@ -182,7 +185,7 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
         rows = []
         for case in chosen:
             calibration, kept = case["calibration"], case["kept"]
-            row = [case["method"], case["psnr"], case["ssim"], case["lpips_alex"]]
+            row = [case["method"], *(case.get(figure.key) for figure in measured)]
             row += [case[part]["psnr"] for part in ("well", "hole", "observed", "unobserved")]
             row += [kept["psnr"], kept["well"]["psnr"], case["changed_share"], case["flicker"]]
             row += [None if calibration is None else calibration["rank_correlation"]]

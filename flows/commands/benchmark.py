@@ -101,24 +101,26 @@ def parsed_variants(given: list[list[str]]) -> dict[str, dict[str, Any]]:
 
 def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
     """What came out: differences to the baseline, spread over seeds, failures, and where the page is."""
-    from flows.tables import DIFFERENCES, METRICS, difference_text, spread_text
+    from flows.tables import difference_text, differences, spread_text, tabled
 
     out = console(error=to_stderr)
     comparison = found["comparison"]
     if comparison["paired_datasets"]:
         table = _table(f"differences to {comparison['baseline']}, mean over sequences [95 % interval]")
-        for column in ("dataset", "profile", "method", "sequences", *DIFFERENCES):
+        for column in ("dataset", "profile", "method", "sequences", *differences()):
             table.add_column(column)
         for row in comparison["paired_datasets"]:
             about = (row["dataset"], row["profile"], row["method"], str(row["n_sequences"]))
-            table.add_row(*about, *(difference_text(name, row["figures"].get(name)) for name in DIFFERENCES))
+            table.add_row(
+                *about, *(difference_text(name, row["figures"].get(name)) for name in differences())
+            )
         out.print(table)
     table = _table("mean ± standard deviation over seeds")
-    for column in ("sequence", "profile", "method", "seeds", *METRICS):
+    for column in ("sequence", "profile", "method", "seeds", *tabled()):
         table.add_column(column)
     for row in comparison["sequences"]:
         name = f"{row['sequence']}@{row['setting']}" if row["setting"] else row["sequence"]
-        figures = (spread_text(metric, row["figures"].get(metric)) for metric in METRICS)
+        figures = (spread_text(metric, row["figures"].get(metric)) for metric in tabled())
         table.add_row(name, row["profile"], row["method"], str(row["n_seeds"]), *figures)
     out.print(table)
     for case in found["cases"]:

@@ -13,7 +13,7 @@ from extrags.store import Store
 from flows.commands.common import parsed_settings, set_up_logging, store_root, write_json
 from flows.environment import prepare
 from flows.methods import METHODS, method_config, refuse_pinned
-from flows.tables import METRICS, figure
+from flows.tables import figure, tabled
 from flows.terminal import console
 
 __all__ = ["evaluate"]
@@ -103,12 +103,12 @@ def _finished(given: argparse.Namespace, config: Any, root: str) -> dict[str, An
 def _print(found: dict[str, Any]) -> None:
     out = console()
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("pixels", *METRICS):
+    for column in ("pixels", *tabled()):
         table.add_column(column)
     metrics = found["metrics"]
     for group in GROUPS:
         tree = metrics[group] if group else metrics
-        table.add_row(group or "valid", *(figure(name, tree.get(name)) for name in METRICS))
+        table.add_row(group or "valid", *(figure(name, tree.get(name)) for name in tabled()))
     out.print(table)
     surface = {name: value for name, value in metrics["surface"].items() if isinstance(value, float)}
     if surface:

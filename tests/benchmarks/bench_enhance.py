@@ -37,10 +37,12 @@ from data_catalog.content import content_circle
 from extrags.cameras import Cameras, pixel_rays
 from extrags.confidence import PerceptualDifference
 from extrags.config import PipelineConfig
+from extrags.data_directories import data_roots
 from extrags.evaluation import render
 from extrags.metrics.image import mean_of_known, psnr
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.protocol import evaluate_views
+from extrags.metrics.registry import figures, metric_named
 from extrags.pipeline import InMemoryPipeline
 from extrags.raster import set_num_threads
 from extrags.raster.bench import machine
@@ -75,7 +77,7 @@ from tasks.weights import lpips_weights
 Case = dict[str, Any]
 Sink = Callable[[list[Case]], None]
 
-LAPAROSCOPY = Path(__file__).resolve().parents[3] / "shared" / "data" / "laparoscopy_frames_40"
+LAPAROSCOPY = "laparoscopy_frames_40"
 TISSUE_PX = (192, 160)
 SHEET_ROWS = 8
 
@@ -108,14 +110,13 @@ def table(names: list[str], methods: list[str], configs: list[PipelineConfig], s
     return cases
 
 
+MEASURED = {figure.label: (figure.key,) for figure in figures("restoration")}
 RESTORED = {
-    "PSNR": ("psnr",),
+    **MEASURED,
     "aligned": ("aligned_psnr",),
     "well": ("well", "psnr"),
     "hole": ("hole", "psnr"),
     "unobserved": ("unobserved", "psnr"),
-    "SSIM": ("ssim",),
-    "LPIPS": ("lpips_alex",),
     "kept PSNR": ("kept", "psnr"),
     "kept well": ("kept", "well", "psnr"),
     "rank corr.": ("calibration", "rank_correlation"),
@@ -123,13 +124,13 @@ RESTORED = {
     "s/frame": ("seconds_per_frame",),
     "prepared in s": ("prepare_seconds",),
 }
+EVALUATED = {
+    figure.label: tuple(figure.name.split("."))
+    for figure in figures("columns")
+    if metric_named(figure.key).kind != "surface"
+}
 FINE_TUNED = {
-    "PSNR": ("psnr",),
-    "observed": ("observed", "psnr"),
-    "unobserved": ("unobserved", "psnr"),
-    "SSIM": ("ssim",),
-    "LPIPS": ("lpips_alex",),
-    "AbsRel": ("depth_absrel",),
+    **EVALUATED,
     "training PSNR": ("train_psnr",),
     "fine-tuned in s": ("seconds", "finetune"),
 }
@@ -174,7 +175,7 @@ def _gain(cases: list[Case], key: str, row: str, baseline: str, name: str, path:
     known = [(own, other) for own, other in pairs if own is not None and other is not None]
     if not known:
         return "-"
-    if name == "LPIPS":
+    if name.startswith("LPIPS"):
         ratios = [own / other for own, other in known]
         if len(ratios) == 1:
             return f"x{ratios[0]:.2f}"
@@ -360,9 +361,9 @@ def laparoscopy_benchmark(frames: int, seed: int, lpips: Lpips | None) -> Restor
     """Real frames with holes and blur, at a constant depth, without any real view to borrow from."""
     from PIL import Image
 
-    files = sorted(LAPAROSCOPY.glob("*.jpg"))
+    files = sorted(file for root in data_roots() for file in (root / LAPAROSCOPY).glob("*.jpg"))
     if not files:
-        raise SystemExit(f"no frames in {LAPAROSCOPY}")
+        raise SystemExit(f"no frames in a folder {LAPAROSCOPY} below {' or '.join(map(str, data_roots()))}")
     chosen = [files[i] for i in np.unique(np.linspace(0, len(files) - 1, frames).round().astype(int))]
     images = []
     for file in chosen:
@@ -466,7 +467,7 @@ def main() -> int:
             text = json.dumps({"machine": machine(), "profile": given.profile, "cases": cases}, indent=1)
             Path(given.json).write_text(text + "\n")
 
-    quality = ["PSNR", "well", "hole", "unobserved", "SSIM", "LPIPS", "kept PSNR", "kept well"]
+    quality = [*MEASURED, "well", "hole", "unobserved", "kept PSNR", "kept well"]
     if given.what == "table":
         cases = table(given.sequences, methods, configs, sink)
         said = markdown(cases, RESTORED, "method", ["none", "classical"], quality)
@@ -477,7 +478,7 @@ def main() -> int:
             FINE_TUNED,
             "arm",
             ["real", "classical"],
-            ["PSNR", "observed", "unobserved", "SSIM", "LPIPS", "AbsRel", "training PSNR"],
+            [*EVALUATED, "training PSNR"],
         )
     else:
         cases = realism(

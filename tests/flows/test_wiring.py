@@ -11,14 +11,18 @@ import time
 from pathlib import Path
 
 import pytest
+from torch import Tensor
 
-from extrags.errors import WeightsError
+from extrags.errors import ConfigError, WeightsError
+from extrags.metrics.image import means_in_regions
+from extrags.metrics.registry import Metric, register_metric, unregister_metric
 from extrags.pipeline import STAGES
 from extrags.store import Store
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.wiring import run_sequence
-from tasks.evaluate import PROTOCOL_VERSION
+from tasks.evaluate import PROTOCOL_VERSION, measure
+from tasks.weights import Weights
 from tests.flows.tiny import SEQUENCE, tiny_config, without_report
 
 
@@ -168,6 +172,46 @@ def test_absent_weights_are_a_reason_not_a_failure(
         if ref is not None
     ]
     assert "put them there" in measured["reasons"]["lpips_alex"]
+
+
+def test_a_metric_of_ones_own_is_measured_anew(finished: tuple[str, SequenceOutcome]) -> None:
+    store, before = finished
+    error = Metric("mae", "Mean absolute error", higher_is_better=False, measure=means_in_regions(_error))
+
+    def evaluated() -> SequenceOutcome:
+        return run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), until="evaluate")
+
+    register_metric(error)
+    try:
+        with_it = evaluated()
+        assert states(with_it)["evaluate"] == "ran"
+        assert 0 < with_it.metrics["final"]["observed"]["mae"] < 1
+    finally:
+        unregister_metric("mae")
+    without = evaluated()
+    assert states(without)["evaluate"] == "cached"
+    assert without.metrics == before.metrics
+
+
+def test_a_process_that_lacks_a_metric_says_so(finished: tuple[str, SequenceOutcome]) -> None:
+    store, outcome = finished
+    found = {
+        name: Store(store).find(Path(outcome.artefacts[name]).name) for name in ("renders_final", "sequence")
+    }
+    with pytest.raises(ConfigError, match="mae@1; registered in this process: none"):
+        measure.fn(
+            store=store,
+            renders=found["renders_final"],
+            sequence=found["sequence"],
+            net="alex",
+            weights_digest=None,
+            weights=Weights(net="alex"),
+            added=["mae@1"],
+        )
+
+
+def _error(render: Tensor, target: Tensor) -> Tensor:
+    return (render - target).abs().mean(-1)
 
 
 def test_the_protocol_version_is_the_librarys() -> None:

@@ -23,9 +23,11 @@ from torch.nn import functional
 from extrags.cameras import Cameras, pixel_rays
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.metrics.exposure import align_exposure
-from extrags.metrics.image import mean_of_known, means_per_image, psnr, psnr_per_image, ssim_map
+from extrags.metrics.image import mean_of_known, psnr
 from extrags.metrics.lpips import Lpips
+from extrags.metrics.photometric import photometric_values
 from extrags.metrics.protocol import COLOR_LEVELS, SMALLEST_PART
+from extrags.metrics.registry import figures, metric_named
 from extrags.restoration.clips import as_images, as_planes, keep_known, render_clips
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.training_data.augmentation import drop_references
@@ -359,17 +361,12 @@ class RestorerBenchmark:
             name: region & (region.sum((1, 2)) >= smallest)[:, None, None]
             for name, region in self.regions.items()
         }
-        structure = ssim_map(render, target)
-        distances = None if self.lpips is None else self.lpips.regional_distances(render, target, regions)
-        tree: dict[str, dict[str, float | None]] = {}
-        for name, region in regions.items():
-            tree[name] = {
-                "psnr": mean_of_known(psnr_per_image(render, target, region)),
-                "ssim": mean_of_known(means_per_image(structure, region)),
-                "lpips_alex": None,
-            }
-            if self.lpips is not None and distances is not None:
-                tree[name][self.lpips.name] = mean_of_known(distances[name])
+        metrics = [metric_named(figure.key) for figure in figures("restoration")]
+        values = photometric_values(render, target, regions, metrics, self.lpips)
+        tree = {
+            name: {key: mean_of_known(column) for key, column in columns.items()}
+            for name, columns in values.items()
+        }
         nothing: dict[str, float | None] = dict.fromkeys(tree["valid"])
         for name in ("observed", "unobserved"):
             tree.setdefault(name, nothing)

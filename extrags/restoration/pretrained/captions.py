@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from extrags.config import CaptionConfig
+from extrags.data_directories import cache_directory
 from extrags.errors import ConfigError, ExtragsError, SourceError, SourceNotFoundError
 from extrags.events import MetricRecorded, emit
 from extrags.sequence import EndoscopicSequence
@@ -213,7 +214,7 @@ def _cache_folder() -> Path:
     given = os.environ.get(CACHE_VARIABLE)
     if given:
         return Path(given).expanduser() / "captions"
-    return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "extrags" / "captions"
+    return cache_directory() / "captions"
 
 
 def _keep(file: Path, caption: Caption) -> None:

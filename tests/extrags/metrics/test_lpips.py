@@ -9,8 +9,9 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
+from extrags.config import LpipsNet
 from extrags.errors import ConfigError, ShapeError, WeightsError
-from extrags.metrics.lpips import WEIGHTS_VARIABLE, Lpips, LpipsNet, find_weights
+from extrags.metrics.lpips import WEIGHTS_VARIABLE, Lpips, find_weights
 
 
 @pytest.fixture(scope="module")
@@ -109,28 +110,18 @@ def test_small_images_are_refused(alex: Lpips) -> None:
         alex.distance(first, second)
 
 
-def empty_search_places(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    import extrags.metrics.lpips as module
-
+def test_search_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-    monkeypatch.setattr(module, "__file__", str(tmp_path / "checkout/extrags/metrics/lpips.py"))
-
-
-def test_search_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    empty_search_places(monkeypatch, tmp_path)
-    with pytest.raises(
-        WeightsError, match=r"no LPIPS weights for alex: lpips_alex_v0\.1\.npz is in none of .*npz"
-    ):
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    with pytest.raises(WeightsError, match=r"no .*/data/extrags/lpips/lpips_alex_v0\.1\.npz and no "):
         find_weights(None, "alex")
 
     cached = tmp_path / "cache" / "extrags" / "lpips" / "lpips_alex_v0.1.npz"
-    beside_checkout = tmp_path / "shared" / "data" / "lpips_weights" / "lpips_alex_v0.1.npz"
+    in_data = tmp_path / "data" / "extrags" / "lpips" / "lpips_alex_v0.1.npz"
     by_variable = tmp_path / "elsewhere" / "lpips_alex_v0.1.npz"
     explicit = tmp_path / "mine.npz"
-    for file in (cached, beside_checkout, by_variable, explicit):
+    for file in (cached, in_data, by_variable, explicit):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.touch()
         if file == by_variable:

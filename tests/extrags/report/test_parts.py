@@ -10,13 +10,14 @@ import pytest
 from PIL import Image
 
 from extrags.errors import CaptureError, ConfigError, NonFiniteError, ShapeError
+from extrags.metrics.registry import metric_named
 from extrags.report import DatasetRow, ReportInputs, build_dataset_report
 from extrags.report.animation import write_animation
 from extrags.report.charts import drawing_style, history_chart, views_chart
 from extrags.report.encode import as_uint8, color_mapped, fitted_image, outlined, png_image
 from extrags.report.image_table import evenly_spaced
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
-from extrags.report.wording import METRICS, compare, duration, number
+from extrags.report.wording import compare, duration, number
 
 from .conftest import metrics_of
 from .pages import Page, decoded
@@ -88,7 +89,7 @@ def test_numbers_have_a_real_minus_and_no_minus_zero() -> None:
 
 
 def test_better_depends_on_the_metric() -> None:
-    psnr, lpips = METRICS[0], METRICS[2]
+    psnr, lpips = metric_named("psnr"), metric_named("lpips_alex")
     assert compare(psnr, 20, 21).verdict == "better"
     assert compare(lpips, 0.3, 0.4).verdict == "worse"
     assert compare(psnr, 20, 20.001).verdict == "equal"

@@ -1,0 +1,235 @@
+"""The registry against the protocol, and a metric of one's own in everything that shows metrics."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from extrags.config import LpipsNet
+from extrags.errors import ConfigError, NonFiniteError, ShapeError
+from extrags.metrics import protocol
+from extrags.metrics.comparison import compare_runs, figure_of
+from extrags.metrics.image import means_in_regions
+from extrags.metrics.photometric import photometric_values
+from extrags.metrics.protocol import EvaluationResult, RenderedViews, evaluate_views
+from extrags.metrics.registry import (
+    Metric,
+    added_metrics,
+    figures,
+    metric_named,
+    metrics,
+    register_metric,
+    unregister_metric,
+)
+from extrags.metrics.surface import SurfaceErrors, SurfaceResult
+from extrags.report.benchmark import BenchmarkInputs, build_benchmark_report
+from extrags.report.dataset import DatasetRow, build_dataset_report
+from extrags.sequence import EndoscopicSequence, Split
+from flows.outcome import SequenceOutcome
+from flows.tables import benchmark_markdown, sequence_markdown
+
+TEST = np.array([1, 3])
+OFFSET = 16 / 255
+
+
+def absolute_error(render: Tensor, target: Tensor) -> Tensor:
+    return (render - target).abs().mean(-1)
+
+
+MEAN_ABSOLUTE_ERROR = Metric(
+    "mae",
+    "Mean absolute error",
+    higher_is_better=False,
+    measure=means_in_regions(absolute_error),
+    description="What the toy says of itself.",
+)
+
+
+@pytest.fixture
+def mean_absolute_error() -> Iterator[Metric]:
+    register_metric(MEAN_ABSOLUTE_ERROR)
+    yield MEAN_ABSOLUTE_ERROR
+    unregister_metric("mae")
+
+
+@pytest.fixture
+def sequence() -> EndoscopicSequence:
+    mask = np.ones((5, 48, 64), dtype=bool)
+    mask[:, :, :8] = False
+    observed = np.zeros_like(mask)
+    observed[:, :, :40] = True
+    return EndoscopicSequence(
+        name="made/up@here",
+        rgb=np.random.default_rng(0).integers(40, 200, (5, 48, 64, 3), dtype=np.uint8),
+        K=np.tile(np.eye(3), (5, 1, 1)),
+        mask=mask,
+        split=Split("here", np.array([0, 2, 4]), TEST),
+        depth_mm=np.full((5, 48, 64), 20.0, dtype=np.float32),
+        observed=observed,
+    )
+
+
+def evaluated(sequence: EndoscopicSequence, offset: float) -> EvaluationResult:
+    """Renders that are wrong by an offset where training frames saw the surface."""
+    rgb = (
+        sequence.rgb[TEST].astype(np.float32) / 255 + np.float32(offset) * sequence.observed[TEST, ..., None]
+    )
+    renders = RenderedViews(rgb, np.ones(rgb.shape[:-1], np.float32), sequence.depth_mm[TEST], 7)
+    errors = SurfaceErrors(0.4, 0.2, 0.5, 0.3, 0.9, 0.8, 0.85)
+    surface = SurfaceResult(errors, replace(errors, recall=0.1), 0.6, 0.7, 1.0, "mesh")
+    return evaluate_views(renders, sequence, TEST, None, surface=surface)
+
+
+class TestRegistry:
+    def test_every_figure_stands_in_the_tree_of_the_protocol(self, sequence: EndoscopicSequence) -> None:
+        tree = evaluated(sequence, OFFSET).metrics
+        for figure in figures():
+            if not figure.key.startswith("lpips"):
+                assert figure_of(tree, figure.name) is not None, figure.name
+        assert len({figure.name for figure in figures()}) == len(figures())
+
+    def test_every_key_is_described_in_the_protocol(self) -> None:
+        words = (Path(protocol.__file__).parent / "PROTOCOL.md").read_text()
+        for metric in metrics():
+            assert f"`{metric.key}`" in words, metric.key
+
+    def test_pages_describe_what_they_show(self) -> None:
+        for metric in metrics():
+            if "tiles" in metric.shown:
+                assert metric.description or metric.network, metric.key
+
+    def test_every_network_of_lpips_is_a_metric(self) -> None:
+        assert {metric.lpips_net for metric in metrics() if metric.lpips_net} == set(get_args(LpipsNet))
+
+    def test_functions_of_the_photometric_metrics_are_there(self) -> None:
+        render, target = torch.full((2, 16, 16, 3), 0.6), torch.full((2, 16, 16, 3), 0.5)
+        half = torch.zeros(2, 16, 16, dtype=torch.bool)
+        half[0, 4:] = True
+        found = photometric_values(render, target, {"half": half}, metrics("photometric"), None)["half"]
+        assert list(found) == ["psnr", "ssim", "lpips_alex", "flip"]
+        assert found["psnr"] == [pytest.approx(20, abs=1e-3), None]
+        assert found["lpips_alex"] == [None, None]
+
+    def test_loads_no_torch(self) -> None:
+        program = "import sys, flows.tables as t; t.figure('psnr', 1.0); assert 'torch' not in sys.modules"
+        subprocess.run([sys.executable, "-c", program], check=True, cwd=Path(__file__).parents[3])
+
+
+class TestOwnMetric:
+    def test_is_measured_in_every_group_of_pixels(
+        self, sequence: EndoscopicSequence, mean_absolute_error: Metric
+    ) -> None:
+        result = evaluated(sequence, OFFSET)
+        assert figure_of(result.metrics, "observed.mae") == pytest.approx(OFFSET, abs=1e-6)
+        assert figure_of(result.metrics, "unobserved.mae") == pytest.approx(0, abs=1e-6)
+        assert figure_of(result.metrics, "mae") == pytest.approx(OFFSET * 32 / 56, abs=1e-6)
+        assert figure_of(result.metrics, "whole.mae") == pytest.approx(OFFSET * 40 / 64, abs=1e-6)
+        assert 0 < result.metrics["aligned"]["mae"] < 2 * OFFSET
+        assert [view["observed"]["mae"] for view in result.per_view] == pytest.approx([OFFSET] * 2, abs=1e-6)
+        assert list(result.metrics)[:5] == ["psnr", "ssim", "lpips_alex", "flip", "mae"]
+        json.dumps(result.to_json(), allow_nan=False)
+
+    def test_is_shown_in_tables_comparison_and_pages(
+        self, sequence: EndoscopicSequence, mean_absolute_error: Metric
+    ) -> None:
+        trees = {
+            method: evaluated(sequence, offset).metrics
+            for method, offset in (("3dgs", OFFSET), ("coarse", OFFSET / 2))
+        }
+        runs = [run(method, tree) for method, tree in trees.items()]
+        (row,) = compare_runs(runs, "3dgs")["paired_sequences"]
+        assert row["figures"]["observed.mae"]["mean"] == pytest.approx(-OFFSET / 2, abs=1e-6)
+        assert row["figures"]["observed.mae"]["better"] == 1
+        outcome = SequenceOutcome("made/up", metrics={"coarse": trees["3dgs"], "final": trees["coarse"]})
+        for table in (sequence_markdown(outcome), benchmark_markdown(runs, "3dgs")):
+            assert "| mae |" in table
+            assert f"{trees['coarse']['mae']:.4f}" in table
+        pages = (
+            build_benchmark_report(BenchmarkInputs("x", runs, "3dgs", dict.fromkeys(trees, "a method"))),
+            build_dataset_report(
+                [DatasetRow("made/up", "completed", 1.0, trees["3dgs"], trees["coarse"])], name="x"
+            ),
+        )
+        for page in pages:
+            assert "Mean absolute error" in page.split("How the numbers are taken")[0]
+            assert "What the toy says of itself." in page.split("How the numbers are taken")[1]
+
+    def test_is_part_of_the_key_of_cached_results(self, mean_absolute_error: Metric) -> None:
+        assert added_metrics() == ["mae@1"]
+        unregister_metric("mae")
+        assert added_metrics() == []
+        register_metric(replace(mean_absolute_error, version=2))
+        assert added_metrics() == ["mae@2"]
+
+    def test_without_a_value_there_is_a_reason(self, sequence: EndoscopicSequence) -> None:
+        def blind(
+            render: Tensor, target: Tensor, regions: dict[str, Tensor]
+        ) -> dict[str, list[float | None]]:
+            return {name: [None] * len(render) for name in regions}
+
+        register_metric(replace(MEAN_ABSOLUTE_ERROR, measure=blind))
+        try:
+            result = evaluated(sequence, OFFSET)
+        finally:
+            unregister_metric("mae")
+        assert result.metrics["mae"] is None
+        assert result.reasons["mae"] == "no view has a value"
+
+    @pytest.mark.parametrize(
+        ("values", "error"),
+        [([float("nan")] * 2, NonFiniteError), ([0.1], ShapeError)],
+    )
+    def test_what_no_result_may_hold_is_refused(self, values: list[float], error: type[Exception]) -> None:
+        metric = replace(MEAN_ABSOLUTE_ERROR, measure=lambda *_: {"all": values})
+        images, everything = torch.zeros(2, 8, 8, 3), torch.ones(2, 8, 8, dtype=torch.bool)
+        with pytest.raises(error, match="metric mae"):
+            photometric_values(images, images, {"all": everything}, [metric], None)
+
+    @pytest.mark.parametrize(
+        ("change", "message"),
+        [
+            ({"key": "psnr"}, "psnr: the key is taken"),
+            ({"key": "observed"}, "observed: the key is taken"),
+            ({"measure": None}, "only photometric metrics with a `measure`"),
+            ({"kind": "depth"}, "only photometric metrics with a `measure`"),
+            ({"key": "My metric"}, "a key is lower case"),
+            ({"shown": {"nowhere": ("",)}}, "no place 'nowhere' to show it; known: tables"),
+            ({"shown": {"tables": ("surface",)}}, "a photometric metric has"),
+        ],
+    )
+    def test_what_makes_no_sense_is_refused(
+        self, change: dict[str, Any], message: str, unchecked: None
+    ) -> None:
+        with pytest.raises(ConfigError, match=message):
+            register_metric(replace(MEAN_ABSOLUTE_ERROR, **change))
+        assert added_metrics() == []
+
+    def test_the_protocols_metrics_stay(self) -> None:
+        with pytest.raises(ConfigError, match="belongs to the protocol"):
+            unregister_metric("psnr")
+        with pytest.raises(ConfigError, match="no metric 'mae'; known: psnr, ssim"):
+            metric_named("mae")
+
+
+def run(method: str, tree: dict[str, Any]) -> dict[str, Any]:
+    return {
+        "method": method,
+        "profile": "quick",
+        "sequence": "made/up",
+        "setting": "here",
+        "seed": 0,
+        "seconds": 1.0,
+        "peak_mib": None,
+        "metrics": tree,
+        "error": "",
+    }
