@@ -6,6 +6,8 @@ keeps working. A message names the file, the frame and the field, what was found
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 __all__ = [
     "CaptureError",
     "ConfigError",
@@ -20,7 +22,23 @@ __all__ = [
     "StoreError",
     "UnknownSequenceError",
     "WeightsError",
+    "did_you_mean",
 ]
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """`; did you mean A or B?` for a message about a name that is not known; empty where none is near.
+
+    Args:
+        name: as it was given.
+        known: names there are. The last part of a dotted one is near: `iterations` to `coarse.iterations`.
+    """
+    from difflib import get_close_matches
+
+    known = list(known)
+    ending = f".{name.lstrip('-')}"
+    near = [other for other in known if other.endswith(ending)] or get_close_matches(name, known, n=1)
+    return f"; did you mean {' or '.join(near)}?" if near else ""
 
 
 class ExtragsError(Exception):

@@ -158,7 +158,7 @@ class EnhanceConfig(StageConfig):
     caption: CaptionConfig = CaptionConfig()
     pretrained: PretrainedConfig = PretrainedConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, description="seed of all random sampling")
 
     def batches(self, trajectories: int) -> int:
         """Number of batches that so many trajectories are restored in."""

@@ -7,13 +7,14 @@ iterations, never in seconds: a result must not depend on how busy the machine w
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
 from extrags.config.base import StageConfig
 from extrags.config.restorer import EnhanceConfig
-from extrags.errors import ConfigError
+from extrags.config.settings import settings_of, unknown_setting
 
 __all__ = [
     "AssessConfig",
@@ -120,17 +121,17 @@ class OptimiserConfig(StageConfig):
 
     means: float = Field(1.6e-4, gt=0, description="positions at the start, times the extent")
     means_final: float = Field(1.6e-6, gt=0, description="positions at the end, times the extent")
-    sh0: float = Field(2.5e-3, gt=0)
-    shN: float = Field(1.25e-4, gt=0)
-    opacities: float = Field(0.05, gt=0)
-    scales: float = Field(5e-3, gt=0)
-    quats: float = Field(1e-3, gt=0)
+    sh0: float = Field(2.5e-3, gt=0, description="base colours (degree 0 of the spherical harmonics)")
+    shN: float = Field(1.25e-4, gt=0, description="higher degrees of the spherical harmonics")
+    opacities: float = Field(0.05, gt=0, description="opacities, as logits")
+    scales: float = Field(5e-3, gt=0, description="axis lengths, as logarithms")
+    quats: float = Field(1e-3, gt=0, description="rotations, as quaternions")
 
 
 class DensifyConfig(StageConfig):
     """When Gaussians are cloned, split and pruned."""
 
-    enabled: bool = True
+    enabled: bool = Field(True, description="False: the number of Gaussians stays")
     start_share: float = Field(0.1, ge=0, le=1, description="from this share of the iterations")
     stop_share: float = Field(0.6, ge=0, le=1, description="until this share of the iterations")
     every: int = Field(100, ge=1, description="iterations between two rounds")
@@ -218,7 +219,7 @@ class CoarseConfig(StageConfig):
         "where poses are off by pixels; where they are good it costs held-out views a few tenths of a dB",
     )
     pose_refinement: PoseRefinementConfig = PoseRefinementConfig()
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, description="seed of all random sampling")
 
 
 class AssessConfig(StageConfig):
@@ -241,7 +242,7 @@ class AssessConfig(StageConfig):
         0.25, gt=0, le=1, description="at this share of lacking pixels the whole budget is spent"
     )
     force: bool = Field(False, description="run every stage whatever the measurements say")
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, description="seed of all random sampling")
 
 
 class SurfaceConfig(StageConfig):
@@ -292,8 +293,8 @@ class ExploreConfig(StageConfig):
     length: int = Field(16, ge=2, description="L: views per trajectory, the start included")
     directions: int = Field(32, ge=4, le=32, description="D: equal-area direction bins")
     step_share: float = Field(0.2, gt=0, description="length of a translation, in median rendered depths")
-    rotation_deg: float = Field(10.0, gt=0, le=90)
-    orbit_deg: float = Field(10.0, gt=0, le=90)
+    rotation_deg: float = Field(10.0, gt=0, le=90, description="angle of a turn about the camera itself")
+    orbit_deg: float = Field(10.0, gt=0, le=90, description="angle of a turn about the point in view")
     safety_share: float = Field(0.15, ge=0, description="smallest clearance, in median rendered depths")
     visible_weight: float = Field(
         0.02, gt=0, lt=1, description="a Gaussian is seen when its largest T * alpha exceeds this"
@@ -336,7 +337,7 @@ class ExploreConfig(StageConfig):
 class FinetuneConfig(StageConfig):
     """Real and restored views together."""
 
-    iterations: int = Field(2000, ge=1)
+    iterations: int = Field(2000, ge=1, description="optimisation steps, one view each")
     densify_share: float = Field(0.6, ge=0, le=1, description="densification ends at this share")
     pseudo_share: float = Field(
         0.5, ge=0, lt=1, description="share of virtual views among the steps, at the start"
@@ -363,7 +364,7 @@ class FinetuneConfig(StageConfig):
     confidence_floor: float = Field(
         0.1, ge=0, le=1, description="smallest pixel-level weight, so that no pixel drifts freely"
     )
-    seed: int = Field(0, ge=0)
+    seed: int = Field(0, ge=0, description="seed of all random sampling")
 
 
 LpipsNet = Literal["alex", "squeeze"]
@@ -410,36 +411,26 @@ class PipelineConfig(StageConfig):
         }
         return self.model_copy(update=seeded)
 
-    def with_overrides(self, overrides: dict[str, Any]) -> PipelineConfig:
+    def with_overrides(self, overrides: Mapping[str, Any]) -> PipelineConfig:
         """Apply `{"coarse.iterations": 500}`-like settings.
 
         Raises:
             ConfigError: for an unknown name (with the nearest known one) or a value out of range.
         """
+        known = settings_of(PipelineConfig)
         tree = self.model_dump()
-        for path, value in overrides.items():
-            _set_by_path(tree, path, value)
+        for name, value in overrides.items():
+            if name not in known:
+                raise unknown_setting(name, known)
+            *parents, leaf = name.split(".")
+            node = tree
+            for parent in parents:
+                node = node[parent]
+            node[leaf] = value
         try:
             return PipelineConfig.model_validate(tree)
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(str(part) for part in first["loc"])
-            raise ConfigError(f"setting {where}: {first['msg']} (found {first['input']!r})") from error
-
-
-def _set_by_path(tree: dict[str, Any], path: str, value: Any) -> None:
-    from difflib import get_close_matches
-
-    *parents, leaf = path.split(".")
-    node: Any = tree
-    for done, name in enumerate([*parents, leaf]):
-        if not isinstance(node, dict) or name not in node:
-            known = sorted(node) if isinstance(node, dict) else []
-            near = get_close_matches(name, known, n=1)
-            hint = f"; did you mean {'.'.join([*parents[:done], near[0]])}?" if near else "."
-            raise ConfigError(f"no setting {path}{hint} Known here: {', '.join(known) or 'none'}")
-        if done < len(parents):
-            node = node[name]
-    if isinstance(node[leaf], dict):
-        raise ConfigError(f"{path} is a group of settings; name one of {', '.join(node[leaf])}")
-    node[leaf] = value
+            # A place ends with the member of a union or of a tuple that was tried.
+            place = ".".join(str(part) for part in error.errors()[0]["loc"])
+            wrong = next(name for name in known if f"{place}.".startswith(f"{name}."))
+            raise known[wrong].refused(repr(overrides[wrong])) from error

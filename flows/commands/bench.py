@@ -1,4 +1,4 @@
-"""`bench raster`, `bench train`, `bench stability`, `bench enhance`."""
+"""`bench raster`, `bench train`, `bench stability`, `bench enhance`; `bench pipeline` is `benchmark`."""
 
 from __future__ import annotations
 
@@ -9,14 +9,110 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
-
 from extrags.errors import ConfigError
 from extrags.metrics.registry import figures
-from flows.commands.common import parsed_settings, set_up_logging, write_json
-from flows.terminal import console
+from flows.commands import benchmark
+from flows.commands.common import items, set_up_logging, write_json
+from flows.commands.options import Parser, add_json, add_profile, add_settings, add_verb
 
-__all__ = ["enhance", "raster", "stability", "train"]
+__all__ = ["add_arguments", "enhance", "raster", "stability", "train"]
+
+KERNEL_EXAMPLES = """examples:
+  --size 160x128 --gaussians 10000
+  --size 160x128,320x256 --gaussians 10000,30000 --threads 1 2 --json -
+  --quick --peers torch,reference
+
+peers: direct (the kernels as training uses them, without autograd; train only), torch (batched tiles,
+float32), reference (the specification, float64), gsplat (CUDA).
+A size goes with the number of Gaussians at the same place in the list."""
+
+
+def add_arguments(parser: Parser) -> None:
+    """The verbs below `extrags bench`."""
+    verbs = parser.add_subparsers(
+        metavar="raster|train|stability|enhance|pipeline", required=True, parser_class=Parser
+    )
+    for command, summary, with_error in (
+        (raster, "time and error of the rasteriser, forward and backward", True),
+        (train, "time of a whole training iteration: render, loss, backward, Adam", False),
+    ):
+        made = add_verb(
+            verbs,
+            command.__name__,
+            command,
+            summary,
+            epilog=KERNEL_EXAMPLES,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        _add_kernel_cases(made, with_error=with_error)
+        add_json(made)
+    made = add_verb(
+        verbs,
+        "stability",
+        stability,
+        "numbers at the edges of what the rasteriser can be given",
+        description="Render and differentiate scenes at the edges of what float32 holds, and say what is not "
+        "finite or not what the float64 specification gives. Exit code 1 if a case fails.",
+    )
+    made.add_argument("--axis", nargs="+", metavar="NAME", help="these axes only (default: all)")
+    made.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="threads of the kernels (default: 1)"
+    )
+    add_json(made)
+    _add_enhance(add_verb(verbs, "enhance", enhance, "restorers beside each other on held-out views"))
+    summary = "run time against error of whole runs: the same as `extrags benchmark`"
+    benchmark.add_arguments(add_verb(verbs, "pipeline", benchmark.benchmark, summary))
+
+
+def _add_kernel_cases(parser: Parser, *, with_error: bool) -> None:
+    many: dict[str, Any] = {"nargs": "+", "action": "extend"}
+    parser.add_argument(
+        "--size",
+        metavar="WxH",
+        **many,
+        help="image sizes (default: 160x128 320x256 640x512, with 10000 30000 100000 Gaussians)",
+    )
+    parser.add_argument("--gaussians", metavar="N", **many, help="numbers of Gaussians, one per size")
+    parser.add_argument("--quick", action="store_true", help="the smallest standard size only")
+    parser.add_argument(
+        "--peers",
+        metavar="PEER",
+        **many,
+        help="what to run beside the native kernels (default: torch, and direct for train; native: nothing)",
+    )
+    parser.add_argument("--threads", metavar="N", **many, help="numbers of threads to measure (default: 1 2)")
+    parser.add_argument("--rounds", type=int, default=20, metavar="N", help="timed rounds (default: 20)")
+    parser.add_argument(
+        "--error",
+        action=argparse.BooleanOptionalAction,
+        default=with_error,
+        help=f"compare image and gradients with float64 (default: {'yes' if with_error else 'no'})",
+    )
+
+
+def _add_enhance(parser: Parser) -> None:
+    parser.description = (
+        "Reconstruct each sequence, restore its held-out views with every method, and compare with what they "
+        "really look like: whole, well seen, holes, observed and unobserved."
+    )
+    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=["none", "classical", "embedded"],
+        metavar="METHOD",
+        help="none, classical, embedded (as the settings say), embedded-1, embedded-4 (steps), zero-shot "
+        "(pretrained weights alone), scene-trained (trained further on the scene), scratch (trained on the "
+        "scene alone), deterministic (the same as a plain regression), each also with /no-references behind "
+        "it (default: none classical embedded)",
+    )
+    add_profile(parser, "quick")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")
+    add_settings(parser)
+    parser.add_argument(
+        "--figure", metavar="FILE.png", help="draw predicted against true error (the calibration)"
+    )
+    add_json(parser)
 
 
 def raster(given: argparse.Namespace) -> int:
@@ -49,13 +145,13 @@ def enhance(given: argparse.Namespace) -> int:
     _let_waiting_threads_sleep()
     from flows.settings import pipeline_config
 
-    config = pipeline_config(given.profile, parsed_settings(given.settings), given.seed)
+    config = pipeline_config(given.profile, given.settings, given.seed)
     from data_catalog.catalog import read, resolve
     from extrags.metrics.lpips import Lpips
     from extrags.restoration.benchmark.comparison import bench_enhance, check_methods
     from tasks.weights import lpips_weights
 
-    methods = check_methods(_items(given.methods))
+    methods = check_methods(items(given.methods))
     # All of them before the first takes its minutes: a name that is wrong is said at once.
     sources = [resolve(name) for name in given.sequences]
     weights = lpips_weights(config.evaluate)
@@ -84,9 +180,9 @@ def _kernels(given: argparse.Namespace, *, training: bool) -> int:
     set_up_logging(debug=given.debug, terminal=True)
     _let_waiting_threads_sleep()
     sizes = _sizes(given)
-    threads = [_number("--threads", text) for text in _items(given.threads or ["1", "2"])]
+    threads = [_number("--threads", text) for text in items(given.threads or ["1", "2"])]
     usual = ["direct", "torch"] if training else ["torch"]
-    peers = _items(usual if given.peers is None else given.peers)
+    peers = items(usual if given.peers is None else given.peers)
     from extrags.raster.bench import BenchSize, bench_raster, bench_train
 
     found = (bench_train if training else bench_raster)(
@@ -114,7 +210,7 @@ def _sizes(given: argparse.Namespace) -> list[tuple[int, int, int]] | None:
         return None
     if given.quick:
         raise ConfigError("--quick is the smallest standard size: it does not go with --size or --gaussians")
-    sizes, counts = _items(given.size or []), _items(given.gaussians or [])
+    sizes, counts = items(given.size or []), items(given.gaussians or [])
     if len(sizes) != len(counts):
         raise ConfigError(
             f"--size names {len(sizes)} sizes and --gaussians {len(counts)} numbers; they go in pairs"
@@ -128,11 +224,6 @@ def _sizes(given: argparse.Namespace) -> list[tuple[int, int, int]] | None:
     return pairs
 
 
-def _items(given: list[str]) -> list[str]:
-    """`["a,b", "c"]` to `["a", "b", "c"]`."""
-    return [item for text in given for item in text.split(",") if item]
-
-
 def _number(option: str, text: str) -> int:
     if not text.isdecimal():
         raise ConfigError(f"{option} {text}: expected a whole number")
@@ -140,6 +231,8 @@ def _number(option: str, text: str) -> int:
 
 
 def _print_kernels(cases: list[dict[str, Any]]) -> None:
+    from flows.terminal import console
+
     header = ["size", "Gaussians", "backend", "threads", "forward ms", "backward ms", "iteration ms"]
     header += ["10 % - 90 %", "cpu ms", "x native", "peak MiB"]
     with_error = any("error" in case for case in cases)
@@ -172,6 +265,8 @@ def _print_kernels(cases: list[dict[str, Any]]) -> None:
 
 def _print_restorers(cases: list[dict[str, Any]]) -> None:
     """A table per sequence; what is kept of known texture is what fine-tuning is given."""
+    from flows.terminal import console
+
     measured = [figure for figure in figures("restoration") if any(figure.key in case for case in cases)]
     header = ["method", *(figure.label for figure in measured)]
     header += ["well", "hole", "observed", "unobserved", "kept PSNR", "kept well"]
@@ -194,6 +289,10 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
 
 
 def _print(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    from rich.table import Table
+
+    from flows.terminal import console
+
     table = Table(box=None, pad_edge=False, header_style="bold")
     for name in header:
         table.add_column(name)

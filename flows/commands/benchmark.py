@@ -4,27 +4,67 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.markup import escape
-from rich.table import Table
-
-from extrags.config import profile_config
 from extrags.errors import ConfigError
-from extrags.store import Store
-from flows.commands.common import parsed_settings, set_up_logging, store_root, write_json
-from flows.environment import prepare, without_heartbeat
-from flows.terminal import console
+from flows.commands.common import items, parsed_settings, set_up_logging, store_root, write_json
+from flows.commands.options import Parser, add_json, add_runner, add_settings, add_store
 
-__all__ = ["benchmark", "items", "parsed_seeds", "parsed_variants", "print_benchmark"]
+if TYPE_CHECKING:
+    from rich.table import Table
+
+__all__ = ["add_arguments", "benchmark", "parsed_seeds", "parsed_variants", "print_benchmark"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags benchmark`, and of `extrags bench pipeline`, which is the same."""
+    from flows.methods import METHODS
+
+    parser.description = (
+        "Run every method on every sequence with every seed, and compare them pair by pair. What is in the "
+        "store already is taken from there with the time it took when it was made."
+    )
+    parser.set_defaults(command=benchmark)
+    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=["coarse", "extrags"],
+        metavar="METHOD",
+        help=f"of {', '.join(METHODS)} (default: coarse extrags)",
+    )
+    parser.add_argument(
+        "--variant",
+        dest="variants",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("NAME", "METHOD|SETTING=VALUE"),
+        help="a further method: coarse, or METHOD, with other settings; repeatable",
+    )
+    parser.add_argument(
+        "--baseline", metavar="METHOD", help="what the others are compared with (default: 3dgs)"
+    )
+    parser.add_argument("--seeds", nargs="+", default=["0"], metavar="N", help="e.g. 0,1,2 (default: 0)")
+    parser.add_argument(
+        "--profiles", nargs="+", default=["quick"], metavar="PROFILE", help="named settings (default: quick)"
+    )
+    parser.add_argument("--name", default="benchmark", help="title of the page")
+    add_settings(parser)
+    add_store(parser)
+    add_runner(parser)
+    add_json(parser)
 
 
 def benchmark(given: argparse.Namespace) -> int:
     """`extrags benchmark`; exit code 1 when a run failed."""
+    from extrags.config import profile_config
+    from extrags.store import Store
+    from flows.environment import prepare, without_heartbeat
+
     terminal = sys.stderr.isatty()
     set_up_logging(debug=given.debug, terminal=terminal)
     root = store_root(given)
-    settings = parsed_settings(given.settings)
     # Any: the flow wants the literal names, which are looked at below.
     methods: Any = items(given.methods)
     profiles: Any = items(given.profiles)
@@ -46,7 +86,7 @@ def benchmark(given: argparse.Namespace) -> int:
             profiles=profiles,
             methods=methods,
             seeds=seeds,
-            settings=settings,
+            settings=given.settings,
             variants=variants,
             baseline=given.baseline,
             store=root,
@@ -55,11 +95,6 @@ def benchmark(given: argparse.Namespace) -> int:
     print_benchmark(found, to_stderr=given.json == "-")
     write_json(found, given.json)
     return 1 if any(case["error"] for case in found["cases"]) else 0
-
-
-def items(given: list[str]) -> list[str]:
-    """`["a,b", "c"]` to `["a", "b", "c"]`."""
-    return [item for text in given for item in text.split(",") if item]
 
 
 def parsed_seeds(given: list[str]) -> list[int]:
@@ -101,7 +136,10 @@ def parsed_variants(given: list[list[str]]) -> dict[str, dict[str, Any]]:
 
 def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
     """What came out: differences to the baseline, spread over seeds, failures, and where the page is."""
+    from rich.markup import escape
+
     from flows.tables import difference_text, differences, spread_text, tabled
+    from flows.terminal import console
 
     out = console(error=to_stderr)
     comparison = found["comparison"]
@@ -131,4 +169,6 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
 
 
 def _table(title: str) -> Table:
+    from rich.table import Table
+
     return Table(box=None, pad_edge=False, header_style="bold", title=title, title_justify="left")

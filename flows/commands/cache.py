@@ -3,18 +3,49 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
-from rich.table import Table
-
-from extrags.store import Manifest, Ref, Store
 from flows.commands.common import store_root, write_json
-from flows.terminal import console
+from flows.commands.options import Parser, add_json, add_store, add_verb
 
-__all__ = ["gc", "ls", "rm"]
+if TYPE_CHECKING:
+    from extrags.store import Manifest, Ref, Store
+
+__all__ = ["add_arguments", "gc", "ls", "rm"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The verbs below `extrags cache`."""
+    parser.description = "Look into the artefact store and clean it."
+    verbs = parser.add_subparsers(metavar="ls|rm|gc", required=True, parser_class=Parser)
+    made = add_verb(verbs, "ls", ls, "list artefacts")
+    made.add_argument("pattern", nargs="?", default="*", help="shell pattern over key, stage or sequence")
+    made.add_argument("--verify", action="store_true", help="read every file and compare digests")
+    add_store(made)
+    add_json(made)
+    made = add_verb(verbs, "rm", rm, "remove artefacts")
+    made.add_argument(
+        "patterns", nargs="+", metavar="PATTERN", help="shell pattern over key, stage or sequence"
+    )
+    add_store(made)
+    made = add_verb(
+        verbs,
+        "gc",
+        gc,
+        "remove what can never be used again",
+        description="Remove what killed runs left, debugging files of failures, and artefacts of former "
+        "versions of their stage.",
+    )
+    add_store(made)
 
 
 def ls(given: argparse.Namespace) -> int:
     """`extrags cache ls`; with `--verify`, exit code 1 when an artefact is damaged."""
+    from rich.table import Table
+
+    from extrags.store import Store
+    from flows.terminal import console
+
     store = Store(store_root(given))
     manifests = store.ls(given.pattern)
     damaged = [item.key for item in manifests if given.verify and not store.verify(_ref(store, item))]
@@ -41,6 +72,8 @@ def ls(given: argparse.Namespace) -> int:
 
 def rm(given: argparse.Namespace) -> int:
     """`extrags cache rm`."""
+    from extrags.store import Store
+
     store = Store(store_root(given))
     removed = [key for pattern in given.patterns for key in store.rm(pattern)]
     for key in removed:
@@ -52,6 +85,7 @@ def rm(given: argparse.Namespace) -> int:
 def gc(given: argparse.Namespace) -> int:
     """`extrags cache gc`."""
     import flows.wiring  # noqa: F401  (registers every stage with its version)
+    from extrags.store import Store
     from tasks.locks import sweep_locks
     from tasks.stage import stage_versions
 
@@ -64,6 +98,8 @@ def gc(given: argparse.Namespace) -> int:
 
 
 def _ref(store: Store, manifest: Manifest) -> Ref:
+    from extrags.store import Ref
+
     return Ref(uri=store.backend.uri(manifest.key), digest=manifest.digest)
 
 

@@ -1,4 +1,7 @@
-"""What verbs share: settings from the command line, JSON out, the log."""
+"""What verbs share: settings from the command line, a finished run, JSON out, the log.
+
+Nothing heavy is imported here: every verb loads this module before its options are known.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,24 @@ import json
 import logging
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import yaml
+from extrags.errors import ConfigError, ExtragsError, StoreError
 
-from extrags.errors import ConfigError, StoreError
-from flows.settings import default_store
+if TYPE_CHECKING:
+    from extrags.config import PipelineConfig
+    from extrags.pipeline import StageName
+    from flows.wiring import SequenceRun
 
-__all__ = ["parsed_settings", "set_up_logging", "store_root", "write_json"]
+__all__ = [
+    "finished_run",
+    "items",
+    "parsed_settings",
+    "run_config",
+    "set_up_logging",
+    "store_root",
+    "write_json",
+]
 
 
 def parsed_settings(assignments: list[str]) -> dict[str, Any]:
@@ -38,14 +51,76 @@ def _value(assignment: str, text: str) -> Any:
         return json.loads(text)
     except ValueError:
         pass
+    import yaml
+
     try:
         return yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise ConfigError(f"--set {assignment}: the value is neither JSON nor YAML") from error
 
 
+def items(given: list[str]) -> list[str]:
+    """`["a,b", "c"]` to `["a", "b", "c"]`."""
+    return [item for text in given for item in text.split(",") if item]
+
+
+def run_config(given: argparse.Namespace) -> PipelineConfig:
+    """The settings of a run: its profile, then the seed, then what the command line overrides.
+
+    Raises:
+        ConfigError: for an unknown setting, a value out of range, or one that the method sets itself.
+    """
+    from flows.methods import method_config, refuse_pinned
+
+    refuse_pinned(given.method, given.settings)
+    return method_config(given.method, given.profile, given.settings, given.seed)
+
+
+def finished_run(given: argparse.Namespace, until: StageName, otherwise: str = "") -> SequenceRun:
+    """A run that is in the store up to a stage, with the refs of what it made.
+
+    Args:
+        given: a verb's arguments: `sequence`, `method`, `profile`, `settings`, `seed`, `store`, `debug`.
+        until: the last stage that is needed.
+        otherwise: what else may be done where the run is not there, for the message.
+
+    Raises:
+        StoreError: when it is not in the store.
+        ExtragsError: what made a stage fail that was looked up.
+    """
+    from extrags.store import Store
+    from flows.environment import prepare
+
+    root, config = store_root(given), run_config(given)
+    prepare(Store(root).state, debug=given.debug)
+    from flows.methods import METHODS, profile_label
+    from flows.runners import NotInStoreError, StoreRunner
+    from flows.wiring import SequenceRun
+
+    run = SequenceRun(
+        given.sequence,
+        config,
+        root,
+        StoreRunner(root),
+        profile_label(given.profile, given.method),
+        leave_out=METHODS[given.method].leave_out,
+    )
+    try:
+        outcome = run.run(until)
+    except NotInStoreError as error:
+        raise StoreError(
+            f"{given.sequence} with these settings is not finished in {root}; run it first{otherwise} "
+            f"({error})"
+        ) from error
+    if outcome.status == "failed":
+        raise outcome.error or ExtragsError(f"{outcome.name} failed")
+    return run
+
+
 def store_root(given: argparse.Namespace) -> str:
     """Root of the store as an absolute path or a URL."""
+    from flows.settings import default_store
+
     root: str = given.store or default_store()
     return root if "://" in root else str(Path(root).expanduser().absolute())
 

@@ -6,24 +6,57 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.markup import escape
-from rich.table import Table
-
-from data_catalog.catalog import Descriptor, describe, list_sequences, resolve
 from extrags.errors import SourceNotFoundError, StoreError, UnknownSequenceError
-from flows.commands.common import parsed_settings, set_up_logging, write_json
-from flows.terminal import console
+from flows.commands.common import set_up_logging, write_json
+from flows.commands.options import Parser, add_json, add_settings, add_verb
 
 if TYPE_CHECKING:
+    from data_catalog.catalog import Descriptor
     from extrags.config import IngestConfig
     from extrags.sequence import EndoscopicSequence
 
-__all__ = ["check", "list_all", "show"]
+__all__ = ["add_arguments", "check", "list_all", "show"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The verbs below `extrags data`."""
+    parser.description = "What sequences there are, what is in one, and what is wrong with one."
+    verbs = parser.add_subparsers(metavar="list|show|check", required=True, parser_class=Parser)
+    made = add_verb(verbs, "list", list_all, "all named sequences, and whether they can be read here")
+    made.add_argument("pattern", nargs="?", default="*", help="shell pattern or beginning of a name")
+    made.add_argument("--here", action="store_true", help="only those whose data are on this machine")
+    add_json(made)
+    made = add_verb(verbs, "show", show, "what is known about one sequence, and what its frames hold")
+    made.add_argument("sequence", metavar="SEQUENCE")
+    add_settings(made, "ingest")
+    made.add_argument(
+        "--picture",
+        metavar="FILE.png",
+        help="write a contact sheet: masks blue, highlights green, held-out framed",
+    )
+    add_json(made)
+    made = add_verb(
+        verbs,
+        "check",
+        check,
+        "say what is wrong with a source",
+        description="Read a source and say what is wrong with it: axes, pose direction, depth scale, mask "
+        "polarity, intrinsics, exposure, parallax, names. Exit code 1 when anything is.",
+    )
+    made.add_argument("sources", nargs="+", metavar="PATH|SEQUENCE")
+    add_settings(made, "ingest")
+    add_json(made)
 
 
 def list_all(given: argparse.Namespace) -> int:
     """`extrags data list`."""
     from fnmatch import fnmatchcase
+
+    from rich.markup import escape
+    from rich.table import Table
+
+    from data_catalog.catalog import list_sequences
+    from flows.terminal import console
 
     sequences = [
         item
@@ -55,6 +88,12 @@ def list_all(given: argparse.Namespace) -> int:
 
 def show(given: argparse.Namespace) -> int:
     """`extrags data show`."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from data_catalog.catalog import resolve
+    from flows.terminal import console
+
     set_up_logging(debug=given.debug, terminal=True)
     found = _known(given.sequence)
     measured: dict[str, Any] | None = None
@@ -96,7 +135,10 @@ def check(given: argparse.Namespace) -> int:
     """`extrags data check`; exit code 1 when anything is wrong."""
     if given.debug:
         set_up_logging(debug=True, terminal=True)
+    from rich.markup import escape
+
     from data_catalog.inspection import inspect
+    from flows.terminal import console
 
     inspections = [inspect(name, _ingest(given)) for name in given.sources]
     if given.json != "-":
@@ -125,6 +167,8 @@ def check(given: argparse.Namespace) -> int:
 
 def _known(name: str) -> Descriptor | None:
     """The catalogue's entry; None for a path."""
+    from data_catalog.catalog import describe
+
     try:
         return describe(name)
     except UnknownSequenceError:
@@ -134,7 +178,7 @@ def _known(name: str) -> Descriptor | None:
 def _ingest(given: argparse.Namespace) -> IngestConfig:
     from flows.settings import pipeline_config
 
-    return pipeline_config("balanced", parsed_settings(given.settings)).ingest
+    return pipeline_config("balanced", given.settings).ingest
 
 
 def _write_picture(sequence: EndoscopicSequence, target: Path) -> None:

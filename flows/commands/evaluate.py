@@ -6,40 +6,57 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from rich.table import Table
+from extrags.errors import ConfigError
+from flows.commands.common import finished_run, run_config, set_up_logging, store_root, write_json
+from flows.commands.options import Parser, add_json, add_method
 
-from extrags.errors import ConfigError, StoreError
-from extrags.store import Store
-from flows.commands.common import parsed_settings, set_up_logging, store_root, write_json
-from flows.environment import prepare
-from flows.methods import METHODS, method_config, refuse_pinned
-from flows.tables import figure, tabled
-from flows.terminal import console
-
-__all__ = ["evaluate"]
+__all__ = ["add_arguments", "evaluate"]
 
 GROUPS = ("", "aligned", "observed", "unobserved", "whole")
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags evaluate`."""
+    parser.description = (
+        "Measure a folder of renders of the held-out frames by the protocol of extrags/metrics/PROTOCOL.md; "
+        "without --renders, show the figures of a run that is in the store."
+    )
+    parser.set_defaults(command=evaluate)
+    parser.add_argument("sequence", metavar="SEQUENCE")
+    parser.add_argument(
+        "--renders",
+        metavar="FOLDER",
+        help="8-bit images of the sequence's size, named after the held-out frames or numbered in order",
+    )
+    parser.add_argument(
+        "--depth", metavar="FOLDER", help="z-depth of the same frames: .npy, or 16-bit PNG or TIFF; 0: none"
+    )
+    parser.add_argument(
+        "--depth-step", type=float, metavar="MM", help="what one level of an integer depth image stands for"
+    )
+    add_method(parser)
+    add_json(parser)
 
 
 def evaluate(given: argparse.Namespace) -> int:
     """`extrags evaluate`."""
     set_up_logging(debug=given.debug, terminal=True)
-    settings = parsed_settings(given.settings)
-    refuse_pinned(given.method, settings)
-    config = method_config(given.method, given.profile, settings, given.seed)
     if given.renders is None and (given.depth is not None or given.depth_step is not None):
         raise ConfigError("--depth goes with --renders: it holds the depth of the same frames")
-    root = store_root(given)
-    prepare(Store(root).state, debug=given.debug)
-    found = _finished(given, config, root) if given.renders is None else _renders(given, config, root)
+    found = _finished(given) if given.renders is None else _renders(given)
     if given.json != "-":
         _print(found)
     write_json(found, given.json)
     return 0
 
 
-def _renders(given: argparse.Namespace, config: Any, root: str) -> dict[str, Any]:
+def _renders(given: argparse.Namespace) -> dict[str, Any]:
     """Measure a folder; the sequence comes from the store, or is read into it."""
+    from extrags.store import Store
+    from flows.environment import prepare
+
+    root, config = store_root(given), run_config(given)
+    prepare(Store(root).state, debug=given.debug)
     from extrags.metrics.folder import read_renders
     from extrags.metrics.lpips import Lpips
     from extrags.metrics.protocol import evaluate_views
@@ -70,37 +87,24 @@ def _renders(given: argparse.Namespace, config: Any, root: str) -> dict[str, Any
     ).to_json()
 
 
-def _finished(given: argparse.Namespace, config: Any, root: str) -> dict[str, Any]:
+def _finished(given: argparse.Namespace) -> dict[str, Any]:
     """The figures of a run that is in the store."""
-    from flows.runners import NotInStoreError, StoreRunner
-    from flows.wiring import SequenceRun
+    run = finished_run(given, "evaluate", ", or name a folder with --renders")
     from tasks.evaluate import METRICS_FILE
 
-    run = SequenceRun(
-        given.sequence,
-        config,
-        root,
-        StoreRunner(root),
-        given.profile,
-        leave_out=METHODS[given.method].leave_out,
-    )
-    try:
-        outcome = run.run("evaluate")
-    except NotInStoreError as error:
-        raise StoreError(
-            f"{given.sequence} with these settings is not finished in {root}; run it first, or name a folder "
-            f"with --renders ({error})"
-        ) from error
-    if outcome.error is not None:
-        raise outcome.error
-    ref = outcome.final_metrics
+    ref = run.outcome.final_metrics
     if ref is None:
-        raise ConfigError(f"{outcome.name} has no held-out frames to evaluate on")
+        raise ConfigError(f"{given.sequence} has no held-out frames to evaluate on")
     found: dict[str, Any] = run.store.load_json(METRICS_FILE, ref)
     return found
 
 
 def _print(found: dict[str, Any]) -> None:
+    from rich.table import Table
+
+    from flows.tables import figure, tabled
+    from flows.terminal import console
+
     out = console()
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("pixels", *tabled()):

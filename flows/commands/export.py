@@ -4,20 +4,35 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, StoreError
-from extrags.pipeline import StageName
-from extrags.store import Store
-from flows.commands.common import parsed_settings, set_up_logging, store_root
-from flows.environment import prepare
-from flows.methods import METHODS, method_config, refuse_pinned
+from flows.commands.common import finished_run, run_config, set_up_logging
+from flows.commands.options import Parser, add_method
 
-if TYPE_CHECKING:
-    from flows.wiring import SequenceRun
+__all__ = ["add_arguments", "export"]
 
-__all__ = ["export"]
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags export`."""
+    parser.description = (
+        "Write a finished run's scene as PLY, or a sequence with its poses, images, masks, depth and points "
+        "for COLMAP or nerfstudio. Poses that a run has estimated are taken from its store."
+    )
+    parser.set_defaults(command=export)
+    parser.add_argument("sequence", metavar="SEQUENCE")
+    add_method(parser)
+    parser.add_argument(
+        "--to",
+        choices=("ply", "colmap", "colmap-text", "transforms"),
+        default="ply",
+        help="ply: the scene; the others: the sequence (default: ply)",
+    )
+    parser.add_argument(
+        "--scene", choices=("final", "coarse"), default="final", help="which scene, for ply (default: final)"
+    )
+    parser.add_argument(
+        "-o", "--output", "--out", required=True, metavar="FILE.ply|DIR", help="file, or folder to write into"
+    )
 
 
 def export(given: argparse.Namespace) -> int:
@@ -27,9 +42,9 @@ def export(given: argparse.Namespace) -> int:
 
 
 def _scene(given: argparse.Namespace) -> int:
+    run = finished_run(given, "coarse" if given.scene == "coarse" else "finetune")
     from extrags.scene import Scene
 
-    run = _from_store(given, "coarse" if given.scene == "coarse" else "finetune")
     # Where the plan left fine-tuning out, the coarse scene is the final one.
     ref = run.refs.get("finetune", run.refs["coarse"])
     scene = run.store.load(Scene, ref)
@@ -52,10 +67,10 @@ def _sequence(given: argparse.Namespace) -> int:
     target = Path(given.output)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ConfigError(f"{target} exists and is not an empty folder; nothing is written over it")
-    sequence = read(given.sequence, _config(given).ingest)
+    sequence = read(given.sequence, run_config(given).ingest)
     if sequence.world_from_camera is None:
         # Poses of a source that has none come from its run.
-        run = _from_store(given, "poses")
+        run = finished_run(given, "poses")
         sequence = run.store.load(EndoscopicSequence, run.refs["poses"])
     found = points_of(sequence)
     points, points_rgb = found if found is not None else (None, None)
@@ -70,39 +85,3 @@ def _sequence(given: argparse.Namespace) -> int:
     count = 0 if points is None else len(points)
     print(f"{target}: {len(sequence)} frames with poses, {count} points")
     return 0
-
-
-def _config(given: argparse.Namespace) -> PipelineConfig:
-    settings = parsed_settings(given.settings)
-    refuse_pinned(given.method, settings)
-    return method_config(given.method, given.profile, settings, given.seed)
-
-
-def _from_store(given: argparse.Namespace, until: StageName) -> SequenceRun:
-    """A finished run's refs.
-
-    Raises:
-        StoreError: when the stage is not in the store.
-    """
-    root = store_root(given)
-    prepare(Store(root).state, debug=given.debug)
-    from flows.runners import NotInStoreError, StoreRunner
-    from flows.wiring import SequenceRun
-
-    sequence = SequenceRun(
-        given.sequence,
-        _config(given),
-        root,
-        StoreRunner(root),
-        given.profile,
-        leave_out=METHODS[given.method].leave_out,
-    )
-    try:
-        outcome = sequence.run(until)
-    except NotInStoreError as error:
-        raise StoreError(
-            f"{given.sequence} with these settings is not finished in {root}; run it first ({error})"
-        ) from error
-    if outcome.error is not None:
-        raise outcome.error
-    return sequence

@@ -13,12 +13,56 @@ from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
 from flows.commands.common import set_up_logging
-from flows.terminal import console
+from flows.commands.options import Parser
 
 if TYPE_CHECKING:
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
 
-__all__ = ["pretrain"]
+__all__ = ["add_arguments", "pretrain"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags pretrain`."""
+    parser.description = (
+        "Make pretraining scenes (colons that are never evaluated), reconstruct them, and train the restorer "
+        "on views far off their paths. This is how the weights of the package were made; hours on two cores. "
+        "Pretraining scenes that are in the folder already are taken from there."
+    )
+    parser.set_defaults(command=pretrain)
+    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the weights go")
+    parser.add_argument(
+        "--scenes-folder",
+        default=".extrags/pretraining",
+        metavar="FOLDER",
+        help="where pretraining scenes are kept, 40 MB each (default: %(default)s)",
+    )
+    parser.add_argument("--scenes", type=int, metavar="N", help="pretraining scenes (default: 86)")
+    parser.add_argument(
+        "--validation-scenes", type=int, metavar="N", help="how many of them only judge (default: 6)"
+    )
+    parser.add_argument("--iterations", type=int, metavar="N", help="optimisation steps (default: 13500)")
+    parser.add_argument("--batch", type=int, metavar="N", help="crops per step (default: 4)")
+    parser.add_argument("--start", metavar="FOLDER", help="go on from these weights instead of from nothing")
+    parser.add_argument("--learning-rate", type=float, metavar="X", help="the peak (default: 8e-4)")
+    parser.add_argument(
+        "--perceptual-weight", type=float, metavar="X", help="of the perceptual distance (default: 0.15)"
+    )
+    parser.add_argument(
+        "--error-weight", type=float, metavar="X", help="of the expected error's likelihood (default: 0.02)"
+    )
+    parser.add_argument("--seed", type=int, metavar="N", help="of the training (default: 0)")
+    parser.add_argument("--threads", type=int, metavar="N", help="threads of the training (default: all)")
+    parser.add_argument(
+        "--workers", type=int, default=1, metavar="N", help="scenes made at once (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--without-perceptual",
+        action="store_true",
+        help="train without the perceptual distance, whose weights (LPIPS, SqueezeNet) must be had",
+    )
+    parser.add_argument(
+        "--deterministic", action="store_true", help="a plain regression: the baseline of the diffusion"
+    )
 
 
 def pretrain(given: argparse.Namespace) -> int:
@@ -34,6 +78,7 @@ def pretrain(given: argparse.Namespace) -> int:
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
     from extrags.restoration.diffusion.pretraining import pretrain as trained
     from flows.console import watched
+    from flows.terminal import console
 
     values = {
         "scenes": given.scenes,

@@ -1,33 +1,59 @@
-"""`run`, `plan`, `report`: the verbs that take sequences through stages."""
+"""`run`: sequences through all stages."""
 
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from data_catalog.catalog import resolve
-from extrags.config import PipelineConfig
-from extrags.errors import ConfigError, ExtragsError, StoreError, UnknownSequenceError
-from extrags.pipeline import StageName, check_stage
-from extrags.store import Store
-from flows.commands.common import parsed_settings, set_up_logging, store_root, write_json
-from flows.environment import prepare, without_heartbeat
-from flows.methods import METHODS, method_config, profile_label, refuse_pinned
-from flows.outcome import DatasetOutcome
-from flows.preflight import preflight
+from extrags.errors import ConfigError, ExtragsError, UnknownSequenceError
+from flows.commands.common import run_config, set_up_logging, store_root, write_json
+from flows.commands.options import Parser, add_json, add_method, add_runner
+from flows.failures import told
 
-__all__ = ["execute", "plan", "report", "run"]
+if TYPE_CHECKING:
+    from extrags.config import PipelineConfig
+    from extrags.pipeline import StageName
+    from flows.outcome import DatasetOutcome
+
+__all__ = ["add_arguments", "execute", "run"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags run`."""
+    from extrags.pipeline import STAGES
+
+    parser.description = (
+        "Take each sequence through all stages. What is in the store already is not made again; a failure of "
+        "one sequence does not stop the others."
+    )
+    parser.set_defaults(command=run)
+    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    add_method(parser)
+    add_runner(parser)
+    add_json(parser)
+    parser.add_argument(
+        "--until", choices=STAGES, default="report", metavar="STAGE", help="stop after this stage"
+    )
+    parser.add_argument(
+        "--refresh", action="store_true", help="run every stage although its artefact is in the store"
+    )
+    parser.add_argument(
+        "--at-once", type=int, default=1, metavar="N", help="sequences in work at the same time (default: 1)"
+    )
+    parser.add_argument(
+        "--always-flow",
+        action="store_true",
+        help="start a flow run even if everything is in the store already",
+    )
 
 
 def run(given: argparse.Namespace) -> int:
     """`extrags run`."""
     if given.at_once < 1:
         raise ConfigError(f"--at-once is {given.at_once}; expected 1 or more")
-    check_stage(given.until)
     begun = time.monotonic()
     outcome = execute(
         given.sequences,
@@ -41,59 +67,11 @@ def run(given: argparse.Namespace) -> int:
     from flows.console import print_outcomes
 
     print_outcomes(outcome, seconds)
+    errors = [sequence.error for sequence in outcome.sequences if sequence.error is not None]
+    for hint in dict.fromkeys(hint for error in errors for hint in told(error)[1:]):
+        print(f"extrags: {hint}", file=sys.stderr)
     write_json(outcome.to_json(seconds), given.json)
     return 0 if all(sequence.status == "ok" for sequence in outcome.sequences) else 1
-
-
-def plan(given: argparse.Namespace) -> int:
-    """`extrags plan`."""
-    (outcome,) = execute([given.sequence], given, until="assess").sequences
-    if outcome.status == "failed":
-        raise outcome.error or ExtragsError(f"{outcome.name} failed")
-    from flows.console import print_plan
-
-    if given.json != "-":
-        print_plan(outcome)
-    write_json({"sequence": outcome.name, **(outcome.plan or {})}, given.json)
-    return 0
-
-
-def report(given: argparse.Namespace) -> int:
-    """`extrags report`: from what is in the store, without running anything else."""
-    set_up_logging(debug=given.debug, terminal=True)
-    root, config = store_root(given), _config(given)
-    prepare(Store(root).state, debug=given.debug)
-    from flows.runners import DirectRunner, NotInStoreError, StoreRunner
-    from flows.wiring import SequenceRun
-    from tasks.report import PAGE
-
-    _check_names([given.sequence])
-    sequence = SequenceRun(
-        given.sequence,
-        config,
-        root,
-        StoreRunner(root),
-        profile_label(given.profile, given.method),
-        leave_out=METHODS[given.method].leave_out,
-    )
-    try:
-        outcome = sequence.run("evaluate")
-    except NotInStoreError as error:
-        raise StoreError(
-            f"{given.sequence} with these settings is not finished in {root}; run it first ({error})"
-        ) from error
-    if outcome.status == "failed":
-        raise outcome.error or ExtragsError(f"{outcome.name} failed")
-    sequence.runner = DirectRunner(root, refresh=True)
-    sequence.report()
-    page = sequence.store.open(sequence.refs["report"]) / PAGE
-    if given.output:
-        try:
-            shutil.copyfile(page, given.output)
-        except OSError as error:
-            raise StoreError(f"{given.output} cannot be written: {error.strerror or error}") from error
-    print(given.output or page)
-    return 0
 
 
 def execute(
@@ -114,18 +92,23 @@ def execute(
         WeightsError: when a model or weights that the settings name are not there.
         MissingDependencyError: when a package that the settings need is not there.
     """
+    from extrags.store import Store
+    from flows.environment import prepare, without_heartbeat
+    from flows.methods import METHODS
+
     terminal = sys.stderr.isatty()
     set_up_logging(debug=given.debug, terminal=terminal)
-    root, config = store_root(given), _config(given)
+    root, config = store_root(given), run_config(given)
     _check_names(sequences)
-    store = Store(root)
-    prepare(store.state, debug=given.debug)
+    prepare(Store(root).state, debug=given.debug)
     if not refresh and not always_flow:
         # Nothing to make: no need to wait for a server.
         found = _from_store(sequences, config, root, given.profile, given.method, until)
         if found is not None:
             return found
     # The flow looks as well; here it is said without waiting for a server.
+    from flows.preflight import preflight
+
     preflight(config, until, METHODS[given.method].leave_out)
     from flows.console import watched
     from flows.dataset import reconstruct_dataset
@@ -134,7 +117,7 @@ def execute(
         outcome: DatasetOutcome = reconstruct_dataset(
             sequences=sequences,
             profile=given.profile,
-            settings=parsed_settings(given.settings),
+            settings=given.settings,
             seed=given.seed,
             store=root,
             refresh=refresh,
@@ -154,6 +137,8 @@ def _from_store(
     sequences: list[str], config: PipelineConfig, root: str, profile: str, method: str, until: StageName
 ) -> DatasetOutcome | None:
     """Outcomes from the store alone; None as soon as anything is missing or wrong."""
+    from flows.methods import METHODS, profile_label
+    from flows.outcome import DatasetOutcome
     from flows.pages import dataset_page
     from flows.runners import NotInStoreError, StoreRunner
     from flows.wiring import run_sequence
@@ -186,14 +171,10 @@ def _from_store(
     return DatasetOutcome(outcomes, page)
 
 
-def _config(given: argparse.Namespace) -> PipelineConfig:
-    settings: dict[str, Any] = parsed_settings(given.settings)
-    refuse_pinned(given.method, settings)
-    return method_config(given.method, given.profile, settings, given.seed)
-
-
 def _check_names(sequences: list[str]) -> None:
     """An unknown name is wrong usage and stops everything; a source that is wrong concerns its own run."""
+    from data_catalog.catalog import resolve
+
     for sequence in sequences:
         try:
             resolve(sequence)

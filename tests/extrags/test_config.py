@@ -1,9 +1,18 @@
 from __future__ import annotations
 
+import math
+import re
+from types import UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
+
 import pytest
+from hypothesis import assume, given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
 from extrags.config import PROFILES, PipelineConfig, profile_config
+from extrags.config.settings import Setting, groups_of, settings_of
 from extrags.errors import ConfigError
 
 
@@ -41,6 +50,8 @@ class TestConfig:
             ("coarse.iteration", "did you mean coarse.iterations"),
             ("coars.iterations", "did you mean coarse"),
             ("coarse", "group of settings"),
+            ("iterations", "did you mean coarse.iterations or finetune.iterations"),
+            ("qqq", "settings begin with ingest, poses, coarse"),
             ("coarse.iterations.more", "no setting"),
         ],
     )
@@ -48,9 +59,23 @@ class TestConfig:
         with pytest.raises(ConfigError, match=message):
             PipelineConfig().with_overrides({path: 1})
 
-    def test_value_out_of_range_names_the_setting(self) -> None:
-        with pytest.raises(ConfigError, match=r"coarse\.iterations"):
-            PipelineConfig().with_overrides({"coarse.iterations": -7})
+    @pytest.mark.parametrize(
+        ("name", "value", "expected"),
+        [
+            ("coarse.iterations", -7, "is -7; expected a whole number of at least 1"),
+            ("coarse.thickness", 0, "is 0; expected a number above 0 and at most 1"),
+            ("ingest.width", 5, "is 5; expected a whole number from 16 to 4096 or none"),
+            ("coarse.refine_poses", "often", "is 'often'; expected true, false or auto"),
+            ("enhance.channels", [8, "x", 8], "expected 3 whole numbers with commas between"),
+        ],
+    )
+    def test_a_wrong_value_is_one_sentence_with_the_range(
+        self, name: str, value: object, expected: str
+    ) -> None:
+        with pytest.raises(ConfigError, match=re.escape(expected)) as caught:
+            PipelineConfig().with_overrides({name: value})
+        assert str(caught.value).startswith(f"setting {name} is ")
+        assert "\n" not in str(caught.value)
 
     def test_seed_reaches_every_stage_that_has_one(self) -> None:
         config = PipelineConfig().with_seed(7)
@@ -59,3 +84,66 @@ class TestConfig:
     def test_unknown_profile(self) -> None:
         with pytest.raises(ConfigError, match="quick"):
             profile_config("fast")
+
+
+SETTINGS = settings_of(PipelineConfig)
+
+
+def values(setting: Setting) -> st.SearchStrategy[Any]:
+    """Anything a setting takes."""
+    union = get_origin(setting.annotation) in (Union, UnionType)
+    kinds: tuple[Any, ...] = get_args(setting.annotation) if union else (setting.annotation,)
+    limited = (Annotated[kind, setting.name, *setting.limits] for kind in kinds if kind in (int, float, str))
+    free = (kind for kind in kinds if kind not in (int, float, str))
+    return st.one_of(*(st.from_type(kind) for kind in (*limited, *free)))
+
+
+class TestSettings:
+    """The list of all settings, which flags, help and errors are made from."""
+
+    def test_it_holds_every_field_of_every_model(self) -> None:
+        fields = [field for model in all_models(PipelineConfig) for field in model.model_fields.values()]
+        assert len(SETTINGS) == len(fields) - (len(all_models(PipelineConfig)) - 1)
+        for name in SETTINGS:
+            value: Any = PipelineConfig()
+            for part in name.split("."):
+                value = getattr(value, part)
+            assert not isinstance(value, BaseModel)
+
+    def test_every_setting_says_what_it_does_and_what_it_takes(self) -> None:
+        groups = groups_of(PipelineConfig)
+        for name, setting in SETTINGS.items():
+            assert setting.description, name
+            assert setting.expected, name
+            assert groups[setting.group], name
+
+    @given(st.data())
+    @hypothesis_settings(deadline=None)
+    def test_text_stands_for_the_value_it_was_made_from(self, data: st.DataObject) -> None:
+        setting = SETTINGS[data.draw(st.sampled_from(sorted(SETTINGS)))]
+        value = data.draw(values(setting))
+        if isinstance(value, float):
+            assume(math.isfinite(value))
+        if isinstance(value, str):
+            assume(value.strip().lower() not in ("none", "null"))
+        found = setting.parse(setting.text(value))
+        assert found == value
+        assert type(found) is type(value)
+
+    @pytest.mark.parametrize(
+        ("name", "text", "value"),
+        [
+            ("coarse.light.enabled", "False", False),
+            ("coarse.refine_poses", "true", True),
+            ("coarse.thickness", "1e-1", 0.1),
+            ("enhance.steps", "4", 4),
+            ("enhance.steps", "auto", "auto"),
+            ("enhance.channels", "[8, 8, 16]", (8, 8, 16)),
+            ("enhance.pretrained.revision", "1234567", "1234567"),
+            ("ingest.width", "None", None),
+        ],
+    )
+    def test_what_is_written_by_hand(self, name: str, text: str, value: object) -> None:
+        found = SETTINGS[name].parse(text)
+        assert found == value
+        assert type(found) is type(value)

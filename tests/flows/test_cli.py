@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import subprocess
@@ -9,12 +10,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 
-from extrags.errors import ConfigError
+from extrags.config import PROFILES, PipelineConfig
+from extrags.config.settings import settings_of
+from extrags.errors import ConfigError, MissingDependencyError
 from extrags.store import Store
-from flows.cli import main
-from flows.commands.common import parsed_settings
+from flows.cli import VERBS, main, parser
+from flows.commands.common import parsed_settings, run_config
 from flows.outcome import SequenceOutcome
 from tests.flows.tiny import SEQUENCE, TINY, without_report
 
@@ -68,9 +72,7 @@ class TestStart:
         assert main(["--version"]) == 0
         assert capsys.readouterr().out.strip() == __version__
 
-    @pytest.mark.parametrize(
-        "verb", ["run", "plan", "report", "export", "data", "cache", "evaluate", "benchmark", "bench"]
-    )
+    @pytest.mark.parametrize("verb", VERBS)
     def test_every_verb_has_help(self, verb: str, capsys: pytest.CaptureFixture[str]) -> None:
         with pytest.raises(SystemExit) as ended:
             main([verb, "--help"])
@@ -88,7 +90,20 @@ class TestUsage:
             ([SEQUENCE, "--set", "coarse.iterations=-1"], "coarse.iterations"),
             ([SEQUENCE, "--set", "coarse.iterations"], "expected NAME=VALUE"),
             ([SEQUENCE, "--seed", "-1"], "the seed is -1"),
-            ([SEQUENCE, "--until", "finnish"], "no stage 'finnish'"),
+            ([SEQUENCE, "--until", "finnish"], "invalid choice: 'finnish' (choose from 'ingest', 'poses'"),
+            ([], "the following arguments are required: SEQUENCE (see extrags run --help)"),
+            ([SEQUENCE, "--reruns", "2"], "unknown argument --reruns"),
+            ([SEQUENCE, "--sed", "2"], "did you mean --seed"),
+            ([SEQUENCE, "--coarse.iteration", "2"], "did you mean --coarse.iterations"),
+            ([SEQUENCE, "--iterations=2"], "did you mean --coarse.iterations or --finetune.iterations"),
+            ([SEQUENCE, "--coarse.light", "no"], "--coarse.light is a group of settings; name one of"),
+            ([SEQUENCE, "--coarse.iterations", "-1"], "is -1; expected a whole number of at least 1"),
+            ([SEQUENCE, "--coarse.iterations", "1.5"], "is 1.5; expected a whole number of at least 1"),
+            ([SEQUENCE, "--coarse.thickness=0"], "is 0; expected a number above 0 and at most 1"),
+            ([SEQUENCE, "--enhance.backend", "clasical"], "is clasical; expected embedded, classical,"),
+            ([SEQUENCE, "--coarse.light.enabled", "maybe"], "is maybe; expected true or false"),
+            ([SEQUENCE, "--method", "3dgs", "--coarse.sh_degree", "1"], "sets coarse.sh_degree itself"),
+            ([SEQUENCE, "--help-settings", "coarse.lite"], "no setting coarse.lite; did you mean coarse."),
             ([SEQUENCE, "--at-once", "0"], "--at-once is 0"),
             ([SEQUENCE, SEQUENCE], "named twice"),
         ],
@@ -122,6 +137,147 @@ class TestUsage:
         assert parsed["a.f"] is None
         assert parsed["a.g"] == "text"
         assert parsed["a.h"] == 1e-3
+
+
+def parsed(*arguments: str) -> dict[str, object]:
+    return dict(parser("run").parse_args(["run", SEQUENCE, *arguments]).settings)
+
+
+class TestSettings:
+    """Every setting is a flag; the profile comes first, then whatever stands last on the command line."""
+
+    @pytest.mark.parametrize("profile", PROFILES)
+    def test_every_field_has_a_flag_that_takes_its_default(self, profile: str) -> None:
+        def flags(model: object, prefix: str = "") -> Iterator[tuple[str, object]]:
+            for name, value in model:  # type: ignore[attr-defined]
+                if hasattr(type(value), "model_fields"):
+                    yield from flags(value, f"{prefix}{name}.")
+                else:
+                    yield f"{prefix}{name}", value
+
+        wanted = dict(flags(PROFILES[profile]))
+        known = settings_of(PipelineConfig)
+        given = parsed(*(f"--{name}={known[name].text(value)}" for name, value in wanted.items()))
+        assert given == wanted
+        assert PipelineConfig().with_overrides(given) == PROFILES[profile]
+
+    def test_flags_and_set_come_after_profile_and_seed(self) -> None:
+        arguments = ["--coarse.iterations", "7", "--profile", "quick", "--seed", "3", "--coarse.seed", "5"]
+        given = parser("run").parse_args(["run", *arguments, "--set", "coarse.max_points=50", SEQUENCE])
+        config = run_config(given)
+        assert (config.coarse.iterations, config.coarse.max_points) == (7, 50)
+        assert (config.coarse.seed, config.finetune.seed) == (5, 3)
+        assert config.enhance == PROFILES["quick"].with_seed(3).enhance
+
+    def test_the_last_one_counts(self) -> None:
+        flag, assignment = ["--coarse.iterations", "7"], ["--set", "coarse.iterations=8"]
+        assert parsed(*flag, *assignment) == {"coarse.iterations": 8}
+        assert parsed(*assignment, *flag) == {"coarse.iterations": 7}
+        assert parsed() == {}
+
+    @pytest.mark.parametrize("verb", ["run", "plan", "report", "export", "evaluate", "benchmark"])
+    def test_help_names_every_setting_by_group(self, verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.raises(SystemExit):
+            main([verb, "--help"])
+        listed = capsys.readouterr().out.partition("settings (")[2]
+        for setting in settings_of(PipelineConfig).values():
+            _, _, behind = listed.partition(f"  --{setting.group}.*: ")
+            assert setting.name.rpartition(".")[2] in behind.partition("--")[0].split()
+
+    @pytest.mark.parametrize("arguments", [["run"], ["export"], ["bench", "enhance"]])
+    def test_settings_are_explained_with_the_defaults_of_the_profile(
+        self, arguments: list[str], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main([*arguments, "--help-settings", "--profile", "paper"]) == 0
+        said = " ".join(capsys.readouterr().out.split())
+        for setting in settings_of(PipelineConfig).values():
+            assert f"--{setting.name} " in said
+            assert f"{setting.description} ({setting.expected})" in said
+        assert "--coarse.iterations 30000 optimisation steps" in said
+        assert "--enhance.channels 48,96,160 " in said
+        assert "--ingest.width none " in said
+
+    def test_one_group_alone(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["run", "--help-settings", "coarse.light"]) == 0
+        said = capsys.readouterr().out
+        assert "--coarse.light.exponent 0.6" in said
+        assert "--coarse.iterations" not in said
+
+    def test_reading_data_takes_the_settings_of_ingest_alone(
+        self, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["data", "show", SEQUENCE, "--ingest.width", "48", "--json", "-"]) == 0
+        assert json.loads(capsys.readouterr().out)["measured"]["width"] == 48
+        assert main(["data", "show", SEQUENCE, "--coarse.iterations", "4"]) == 2
+        assert "unknown argument --coarse.iterations" in capsys.readouterr().err
+
+
+class TestFailures:
+    """What is said of an exception: one line each, a hint where there is one, no traceback."""
+
+    @pytest.fixture
+    def fail(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+        def failing(error: Exception, *more: str) -> tuple[int, list[str]]:
+            def execute(*_: object, **__: object) -> None:
+                raise error
+
+            monkeypatch.setattr("flows.commands.run.execute", execute)
+            code = main(["run", SEQUENCE, *more])
+            return code, capsys.readouterr().err.splitlines()
+
+        return failing
+
+    def test_an_expected_one_is_its_sentence_and_its_note(self, fail) -> None:
+        error = MissingDependencyError("diffusers is not installed")
+        error.add_note("pip install 'extrags[diffusers]'")
+        assert fail(error) == (
+            1,
+            ["extrags: diffusers is not installed", "extrags: pip install 'extrags[diffusers]'"],
+        )
+
+    def test_an_expected_one_behind_another(self, fail) -> None:
+        error = RuntimeError("Task run failed")
+        error.__cause__ = ConfigError("the crop is 33; expected a multiple of 8")
+        assert fail(error) == (1, ["extrags: the crop is 33; expected a multiple of 8"])
+
+    @pytest.mark.parametrize(
+        "error",
+        [ConnectionRefusedError(111, "Connection refused"), httpx.ConnectError("All attempts failed")],
+    )
+    def test_a_server_that_went_away(self, error: Exception, fail, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setenv("PREFECT_API_URL", "http://127.0.0.1:4200/api")
+        code, (said, hint) = fail(error)
+        assert code == 1
+        assert said == f"extrags: a server went away or was never there: {type(error).__name__}: {error}"
+        assert "http://127.0.0.1:4200/api" in hint
+        assert hint.endswith("run again: what is finished stays in the store")
+
+    def test_an_unexpected_one_is_one_line_and_where_to_find_more(self, fail) -> None:
+        code, said = fail(ZeroDivisionError("division\nby zero"))
+        assert code == 1
+        assert said == [
+            "extrags: ZeroDivisionError: division by zero",
+            "extrags: run again with --debug for the traceback",
+        ]
+
+    def test_debug_shows_where(self, fail) -> None:
+        with pytest.raises(ZeroDivisionError):
+            fail(ZeroDivisionError(), "--debug")
+
+    @pytest.mark.parametrize(
+        "arguments",
+        [["--debug", "cache", "ls"], ["cache", "--debug", "ls"], ["cache", "ls", "--debug"]],
+    )
+    def test_debug_may_stand_behind_any_verb(
+        self, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def root(given: argparse.Namespace) -> str:
+            assert given.debug
+            raise ZeroDivisionError
+
+        monkeypatch.setattr("flows.commands.cache.store_root", root)
+        with pytest.raises(ZeroDivisionError):
+            main([*arguments, "--store", str(tmp_path)])
 
 
 class TestFinished:

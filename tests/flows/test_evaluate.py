@@ -15,7 +15,8 @@ from extrags.errors import ConfigError
 from extrags.metrics.protocol import RenderedViews
 from extrags.sequence import EndoscopicSequence
 from flows.cli import main
-from flows.commands.benchmark import items, parsed_seeds, parsed_variants
+from flows.commands.benchmark import parsed_seeds, parsed_variants
+from flows.commands.common import items
 from flows.outcome import SequenceOutcome
 from tests.flows.tiny import SEQUENCE, TINY
 

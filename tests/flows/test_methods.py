@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import get_args
 
 import pytest
-from pydantic import BaseModel
 
 from extrags.config import PROFILES, CoarseConfig, PipelineConfig
+from extrags.config.settings import settings_of
 from extrags.errors import ConfigError
-from flows.cli import METHOD_NAMES
 from flows.methods import (
     METHODS,
     THREE_DGS_SHARED,
@@ -21,27 +20,15 @@ from flows.methods import (
 )
 
 
-def leaves(model: type[BaseModel], prefix: str = "") -> set[str]:
-    """Dotted names of all settings of a model."""
-    found: set[str] = set()
-    for name, described in model.model_fields.items():
-        kind: Any = described.annotation
-        if isinstance(kind, type) and issubclass(kind, BaseModel):
-            found |= leaves(kind, f"{prefix}{name}.")
-        else:
-            found.add(f"{prefix}{name}")
-    return found
-
-
-def test_the_names_are_those_of_the_command_line() -> None:
-    assert tuple(METHODS) == get_args(MethodName) == METHOD_NAMES
+def test_the_names_are_those_of_the_flows_parameter() -> None:
+    assert tuple(METHODS) == get_args(MethodName)
 
 
 def test_the_baseline_decides_on_every_setting_of_the_coarse_stage() -> None:
     """A new setting must be pinned for plain 3DGS in `three_dgs`, or named in `THREE_DGS_SHARED`."""
     pinned = {name.removeprefix("coarse.") for name in three_dgs(PipelineConfig())}
     # With the light switched off its other settings do nothing.
-    every = {name for name in leaves(CoarseConfig) if not name.startswith("light.")} | {"light.enabled"}
+    every = {name for name in settings_of(CoarseConfig) if not name.startswith("light.")} | {"light.enabled"}
     assert pinned & THREE_DGS_SHARED == set()
     assert every - pinned - THREE_DGS_SHARED == set()
     assert (pinned | THREE_DGS_SHARED) - every == set()

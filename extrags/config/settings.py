@@ -1,0 +1,141 @@
+"""Every setting by its dotted name: what it is, which values it takes, and how text becomes one.
+
+The flags and the help of the command line are made from this, and so are the errors of
+`PipelineConfig.with_overrides`: a field of a model, with its limits and its description, is all there is
+to write for a new setting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from extrags.errors import ConfigError, did_you_mean
+
+__all__ = ["Setting", "groups_of", "settings_of", "unknown_setting"]
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting of a run.
+
+    Args:
+        name: dotted, e.g. `coarse.light.exponent`.
+        description: what it does.
+        annotation: type of its values.
+        limits: range and length, as pydantic keeps them (`annotated_types`).
+    """
+
+    name: str
+    description: str
+    annotation: Any
+    limits: tuple[Any, ...]
+
+    @property
+    def group(self) -> str:
+        """All but the last part of the name."""
+        return self.name.rpartition(".")[0]
+
+    @property
+    def expected(self) -> str:
+        """The values it takes, in words: `a number above 0 and at most 1, or none`."""
+        words = [word for kind in self._kinds for word in self._words(kind)]
+        return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
+
+    def parse(self, text: str) -> Any:
+        """The value that a text stands for: `none`, `true`, `1e-3`, or numbers with commas between.
+
+        Raises:
+            ConfigError: names the setting, what was found and what was expected.
+        """
+        if NoneType in self._kinds and text.strip().lower() in ("none", "null"):
+            return None
+        several = get_origin(self.annotation) is tuple
+        found = text.strip("[]() ").split(",") if several else text
+        try:
+            # The name, because `Annotated` wants at least one thing to hold; pydantic passes over it.
+            kind: Any = Annotated[self.annotation, self.name, *self.limits]
+            return TypeAdapter(kind).validate_python(found)
+        except ValidationError:
+            raise self.refused(text) from None
+
+    def text(self, value: Any) -> str:
+        """What `parse` reads this value from."""
+        if isinstance(value, tuple):
+            return ",".join(str(part) for part in value)
+        return str(value).lower() if value is None or isinstance(value, bool) else str(value)
+
+    def refused(self, found: str) -> ConfigError:
+        """The error for a value that it does not take."""
+        return ConfigError(f"setting {self.name} is {found or 'empty'}; expected {self.expected}")
+
+    @property
+    def _kinds(self) -> tuple[Any, ...]:
+        union = get_origin(self.annotation) in (Union, UnionType)
+        return get_args(self.annotation) if union else (self.annotation,)
+
+    def _words(self, kind: Any) -> list[str]:
+        if get_origin(kind) is Literal:
+            return [str(value) for value in get_args(kind)]
+        if get_origin(kind) is tuple:
+            return [f"{len(get_args(kind))} whole numbers with commas between"]
+        if kind in (int, float):
+            return [("a whole number" if kind is int else "a number") + self._range()]
+        return {bool: ["true", "false"], str: ["text"], NoneType: ["none"]}[kind]
+
+    def _range(self) -> str:
+        words = {"gt": "above", "ge": "of at least", "lt": "below", "le": "at most"}
+        limit = {name: getattr(item, name) for name in words for item in self.limits if hasattr(item, name)}
+        if {"ge", "le"} <= set(limit):
+            return f" from {limit['ge']} to {limit['le']}"
+        parts = [f"{words[name]} {value}" for name, value in limit.items()]
+        return f" {' and '.join(parts)}" if parts else ""
+
+
+@cache
+def settings_of(model: type[BaseModel]) -> dict[str, Setting]:
+    """All settings of a model and of those inside it, by dotted name, in the order they are written."""
+    return {
+        f"{prefix}{name}": Setting(
+            f"{prefix}{name}", field.description or "", field.annotation, tuple(field.metadata)
+        )
+        for prefix, inner in _models(model)
+        for name, field in inner.model_fields.items()
+        if not _is_model(field.annotation)
+    }
+
+
+def groups_of(model: type[BaseModel]) -> dict[str, str]:
+    """What each group of settings is for, by dotted name: the first line of its model's docstring."""
+    return {
+        prefix.removesuffix("."): (inner.__doc__ or "").strip().partition("\n")[0]
+        for prefix, inner in _models(model)
+        if prefix
+    }
+
+
+def unknown_setting(name: str, known: Iterable[str]) -> ConfigError:
+    """The error for a name that no setting has, with those that were perhaps meant."""
+    known = list(known)
+    inside = [other.removeprefix(f"{name}.") for other in known if other.startswith(f"{name}.")]
+    if inside:
+        return ConfigError(f"{name} is a group of settings; name one of {', '.join(inside)}")
+    meant = did_you_mean(name, known)
+    groups = ", ".join(dict.fromkeys(other.partition(".")[0] for other in known))
+    return ConfigError(f"no setting {name}{meant or f'; settings begin with {groups}'}")
+
+
+def _models(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
+    yield prefix, model
+    for name, field in model.model_fields.items():
+        if _is_model(field.annotation):
+            yield from _models(field.annotation, f"{prefix}{name}.")
+
+
+def _is_model(kind: Any) -> TypeGuard[type[BaseModel]]:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)

@@ -1,0 +1,263 @@
+"""What the parsers of several verbs share: the parser itself, and options that mean the same everywhere.
+
+Nothing heavy is imported here: the settings are loaded for the verbs that have some.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import shutil
+import textwrap
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from extrags.errors import ConfigError, did_you_mean
+from flows.commands.common import items, parsed_settings
+
+if TYPE_CHECKING:
+    from extrags.config.settings import Setting
+
+__all__ = [
+    "Parser",
+    "add_json",
+    "add_method",
+    "add_profile",
+    "add_runner",
+    "add_settings",
+    "add_store",
+    "add_verb",
+]
+
+DEFAULT_PROFILE = "balanced"
+
+
+class Parser(argparse.ArgumentParser):
+    """A parser that raises `ConfigError` for wrong usage, with the option that was perhaps meant."""
+
+    def __init__(self, **more: Any) -> None:
+        super().__init__(allow_abbrev=False, **more)
+        self.listing = ""
+        """What `--help` ends with."""
+        # On every parser: it may stand behind any verb. SUPPRESS, lest the inner one reset the outer one.
+        self.add_argument(
+            "--debug", action="store_true", default=argparse.SUPPRESS, help="show tracebacks and the log"
+        )
+
+    def format_help(self) -> str:
+        """The help of argparse, and the listing behind it."""
+        return "\n".join(part for part in (super().format_help(), self.listing) if part)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse here what is not known: the parser of the verb knows what is near."""
+        given, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            name = unknown[0].partition("=")[0]
+            options = [option for action in self._actions for option in action.option_strings]
+            inside = [option for option in options if option.startswith(f"{name}.")]
+            if inside:
+                self.error(f"{name} is a group of settings; name one of {', '.join(inside)}")
+            self.error(f"unknown argument {name}{did_you_mean(name, options)}")
+        return given, unknown
+
+    def error(self, message: str) -> NoReturn:
+        """Raise instead of leaving: `flows.cli.main` says it."""
+        raise ConfigError(f"{message} (see {self.prog} --help)")
+
+
+def add_verb(
+    verbs: Any, name: str, command: Callable[[argparse.Namespace], int], summary: str, **more: Any
+) -> Parser:
+    """A verb below another one.
+
+    Args:
+        verbs: what `add_subparsers` returned.
+        name: of the verb.
+        command: what it does, given its arguments; returns the exit code.
+        summary: what it does, in words.
+        more: for the parser, e.g. a longer `description`.
+    """
+    made: Parser = verbs.add_parser(name, help=summary, **{"description": summary, **more})
+    made.set_defaults(command=command)
+    return made
+
+
+def add_store(parser: Parser) -> None:
+    """`--store`."""
+    parser.add_argument(
+        "--store",
+        metavar="DIR|URL",
+        help="where artefacts are kept (default: $EXTRAGS_STORE, else .extrags)",
+    )
+
+
+def add_json(parser: Parser) -> None:
+    """`--json`."""
+    parser.add_argument(
+        "--json", metavar="FILE|-", help="write the results as JSON to a file or to standard output"
+    )
+
+
+def add_runner(parser: Parser) -> None:
+    """`--runner`."""
+    parser.add_argument(
+        "--runner",
+        default="threads",
+        metavar="threads|dask[:ADDRESS]",
+        help="where tasks run; an address is that of a Dask scheduler that is already up",
+    )
+
+
+def add_profile(parser: Parser, usual: str = DEFAULT_PROFILE) -> None:
+    """`--profile`."""
+    from extrags.config import PROFILES
+
+    parser.add_argument(
+        "--profile",
+        choices=tuple(PROFILES),
+        default=usual,
+        help=f"named settings: a look, a good result, or the paper's counts (default: {usual})",
+    )
+
+
+def add_method(parser: Parser) -> None:
+    """`--profile`, `--seed`, `--method`, `--store` and all settings: what a run is made of."""
+    from flows.methods import METHODS
+
+    add_profile(parser)
+    parser.add_argument(
+        "--seed", type=int, metavar="N", help="seed of all stages (default: each stage's own)"
+    )
+    parser.add_argument(
+        "--method",
+        choices=tuple(METHODS),
+        default="extrags",
+        help="the whole pipeline (default), the coarse scene alone, plain 3DGS, ...",
+    )
+    add_store(parser)
+    add_settings(parser)
+
+
+def add_settings(parser: Parser, group: str = "") -> None:
+    """`--set`, a flag for every setting, and `--help-settings`.
+
+    All of them end up in `settings`, by dotted name; what stands last on the command line counts.
+
+    Args:
+        parser: of a verb.
+        group: settings of this group only.
+    """
+    known = _settings(group)
+    parser.add_argument(
+        "--set",
+        dest="settings",
+        metavar="NAME=VALUE",
+        action=_Assign,
+        default={},
+        help="override one setting; the same as --NAME VALUE, with a value in JSON or YAML; repeatable",
+    )
+    for name in known:
+        parser.add_argument(
+            f"--{name}", dest="settings", action=_Assign, default=argparse.SUPPRESS, help=argparse.SUPPRESS
+        )
+    parser.add_argument(
+        "--help-settings",
+        metavar="GROUP",
+        nargs="?",
+        const=group,
+        action=_HelpSettings,
+        default=argparse.SUPPRESS,
+        help="explain the settings of a group, or of all: values they take, and defaults of the profile",
+    )
+    parser.listing = _listing(known)
+
+
+class _Assign(argparse.Action):
+    """`--set NAME=VALUE` and `--NAME VALUE` to an entry of `settings`."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        if option_string == "--set":
+            changed = parsed_settings([values])
+        else:
+            name = str(option_string).removeprefix("--")
+            changed = {name: _settings()[name].parse(values)}
+        # Not in place: the dictionary that is there first is the parser's default.
+        setattr(namespace, self.dest, {**getattr(namespace, self.dest), **changed})
+
+
+class _HelpSettings(argparse.Action):
+    """`--help-settings`: take the place of the verb, whose arguments need not be there."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        namespace.help_settings = values
+        namespace.command = _explain
+        for action in parser._actions:
+            action.required = False
+
+
+def _settings(group: str = "") -> dict[str, Setting]:
+    from extrags.config import PipelineConfig
+    from extrags.config.settings import settings_of
+
+    known = settings_of(PipelineConfig)
+    return {name: known[name] for name in known if not group or f"{name}.".startswith(f"{group}.")}
+
+
+def _listing(known: dict[str, Setting]) -> str:
+    """Names of all settings by group, for `--help`."""
+    groups: dict[str, list[str]] = {}
+    for setting in known.values():
+        groups.setdefault(setting.group, []).append(setting.name.rpartition(".")[2])
+    lines = ["settings (--GROUP.NAME VALUE; --help-settings [GROUP] explains them):"]
+    for group, names in groups.items():
+        lines += textwrap.wrap(
+            " ".join(names),
+            _columns(),
+            initial_indent=f"  --{group}.*: ",
+            subsequent_indent=" " * 8,
+            break_on_hyphens=False,
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _explain(given: argparse.Namespace) -> int:
+    """`--help-settings`: description, values and default of each setting of a group."""
+    from extrags.config import PipelineConfig, profile_config
+    from extrags.config.settings import groups_of, unknown_setting
+
+    group = given.help_settings
+    chosen = _settings(group)
+    if not chosen:
+        raise unknown_setting(group, _settings())
+    profile = given.profile if "profile" in given else items(getattr(given, "profiles", [DEFAULT_PROFILE]))[0]
+    tree = profile_config(profile).model_dump()
+    about = groups_of(PipelineConfig)
+    shown = ""
+    for setting in chosen.values():
+        if setting.group != shown:
+            shown = setting.group
+            print(f"\n{shown}: {about[shown]}")
+        default = tree
+        for part in setting.name.split("."):
+            default = default[part]
+        print(f"  --{setting.name} {shlex.quote(setting.text(default))}")
+        text = f"{setting.description} ({setting.expected})"
+        print(textwrap.fill(text, _columns(), initial_indent=" " * 6, subsequent_indent=" " * 6))
+    print(f"\nThe values shown are those of the profile {profile}.")
+    return 0
+
+
+def _columns() -> int:
+    return shutil.get_terminal_size().columns - 2

@@ -1,0 +1,34 @@
+"""`plan`: which stages a scene needs, and why."""
+
+from __future__ import annotations
+
+import argparse
+
+from extrags.errors import ExtragsError
+from flows.commands.common import write_json
+from flows.commands.options import Parser, add_json, add_method, add_runner
+from flows.commands.run import execute
+
+__all__ = ["add_arguments", "plan"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags plan`."""
+    parser.set_defaults(command=plan)
+    parser.add_argument("sequence", metavar="SEQUENCE")
+    add_method(parser)
+    add_runner(parser)
+    add_json(parser)
+
+
+def plan(given: argparse.Namespace) -> int:
+    """`extrags plan`."""
+    (outcome,) = execute([given.sequence], given, until="assess").sequences
+    if outcome.status == "failed":
+        raise outcome.error or ExtragsError(f"{outcome.name} failed")
+    from flows.console import print_plan
+
+    if given.json != "-":
+        print_plan(outcome)
+    write_json({"sequence": outcome.name, **(outcome.plan or {})}, given.json)
+    return 0

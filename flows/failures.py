@@ -1,0 +1,57 @@
+"""What the command line says of an exception."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+
+from extrags.errors import ExtragsError
+
+__all__ = ["told"]
+
+SEE_TRACEBACK = "run again with --debug for the traceback"
+
+
+def told(error: BaseException) -> list[str]:
+    """An exception in one line; and, where there is something to do about it, that in a second one.
+
+    An error of ours speaks for itself, also where something raised another one because of it. So does a
+    server that cannot be reached: nothing is wrong with the program then. Anything else is told by its name.
+    """
+    for cause in _causes(error):
+        if isinstance(cause, ExtragsError):
+            return [_line(str(cause)), *getattr(cause, "__notes__", [])]
+    for cause in _causes(error):
+        if _is_connection_error(cause):
+            return [f"a server went away or was never there: {_named(cause)}", _server_hint()]
+    return [_named(error), SEE_TRACEBACK]
+
+
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    while error is not None:
+        yield error
+        error = error.__cause__
+
+
+def _named(error: BaseException) -> str:
+    return _line(f"{type(error).__name__}: {error}".rstrip(": "))
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _is_connection_error(error: BaseException) -> bool:
+    # Not imported for this: where they were never loaded, the error is none of theirs.
+    kinds = [("httpx", "TransportError"), ("distributed.comm.core", "CommClosedError")]
+    loaded = [getattr(sys.modules[module], name) for module, name in kinds if module in sys.modules]
+    return isinstance(error, (ConnectionError, *loaded))
+
+
+def _server_hint() -> str:
+    address = os.environ.get("PREFECT_API_URL")
+    server = (
+        f"the Prefect server at {address}" if address else "the server of the run, or of its Dask cluster,"
+    )
+    return f"see whether {server} is up, and run again: what is finished stays in the store"
