@@ -263,7 +263,7 @@ def explore(
     Raises:
         CaptureError: when there is no training view or none sees a surface.
 
-    Source: paper, section "Virtual exploration view sampling".
+    Source: [ExtraGS, section "Virtual Exploration View Sampling"], see docs/references.md.
     """
     config = ExploreConfig() if config is None else config
     cameras = sequence.training_cameras

@@ -65,7 +65,8 @@ def finetune(
     Raises:
         DivergedError: when the optimisation does not stay finite.
 
-    Source: paper equations 10 (training views) and 11 (virtual views); their depth term is our own.
+    Source: [ExtraGS, eq. 24] (training views) and [ExtraGS, eq. 25] (virtual views), see
+    docs/references.md; their depth term is our own.
     """
     config = FinetuneConfig() if config is None else config
     coarse = CoarseConfig() if coarse is None else coarse
