@@ -1,4 +1,4 @@
-"""Which Gaussian was seen from which direction: one packed word per Gaussian."""
+"""Coverage map: from which directions each Gaussian was seen, packed into one word per Gaussian."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the current view is under-lit: the dark direction of the illumination-aware weight."""
+"""The dark direction of a view, and the illumination-aware weight of candidates."""
 
 from __future__ import annotations
 
