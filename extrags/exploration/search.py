@@ -82,7 +82,7 @@ class SearchContext:
 
 @dataclass(frozen=True)
 class Branch(Storable):
-    """What one search found.
+    """Result of one search.
 
     Args:
         anchor: index of the training view it starts from (its position among the training views).

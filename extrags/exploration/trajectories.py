@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Exploration(Storable):
-    """Virtual trajectories with what each of them adds.
+    """Virtual trajectories and the coverage each of them adds.
 
     Trajectories have at most L views; one that met a dead end has fewer. All views stand one after the
     other, `trajectory` tells which belong together.

@@ -117,7 +117,7 @@ def merge_wave(
 
 @dataclass(frozen=True)
 class WaveState(Storable):
-    """How far the exploration is; each wave takes one and leaves the next.
+    """State of the exploration between two waves.
 
     Args:
         coverage_before: coverage by the training views, packed, [N].
