@@ -115,6 +115,23 @@ def _runnable() -> list[tuple[str, str]]:
     return [(name_of(page), code) for page in PAGES for code, run in blocks(page, "python") if run]
 
 
+@pytest.fixture
+def registered_for_one_test() -> Iterator[None]:
+    """Take back what a block registers."""
+    from data_catalog import folders
+    from extrags.config.backends import BACKENDS
+    from extrags.metrics.registry import added_metrics, unregister_metric
+
+    backends, readers = dict(BACKENDS), list(folders._registered)
+    yield
+    for added in added_metrics():
+        unregister_metric(added.partition("@")[0])
+    for name in BACKENDS.keys() - backends.keys():
+        del BACKENDS[name]
+    folders._registered[:] = readers
+
+
+@pytest.mark.usefixtures("registered_for_one_test")
 @pytest.mark.parametrize(("page", "code"), _runnable())
 def test_runnable_blocks_run(page: str, code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
