@@ -241,7 +241,7 @@ class TestReferences:
 
     @pytest.fixture
     def titles(self) -> set[str]:
-        return set(re.findall(r"\*([^*]+)\*", REFERENCES.read_text(encoding="utf-8")))
+        return set(re.findall(r": \*([^*]+)\*", REFERENCES.read_text(encoding="utf-8")))
 
     def test_each_entry_is_read(self, entries: dict[str, str]) -> None:
         assert len(entries) == REFERENCES.read_text(encoding="utf-8").count("**[")
