@@ -1,7 +1,7 @@
 """Which pixels of an endoscope's video show tissue: the picture inside its dark frame, less burnt-in text.
 
-Everything is found from several frames of one recording together and nothing is learned: the dark frame is
-dark always, a burnt-in sign has the same edges in every frame while the scene moves under it.
+Everything is derived from several frames of one recording: the dark frame stays dark in all of them, and a
+burnt-in overlay keeps its edges while the scene moves.
 """
 
 from __future__ import annotations

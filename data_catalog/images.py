@@ -1,4 +1,4 @@
-"""Image files in, arrays out; and one plan of cropping and shrinking for all that belongs to a frame."""
+"""Reading of image files, and one crop and resize applied to everything that belongs to a frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A source looked over: what is known about it, what is wrong with it, and a picture of its frames."""
+"""Inspection of a source: facts, findings, and a contact sheet of its frames."""
 
 from __future__ import annotations
 

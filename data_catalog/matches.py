@@ -1,4 +1,4 @@
-"""Do poses explain where features went? For sources whose poses no depth can check.
+"""Consistency of poses with feature matches, for sources without depth to check them.
 
 Features are matched between neighbouring frames; a match supports the poses when it lies near its epipolar
 line and its point in front of both cameras. The same is counted for other readings of the axes.

@@ -13,7 +13,8 @@ __all__ = ["every_nth"]
 def every_nth(frames: int, holdout_every: int, *, file: object = None) -> Split:
     """Hold out frames 0, n, 2n, ... in the order of the recording.
 
-    Source: the convention of the LLFF scenes in Mip-NeRF 360 and 3D Gaussian Splatting (n = 8).
+    Source: the convention (n = 8) of Barron et al., Mip-NeRF 360, CVPR 2022, and Kerbl et al., 3D Gaussian
+    Splatting, 2023.
 
     Raises:
         SourceError: fewer than two frames, so that nothing could train.

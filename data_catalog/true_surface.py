@@ -10,7 +10,7 @@ __all__ = ["true_surface"]
 
 
 def true_surface(sequence: EndoscopicSequence) -> TrueSurface | None:
-    """What a reconstruction of the sequence is held against; None where nothing is known.
+    """Ground truth that a reconstruction of the sequence is compared with; None where there is none.
 
     The phantom's wall is made again from the settings that the sequence carries in `truth`.
     """

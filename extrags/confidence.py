@@ -41,7 +41,7 @@ def gaussian_iou(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"]) -
     Raises:
         ShapeError: when the shapes differ.
 
-    Source: paper equations 7 and 8.
+    Source: [ExtraGS, eq. 20 and 21], see docs/references.md.
     """
     if virtual.shape != reference.shape:
         raise ShapeError(f"visibilities {tuple(virtual.shape)} and {tuple(reference.shape)} do not fit")
@@ -59,7 +59,7 @@ def image_confidence(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"
     Raises:
         ShapeError: when the shapes differ.
 
-    Source: paper equation 9.
+    Source: [ExtraGS, eq. 22], see docs/references.md.
     """
     return 1 - gaussian_iou(virtual, reference)
 
@@ -121,7 +121,7 @@ def pixel_confidence(
     Raises:
         ShapeError: when the images differ in shape, or are too small for the measure.
 
-    Source: paper equation 10.
+    Source: [ExtraGS, eq. 23], see docs/references.md; the bound is our own.
     """
     if rendered.shape != restored.shape:
         raise ShapeError(f"images {rendered.shape} and {restored.shape} do not fit")

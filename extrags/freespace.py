@@ -194,7 +194,7 @@ def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | 
     Raises:
         CaptureError: when no voxel is free.
 
-    Source: paper, section "Scene initialization and feasible region estimation".
+    Source: [ExtraGS, section "Scene Initialization and Feasible Region Estimation"], see docs/references.md.
     """
     config = FreespaceConfig() if config is None else config
     from scipy.ndimage import distance_transform_edt

@@ -1,4 +1,4 @@
-r"""Light and sensor of the phantom: more than any reconstruction in this project models, on purpose.
+r"""Light and sensor of the phantom, deliberately richer than any light model of a reconstruction.
 
 Two small lamps sit left and right of the lens. A lamp with intensity :math:`I` sends to a wall point
 at distance :math:`r`, :math:`\beta` off the lamp's axis,

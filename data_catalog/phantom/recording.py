@@ -1,4 +1,4 @@
-"""A recording of the phantom: rays in, an `EndoscopicSequence` with exact ground truth out.
+"""Rendering of the phantom into an `EndoscopicSequence` with exact ground truth.
 
 Axes are OpenCV's, lengths millimetres, depth is z-depth at pixel centres. Frames of recording B (training)
 come first, then those of recording A (evaluation). Only frames that are used are rendered.

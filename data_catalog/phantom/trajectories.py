@@ -1,4 +1,4 @@
-"""How the phantom's recordings travel through the lumen.
+"""Camera paths of the phantom's recordings.
 
 Recording B (it trains) advances along the tube a little off its axis and looks ahead, swaying. Recording A
 (it evaluates) passes the same stretch again: in the setting `sparse` off the axis on another side and turned
@@ -40,7 +40,7 @@ _DENSE = 201
 
 @dataclass(frozen=True)
 class PathStyle:
-    """What tells one recording from another."""
+    """Parameters in which recordings differ."""
 
     start_mm: float
     end_mm: float

@@ -1,4 +1,4 @@
-"""How a scene of the phantom leaves the standard colon: for training on many, never for evaluating.
+"""Variation of phantom scenes about the standard colon; for pretraining only, never for evaluation.
 
 Every number here is a factor or a value that the standard scenes have too; with `variation` 0 a scene is
 a standard one, bit by bit.

@@ -1,4 +1,4 @@
-"""Which Gaussian was seen from which direction: one packed word per Gaussian."""
+"""Coverage map: from which directions each Gaussian was seen, packed into one word per Gaussian."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ def count_pairs(pairs: UInt32[np.ndarray, "*b n"]) -> Int[np.ndarray, "*b"]:
 def coverage_gain(
     covered: UInt32[np.ndarray, "n"], pairs: UInt32[np.ndarray, "*b n"]
 ) -> Int[np.ndarray, "*b"]:
-    r"""Newly covered pairs, :math:`IG_c = \sum_{j,k} \Delta M[j,k]` (paper, eq. for IG_c)."""
+    r"""Newly covered pairs, :math:`IG_c = \sum_{j,k} \Delta M[j,k]` [ExtraGS, eq. 11]."""
     return count_pairs(pairs & ~covered)
 
 

@@ -1,4 +1,4 @@
-"""Where the current view is under-lit: the dark direction of the illumination-aware weight."""
+"""The dark direction of a view, and the illumination-aware weight of candidates."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def dark_direction(
         The ray, or the zero vector when no patch is markedly darker than the view's median, so that
         it favours no direction.
 
-    Source: paper, section "Illumination-aware exploration reweighting".
+    Source: [ExtraGS, section "Illumination-aware exploration reweighting"], see docs/references.md.
     """
     from scipy.ndimage import uniform_filter
 
@@ -122,7 +122,7 @@ def illumination_weight(
     candidates: Float[np.ndarray, "a 4 4"],
     strength: float,
 ) -> Float[np.ndarray, "a"]:
-    r"""w_ill = 1 + lambda_l max(0, <d_dark, d_a>) for every candidate (paper, eq. for w_ill).
+    r"""w_ill = 1 + lambda_l max(0, <d_dark, d_a>) for every candidate [ExtraGS, eq. 13].
 
     d_a is the direction of the camera's displacement. A pure rotation has none: there the change of
     the optical axis takes its place, so that turning towards the dark is favoured like going there.

@@ -1,4 +1,4 @@
-"""What a candidate view is worth to the search: its coverage gain, times the factors listed in `FACTORS`.
+"""Score of a candidate view: its coverage gain, times the factors listed in `FACTORS`.
 
 To change what the search looks for, add a factor here and its setting to `ExploreConfig`; the search itself
 only ranks. `stage_inventory` then names the stages whose version has to be raised.
@@ -20,14 +20,14 @@ __all__ = ["FACTORS", "Candidates", "fold_weight", "hole_weight", "score"]
 
 @dataclass(frozen=True, slots=True)
 class Candidates:
-    """The feasible moves from one view, with what their small renders told.
+    """The feasible moves from one view, with the measurements of their scoring renders.
 
     Args:
         gain: newly covered (Gaussian, direction) pairs of each, [A].
         hole_share: share of pixels without a surface, [A].
         poses: `world_from_camera` of each, [A, 4, 4].
         start: that of the view they start from, [4, 4].
-        dark: unit direction in which that view is darkest, in its own frame; zero where none is, [3].
+        dark: world-space unit ray through the darkest patch of that view; zero where none is dark, [3].
         turns_deg: angles turned in the last moves, the candidate's own last, [A, K].
     """
 
@@ -61,7 +61,7 @@ def fold_weight(turns_deg: Float[np.ndarray, "*b k"], config: ExploreConfig) -> 
     One primitive alone turns by less than tau_R in every profile: a threshold on single moves would never
     be passed, so the turns of the last moves, the candidate's own included, are added up.
 
-    Source: the paper (docs/references.md), section "Fold-aware pose variation control".
+    Source: [ExtraGS, eq. 15 and 16], see docs/references.md.
     """
     return np.where(turns_deg.sum(axis=-1) > config.fold_angle_deg, config.fold_penalty, 1.0)
 

@@ -40,7 +40,7 @@ VIEWS_PER_BATCH = 16
 
 @dataclass(frozen=True)
 class SearchContext:
-    """What every branch needs and none changes.
+    """Read-only inputs shared by all branches.
 
     Args:
         scene: the reconstructed scene.
@@ -82,7 +82,7 @@ class SearchContext:
 
 @dataclass(frozen=True)
 class Branch(Storable):
-    """What one search found.
+    """Result of one search.
 
     Args:
         anchor: index of the training view it starts from (its position among the training views).
@@ -144,7 +144,7 @@ class Branch(Storable):
 
 @dataclass(frozen=True, slots=True)
 class _State:
-    """A view on some path, with what its own small render told."""
+    """A view on a path, with the measurements of its scoring render."""
 
     pose: Float[np.ndarray, "4 4"]
     pairs: UInt32[np.ndarray, "m"]
@@ -195,7 +195,7 @@ class _VisitedPoses:
 def prepare_search(
     scene: Scene, cameras: Cameras, freespace: FreeSpace, config: ExploreConfig
 ) -> SearchContext:
-    """Measure the scene's depth unit and collect what all branches share.
+    """Measure the scene's depth unit and collect the inputs that all branches share.
 
     Args:
         scene: the reconstructed scene.
@@ -358,7 +358,7 @@ def _observe(
     parent: _State | None = None,
     moves: list[str] | None = None,
 ) -> list[_State]:
-    """Render poses in one batch; reject those that see too little, too bright or stand too near."""
+    """Render poses in one batch; reject those with too many holes, overexposure or too little clearance."""
     config = context.config
     cameras = context.scoring_cameras(poses)
     with torch.no_grad():
@@ -411,8 +411,8 @@ def _look_at_distance(
 ) -> float:
     """Median depth of the surface in the central half of the view, held near the scene's own unit.
 
-    Looking down the lumen the centre may be far away or empty; an orbit about so far a point would be
-    a leap.
+    Looking down the lumen the centre may be far away or empty; an orbit about so
+    distant a point would be a large jump.
     """
     height, width = depth_mm.shape
     centre = (slice(height // 4, height - height // 4), slice(width // 4, width - width // 4))

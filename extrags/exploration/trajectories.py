@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Exploration(Storable):
-    """Virtual trajectories with what each of them adds.
+    """Virtual trajectories and the coverage each of them adds.
 
     Trajectories have at most L views; one that met a dead end has fewer. All views stand one after the
     other, `trajectory` tells which belong together.
@@ -116,7 +116,7 @@ class Exploration(Storable):
         return added / max(1, self.n_pairs)
 
     def summary(self) -> dict[str, Any]:
-        """What is worth reading, ready for JSON."""
+        """Summary of the exploration, ready for JSON."""
         return {
             "trajectories": [
                 {
@@ -184,7 +184,7 @@ class Exploration(Storable):
 
 
 def start_exploration(context: SearchContext, cameras: Cameras) -> WaveState:
-    """The state before the first wave: coverage by the training views, anchors in line.
+    """The state before the first wave: coverage by the training views, and the queue of anchors.
 
     Args:
         context: from `prepare_search`.
@@ -209,7 +209,7 @@ def start_exploration(context: SearchContext, cameras: Cameras) -> WaveState:
 
 
 def grow(context: SearchContext, cameras: Cameras, coverage: UInt32[np.ndarray, "n"], anchor: int) -> Branch:
-    """Grow the branch of one anchor; what a worker does."""
+    """Grow the branch of one anchor: the unit of parallel work."""
     return grow_branch(context, cameras.world_from_camera[anchor], coverage, anchor)
 
 
@@ -263,7 +263,7 @@ def explore(
     Raises:
         CaptureError: when there is no training view or none sees a surface.
 
-    Source: paper, section "Virtual exploration view sampling".
+    Source: [ExtraGS, section "Virtual Exploration View Sampling"], see docs/references.md.
     """
     config = ExploreConfig() if config is None else config
     cameras = sequence.training_cameras

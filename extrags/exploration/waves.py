@@ -67,7 +67,7 @@ def start_views(cameras: Cameras, count: int, depth_unit_mm: float) -> Int[np.nd
 
 @dataclass(frozen=True)
 class Merge:
-    """What a merge decided.
+    """Result of a merge.
 
     Args:
         coverage: the shared coverage with the accepted branches added, packed, [N].
@@ -117,12 +117,12 @@ def merge_wave(
 
 @dataclass(frozen=True)
 class WaveState(Storable):
-    """How far the exploration is; each wave takes one and leaves the next.
+    """State of the exploration between two waves.
 
     Args:
         coverage_before: coverage by the training views, packed, [N].
         coverage: coverage with all accepted trajectories, packed, [N].
-        waiting: anchors whose turn comes next, first in front.
+        waiting: queue of anchors, the next one first.
         room: trajectories that may still be accepted.
         min_gain: pairs a trajectory must add.
         wave: branches per wave.
@@ -159,10 +159,10 @@ class WaveState(Storable):
     def merged(self, branches: Sequence[Branch]) -> WaveState:
         """The state after a wave.
 
-        Anchors of accepted branches go to the end of the line; they grow another branch when their turn
-        comes again and there is room. So do those whose branch only lost to its neighbours. An anchor
-        whose branch would not have been accepted even alone has nothing left to find and retires. Every
-        wave therefore accepts a branch or retires its anchors, and the exploration ends.
+        Anchors of accepted branches go to the end of the queue and grow another branch when their turn
+        comes and there is room. So do anchors whose branch was rejected only because of the others in its
+        wave. An anchor whose branch would not have been accepted even alone is removed. Every wave
+        therefore accepts a branch or removes its anchors, so the exploration terminates.
 
         Args:
             branches: one per anchor of `next_wave()`, in that order.

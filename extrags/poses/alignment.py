@@ -25,12 +25,12 @@ __all__ = ["Agreement", "Posed", "agreement", "align", "moved", "pair_equations"
 REACH = (0.15, 0.1, 0.05, 0.03)
 """Per level: points farther than this share of their depth from the surface they fall on do not count."""
 STRIDES = (3, 3, 2, 1)
-"""Per level: every so many samples; coarse levels only have to point the way."""
+"""Per level: stride over the samples; coarse levels need only an approximate pose."""
 AGREES = 0.02
 """Share of the depth within which two frames show the same surface."""
 ITERATIONS = 8
 SMALLEST_STEPS = (1e-3, 3e-4, 1e-4, 1e-5)
-"""Per level, in radians and depths: what moves less has arrived."""
+"""Per level, in radians and depths: a smaller update ends the iteration."""
 MIN_POINTS = 60
 MIN_GEOMETRIC_SCALE = 5e-4
 MIN_TEXTURE_SCALE = 0.05
@@ -93,7 +93,7 @@ def align(
         first_level: skip the coarser levels for a good guess.
 
     Returns:
-        `world_from_camera`; the last one that could be found where the frames lose sight of each other.
+        `world_from_camera`; the last pose with enough overlap where the frames cease to overlap.
     """
     pose = start.copy()
     for level in range(first_level, len(LEVELS)):
@@ -291,7 +291,7 @@ def _tukey(ratio: np.ndarray) -> np.ndarray:
 
 
 def _solved(A: np.ndarray, b: np.ndarray, unit: float) -> np.ndarray:
-    """Damped a little: a straight tube without texture leaves its axis free."""
+    """Slightly damped: in a straight tube without texture the motion along the axis is undetermined."""
     size = np.tile(np.repeat([1.0, unit], 3), len(b) // 6)
     scaled = A * np.outer(size, size)
     damping = 1e-6 * np.trace(scaled) / len(b) + 1e-12

@@ -33,7 +33,7 @@ _IMAGES_PER_CALL = 16
 
 @dataclass
 class _Told:
-    """Counts steps and tells the caller."""
+    """Counts steps and reports them to the parent process."""
 
     total: int
     done: int = 0

@@ -1,4 +1,4 @@
-"""Frames with depth as the alignment reads them: points, normals and textures that no light changes."""
+"""Frames prepared for alignment: points, normals, and textures invariant to the moving light."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What passes between the caller and the process COLMAP runs in: files in a scratch folder."""
+"""Messages between the caller and COLMAP's process: files in a scratch folder."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["PoseJob", "PoseJobResult"]
 
 @dataclass(frozen=True)
 class PoseJob:
-    """Input of the process; arrays as in `extrags.sequence.Sequence`.
+    """Input of the process; arrays as in `extrags.sequence.EndoscopicSequence`.
 
     Args:
         rgb: uint8, [F, H, W, 3].

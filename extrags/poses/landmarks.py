@@ -1,6 +1,6 @@
-"""Where a frame with depth probably is, from features it shares with others.
+"""Initial poses of frames with depth, from features shared with other frames.
 
-Guesses only: `alignment` makes them exact and says which of them is right.
+`alignment` refines them and decides which one is right.
 """
 
 from __future__ import annotations

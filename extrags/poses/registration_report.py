@@ -1,4 +1,4 @@
-"""What COLMAP saw, frame by frame and pair by pair, and what that means for who holds the camera."""
+"""Report on a COLMAP registration, frame by frame and pair by pair, with advice on what to change."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = [
 FEW_FEATURES = 100
 FEW_INLIERS = 30
 FEW_PARTNERS = 4
-"""A point needs three views before it can carry the next frame: pairs alone do not make a map."""
+"""Fewer verified pairs per frame are too few: only points seen by three views help to register the next."""
 LITTLE_PARALLAX_DEG = 2.0
 NAMED_FRAMES = 12
 """More frames than this are counted and not named in a sentence; the report names them all."""
@@ -84,7 +84,7 @@ def triangulation_angles_deg(result: PoseJobResult) -> np.ndarray:
 def errors_against_given(
     sequence: EndoscopicSequence, world_from_camera: np.ndarray, *, metric: bool
 ) -> dict[str, Any]:
-    """Errors of estimated poses where the source has poses too: a yardstick, never an input.
+    """Errors of estimated poses where the source has poses too; for comparison only, never an input.
 
     The estimate is brought into the source's frame by its training frames alone (rigidly when `metric`, else
     with a scale); held-out frames are measured where that puts them.
@@ -154,7 +154,7 @@ def failure_message(name: str, report: dict[str, Any], min_share: float, *, inst
 
 
 def _advice(report: dict[str, Any]) -> str:
-    """The first thing that is short, and what would lengthen it."""
+    """The first quantity that is insufficient, and how to improve it."""
     if report["features_median"] < FEW_FEATURES:
         return (
             "There is little texture: lower poses.peak_threshold, give larger images (ingest.downscale) "

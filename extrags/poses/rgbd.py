@@ -1,7 +1,7 @@
 """Poses from colour and depth: each frame is aligned with the frames that are placed already.
 
-The model is the placed frames themselves, read from where they stand: nothing is averaged away, and where a
-frame turns out wrong later, it can be moved. Training frames make the model, in the order of time and then
+The model is the set of placed frames, each kept as it is instead of being fused into a volume, so a frame
+that proves wrong later can still be moved. Training frames make the model, in the order of time and then
 all together; held-out frames are aligned with the finished model afterwards, one by one, and never move it.
 """
 
@@ -28,13 +28,13 @@ MIN_SURFACE = 0.6
 """Of the points of a frame that fall into placed frames, at least this share must meet their surface."""
 MIN_OVERLAP = 0.15
 MIN_EVIDENCE = 0.85
-"""Surface and texture together: a wall alone fits any other wall."""
+"""Smallest sum of surface and texture agreement: smooth walls fit each other without texture."""
 RECOGNISED = 15
-"""So many landmarks that agree on a pose are evidence of their own."""
+"""This many landmarks that agree on a pose are sufficient evidence."""
 CERTAIN_SURFACE, CERTAIN_TEXTURE = 0.9, 0.4
-"""What fits so well needs no further start."""
+"""With this agreement no further starting pose is tried."""
 PLACES = 12
-"""Placed frames in which a lost frame is looked for."""
+"""Placed frames with which a frame without a good start is matched."""
 LINKS = 4
 """Frames a new frame is aligned with; the joint adjustment uses more."""
 JOINT_ROUNDS = 8
@@ -44,7 +44,7 @@ POINTS = 4000
 
 @dataclass(frozen=True)
 class RgbdAlignment:
-    """What the alignment found; see `align_by_depth`.
+    """Result of the alignment; see `align_by_depth`.
 
     Args:
         world_from_camera: [F, 4, 4], NaN for frames that were not placed; the first placed frame is the
@@ -128,7 +128,7 @@ class _Alignment:
             self._step()
 
     def _place_all(self, waiting: list[int], *, grows: bool) -> None:
-        """In the order of time; those that do not fit wait until others were placed."""
+        """In temporal order; frames that cannot be placed are tried again after others were."""
         told = self.done + len(waiting)
         thorough = False
         while waiting:
@@ -217,7 +217,7 @@ class _Alignment:
         return [self.placed[other] for _, other in sorted(scored)[:count]]
 
     def _adjust_jointly(self) -> float:
-        """All model frames at once, so that what was passed on from frame to frame does not add up."""
+        """Adjust all model frames together, so that drift from frame to frame does not accumulate."""
         number = {frame: index for index, frame in enumerate(self.model)}
         unit = float(np.median([self.views[frame].median_depth for frame in self.model]))
         pairs: list[tuple[int, int]] = []

@@ -1,4 +1,4 @@
-"""Held-out views as a moving picture: truth, coarse and final side by side."""
+"""Held-out views as an animation: truth, coarse and final side by side."""
 
 from __future__ import annotations
 

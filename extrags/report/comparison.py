@@ -19,7 +19,7 @@ __all__ = ["RenderedMethod", "compared_rows"]
 
 @dataclass(frozen=True)
 class RenderedMethod:
-    """What one method makes of the held-out views of a sequence.
+    """Renders of the held-out views of a sequence by one method.
 
     Args:
         name: of the method.

@@ -1,4 +1,4 @@
-"""Tables of images: rows that share their colour scales, and renders judged against what was recorded."""
+"""Tables of images: rows that share their colour scales, and renders compared with the recorded frames."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class ImageRow:
 
 @dataclass(frozen=True, slots=True)
 class ColorScale:
-    """What the colours of a map mean."""
+    """Value range and label of a colour map."""
 
     bar: DataImage
     low: str

@@ -1,4 +1,4 @@
-"""What a report is made from: plain data, nothing of it opened or computed by the report."""
+"""Inputs of a report: plain data; the report opens no files and computes no results."""
 
 from __future__ import annotations
 

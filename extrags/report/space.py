@@ -1,4 +1,4 @@
-"""The scene from outside: surface, cameras and virtual trajectories, and slices of the occupancy.
+"""The scene seen from outside: surface, cameras and virtual trajectories, and slices of the occupancy.
 
 Orthographic views along the principal axes of the scene. Only surface that faces its nearest camera is
 drawn, so that a tube is seen cut open, from whichever side one looks.
@@ -37,7 +37,7 @@ HELD_OUT_COLOR = "#3f7fbf"
 
 @dataclass(frozen=True, slots=True)
 class SceneFigure:
-    """A picture with what to say about it."""
+    """A picture with its caption."""
 
     image: DataImage
     title: str

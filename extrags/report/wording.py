@@ -53,7 +53,7 @@ def count(value: float | int | None) -> str:
 
 
 def duration(seconds: float | int | None) -> str:
-    """Seconds as people say them: `0.3 s`, `42 s`, `3 min 05 s`, `2 h 04 min`."""
+    """Seconds in readable form: `0.3 s`, `42 s`, `3 min 05 s`, `2 h 04 min`."""
     if seconds is None:
         return MISSING
     if seconds < 9.95:

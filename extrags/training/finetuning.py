@@ -33,7 +33,7 @@ MIN_POINTS = 8
 """Fewer hole points have neither neighbours nor normals."""
 
 MIN_GAIN = 0.05
-"""Albedo in a hole is no brighter than this much light allows: far and grazing guesses are not certain."""
+"""Lower bound of the light divided out of a hole's colour: far and grazing surface there is only guessed."""
 
 HOLE_STRIDE_PX = 2
 """Hole pixels are taken on a grid of this step; thinning would drop most of them anyway."""
@@ -65,7 +65,8 @@ def finetune(
     Raises:
         DivergedError: when the optimisation does not stay finite.
 
-    Source: paper equations 10 (training views) and 11 (virtual views); their depth term is our own.
+    Source: [ExtraGS, eq. 24] (training views) and [ExtraGS, eq. 25] (virtual views), see
+    docs/references.md; their depth term is our own.
     """
     config = FinetuneConfig() if config is None else config
     coarse = CoarseConfig() if coarse is None else coarse
@@ -95,7 +96,7 @@ def finetune(
         iterations=config.iterations,
         densify=coarse.densify.model_copy(update={"stop_share": config.densify_share, "start_share": 0.0}),
     )
-    # All harmonics are there from the first step: the scene is not new.
+    # All harmonics are active from the first step: the scene is optimised already.
     return optimise(start, draw, schedule.resumed(seed=config.seed))
 
 
@@ -116,7 +117,7 @@ def virtual_views(pseudo: PseudoViews, config: FinetuneConfig) -> list[View]:
     """Pseudo-observations as views, with both levels of confidence as weights."""
     views = []
     confidence = np.maximum(pseudo.pixel_confidence, config.confidence_floor)
-    # Where the scene knows its surface, a completed depth has nothing to teach it.
+    # Completed depth supervises only where the scene has no reliable surface.
     depth = np.where(pseudo.uncertainty > UNKNOWN, pseudo.depth_mm, 0).astype(np.float32)
     for index in range(len(pseudo.cameras)):
         weight = config.pseudo_weight * float(pseudo.image_confidence[index])

@@ -136,7 +136,7 @@ class LightFit:
         return float(np.add.reduce(values, dtype=np.float64)) / len(values)
 
     def prior(self) -> float:
-        """The term of the loss that holds log-exposures near zero; only real frames pay it."""
+        """The term of the loss that holds log-exposures near zero; it applies to real frames only."""
         if self._frame is None:
             return 0.0
         exposures = self._log_exposure

@@ -31,7 +31,7 @@ HISTORY_EVERY = 50
 
 @dataclass(frozen=True)
 class TrainingResult:
-    """An optimised scene and how it went.
+    """An optimised scene and the history of its optimisation.
 
     Args:
         scene: without gradient history.
@@ -60,7 +60,7 @@ def optimise(
         draw: gives the view of an iteration.
         schedule: rates, weights and budgets.
         make_step: which implementation of a step; default: the fastest that can take the scene.
-        poses: corrects the poses of real views on the way.
+        poses: corrects the poses of real views during the optimisation.
 
     Raises:
         DivergedError: when loss or parameters stop being finite; names iteration and parameter group.

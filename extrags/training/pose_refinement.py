@@ -1,10 +1,10 @@
 """Small corrections of the training frames' poses, learned together with the Gaussians.
 
 A frame's rotation and centre are corrected apart: `R = exp(turn) R0`, `c = c0 + shift`, both in world axes.
-Corrections that move, turn or scale all frames together are no corrections at all, since the Gaussians would
-just follow; they are taken out after every step (the gauge). So the frame of the world stays where it was.
-Held-out frames are never looked at; `with_refined_poses` lets them go along with the training frames beside
-them, since they were registered in the same map and share its bends.
+Corrections that translate, rotate or scale all frames together have no effect on the images, since the
+Gaussians follow; they are projected out after every step (the gauge), so the world frame stays fixed. Images
+of held-out frames are never used; `with_refined_poses` moves these frames with the training frames next to
+them, since they were registered in the same map and share its distortions.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ BETAS = (0.9, 0.99)
 """A frame is drawn once in an epoch: its own Adam must not remember longer than that lasts."""
 EPSILON = 1e-15
 NEIGHBOURHOOD = 0.3
-"""Training frames within about this many median depths, or radians, of a held-out frame take it along."""
+"""Range, in median depths or radians, within which training frames move a held-out frame with them."""
 
 
 @dataclass(frozen=True)
@@ -161,10 +161,10 @@ class PoseRefinement:
 def with_refined_poses(
     sequence: EndoscopicSequence, refined: Float[np.ndarray, "m 4 4"]
 ) -> EndoscopicSequence:
-    """The sequence with refined poses of its training frames; held-out frames go along with their neighbours.
+    """The sequence with refined poses of its training frames; held-out frames move with their neighbours.
 
     The correction of a held-out frame is the mean of the training frames' corrections, weighted by how near
-    they stand and how alike they look. Its image has no part in that.
+    they are and how similar their directions are. Its image is not used.
 
     Args:
         sequence: whose training frames, in order, were refined.

@@ -42,7 +42,8 @@ def reconstruct(
         The scene; where poses were refined (`refines_poses`), `refined` holds those of `frames`, and the
         scene belongs to them (`extrags.training.pose_refinement.with_refined_poses`).
 
-    Source: 3DGS loss (paper equation 2) inside the mask, with inverse depth where it is known.
+    Source: the loss of 3DGS [ExtraGS, eq. 3] inside the mask, with inverse depth where it is known; see
+    docs/references.md.
     """
     config = CoarseConfig() if config is None else config
     chosen = sequence.train if frames is None else np.asarray(frames)

@@ -1,4 +1,4 @@
-"""Densification as Markov-chain Monte Carlo: dead Gaussians move to live ones, all positions are shaken.
+"""Densification as Markov-chain Monte Carlo: dead Gaussians are relocated, positions are perturbed by noise.
 
 The semantics of gsplat's `MCMCStrategy`, whose own code cannot run here: its relocation is a CUDA kernel.
 """
@@ -86,7 +86,7 @@ class MCMCStrategy(DensityStrategy):
         self._generator = torch.Generator().manual_seed(seed)
 
     def penalty(self, parameters: dict[str, Tensor]) -> Tensor | None:
-        """Mean opacity and mean scale (in extents), weighted: what is not needed fades and becomes dead."""
+        """Mean opacity and mean scale (in extents), weighted: unused Gaussians fade and count as dead."""
         config = self._config
         faded = config.opacity_penalty * parameters["opacities"].sigmoid().mean()
         return faded + config.scale_penalty * parameters["scales"].exp().mean() / self._extent
@@ -148,7 +148,7 @@ class MCMCStrategy(DensityStrategy):
         return torch.multinomial(weights, n, replacement=True, generator=self._generator)
 
     def _shared_out(self, parameters: dict[str, Tensor], source: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The sampled rows, in order, and their parameters once they share their place with the copies."""
+        """The sampled rows, in order, and their parameters after copies were placed at the same position."""
         rows, times = torch.unique(source, return_counts=True)
         values = {name: value.detach()[rows].clone() for name, value in parameters.items()}
         opacities, scales = compute_relocation(

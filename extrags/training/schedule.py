@@ -1,4 +1,4 @@
-"""What the optimisation of a scene goes by: rates, weights and budgets."""
+"""Settings of one optimisation: learning rates, weights and budgets."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Schedule:
         }
 
     def resumed(self, *, seed: int) -> Schedule:
-        """The schedule of a scene that is already there: all harmonics from the first step."""
+        """The schedule for a scene that exists already: all harmonics are active from the first step."""
         return replace(self, sh_every=1, seed=seed)
 
     def depth_weight_at(self, iteration: int) -> float:

@@ -1,4 +1,4 @@
-"""Where the optimisation starts: Gaussians on the surface that depth or sparse points show."""
+"""Starting points of the optimisation: Gaussians on the surface given by depth or sparse points."""
 
 from __future__ import annotations
 
@@ -159,8 +159,8 @@ def depth_from_points(
 ) -> Float[np.ndarray, "f h w"]:
     """Rough depth maps interpolated between the projections of sparse points.
 
-    Only a start: linear inside the convex hull of the points in view, nearest outside it, nothing outside
-    the mask. Frames other than `frames` stay empty.
+    For initialisation only: linear inside the convex hull of the points in view, nearest outside it, nothing
+    outside the mask. Frames other than `frames` stay empty.
 
     Raises:
         CaptureError: when no frame sees enough points.

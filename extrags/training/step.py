@@ -1,7 +1,7 @@
 """One optimisation step: render a view, compare, carry the gradients back, move the parameters.
 
-`AutogradStep` does it with autograd on any backend and says what is meant; `NativeStep` calls the native
-kernels one after the other, into arrays that stay. Both give the same numbers to rounding.
+`AutogradStep` uses autograd on any backend and is the specification; `NativeStep` calls the native kernels
+one after the other and reuses its arrays. Both give the same numbers up to rounding.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ __all__ = ["AutogradStep", "NativeStep", "Observation", "TrainingStep", "trainin
 
 @dataclass(frozen=True)
 class Observation:
-    """What a step saw.
+    """Result of one step's forward and backward pass.
 
     Args:
         loss: all terms.
@@ -63,7 +63,7 @@ class TrainingStep(Protocol):
         Args:
             view: what to match.
             iteration: sets weights and degree.
-            density: says what it needs to know, and may add a penalty.
+            density: tells whether absolute gradients are needed, and may add a penalty.
             viewmat: camera from world instead of the view's own, [4, 4]; its gradient is asked for.
         """
 

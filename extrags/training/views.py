@@ -16,7 +16,7 @@ from extrags.sequence import EndoscopicSequence
 __all__ = ["SATURATED", "View", "epochs", "real_views"]
 
 SATURATED = 250
-"""A channel at or above this (of 255) says nothing about albedo; such pixels do not supervise."""
+"""A channel at or above this (of 255) carries no information on albedo; such pixels do not supervise."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,6 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
 
 
 def epochs(count: int, generator: np.random.Generator) -> Iterator[int]:
-    """Indices in random order without replacement, for ever."""
+    """Endless indices in random order, each once per epoch."""
     while True:
         yield from generator.permutation(count).tolist()

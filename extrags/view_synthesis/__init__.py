@@ -1,1 +1,1 @@
-"""What a virtual view can be told from real ones: references, warp, light transfer, filling."""
+"""What real views say about a virtual one: references, warping, light transfer, filling of holes."""

@@ -1,4 +1,4 @@
-"""What the restorer is told about a virtual view, and the image it starts from.
+"""Input of the restorer: observations of a virtual view, and the base image derived from them.
 
 `Layers` are the raw observations of a view: what the scene renders there, how far it can be trusted, and
 what real views say. They are what pairs keep and what augmentation cuts holes into. `condition` turns

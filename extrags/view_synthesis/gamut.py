@@ -1,7 +1,7 @@
-"""The colours real frames of a scene have, and the bounds they set to restored ones.
+"""Bounds on the hue of restored images, taken from the real frames of a scene.
 
-Far from its training data a network may drift to hues that no tissue has. Brightness is its business,
-hue is not: ratios between channels stay within what the real frames show.
+Far from its training data a network may produce hues that no tissue has. Brightness is left to the network;
+ratios between channels are held within the range of the real frames.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The real views a virtual one may borrow from: colour, depth, exposure, and what each of them saw."""
+"""Real views as references of virtual ones: colour, depth, exposure, and visible Gaussians."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SOLID_ALPHA = 0.9
 
 @dataclass(frozen=True)
 class LightTransfer:
-    """What distance, angle and the camera's response make of a surface's colour, up to a constant.
+    """Effect of distance, angle and camera response on a surface's colour, up to a constant.
 
     Args:
         light: the scene's light; None where the scene has none.
@@ -150,7 +150,7 @@ class ReferenceViews:
         Args:
             scene: the reconstruction; needed for depth and for what each frame saw.
             sequence: posed frames.
-            frames: which frames; training frames only, or the evaluation is worth nothing.
+            frames: which frames; training frames only, else held-out images would leak into the evaluation.
             exposure: gain of each frame; None takes the light's own, for a scene trained on exactly
                 these frames, else 1.
 

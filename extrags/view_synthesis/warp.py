@@ -22,17 +22,17 @@ from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 __all__ = ["Warped", "covisibility", "depth_normals", "fit_falloff_exponent", "warp_references"]
 
 AGREEMENT = 0.05
-"""Relative depth difference at which a real view's word counts 1/e."""
+"""Relative depth difference at which the weight of a real view falls to 1/e."""
 LATTICE_PX = 8
 """Co-visibility is judged on one pixel in this many, along each axis."""
 DISTANCE_TOLERANCE = 0.2
-"""Logarithm of a distance ratio at which a reference is worth 1/e."""
+"""Absolute log ratio of distances at which the quality of a reference falls to 1/e."""
 ANGLE_TOLERANCE_RAD = 0.3
-"""Angle between two viewing rays at which a reference is worth 1/e."""
+"""Angle between two viewing rays at which the quality of a reference falls to 1/e."""
 GOOD_QUALITY = 0.02
 """Reference quality from which the blend replaces the rendering completely."""
 HIGHLIGHT_STEP = 0.12
-"""A sample brighter than the others by this is taken for a highlight and counts 1/e."""
+"""Excess brightness at which the weight of a sample, taken for a highlight, falls to 1/e."""
 BRIGHTNESS_LIMIT = 8.0
 """Larger brightness ratios amplify noise more than they inform."""
 EXPONENT_RANGE = (0.0, 3.0)
@@ -46,9 +46,9 @@ class Warped:
     """Real views as seen from V virtual ones.
 
     Args:
-        nearest: the single best reference, compensated, zero where it says nothing, [V, 3, H, W].
+        nearest: the single best reference, light-compensated, zero where it has no information, [V, 3, H, W].
         nearest_weight: how far it can be trusted, [V, 1, H, W].
-        blend: weighted mean of the best references, zero where none says anything, [V, 3, H, W].
+        blend: weighted mean of the best references, zero where none has information, [V, 3, H, W].
         blend_weight: feathered trust in the blend, [V, 1, H, W].
         log_ratio: log of (distance from the references / distance from the virtual view), [V, 1, H, W].
         reference: index of the best reference among the `ReferenceViews`, [V].
@@ -66,7 +66,7 @@ class Warped:
 
 @dataclass(frozen=True)
 class _Seen:
-    """World points looked up in K references."""
+    """Samples of world points in K references."""
 
     rgb: Float[Tensor, "k 3 p"]
     weight: Float[Tensor, "k p"]

@@ -1,8 +1,8 @@
 r"""Conditional diffusion on a straight path, and its training.
 
 With the clean image z_0 and noise e, both normalised, :math:`z_t = (1 - t) z_0 + t e` for t from 0 to 1,
-and the network predicts z_0 as a residual to the base image. This is the paper's prior (equations 3 and
-4) in another parametrisation of the same Gaussian family: a signal-to-noise ratio per t, and a
+and the network predicts z_0 as a residual to the base image. This is the diffusion prior of [ExtraGS, eq. 4
+and 5] in another parametrisation of the same Gaussian family: a signal-to-noise ratio per t, and a
 prediction from which the noise follows. At t = 1 there is no signal, so a single step is a regression;
 several steps are DDIM's deterministic sampler in terms of the path.
 """
