@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 from extrags.store import Ref, Slot
@@ -57,7 +56,40 @@ def benchmark_report(
     from extrags.sequence import EndoscopicSequence
 
     found = {index: slot.load_json(METRICS_FILE, ref) for index, ref in metrics.items()}
-    every = [
+    every = _with_figures(runs, rows, found, failures)
+
+    def rendered(index: str) -> RenderedMethod:
+        shown = slot.load(RenderedViews, renders[index])
+        return RenderedMethod(str(runs[int(index)]["method"]), shown.rgb, found[index]["per_view"])
+
+    compared = [
+        ComparedViews(
+            slot.load(EndoscopicSequence, sequences[pair["baseline"]]),
+            pair["label"],
+            rendered(pair["baseline"]),
+            rendered(pair["contender"]),
+        )
+        for pair in pictures
+    ]
+    page = build_benchmark_report(
+        BenchmarkInputs(
+            name=name, runs=every, baseline=baseline, methods=methods, pictures=compared, views=views
+        )
+    )
+    (slot.path / PAGE).write_text(page, encoding="utf-8")
+    slot.save_json(COMPARISON_FILE, compare_runs(every, baseline), indent=1)
+    slot.save_json(PER_VIEW_FILE, _per_view(runs, found), indent=1)
+    slot.counts.update(runs=len(runs), kib=round(len(page.encode()) / 1024))
+
+
+def _with_figures(
+    runs: list[dict[str, Any]],
+    rows: list[dict[str, Any]],
+    found: dict[str, Any],
+    failures: dict[str, str],
+) -> list[dict[str, Any]]:
+    """The runs with what they cost, their metrics (None where they failed) and their errors."""
+    return [
         {
             **run,
             **rows[index],
@@ -67,38 +99,11 @@ def benchmark_report(
         for index, run in enumerate(runs)
     ]
 
-    def rendered(index: str) -> RenderedMethod:
-        return RenderedMethod(
-            str(runs[int(index)]["method"]),
-            slot.load(RenderedViews, renders[index]).rgb,
-            found[index]["per_view"],
-        )
 
-    page = build_benchmark_report(
-        BenchmarkInputs(
-            name=name,
-            runs=every,
-            baseline=baseline,
-            methods=methods,
-            pictures=[
-                ComparedViews(
-                    slot.load(EndoscopicSequence, sequences[pair["baseline"]]),
-                    pair["label"],
-                    rendered(pair["baseline"]),
-                    rendered(pair["contender"]),
-                )
-                for pair in pictures
-            ],
-            views=views,
-        )
-    )
-    (slot.path / PAGE).write_text(page, encoding="utf-8")
-    comparison = compare_runs(every, baseline)
-    (slot.path / COMPARISON_FILE).write_text(json.dumps(comparison, indent=1, allow_nan=False))
-    per_view = [
+def _per_view(runs: list[dict[str, Any]], found: dict[str, Any]) -> list[dict[str, Any]]:
+    """Every figure of every held-out view of every run that has figures."""
+    return [
         {**run, "protocol": found[str(index)]["protocol"], "per_view": found[str(index)]["per_view"]}
         for index, run in enumerate(runs)
         if str(index) in found
     ]
-    (slot.path / PER_VIEW_FILE).write_text(json.dumps(per_view, indent=1, allow_nan=False))
-    slot.counts.update(runs=len(runs), kib=round(len(page.encode()) / 1024))

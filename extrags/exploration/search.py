@@ -287,8 +287,14 @@ def grow_branch(
             reason = f"reached {config.length} views"
         elif expansions >= config.max_expansions:
             reason = f"budget of {config.max_expansions} expansions spent, {best.length} views"
-    path = best.path()
-    pairs = np.zeros_like(coverage)
+    return _branch_of(best, anchor, np.zeros_like(coverage), expansions, renders, reason)
+
+
+def _branch_of(
+    last: _State, anchor: int, pairs: UInt32[np.ndarray, "n"], expansions: int, renders: int, reason: str
+) -> Branch:
+    """The path to a state; `pairs` comes empty and is filled with what the path adds."""
+    path = last.path()
     for state in path:
         pairs[state.index] |= state.pairs
     return Branch(
