@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Ref, Slot
 from tasks.stage import stage
 from tasks.weights import Weights
@@ -34,11 +35,6 @@ def render(slot: Slot, scene: Ref, sequence: Ref) -> None:
     if mesh is not None:
         slot.save(mesh)
     slot.counts["triangles"] = 0 if mesh is None else len(mesh.triangles)
-
-
-PROTOCOL_VERSION = 3
-"""`extrags.metrics.protocol.PROTOCOL_VERSION`, written down again: importing it would load torch in every
-process that only looks up keys. A test holds the two together."""
 
 
 # Metrics are a stage of their own: raising the protocol's version measures again without a new render.

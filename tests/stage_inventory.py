@@ -209,7 +209,9 @@ def stages() -> dict[str, tuple[Symbol, int]]:
 def _constant(module: str, node: ast.expr) -> int:
     if isinstance(node, ast.Constant):
         return int(node.value)  # type: ignore[arg-type]
-    (assigned,) = parsed(module).definitions[ast.unparse(node)]
+    found = resolved(module, ast.unparse(node))
+    assert found is not None, f"{module}: {ast.unparse(node)} is no constant of this project"
+    (assigned,) = parsed(found[0]).definitions[found[1]]
     return int(ast.literal_eval(assigned.value))  # type: ignore[attr-defined]
 
 

@@ -26,6 +26,7 @@ from extrags.metrics.exposure import align_exposure, exposure_gain
 from extrags.metrics.image import mean_of_known
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.photometric import photometric_values
+from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.metrics.registry import metrics as registered_metrics
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
 from extrags.sequence import EndoscopicSequence
@@ -34,8 +35,6 @@ from extrags.zarr_io import open_group, read_array, write_frames
 
 __all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
 
-PROTOCOL_VERSION = 3
-"""Raised by hand whenever a figure could change for the same renders."""
 SMALLEST_PART = 0.003
 """Share of the image below which a part of the pixels has no figure: a handful of pixels is noise."""
 SURFACE_ALPHA = 0.5

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 __all__ = [
+    "PROTOCOL_VERSION",
     "Figure",
     "Kind",
     "Measure",
@@ -44,6 +45,10 @@ __all__ = [
     "register_metric",
     "unregister_metric",
 ]
+
+PROTOCOL_VERSION = 3
+"""Of the protocol in `PROTOCOL.md`; raised by hand whenever a figure could change for the same renders, or
+one is added."""
 
 Measure = Callable[["Tensor", "Tensor", "dict[str, Tensor]"], "dict[str, list[float | None]]"]
 """From render and target, [n, h, w, 3] in [0, 1], and regions by name, [n, h, w]: one value per image and

@@ -21,7 +21,7 @@ from extrags.store import Store
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.wiring import run_sequence
-from tasks.evaluate import PROTOCOL_VERSION, measure
+from tasks.evaluate import measure
 from tasks.weights import Weights
 from tests.flows.tiny import SEQUENCE, tiny_config, without_report
 
@@ -176,7 +176,7 @@ def test_absent_weights_are_a_reason_not_a_failure(
 
 def test_a_metric_of_ones_own_is_measured_anew(finished: tuple[str, SequenceOutcome]) -> None:
     store, before = finished
-    error = Metric("mae", "Mean absolute error", higher_is_better=False, measure=means_in_regions(_error))
+    error = Metric("toy_error", "Toy error", higher_is_better=False, measure=means_in_regions(_error))
 
     def evaluated() -> SequenceOutcome:
         return run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), until="evaluate")
@@ -185,9 +185,9 @@ def test_a_metric_of_ones_own_is_measured_anew(finished: tuple[str, SequenceOutc
     try:
         with_it = evaluated()
         assert states(with_it)["evaluate"] == "ran"
-        assert 0 < with_it.metrics["final"]["observed"]["mae"] < 1
+        assert 0 < with_it.metrics["final"]["observed"]["toy_error"] < 1
     finally:
-        unregister_metric("mae")
+        unregister_metric("toy_error")
     without = evaluated()
     assert states(without)["evaluate"] == "cached"
     assert without.metrics == before.metrics
@@ -198,7 +198,7 @@ def test_a_process_that_lacks_a_metric_says_so(finished: tuple[str, SequenceOutc
     found = {
         name: Store(store).find(Path(outcome.artefacts[name]).name) for name in ("renders_final", "sequence")
     }
-    with pytest.raises(ConfigError, match="mae@1; registered in this process: none"):
+    with pytest.raises(ConfigError, match="toy_error@1; registered in this process: none"):
         measure.fn(
             store=store,
             renders=found["renders_final"],
@@ -206,18 +206,12 @@ def test_a_process_that_lacks_a_metric_says_so(finished: tuple[str, SequenceOutc
             net="alex",
             weights_digest=None,
             weights=Weights(net="alex"),
-            added=["mae@1"],
+            added=["toy_error@1"],
         )
 
 
 def _error(render: Tensor, target: Tensor) -> Tensor:
     return (render - target).abs().mean(-1)
-
-
-def test_the_protocol_version_is_the_librarys() -> None:
-    from extrags.metrics import protocol
-
-    assert protocol.PROTOCOL_VERSION == PROTOCOL_VERSION
 
 
 def start(store: Path) -> subprocess.Popen[str]:
