@@ -60,8 +60,8 @@ class Slot:
         value.save(self.path / value.stored_as)
 
     def save_json(self, file: str, value: Any, *, indent: int | None = None) -> None:
-        """Write plain JSON beside the arrays."""
-        (self.path / file).write_text(json.dumps(value, indent=indent), encoding="utf-8")
+        """Write plain JSON beside the arrays; NaN and infinity are no JSON and raise ValueError."""
+        (self.path / file).write_text(json.dumps(value, indent=indent, allow_nan=False), encoding="utf-8")
 
     @property
     def debug(self) -> Path:
