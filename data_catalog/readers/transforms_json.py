@@ -25,15 +25,15 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from data_catalog.formats import FolderFormat
-from data_catalog.images import COLOUR_SUFFIXES, natural_key, read_depth
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import COLOUR_SUFFIXES, image_size, natural_key, read_depth, save_images
 from data_catalog.lens import LENS_PARAMETERS, Lens
-from data_catalog.posed_frames import PosedFrame, assembled, save_images
+from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FORMAT", "TRANSFORMS_FILE", "write_transforms"]
+__all__ = ["READER", "TRANSFORMS_FILE", "write_transforms"]
 
 TRANSFORMS_FILE = "transforms.json"
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -58,7 +58,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for file in found if file.is_file() and file.is_relative_to(folder))
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / TRANSFORMS_FILE
     content = _load(file)
     unit = content.get("length_unit", "arbitrary")
@@ -97,29 +97,29 @@ def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
         )
     points, points_rgb = _points(folder, content, file)
 
-    def depth_of(depth_file: Path, frame: str) -> Float[np.ndarray, "h w"]:
+    def depth_of(depth_file: Path, frame: str | int) -> Float[np.ndarray, "h w"]:
         factor = _depth_factor(content, depth_file, file) * scale
         return (read_depth(depth_file, frame=frame) * factor).astype(np.float32)
 
-    return assembled(
+    return SourceFrames(
         frames,
-        config,
-        name=name,
         pose_file=file,
         metric=unit != "arbitrary",
+        intrinsics_file=file,
         read_depth=depth_of,
         points=None if points is None else points * scale,
         points_rgb=points_rgb,
     )
 
 
-FORMAT = FolderFormat(
+READER = FolderReader(
     name="transforms",
-    version=1,
-    summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in data_catalog/transforms_json.py",
+    version=2,
+    summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in "
+    "data_catalog/readers/transforms_json.py",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="OpenGL camera axes (y up, z backward, turned on reading), camera to world; "
     "depth in thousandths of the pose unit unless it says otherwise",
 )
@@ -260,7 +260,7 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
     if "w" in values and "h" in values:
         width, height = int(number("w")), int(number("h"))
     else:
-        width, height = _image_size(image)
+        width, height = image_size(image, frame=frame)
     if "fl_x" in values or "fl_y" in values:
         fx = number("fl_x") if "fl_x" in values else number("fl_y")
         fy = number("fl_y", fx)
@@ -312,13 +312,6 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
             field="camera_model",
         )
     return Lens(model, tuple(float(named[key]) for key in names), width, height)
-
-
-def _image_size(image: Path) -> tuple[int, int]:
-    from data_catalog.images import read_colour
-
-    height, width = read_colour(image, frame=image.name).shape[:2]
-    return width, height
 
 
 def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> float:

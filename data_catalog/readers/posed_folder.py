@@ -38,17 +38,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.checks import check_depth, check_intrinsics, check_pose
-from data_catalog.formats import FolderFormat
-from data_catalog.images import Resampling, colour_files, read_colour, read_depth, read_mask, spread
-from data_catalog.splits import every_nth
-from data_catalog.visibility import observed_from_depth
-from extrags.cameras import Cameras
+from data_catalog.checks import check_intrinsics
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import colour_files, image_size
+from data_catalog.lens import Lens
+from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import EndoscopicSequence, Split
 
-__all__ = ["FORMAT", "POSES_FILE"]
+__all__ = ["POSES_FILE", "READER"]
 
 POSES_FILE = "poses.json"
 _DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
@@ -69,67 +67,39 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for file in [folder / POSES_FILE, *inside] if file.is_file())
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / POSES_FILE
     content = _load(file)
-    frames = content["frames"]
-    _check_count(folder, frames)
-    metric = content.get("length_unit", "mm") == "mm"
-    depth_files = _depth_files(folder, frames)
-    kept = spread(len(frames), config.max_frames)
-
-    colours, intrinsics, poses, masks, depths = [], [], [], [], []
-    resampling: Resampling | None = None
-    for index in kept:
-        entry = frames[index]
-        frame = entry["file"]
-        poses.append(
-            check_pose(_matrix(entry, "world_from_camera", (4, 4), file, frame), frame=frame, file=file)
-        )
-        K = _matrix(entry if "K" in entry else content, "K", (3, 3), file, frame)
-        colour = read_colour(folder / frame, frame=frame)
-        if resampling is None:
-            resampling = Resampling.planned(colour.shape[1], colour.shape[0], config)
-        check_intrinsics(K, resampling.source_width, resampling.source_height, frame=frame, file=file)
-        colours.append(resampling.colour(colour, file=folder / frame, frame=frame))
-        intrinsics.append(resampling.intrinsics(K))
-        mask_file = folder / "mask" / f"{Path(frame).stem}.png"
-        mask = read_mask(mask_file, frame=frame) if mask_file.is_file() else np.ones(colour.shape[:2], bool)
-        masks.append(resampling.mask(mask, file=mask_file, frame=frame))
-        if depth_files:
-            depth = read_depth(depth_files[index], frame=frame)
-            # Before shrinking, so that row, column and count are those of the file.
-            check_depth(depth, frame=frame, file=depth_files[index])
-            depths.append(resampling.depth(depth, file=depth_files[index], frame=frame))
-    if resampling is None:
-        raise SourceError("the list of frames is empty", file=file, field="frames")
-    cameras = Cameras(np.stack(intrinsics), np.stack(poses), resampling.width, resampling.height)
-    depth_mm = np.stack(depths) if depths else None
-    split = _split([frames[index] for index in kept], config, file)
-    return EndoscopicSequence(
-        name=name,
-        rgb=np.stack(colours),
-        K=cameras.K,
-        mask=np.stack(masks),
-        split=split,
-        world_from_camera=cameras.world_from_camera,
-        depth_mm=depth_mm,
-        recording=np.array([int(frames[index].get("recording", 0)) for index in kept], dtype=np.int64),
-        frame_names=tuple(Path(frames[index]["file"]).stem for index in kept),
-        metric=metric,
-        observed=(
-            None if depth_mm is None else observed_from_depth(cameras, depth_mm, split.train, split.test)
-        ),
+    entries = content["frames"]
+    _check_count(folder, entries)
+    _check_splits(entries, file)
+    depth_files = _depth_files(folder, entries)
+    return SourceFrames(
+        frames=[
+            PosedFrame(
+                name=entry["file"],
+                file=folder / entry["file"],
+                lens=_lens(folder, entry, content, file),
+                world_from_camera=_matrix(entry, "world_from_camera", (4, 4), file, entry["file"]),
+                mask_file=_mask_file(folder, entry["file"]),
+                depth_file=depth_files[index] if depth_files else None,
+                recording=int(entry.get("recording", 0)),
+                split=entry.get("split"),
+            )
+            for index, entry in enumerate(entries)
+        ],
+        pose_file=file,
+        metric=content.get("length_unit", "mm") == "mm",
     )
 
 
-FORMAT = FolderFormat(
+READER = FolderReader(
     name="extrags",
-    version=1,
-    summary=f"{POSES_FILE} with rgb/ (and depth/, mask/), described in data_catalog/posed_folder.py",
+    version=2,
+    summary=f"{POSES_FILE} with rgb/ (and depth/, mask/), described in data_catalog/readers/posed_folder.py",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="OpenCV camera axes, camera to world, pixel centres at +0.5; z-depth",
 )
 
@@ -222,10 +192,10 @@ def _depth_files(folder: Path, frames: list[dict[str, Any]]) -> list[Path]:
     return found
 
 
-def _split(frames: list[dict[str, Any]], config: IngestConfig, file: Path) -> Split:
+def _check_splits(frames: list[dict[str, Any]], file: Path) -> None:
     named = [entry.get("split") for entry in frames]
     if all(value is None for value in named):
-        return every_nth(len(frames), config.holdout_every, file=file)
+        return
     for entry, value in zip(frames, named, strict=True):
         if value not in ("train", "test"):
             raise SourceError(
@@ -234,6 +204,16 @@ def _split(frames: list[dict[str, Any]], config: IngestConfig, file: Path) -> Sp
                 frame=entry["file"],
                 field="split",
             )
-    index = np.arange(len(frames))
-    is_test = np.array([value == "test" for value in named])
-    return Split("manifest", index[~is_test], index[is_test])
+
+
+def _lens(folder: Path, entry: dict[str, Any], content: dict[str, Any], file: Path) -> Lens:
+    frame = entry["file"]
+    width, height = image_size(folder / frame, frame=frame)
+    K = _matrix(entry if "K" in entry else content, "K", (3, 3), file, frame)
+    check_intrinsics(K, width, height, frame=frame, file=file)
+    return Lens.pinhole(K, width, height)
+
+
+def _mask_file(folder: Path, frame: str) -> Path | None:
+    file = folder / "mask" / f"{Path(frame).stem}.png"
+    return file if file.is_file() else None

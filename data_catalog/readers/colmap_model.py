@@ -26,17 +26,17 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from data_catalog.colmap_files import ColmapImage, ColmapModel, read_model, write_model
-from data_catalog.formats import FolderFormat
-from data_catalog.images import COLOUR_SUFFIXES, natural_key
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
 from data_catalog.lens import Lens
-from data_catalog.posed_frames import PosedFrame, assembled, save_images
+from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FORMAT", "model_folder", "points_of", "read_depth_map", "write_colmap", "write_depth_map"]
+__all__ = ["READER", "model_folder", "points_of", "read_depth_map", "write_colmap", "write_depth_map"]
 
 logger = logging.getLogger(__name__)
 
@@ -105,7 +105,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(found)
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     place = model_folder(folder)
     if place is None:
         raise SourceNotFoundError("no COLMAP model in this folder", file=folder)
@@ -136,25 +136,25 @@ def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
                 frame=frame.name,
                 field="name",
             )
-    return assembled(
+    pose_file = next(file for file in (place / "images.bin", place / "images.txt") if file.is_file())
+    return SourceFrames(
         frames,
-        config,
-        name=name,
-        pose_file=next(file for file in (place / "images.bin", place / "images.txt") if file.is_file()),
+        pose_file=pose_file,
         metric=_is_metric(folder),
+        intrinsics_file=pose_file,
         read_depth=lambda file, frame: read_depth_map(file, frame=frame),
         points=model.points if len(model.points) else None,
         points_rgb=model.points_rgb if len(model.points) else None,
     )
 
 
-FORMAT = FolderFormat(
+READER = FolderReader(
     name="colmap",
-    version=1,
-    summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/colmap_model.py",
+    version=2,
+    summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/readers/colmap_model.py",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="COLMAP poses (camera from world, OpenCV axes, inverted on reading), pixel "
     "centres at +0.5; arbitrary unit unless length_unit.txt says mm",
 )
