@@ -15,10 +15,10 @@ from data_catalog.catalog import read, resolve
 from data_catalog.dataset import Source
 from data_catalog.diagnostics import Finding, diagnose
 from data_catalog.folders import find_reader
-from data_catalog.specular import saturated_mask, specular_masks
+from data_catalog.specular import specular_masks
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
 
