@@ -31,6 +31,7 @@ from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
 from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
+from data_catalog.readers.frame_list import split_by_name
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
@@ -305,10 +306,9 @@ def _is_metric(folder: Path) -> bool:
 
 def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train", "test"]]:
     known = {image.name for image in images}
-    result: dict[str, Literal["train", "test"]] = {}
     file = folder / "test_list.txt"
     if not file.is_file():
-        return result
+        return {}
     held_out = set(file.read_text(encoding="utf-8").split("\n")) - {""}
     unknown = sorted(held_out - known, key=natural_key)
     if unknown:
@@ -321,17 +321,8 @@ def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train
         )
     listed = folder / "train_list.txt"
     training = set(listed.read_text(encoding="utf-8").split("\n")) if listed.is_file() else known - held_out
-    both = sorted(held_out & training, key=natural_key)
-    if both:
-        raise SourceError(
-            f"{len(both)} images both train and evaluate, this one is the first",
-            file=file,
-            frame=both[0],
-            field="split",
-        )
-    for name in known:
-        result[name] = "test" if name in held_out else "train"
-    return result
+    # The list may name more than the model holds.
+    return split_by_name(known - held_out | (training & held_out), held_out, file=file)
 
 
 def _tell_about_unposed(root: Path, posed: set[str]) -> None:

@@ -31,18 +31,15 @@ other axes, the sequence is refused and the axes that fit are named.
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-from jaxtyping import Float
 
 from data_catalog.checks import check_intrinsics
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import colour_files, image_size
 from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.frame_list import load_frame_list, matrix_of
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 
@@ -80,7 +77,9 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
                 name=entry["file"],
                 file=folder / entry["file"],
                 lens=_lens(folder, entry, content, file),
-                world_from_camera=_matrix(entry, "world_from_camera", (4, 4), file, entry["file"]),
+                world_from_camera=matrix_of(
+                    entry, "world_from_camera", 4, file=file, frame=entry["file"], error=PoseError
+                ),
                 mask_file=_mask_file(folder, entry["file"]),
                 depth_file=depth_files[index] if depth_files else None,
                 recording=int(entry.get("recording", 0)),
@@ -105,14 +104,7 @@ READER = FolderReader(
 
 
 def _load(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text())
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise SourceError(f"not readable as JSON: {error}", file=file) from error
-    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
-        raise SourceError("expected an object with a list `frames`", file=file, field="frames")
-    if not content["frames"]:
-        raise SourceError("the list of frames is empty", file=file, field="frames")
+    content = load_frame_list(file, "file")
     unit = content.get("length_unit", "mm")
     if unit not in _LENGTH_UNITS:
         raise SourceError(
@@ -120,17 +112,11 @@ def _load(file: Path) -> dict[str, Any]:
             file=file,
             field="length_unit",
         )
-    for index, entry in enumerate(content["frames"]):
-        if not isinstance(entry, dict) or not isinstance(entry.get("file"), str):
-            raise SourceError("expected an object with `file`", file=file, frame=index, field="file")
     return content
 
 
 def _check_count(folder: Path, frames: list[dict[str, Any]]) -> None:
     listed = [entry["file"] for entry in frames]
-    if len(set(listed)) != len(listed):
-        twice = next(name for name in listed if listed.count(name) > 1)
-        raise SourceError("the frame is listed twice", file=folder / POSES_FILE, frame=twice, field="file")
     for name in listed:
         if not (folder / name).is_file():
             raise SourceNotFoundError(
@@ -149,28 +135,6 @@ def _check_count(folder: Path, frames: list[dict[str, Any]]) -> None:
             frame=extra[0],
             field="world_from_camera",
         )
-
-
-def _matrix(
-    owner: dict[str, Any], field: str, shape: tuple[int, int], file: Path, frame: str
-) -> Float[np.ndarray, "r c"]:
-    kind = PoseError if field == "world_from_camera" else SourceError
-    if field not in owner:
-        raise kind(
-            f"no {field}; expected {shape[0]} x {shape[1]} numbers", file=file, frame=frame, field=field
-        )
-    try:
-        matrix = np.asarray(owner[field], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise kind(f"not a matrix of numbers: {error}", file=file, frame=frame, field=field) from error
-    if matrix.shape != shape:
-        raise kind(
-            f"found shape {matrix.shape}; expected {shape[0]} rows of {shape[1]} numbers",
-            file=file,
-            frame=frame,
-            field=field,
-        )
-    return matrix
 
 
 def _depth_files(folder: Path, frames: list[dict[str, Any]]) -> list[Path]:
@@ -209,7 +173,7 @@ def _check_splits(frames: list[dict[str, Any]], file: Path) -> None:
 def _lens(folder: Path, entry: dict[str, Any], content: dict[str, Any], file: Path) -> Lens:
     frame = entry["file"]
     width, height = image_size(folder / frame, frame=frame)
-    K = _matrix(entry if "K" in entry else content, "K", (3, 3), file, frame)
+    K = matrix_of(entry if "K" in entry else content, "K", 3, file=file, frame=frame)
     check_intrinsics(K, width, height, frame=frame, file=file)
     return Lens.pinhole(K, width, height)
 
