@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any
 
 from data_catalog.c3vd import reader as c3vd
-from data_catalog.data_roots import find_folder, not_on_this_machine
 from data_catalog.dataset import Descriptor, Source
 from data_catalog.folder_reader import FolderReader
+from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.readers import (
     colmap_model,
     endonerf,

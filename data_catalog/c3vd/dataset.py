@@ -12,8 +12,8 @@ from typing import Any
 
 from data_catalog.c3vd.published import Recording, RecordingPair, find, find_scene, published_sets
 from data_catalog.c3vd.reader import READER, pair_files, pair_frames
-from data_catalog.data_roots import find_folder, not_on_this_machine
 from data_catalog.dataset import Descriptor, Source, file_digests
+from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.posed_frames import assembled
 from extrags.config import IngestConfig
 from extrags.errors import SourceError

@@ -50,7 +50,7 @@ def data_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def only_here(data_root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("data_catalog.data_roots.data_roots", lambda: [data_root])
+    monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [data_root])
     return data_root
 
 
@@ -104,7 +104,7 @@ class TestCatalogue:
         assert not describe("c3vdv2/c1_cecum_t1@sparse").available
 
     def test_videos_in_a_folder_of_their_own(self, own_root, monkeypatch) -> None:
-        monkeypatch.setattr("data_catalog.data_roots.data_roots", list)
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", list)
         source = resolve(own_root / "c9_transverse1_t3@sparse")
         assert source.name == f"{SCENE}@sparse"
         assert source.path == str(own_root / "c9_transverse1_t3_v2")
@@ -127,7 +127,7 @@ class TestCatalogue:
                 question(name)
 
     def test_known_but_not_here(self, tmp_path, monkeypatch) -> None:
-        monkeypatch.setattr("data_catalog.data_roots.data_roots", lambda: [tmp_path])
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [tmp_path])
         with pytest.raises(
             SourceNotFoundError, match=r"no folder c3vdv2/c1_cecum_t1_v2 in .*FOLDER/c1_cecum_t1@sparse"
         ):
@@ -173,7 +173,7 @@ class TestPairs:
         assert found.residual_mm < found.largest_residual_mm < 2e-4
 
     def test_every_tenth_frame_of_a_published_scene(self, tmp_path, monkeypatch) -> None:
-        monkeypatch.setattr("data_catalog.data_roots.data_roots", lambda: [tmp_path])
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [tmp_path])
         for name, frames, phase in (("v1", 156, 0.0), ("v2", 117, 1.0)):
             write_video(
                 tmp_path / "C3VDv2" / f"c1_transverse1_t1_{name}",

@@ -52,7 +52,7 @@ class TestNames:
             resolve("phantom/3@spars")
 
     def test_known_set_without_its_files(self, tmp_path, monkeypatch) -> None:
-        monkeypatch.setattr("data_catalog.data_roots.data_roots", lambda: [tmp_path])
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [tmp_path])
         assert not describe("sinus/hopkins").available
         with pytest.raises(SourceNotFoundError, match="EXTRAGS_DATA"):
             resolve("sinus/hopkins")

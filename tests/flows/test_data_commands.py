@@ -80,7 +80,7 @@ class TestShow:
     def test_without_the_data(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        monkeypatch.setattr("data_catalog.data_roots.data_roots", lambda: [tmp_path])
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [tmp_path])
         assert main(["data", "show", "sinus/hopkins", "--json", "-"]) == 0
         shown = json.loads(capsys.readouterr().out)
         assert shown["available"] is False

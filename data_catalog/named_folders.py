@@ -1,31 +1,14 @@
-"""Where named sets are looked for on this machine.
-
-`$EXTRAGS_DATA`, then `../shared/data` beside the working directory and beside the checkout.
-"""
+"""Folders of named sets below the data roots (`extrags.data_directories`)."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from extrags.data_directories import DATA_VARIABLE, data_roots
 from extrags.errors import SourceNotFoundError
 
-__all__ = ["DATA_ROOT_VARIABLE", "data_roots", "find_folder", "not_on_this_machine"]
-
-DATA_ROOT_VARIABLE = "EXTRAGS_DATA"
-
-
-def data_roots() -> list[Path]:
-    """Folders that may hold named sets, the first one first."""
-    roots = [
-        Path.cwd().parent / "shared" / "data",
-        Path(__file__).resolve().parents[2] / "shared" / "data",
-    ]
-    chosen = os.environ.get(DATA_ROOT_VARIABLE)
-    if chosen:
-        roots.insert(0, Path(chosen).expanduser())
-    return list(dict.fromkeys(roots))
+__all__ = ["find_folder", "not_on_this_machine"]
 
 
 def find_folder(names: Iterable[str], roots: Sequence[Path] | None = None) -> Path | None:
@@ -54,6 +37,6 @@ def not_on_this_machine(
     looked_at = ", ".join(str(root) for root in (data_roots() if roots is None else roots))
     return SourceNotFoundError(
         f"{name} is not on this machine: no folder {folder} in {looked_at}. Put it there, set "
-        f"{DATA_ROOT_VARIABLE} to the folder that holds it, or give {instead}",
+        f"{DATA_VARIABLE} to the folder that holds it, or give {instead}",
         file=folder,
     )
