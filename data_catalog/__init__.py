@@ -1,4 +1,55 @@
-"""What datasets there are, and how each is read into an `extrags.sequence.Sequence`.
+"""What datasets there are, and how each is read into an `extrags.sequence.EndoscopicSequence`.
 
-Imports stay light here: the readers are loaded when a sequence is read.
+The front door: `read`, `resolve`, `describe`, `list_sequences`, `source_fingerprint`, `Source`, `Descriptor`,
+`FolderReader`, `PosedFrame`, `SourceFrames`, `register_reader`. Each is loaded when it is first asked for.
 """
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from data_catalog.catalog import describe, list_sequences, read, resolve, source_fingerprint
+    from data_catalog.dataset import Descriptor, Source
+    from data_catalog.folder_reader import FolderReader
+    from data_catalog.folders import register_reader
+    from data_catalog.posed_frames import PosedFrame, SourceFrames
+
+__all__ = [
+    "Descriptor",
+    "FolderReader",
+    "PosedFrame",
+    "Source",
+    "SourceFrames",
+    "describe",
+    "list_sequences",
+    "read",
+    "register_reader",
+    "resolve",
+    "source_fingerprint",
+]
+
+_MODULES = {
+    "Descriptor": "dataset",
+    "FolderReader": "folder_reader",
+    "PosedFrame": "posed_frames",
+    "Source": "dataset",
+    "SourceFrames": "posed_frames",
+    "describe": "catalog",
+    "list_sequences": "catalog",
+    "read": "catalog",
+    "register_reader": "folders",
+    "resolve": "catalog",
+    "source_fingerprint": "catalog",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -18,9 +18,8 @@ from pydantic import BaseModel, ConfigDict
 from data_catalog.checks import axis_readings, reading_name
 from data_catalog.images import natural_key
 from data_catalog.matches import match_neighbours, pose_support
-from data_catalog.specular import saturated_mask
 from extrags.cameras import invert_poses, rotation_angle_deg
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "diagnose"]
 

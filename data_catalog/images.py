@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,15 +13,19 @@ from jaxtyping import Bool, Float, UInt8
 
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
+from extrags.events import Progress, emit
+from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "COLOUR_SUFFIXES",
     "Resampling",
     "colour_files",
+    "image_size",
     "natural_key",
     "read_colour",
     "read_depth",
     "read_mask",
+    "save_images",
     "spread",
 ]
 
@@ -49,6 +55,19 @@ def read_colour(file: Path, *, frame: object = None) -> UInt8[np.ndarray, "h w 3
         SourceError: the file is truncated or no image.
     """
     return np.array(_opened(file, frame, "rgb", mode="RGB"), dtype=np.uint8)
+
+
+def image_size(file: Path, *, frame: object = None) -> tuple[int, int]:
+    """Width and height of an image in pixels, from its first bytes.
+
+    Raises:
+        SourceNotFoundError: there is no such file.
+        SourceError: the file is no image.
+    """
+    from PIL import Image
+
+    with _image_errors(file, frame, "rgb"), Image.open(file) as image:
+        return image.size
 
 
 def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
@@ -85,6 +104,39 @@ def read_depth(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:
             field="depth",
         )
     return np.asarray(values, dtype=np.float32)
+
+
+def save_images(sequence: EndoscopicSequence, folder: Path) -> list[str]:
+    """Write colour images and masks of a sequence, as exporters do.
+
+    Args:
+        sequence: frames of several recordings go to folders of their own, unless their names say folders.
+        folder: gets `images/NAME.png`, and `masks/NAME.png.png` (COLMAP's naming; white is tissue) where a
+            mask leaves anything out.
+
+    Returns:
+        The names of the images below `images/`, one per frame.
+    """
+    from PIL import Image
+
+    several = sequence.recording is not None and len(np.unique(sequence.recording)) > 1
+    names = []
+    for index in range(len(sequence)):
+        name = sequence.frame_name(index)
+        if several and sequence.recording is not None and "/" not in name:
+            name = f"recording_{int(sequence.recording[index])}/{name}"
+        names.append(f"{name}.png")
+    masked = not sequence.mask.all()
+    for index, name in enumerate(names):
+        places = [(folder / "images" / name, Image.fromarray(sequence.rgb[index]))]
+        if masked:
+            white = (sequence.mask[index] * 255).astype(np.uint8)
+            places.append((folder / "masks" / f"{name}.png", Image.fromarray(white)))
+        for place, picture in places:
+            place.parent.mkdir(parents=True, exist_ok=True)
+            picture.save(place)
+        emit(Progress("export", index + 1, len(names)))
+    return names
 
 
 def spread(count: int, at_most: int | None) -> list[int]:
@@ -242,14 +294,22 @@ class Resampling:
 
 
 def _opened(file: Path, frame: object, field: str, *, mode: str | None) -> np.ndarray:
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
+
+    with _image_errors(file, frame, field), Image.open(file) as image:
+        image.load()
+        return np.asarray(image if mode is None else image.convert(mode))
+
+
+@contextmanager
+def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
+    """What Pillow raises for a file, as the errors of a source."""
+    from PIL import UnidentifiedImageError
 
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file, frame=frame, field=field)
     try:
-        with Image.open(file) as image:
-            image.load()
-            return np.asarray(image if mode is None else image.convert(mode))
+        yield
     except UnidentifiedImageError as error:
         raise SourceError(
             f"not an image, or damaged from its first bytes ({file.stat().st_size} bytes)",

@@ -11,13 +11,14 @@ import numpy as np
 from jaxtyping import UInt8
 from pydantic import BaseModel, ConfigDict
 
-from data_catalog.catalog import Source, read, resolve
+from data_catalog.catalog import read, resolve
+from data_catalog.dataset import Source
 from data_catalog.diagnostics import Finding, diagnose
-from data_catalog.formats import folder_formats
-from data_catalog.specular import saturated_mask, specular_masks
+from data_catalog.folders import find_reader
+from data_catalog.specular import specular_masks
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
 
@@ -65,10 +66,10 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
     with _HeardWarnings() as heard:
         try:
             source = resolve(name_or_path)
-            kind = next((item for item in folder_formats() if item.name == source.format), None)
-            conventions = kind.conventions if kind is not None else "OpenCV camera axes, camera to world; mm"
-            if kind is not None and kind.notes is not None:
-                notes = kind.notes(Path(str(source.path)))
+            reader = find_reader(source.format)
+            conventions = "OpenCV camera axes, camera to world; mm" if reader is None else reader.conventions
+            if reader is not None and reader.notes is not None:
+                notes = reader.notes(Path(str(source.path)))
             sequence = read(source, config)
         except (UnknownSequenceError, ConfigError):
             raise

@@ -80,6 +80,18 @@ class Lens:
             if not np.isfinite(value):
                 raise SourceError(f"{name} = {value}; expected a finite number", field="camera parameters")
 
+    @classmethod
+    def pinhole(cls, K: Float[np.ndarray, "3 3"], width: int, height: int) -> Lens:
+        """The lens of an undistorted image.
+
+        Args:
+            K: without skew.
+            width: image width in pixels.
+            height: image height in pixels.
+        """
+        parameters = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        return cls("PINHOLE", parameters, width, height)
+
     def value(self, name: str) -> float:
         """One parameter by name; 0 where the model has none of that name."""
         names = LENS_PARAMETERS[self.model]

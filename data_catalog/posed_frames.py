@@ -1,27 +1,35 @@
-"""From frames with lens and pose to an `EndoscopicSequence`: what readers of posed formats share."""
+"""What readers hand over, and how it becomes an `EndoscopicSequence`: the one place for all readers.
+
+A reader says which frames there are (`PosedFrame`) and what they share (`SourceFrames`). `assembled` thins
+them, splits them, reads their pixels, undoes lenses, shrinks, masks, and checks what only files can show.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.checks import check_depth, check_intrinsics, check_pose
-from data_catalog.images import Resampling, read_colour, read_mask, spread
-from data_catalog.lens import Lens, Undistortion
+from data_catalog.images import COLOUR_SUFFIXES, read_colour, read_depth, read_mask, spread
+from data_catalog.lens import Lens
+from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from data_catalog.splits import every_nth
-from data_catalog.visibility import observed_from_depth
+from data_catalog.visibility import observed_by_depth
 from extrags.cameras import Cameras
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
 from extrags.sequence import EndoscopicSequence, Split
 
-__all__ = ["PosedFrame", "assembled", "save_images"]
+__all__ = ["MaskFinder", "PosedFrame", "SourceFrames", "assembled"]
+
+
+_EXACT_POSE = 1e-14
 
 
 @dataclass(frozen=True)
@@ -29,165 +37,252 @@ class PosedFrame:
     """One frame on disk, its pose in OpenCV axes, camera to world.
 
     Args:
-        name: as the format calls it, for messages.
-        file: the colour image.
+        name: as the format calls it; the sequence drops an image's suffix.
+        file: the colour image, or what it is decoded from.
         lens: for the image as it lies on disk.
-        world_from_camera: as read; checked by `assembled`.
+        world_from_camera: as read; checked by `assembled`. None where the poses stage has to find it.
         mask_file: None where there is none.
         depth_file: None where there is none.
         recording: index of the recording.
         split: None where the format names none.
+        number: names the frame in messages where a source counts its frames; None takes the name.
     """
 
     name: str
     file: Path
-    lens: Lens
-    world_from_camera: Float[np.ndarray, "4 4"]
+    lens: CameraModel
+    world_from_camera: Float[np.ndarray, "4 4"] | None = None
     mask_file: Path | None = None
     depth_file: Path | None = None
     recording: int = 0
     split: Literal["train", "test"] | None = None
+    number: int | None = None
+
+    @property
+    def label(self) -> str | int:
+        """What messages call it."""
+        return self.name if self.number is None else self.number
 
 
-def assembled(
-    frames: Sequence[PosedFrame],
-    config: IngestConfig,
-    *,
-    name: str,
-    pose_file: Path,
-    metric: bool,
-    read_depth: Callable[[Path, str], Float[np.ndarray, "h w"]],
-    white_is_tissue: bool = True,
-    points: Float[np.ndarray, "p 3"] | None = None,
-    points_rgb: UInt8[np.ndarray, "p 3"] | None = None,
-) -> EndoscopicSequence:
+@runtime_checkable
+class MaskFinder(Protocol):
+    """Finds the mask of frames that have no file: one for each recording, from its images."""
+
+    def see(
+        self,
+        frame: PosedFrame,
+        image: UInt8[np.ndarray, "h w 3"],
+        sampled: UInt8[np.ndarray, "h2 w2 3"],
+    ) -> None:
+        """Take note of a frame, as it lies on disk and as the sequence holds it."""
+
+    def mask(self, frame: PosedFrame, sampling: Sampling) -> Bool[np.ndarray, "h2 w2"]:
+        """The mask of a frame's recording, once all frames were seen."""
+
+
+def _colour_of(frame: PosedFrame) -> UInt8[np.ndarray, "h w 3"]:
+    return read_colour(frame.file, frame=frame.label)
+
+
+def _depth_of(file: Path, label: str | int) -> Float[np.ndarray, "h w"]:
+    return read_depth(file, frame=label)
+
+
+@dataclass(frozen=True)
+class SourceFrames:
+    """All frames of a source, in order, and what they share.
+
+    Args:
+        frames: before any thinning.
+        pose_file: named in errors about poses and the split.
+        metric: whether lengths are millimetres.
+        intrinsics_file: says for images of which size the lenses hold; None where they were made for the
+            images there are.
+        read_colour: a frame's image; asked for once, in order.
+        read_depth: file and frame's label to z-depth in the sequence's unit, 0 where unknown.
+        white_is_tissue: polarity of mask files.
+        masks: finds masks of frames without a file; None leaves such frames whole.
+        sampling: a frame's lens, the settings and the first lens's sampling (None for the first) to its own.
+        observed: cameras, masks, depth and split to the pixels of held-out frames whose surface was seen by
+            training frames, or None where nothing tells.
+        split_name: of the split, where frames name theirs.
+        split_version: of the rule behind it.
+        points: sparse points of the source.
+        points_rgb: their colours.
+        truth: what else is known, for `EndoscopicSequence.truth`.
+        looked_at: steps of progress that were reported before the first frame is read.
+    """
+
+    frames: Sequence[PosedFrame]
+    pose_file: Path
+    metric: bool
+    intrinsics_file: Path | None = None
+    read_colour: Callable[[PosedFrame], UInt8[np.ndarray, "h w 3"]] = _colour_of
+    read_depth: Callable[[Path, str | int], Float[np.ndarray, "h w"]] = _depth_of
+    white_is_tissue: bool = True
+    masks: MaskFinder | None = None
+    sampling: Callable[[Any, IngestConfig, Sampling | None], Sampling] = LensSampling.planned
+    observed: Callable[
+        [Cameras, Bool[np.ndarray, "f h w"], Float[np.ndarray, "f h w"] | None, Split],
+        Bool[np.ndarray, "f h w"] | None,
+    ] = observed_by_depth
+    split_name: str = "manifest"
+    split_version: int = 1
+    points: Float[np.ndarray, "p 3"] | None = None
+    points_rgb: UInt8[np.ndarray, "p 3"] | None = None
+    truth: Callable[[EndoscopicSequence], dict[str, Any]] | None = None
+    looked_at: int = 0
+
+
+def assembled(source: SourceFrames, config: IngestConfig, name: str) -> EndoscopicSequence:
     """Read images, undo lenses, shrink, and put everything into one sequence.
 
     Args:
-        frames: all frames of the source, in order.
+        source: what a reader found.
         config: size, frames and split.
         name: of the sequence.
-        pose_file: named in errors about poses, intrinsics and the split.
-        metric: whether lengths are millimetres.
-        read_depth: file and frame name to z-depth in the sequence's unit, 0 where unknown.
-        white_is_tissue: polarity of mask files.
-        points: sparse points of the source.
-        points_rgb: their colours.
 
     Raises:
         SourceError: a file is wrong or of another size than its camera; names file, frame and field.
         PoseError: a pose that is no rigid motion.
+        ConfigError: a size that the source cannot give.
     """
-    with_depth = [frame for frame in frames if frame.depth_file is not None]
-    if with_depth and len(with_depth) != len(frames):
-        lacking = next(frame for frame in frames if frame.depth_file is None)
-        raise SourceError(
-            f"no depth for this frame, but for {len(with_depth)} of {len(frames)}; "
-            "expected it for all frames or for none",
-            file=pose_file,
-            frame=lacking.name,
-            field="depth",
-        )
-    kept = [frames[index] for index in spread(len(frames), config.max_frames)]
-    split = _split(kept, config, pose_file)
-    plans: dict[Lens, tuple[Undistortion | None, Float[np.ndarray, "3 3"]]] = {}
-    resampling: Resampling | None = None
-    colours, masks, depths, intrinsics, poses = [], [], [], [], []
-    for index, frame in enumerate(kept):
-        poses.append(check_pose(frame.world_from_camera, frame=frame.name, file=pose_file))
-        if frame.lens not in plans:
-            check_intrinsics(
-                frame.lens.K, frame.lens.width, frame.lens.height, frame=frame.name, file=pose_file
-            )
-            plan = (
-                None if frame.lens.is_pinhole else Undistortion.planned(frame.lens, config.field_of_view_deg)
-            )
-            plans[frame.lens] = (plan, frame.lens.K if plan is None else plan.K)
-        plan, K = plans[frame.lens]
-        colour = read_colour(frame.file, frame=frame.name)
-        _check_size(colour, frame, frame.file, "rgb", pose_file)
-        if resampling is None:
-            resampling = Resampling.planned(colour.shape[1], colour.shape[0], config)
-        mask = np.ones(colour.shape[:2], dtype=bool)
-        if frame.mask_file is not None:
-            mask = read_mask(frame.mask_file, frame=frame.name) == white_is_tissue
-            _check_size(mask, frame, frame.mask_file, "mask", pose_file)
-        depth = None
-        if frame.depth_file is not None:
-            depth = read_depth(frame.depth_file, frame.name)
-            check_depth(depth, frame=frame.name, file=frame.depth_file)
-            _check_size(depth, frame, frame.depth_file, "depth", pose_file)
-        if plan is not None:
-            colour, mask = plan.colour(colour), plan.mask(mask)
-            depth = None if depth is None else plan.depth(depth)
-        colours.append(resampling.colour(colour, file=frame.file, frame=frame.name))
-        masks.append(resampling.mask(mask, file=frame.mask_file, frame=frame.name))
-        intrinsics.append(resampling.intrinsics(K))
-        if depth is not None:
-            depths.append(resampling.depth(depth, file=frame.depth_file, frame=frame.name))
-        emit(Progress("ingest", index + 1, len(kept)))
-    if resampling is None:
-        raise SourceError("there is no frame", file=pose_file, field="frames")
-    cameras = Cameras(np.stack(intrinsics), np.stack(poses), resampling.width, resampling.height)
-    depth_mm = np.stack(depths) if depths else None
-    return EndoscopicSequence(
+    if not source.frames:
+        raise SourceError("there is no frame", file=source.pose_file, field="frames")
+    _check_for_all_or_none(source, "depth", [frame.depth_file for frame in source.frames])
+    _check_for_all_or_none(source, "world_from_camera", [frame.world_from_camera for frame in source.frames])
+    kept = [source.frames[index] for index in spread(len(source.frames), config.max_frames)]
+    split = _split(kept, source, config)
+    world_from_camera = _poses(kept, source)
+    pixels = _Pixels(source, config)
+    for index, frame in enumerate(kept, start=source.looked_at + 1):
+        pixels.read(frame)
+        emit(Progress("ingest", index, source.looked_at + len(kept)))
+    K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
+    rgb, mask = np.stack(pixels.colours), pixels.masks(kept)
+    depth_mm = np.stack(pixels.depths) if pixels.depths else None
+    observed = None
+    if world_from_camera is not None:
+        cameras = Cameras(K, world_from_camera, rgb.shape[2], rgb.shape[1])
+        observed = source.observed(cameras, mask, depth_mm, split)
+    sequence = EndoscopicSequence(
         name=name,
-        rgb=np.stack(colours),
-        K=cameras.K,
-        mask=np.stack(masks),
+        rgb=rgb,
+        K=K,
+        mask=mask,
         split=split,
-        world_from_camera=cameras.world_from_camera,
+        world_from_camera=world_from_camera,
         depth_mm=depth_mm,
         recording=np.array([frame.recording for frame in kept], dtype=np.int64),
         frame_names=_frame_names(kept),
-        metric=metric,
-        observed=(
-            None if depth_mm is None else observed_from_depth(cameras, depth_mm, split.train, split.test)
-        ),
-        points=points,
-        points_rgb=points_rgb,
+        metric=source.metric,
+        observed=observed,
+        points=source.points,
+        points_rgb=source.points_rgb,
     )
+    return sequence if source.truth is None else replace(sequence, truth=source.truth(sequence))
 
 
-def save_images(sequence: EndoscopicSequence, folder: Path) -> list[str]:
-    """Write colour images and masks of a sequence, as exporters do.
+class _Pixels:
+    """Images, masks and depth of the frames that are kept, brought to the sequence's pinhole."""
 
-    Args:
-        sequence: frames of several recordings go to folders of their own, unless their names say folders.
-        folder: gets `images/NAME.png`, and `masks/NAME.png.png` (COLMAP's naming; white is tissue) where a
-            mask leaves anything out.
+    def __init__(self, source: SourceFrames, config: IngestConfig) -> None:
+        self.source = source
+        self.config = config
+        self.samplings: dict[CameraModel, Sampling] = {}
+        self.colours: list[UInt8[np.ndarray, "h w 3"]] = []
+        self.depths: list[Float[np.ndarray, "h w"]] = []
+        # Many frames share one file: it is read again only when another one, or another lens, comes.
+        self._last_mask: tuple[Path | None, CameraModel, Bool[np.ndarray, "h w"]] | None = None
+        self._masks: list[Bool[np.ndarray, "h w"] | None] = []
 
-    Returns:
-        The names of the images below `images/`, one per frame.
-    """
-    from PIL import Image
+    def read(self, frame: PosedFrame) -> None:
+        """Take in the next frame."""
+        source = self.source
+        image = source.read_colour(frame)
+        _check_size(image, frame, frame.file, "rgb", source.intrinsics_file)
+        sampling = self._sampling(frame)
+        self.colours.append(sampling.colour(image, file=frame.file, frame=frame.label))
+        if frame.mask_file is None and source.masks is not None:
+            source.masks.see(frame, image, self.colours[-1])
+            self._masks.append(None)
+        else:
+            self._masks.append(self._mask(frame, sampling))
+        if frame.depth_file is not None:
+            depth = source.read_depth(frame.depth_file, frame.label)
+            # Before shrinking, so that row, column and count are those of the file.
+            check_depth(depth, frame=frame.label, file=frame.depth_file)
+            _check_size(depth, frame, frame.depth_file, "depth", None)
+            self.depths.append(sampling.depth(depth, file=frame.depth_file, frame=frame.label))
 
-    several = sequence.recording is not None and len(np.unique(sequence.recording)) > 1
-    names = []
-    for index in range(len(sequence)):
-        name = sequence.frame_name(index)
-        if several and sequence.recording is not None and "/" not in name:
-            name = f"recording_{int(sequence.recording[index])}/{name}"
-        names.append(f"{name}.png")
-    masked = not sequence.mask.all()
-    for index, name in enumerate(names):
-        places = [(folder / "images" / name, Image.fromarray(sequence.rgb[index]))]
-        if masked:
-            white = (sequence.mask[index] * 255).astype(np.uint8)
-            places.append((folder / "masks" / f"{name}.png", Image.fromarray(white)))
-        for place, picture in places:
-            place.parent.mkdir(parents=True, exist_ok=True)
-            picture.save(place)
-        emit(Progress("export", index + 1, len(names)))
-    return names
+    def masks(self, frames: Sequence[PosedFrame]) -> Bool[np.ndarray, "f h w"]:
+        """Masks of all frames, once they were read."""
+        finder = self.source.masks
+        found: dict[int, Bool[np.ndarray, "h w"]] = {}
+        if finder is not None:
+            one_of_each = {frame.recording: frame for frame in frames if frame.mask_file is None}
+            found = {
+                recording: finder.mask(frame, self.samplings[frame.lens])
+                for recording, frame in one_of_each.items()
+            }
+        return np.stack(
+            [
+                found[frame.recording] if mask is None else mask
+                for frame, mask in zip(frames, self._masks, strict=True)
+            ]
+        )
+
+    def _sampling(self, frame: PosedFrame) -> Sampling:
+        lens = frame.lens
+        if lens not in self.samplings:
+            if isinstance(lens, Lens):
+                named = self.source.intrinsics_file or self.source.pose_file
+                check_intrinsics(lens.K, lens.width, lens.height, frame=frame.label, file=named)
+            first = next(iter(self.samplings.values()), None)
+            self.samplings[lens] = self.source.sampling(lens, self.config, first)
+        return self.samplings[lens]
+
+    def _mask(self, frame: PosedFrame, sampling: Sampling) -> Bool[np.ndarray, "h w"]:
+        file, lens = frame.mask_file, frame.lens
+        if self._last_mask is None or self._last_mask[:2] != (file, lens):
+            mask = np.ones((lens.height, lens.width), dtype=bool)
+            if file is not None:
+                mask = read_mask(file, frame=frame.label) == self.source.white_is_tissue
+                _check_size(mask, frame, file, "mask", None)
+            self._last_mask = (file, lens, sampling.mask(mask, file=file, frame=frame.label))
+        return self._last_mask[2]
+
+
+def _check_for_all_or_none(source: SourceFrames, field: str, values: Sequence[object]) -> None:
+    there = sum(value is not None for value in values)
+    if there and there != len(values):
+        lacking = next(k for k, value in enumerate(values) if value is None)
+        raise SourceError(
+            f"no {field} for this frame, but for {there} of {len(values)}; "
+            "expected it for all frames or for none",
+            file=source.pose_file,
+            frame=source.frames[lacking].label,
+            field=field,
+        )
+
+
+def _poses(frames: Sequence[PosedFrame], source: SourceFrames) -> Float[np.ndarray, "f 4 4"] | None:
+    found = []
+    for frame in frames:
+        if frame.world_from_camera is not None:
+            rigid = check_pose(frame.world_from_camera, frame=frame.label, file=source.pose_file)
+            # What is rigid already stays as it is: projecting again would only turn its last digits.
+            exact = np.allclose(rigid, frame.world_from_camera, rtol=0, atol=_EXACT_POSE)
+            found.append(frame.world_from_camera if exact else rigid)
+    return np.stack(found) if found else None
 
 
 def _frame_names(frames: Sequence[PosedFrame]) -> tuple[str, ...]:
-    """Names without their suffix; the folder stays where names would otherwise meet."""
-    short = tuple(Path(frame.name).stem for frame in frames)
-    if len(set(short)) == len(short):
-        return short
-    return tuple(Path(frame.name).with_suffix("").as_posix() for frame in frames)
+    """Names without an image's suffix; the folder stays where names would otherwise meet."""
+    named = [Path(frame.name) for frame in frames]
+    bare = [name.with_suffix("") if name.suffix.lower() in COLOUR_SUFFIXES else name for name in named]
+    short = tuple(name.name for name in bare)
+    return short if len(set(short)) == len(short) else tuple(name.as_posix() for name in bare)
 
 
 def _check_size(
@@ -195,32 +290,42 @@ def _check_size(
     frame: PosedFrame,
     file: Path,
     field: str,
-    pose_file: Path,
+    intrinsics_file: Path | None,
 ) -> None:
     height, width = array.shape[:2]
-    if (width, height) == (frame.lens.width, frame.lens.height):
+    lens = frame.lens
+    if (width, height) == (lens.width, lens.height):
         return
-    if field != "rgb":
-        problem = f"{width} x {height} pixels; expected {frame.lens.width} x {frame.lens.height} as the image"
-        raise SourceError(problem, file=file, frame=frame.name, field=field)
-    ratio = width / frame.lens.width
+    if intrinsics_file is None:
+        where = "in the first frame" if field == "rgb" else "the image"
+        problem = f"{width} x {height} pixels; expected {lens.width} x {lens.height} as {where}"
+        raise SourceError(problem, file=file, frame=frame.label, field=field)
+    ratio = width / lens.width
     hint = (
         f"the intrinsics belong to images {1 / ratio:.3g} times as large; scale them or use those images"
-        if abs(height / frame.lens.height - ratio) < 0.01
+        if abs(height / lens.height - ratio) < 0.01
         else "the proportions differ too: these intrinsics are of another camera or of an uncropped image"
     )
     raise SourceError(
-        f"the image has {width} x {height} pixels, but {pose_file.name} describes a camera of "
-        f"{frame.lens.width} x {frame.lens.height}; {hint}",
+        f"the image has {width} x {height} pixels, but {intrinsics_file.name} describes a camera of "
+        f"{lens.width} x {lens.height}; {hint}",
         file=file,
-        frame=frame.name,
+        frame=frame.label,
         field="K",
     )
 
 
-def _split(frames: Sequence[PosedFrame], config: IngestConfig, file: Path) -> Split:
+def _split(frames: Sequence[PosedFrame], source: SourceFrames, config: IngestConfig) -> Split:
     if all(frame.split is None for frame in frames):
-        return every_nth(len(frames), config.holdout_every, file=file)
+        return every_nth(len(frames), config.holdout_every, file=source.pose_file)
+    for frame in frames:
+        if frame.split is None:
+            raise SourceError(
+                "found None; expected 'train' or 'test', in all frames or in none",
+                file=source.pose_file,
+                frame=frame.label,
+                field="split",
+            )
     index = np.arange(len(frames))
     is_test = np.array([frame.split == "test" for frame in frames])
-    return Split("manifest", index[~is_test], index[is_test])
+    return Split(source.split_name, index[~is_test], index[is_test], source.split_version)

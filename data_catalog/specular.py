@@ -8,8 +8,8 @@ median over a window, of which the brightest nearby counts: the lit side of a fo
 highlight. Regions grow from such pixels into neighbours that stand out half as much, and are dilated by the
 width of a blurred rim.
 
-Saturated pixels (any channel at 250 or above) are told apart: their true value is not known, whatever shines
-there, and a simulated or overexposed wall may be saturated as a whole.
+Saturated pixels are told apart (`extrags.sequence.saturated_mask`): their true value is not known, whatever
+shines there, and a simulated or overexposed wall may be saturated as a whole.
 
 Source: the contrast to a median-filtered image with an image-dependent threshold follows Arnold et al.,
 "Automatic segmentation and inpainting of specular highlights for endoscopic imaging", EURASIP Journal on
@@ -26,11 +26,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from extrags.sequence import EndoscopicSequence
+from extrags.thresholds import SATURATED
 
-__all__ = ["SATURATED", "saturated_mask", "specular_mask", "specular_masks", "with_specular"]
+__all__ = ["specular_mask", "specular_masks", "with_specular"]
 
-SATURATED = 250
-"""A channel at or above this (of 255) is taken for saturated."""
 _WINDOW_SHARE = 0.10
 _DEVIATIONS = 8.0
 _FLOOR = 36.0
@@ -74,11 +73,6 @@ def specular_mask(
     rim = max(1, round(_RIM_SHARE * width))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * rim + 1, 2 * rim + 1))
     return np.asarray((cv2.dilate(found.astype(np.uint8), kernel) > 0) & inside)
-
-
-def saturated_mask(rgb: UInt8[np.ndarray, "*f h w 3"]) -> Bool[np.ndarray, "*f h w"]:
-    """True where any channel is at or above `SATURATED`."""
-    return np.asarray(rgb.max(axis=-1) >= SATURATED)
 
 
 def specular_masks(

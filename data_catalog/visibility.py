@@ -6,8 +6,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import Cameras, pixel_rays
+from extrags.sequence import Split
 
-__all__ = ["observed_from_depth"]
+__all__ = ["observed_by_depth", "observed_from_depth"]
 
 
 def observed_from_depth(
@@ -46,6 +47,20 @@ def observed_from_depth(
             seen |= _in_front(points, cameras[int(other)], depth_mm[other], tolerance_share, tolerance_mm)
         observed[index][known] = seen
     return observed
+
+
+def observed_by_depth(
+    cameras: Cameras,
+    mask: Bool[np.ndarray, "f h w"],
+    depth_mm: Float[np.ndarray, "f h w"] | None,
+    split: Split,
+    *,
+    tolerance_mm: float = 0.0,
+) -> Bool[np.ndarray, "f h w"] | None:
+    """`observed_from_depth` for the frames of a split, masks aside; None where there is no depth."""
+    if depth_mm is None:
+        return None
+    return observed_from_depth(cameras, depth_mm, split.train, split.test, tolerance_mm=tolerance_mm)
 
 
 def _in_front(

@@ -13,9 +13,10 @@ from jaxtyping import Bool, Float, Int, UInt8
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.store.storable import Storable
+from extrags.thresholds import SATURATED
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["EndoscopicSequence", "PoseSource", "Split"]
+__all__ = ["EndoscopicSequence", "PoseSource", "Split", "saturated_mask"]
 
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
 """given: by the source; estimated: by COLMAP; aligned: by colour and depth; refined: corrected by the
@@ -147,6 +148,18 @@ class EndoscopicSequence(Storable):
         """
         return self.cameras[self.train]
 
+    def supervised_mask(self, frames: int | Int[np.ndarray, "n"]) -> Bool[np.ndarray, "*n h w"]:
+        """Pixels that may supervise: tissue, less specular highlights where they were looked for.
+
+        Args:
+            frames: one frame, or several.
+
+        Returns:
+            [H, W] for one frame, [N, H, W] for several; a copy.
+        """
+        mask = self.mask[frames]
+        return np.array(mask) if self.specular is None else np.asarray(mask & ~self.specular[frames])
+
     def frame_name(self, index: int) -> str:
         """Name of a frame for messages."""
         return self.frame_names[index] if self.frame_names else f"{index:04d}"
@@ -251,3 +264,8 @@ class EndoscopicSequence(Storable):
             pose_source=cast("PoseSource", attributes.get("pose_source", "given")),
             **optional,
         )
+
+
+def saturated_mask(rgb: UInt8[np.ndarray, "*f h w 3"]) -> Bool[np.ndarray, "*f h w"]:
+    """True where any channel is saturated: the true value is not known, whatever shines there."""
+    return np.asarray(rgb.max(axis=-1) >= SATURATED)

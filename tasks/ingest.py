@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from data_catalog.catalog import Source
+from data_catalog import Source
 from extrags.config import IngestConfig
 from extrags.store import Ref, Slot
 from tasks.stage import stage
@@ -15,11 +15,11 @@ __all__ = ["ingest", "training_frames"]
 # The fingerprint holds the content of the files; where they lie does not matter.
 @stage("ingest", version=2, ignore=("source",))
 def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: IngestConfig) -> None:
-    """Read a source into `sequence/`, and mark its specular highlights."""
-    from data_catalog.catalog import read
-    from data_catalog.specular import saturated_mask, with_specular
+    """Read a source into `sequence/`."""
+    from data_catalog import read
+    from extrags.sequence import saturated_mask
 
-    sequence = with_specular(read(source, config))
+    sequence = read(source, config)
     slot.save(sequence)
     inside = max(1, int(sequence.mask.sum()))
     slot.counts.update(

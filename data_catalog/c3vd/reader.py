@@ -11,29 +11,32 @@ Vignetting and the difference in exposure between videos are left as they are.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.c3vd.coverage import Alignment, CoverageMesh, Surface, align, read_coverage_mesh
-from data_catalog.c3vd.datasets import Dataset, Recording, RecordingPair, datasets
 from data_catalog.c3vd.pinhole import PinholeResampling
-from data_catalog.c3vd.video import Video, is_video
+from data_catalog.c3vd.published import PublishedSet, Recording, RecordingPair, find_recording, published_sets
+from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
+from data_catalog.c3vd.video import POSE_FILE, Video, is_video, read_depth_mm
 from data_catalog.content import view_mask
-from data_catalog.formats import FolderFormat
-from data_catalog.images import spread
-from data_catalog.splits import every_nth
-from data_catalog.visibility import observed_from_depth
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import image_size, spread
+from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.sampling import Sampling
+from data_catalog.visibility import observed_by_depth
 from extrags.cameras import Cameras
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
-from extrags.events import Progress, emit
 from extrags.sequence import EndoscopicSequence, Split
 
-__all__ = ["FORMAT", "open_recording", "pair_files", "read_pair"]
+__all__ = ["READER", "open_recording", "pair_files", "pair_frames"]
 
 logger = logging.getLogger(__name__)
 
@@ -47,17 +50,35 @@ class _Part:
     """Some frames of one video, in the world of the sequence."""
 
     video: Video
-    chosen: list[int]
+    chosen: Sequence[int]
     world_from_own: Float[np.ndarray, "4 4"]
     role: int
+    split: Literal["train", "test"] | None = None
+
+    def frames(self) -> list[PosedFrame]:
+        """The frames, of a lens for images as large as the first."""
+        video, folder = self.video, self.video.folder.resolve().name
+        first = video.colour_files[self.chosen[0]]
+        camera = video.camera.scaled(*image_size(first, frame=video.numbers[self.chosen[0]]), file=first)
+        return [
+            PosedFrame(
+                name=f"{folder}_{video.numbers[index]:04d}",
+                file=video.colour_files[index],
+                lens=camera,
+                world_from_camera=self.world_from_own @ video.world_from_camera[index],
+                depth_file=video.depth_files[index] if video.depth_files else None,
+                recording=self.role,
+                split=self.split,
+                number=video.numbers[index],
+            )
+            for index in self.chosen
+        ]
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     video = Video.open(folder)
-    chosen = spread(len(video), config.max_frames)
-    split = every_nth(len(chosen), config.holdout_every, file=folder)
     mesh = None if video.mesh_file is None else read_coverage_mesh(video.mesh_file)
-    return _assembled(name, [_Part(video, chosen, np.eye(4), EVALUATES)], split, mesh, config, {})
+    return _source_frames([_Part(video, range(len(video)), np.eye(4), EVALUATES)], mesh, {})
 
 
 def _notes(folder: Path) -> tuple[str, ...]:
@@ -75,16 +96,22 @@ def _notes(folder: Path) -> tuple[str, ...]:
     )
 
 
-FORMAT = FolderFormat(
+def _known_name(folder: Path) -> str | None:
+    video = find_recording(folder.name)
+    return None if video is None else video.name
+
+
+READER = FolderReader(
     name="c3vd",
     version=1,
     summary="pose.txt with rgb/ and depth/ of C3VDv2, or with NNNN_color.png of C3VD",
     recognises=is_video,
     files=lambda folder: Video.open(folder).files(),
-    read=_read,
+    frames=_frames,
     conventions="OpenCV camera axes, camera-to-world, mm; the world is the video's own. pose.txt is "
     "column-major as published, which is checked; z-depth, 16 bit over 100 mm, 0 and 65535 unknown",
     notes=_notes,
+    known_name=_known_name,
 )
 
 
@@ -95,7 +122,7 @@ def open_recording(folder: Path, recording: Recording) -> Video:
         SourceError: another number of frames, so that a split manifest would mean other frames; and what
             `Video.open` raises.
     """
-    dataset: Dataset = datasets()[recording.dataset]
+    dataset: PublishedSet = published_sets()[recording.dataset]
     video = Video.open(folder, calibration=dataset.calibration, depth_range_mm=dataset.depth_range_mm)
     if len(video) != recording.frames:
         raise SourceError(
@@ -118,7 +145,7 @@ def open_recording(folder: Path, recording: Recording) -> Video:
 
 
 def pair_files(train_folder: Path, test_folder: Path, pair: RecordingPair) -> list[tuple[str, Path]]:
-    """Every file that `read_pair` looks at, each with a name that does not depend on where it lies.
+    """Every file that `pair_frames` looks at, each with a name that does not depend on where it lies.
 
     Raises:
         SourceError: see `open_recording`.
@@ -130,20 +157,19 @@ def pair_files(train_folder: Path, test_folder: Path, pair: RecordingPair) -> li
     return [(f"{role}/{file.relative_to(video.folder).as_posix()}", file) for role, video, file in listed]
 
 
-def read_pair(
+def pair_frames(
     train_folder: Path, test_folder: Path, pair: RecordingPair, config: IngestConfig
-) -> EndoscopicSequence:
+) -> SourceFrames:
     """Two videos of one scene in one world: the training video's frames first, then the others.
 
     Args:
         train_folder: of the video that trains.
         test_folder: of the video that evaluates.
         pair: which frames of each.
-        config: size, field of view, number of frames.
+        config: number of frames.
 
     Raises:
         SourceError: a file is wrong; names file, frame and field.
-        ConfigError: a size the source cannot give.
     """
     train = open_recording(train_folder, pair.train)
     test = open_recording(test_folder, pair.test)
@@ -159,19 +185,13 @@ def read_pair(
         alignment.residual_mm,
         alignment.largest_residual_mm,
     )
-    chosen = _thinned(list(pair.train_frames), list(range(len(test))), config.max_frames)
+    train_chosen, test_chosen = _thinned(list(pair.train_frames), list(range(len(test))), config.max_frames)
     parts = [
-        _Part(train, chosen[0], np.eye(4), TRAINS),
-        _Part(test, chosen[1], alignment.target_from_source, EVALUATES),
+        _Part(train, train_chosen, np.eye(4), TRAINS, "train"),
+        _Part(test, test_chosen, alignment.target_from_source, EVALUATES, "test"),
     ]
-    split = Split(
-        pair.setting,
-        np.arange(len(chosen[0])),
-        np.arange(len(chosen[0]), len(chosen[0]) + len(chosen[1])),
-        pair.version,
-    )
-    truth = {"alignment": _alignment_json(alignment, pair)}
-    return _assembled(pair.name, parts, split, train_mesh, config, truth)
+    frames = _source_frames(parts, train_mesh, {"alignment": _alignment_json(alignment, pair)})
+    return replace(frames, split_name=pair.setting, split_version=pair.version)
 
 
 def _mesh_file(video: Video) -> Path:
@@ -188,96 +208,74 @@ def _thinned(train: list[int], test: list[int], at_most: int | None) -> tuple[li
     return [train[k] for k in spread(len(train), n_train)], [test[k] for k in spread(len(test), n_test)]
 
 
-def _assembled(
-    name: str,
-    parts: list[_Part],
-    split: Split,
-    mesh: CoverageMesh | None,
-    config: IngestConfig,
-    truth: dict[str, Any],
-) -> EndoscopicSequence:
-    """Read, resample and join; `mesh` stands in the world of the sequence."""
-    total = sum(len(part.chosen) for part in parts)
-    plan = _planned(parts[0], None, config)
-    colours, depths, masks, poses, names, recording = [], [], [], [], [], []
-    has_depth = all(part.video.depth_files for part in parts)
-    reports = {}
-    for part in parts:
-        video, own_plan = part.video, _planned(part, plan, config)
-        brightest = np.zeros((own_plan.camera.height, own_plan.camera.width, 3), dtype=np.uint8)
-        for index in part.chosen:
-            file, frame = video.colour_files[index], video.numbers[index]
-            colour = video.colour(index)
-            colours.append(own_plan.colour(colour, file=file, frame=frame))
-            np.maximum(brightest, colour, out=brightest)
-            if has_depth:
-                depths.append(
-                    own_plan.depth(video.depth_mm(index), file=video.depth_files[index], frame=frame)
-                )
-            poses.append(part.world_from_own @ video.world_from_camera[index])
-            names.append(f"{video.folder.resolve().name}_{frame:04d}")
-            emit(Progress("ingest", len(colours), total))
-        mask = own_plan.mask(_inside_picture(brightest))
-        masks += [mask] * len(part.chosen)
-        recording += [part.role] * len(part.chosen)
-        reports[video.folder.resolve().name] = {
-            "camera": video.calibration,
-            "pose_layout": video.layout,
-            "masked_share": float(1 - mask.mean()),
-        }
-    cameras = Cameras(np.repeat(plan.K[None], total, axis=0), np.stack(poses), plan.width, plan.height)
-    mask_stack = np.stack(masks)
-    depth_mm = np.stack(depths) if has_depth else None
-    return EndoscopicSequence(
-        name=name,
-        rgb=np.stack(colours),
-        K=cameras.K,
-        mask=mask_stack,
-        split=split,
-        world_from_camera=cameras.world_from_camera,
-        depth_mm=depth_mm,
-        recording=np.asarray(recording, dtype=np.int64),
-        frame_names=tuple(names),
+def _source_frames(parts: list[_Part], mesh: CoverageMesh | None, truth: dict[str, Any]) -> SourceFrames:
+    """The frames of all parts; `mesh` stands in the world of the sequence."""
+    depth_range_mm = parts[0].video.depth_range_mm
+    frames = [frame for part in parts for frame in part.frames()]
+    return SourceFrames(
+        frames=frames,
+        pose_file=parts[0].video.folder / POSE_FILE,
         metric=True,
-        observed=_observed(cameras, mask_stack, depth_mm, split, mesh),
-        truth={"c3vd": {**truth, "recordings": reports}},
+        read_depth=lambda file, frame: read_depth_mm(file, frame, depth_range_mm),
+        masks=_DarkFrameMask(),
+        sampling=_sampling,
+        observed=observed_by_depth if mesh is None else partial(_observed_on, Surface(mesh)),
+        truth=lambda sequence: {"c3vd": {**truth, "recordings": _reports(parts, sequence)}},
     )
 
 
-def _planned(part: _Part, other: PinholeResampling | None, config: IngestConfig) -> PinholeResampling:
-    """The grid of a video; to the pinhole of another where there is one already."""
-    file = part.video.colour_files[part.chosen[0]]
-    height, width = part.video.colour(part.chosen[0]).shape[:2]
-    camera = part.video.camera.scaled(width, height, file=file)
-    if other is None:
+def _sampling(camera: ScaramuzzaCamera, config: IngestConfig, first: Sampling | None) -> Sampling:
+    """The grid of a video; to the pinhole of the first where there is one already."""
+    if first is None:
         return PinholeResampling.planned(camera, config)
-    if other.camera == camera:
-        return other
-    return PinholeResampling.to_pinhole(camera, other.K, other.width, other.height)
+    return PinholeResampling.to_pinhole(camera, first.K, first.width, first.height)
 
 
-def _observed(
+class _DarkFrameMask:
+    """False in the dark frame round a video's picture, and a margin of it."""
+
+    def __init__(self) -> None:
+        self._brightest: dict[int, UInt8[np.ndarray, "h w 3"]] = {}
+
+    def see(
+        self, frame: PosedFrame, image: UInt8[np.ndarray, "h w 3"], sampled: UInt8[np.ndarray, "h2 w2 3"]
+    ) -> None:
+        """Keep the brightest value that each pixel of a recording took."""
+        brightest = self._brightest.setdefault(frame.recording, np.zeros_like(image))
+        np.maximum(brightest, image, out=brightest)
+
+    def mask(self, frame: PosedFrame, sampling: Sampling) -> Bool[np.ndarray, "h2 w2"]:
+        """The mask of a frame's recording."""
+        import cv2
+
+        inside = view_mask(self._brightest[frame.recording][None]).astype(np.uint8)
+        size = 2 * _FRAME_MARGIN_PX + 1
+        return sampling.mask(np.asarray(cv2.erode(inside, np.ones((size, size), np.uint8))) > 0)
+
+
+def _observed_on(
+    surface: Surface,
     cameras: Cameras,
     mask: Bool[np.ndarray, "f h w"],
     depth_mm: Float[np.ndarray, "f h w"] | None,
     split: Split,
-    mesh: CoverageMesh | None,
-) -> Bool[np.ndarray, "f h w"] | None:
-    """Exact where there is a surface, else from depth, else unknown."""
-    if mesh is not None:
-        return Surface(mesh).observed(cameras, mask, split.train, split.test)
-    if depth_mm is not None:
-        return observed_from_depth(cameras, depth_mm, split.train, split.test)
-    return None
+) -> Bool[np.ndarray, "f h w"]:
+    """Exact: by rays onto the surface that comes with the video."""
+    return surface.observed(cameras, mask, split.train, split.test)
 
 
-def _inside_picture(brightest: UInt8[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
-    """False in the dark frame round the picture and a margin of it."""
-    import cv2
-
-    inside = view_mask(brightest[None]).astype(np.uint8)
-    size = 2 * _FRAME_MARGIN_PX + 1
-    return np.asarray(cv2.erode(inside, np.ones((size, size), np.uint8))) > 0
+def _reports(parts: list[_Part], sequence: EndoscopicSequence) -> dict[str, Any]:
+    """What was found out about each video."""
+    reports = {}
+    for part in parts:
+        ours = sequence.mask if sequence.recording is None else sequence.mask[sequence.recording == part.role]
+        reports[part.video.folder.resolve().name] = {
+            "camera": part.video.calibration,
+            "pose_layout": part.video.layout,
+            # One mask for all frames of a video.
+            "masked_share": float(1 - ours[0].mean()),
+        }
+    return reports
 
 
 def _alignment_json(alignment: Alignment, pair: RecordingPair) -> dict[str, Any]:

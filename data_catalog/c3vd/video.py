@@ -28,19 +28,29 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from data_catalog.c3vd.datasets import datasets, find_recording
+from data_catalog.c3vd.published import find_recording, published_sets
 from data_catalog.c3vd.scaramuzza import CALIBRATIONS, CalibrationName, ScaramuzzaCamera, camera_from_json
 from data_catalog.checks import check_pose
 from data_catalog.images import read_colour, read_depth
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 
-__all__ = ["DEPTH_RANGE_MM", "Layout", "Video", "decode_depth_mm", "is_video", "read_pose_file"]
+__all__ = [
+    "DEPTH_RANGE_MM",
+    "POSE_FILE",
+    "Layout",
+    "Video",
+    "decode_depth_mm",
+    "is_video",
+    "read_depth_mm",
+    "read_pose_file",
+]
 
 logger = logging.getLogger(__name__)
 
 DEPTH_RANGE_MM = 100.0
 """What the largest code stands for, in both datasets."""
 CLIP_CODE = 65535
+POSE_FILE = "pose.txt"
 Layout = Literal["column-major", "row-major"]
 
 # A colon is not a metre long: a translation this far out is in another unit, or not a translation.
@@ -131,7 +141,7 @@ class Video:
                 frame=without[0],
                 field="depth",
             )
-        pose_file = folder / "pose.txt"
+        pose_file = folder / POSE_FILE
         poses, layout = read_pose_file(pose_file)
         mesh = folder / "coverage_mesh.obj"
         camera, origin = _camera(folder, flat, calibration)
@@ -161,25 +171,14 @@ class Video:
         Raises:
             SourceError: a damaged file, or an 8-bit copy.
         """
-        file, frame = self.depth_files[index], self.numbers[index]
-        code = read_depth(file, frame=frame)
-        largest = float(code.max(initial=0))
-        if largest <= _LARGEST_8_BIT_CODE and largest > 0:
-            raise SourceError(
-                f"no code is above {largest:.0f}, which is {largest / CLIP_CODE * self.depth_range_mm:.2g} "
-                "mm; expected 16-bit codes. Was the file converted to 8 bits?",
-                file=file,
-                frame=frame,
-                field="depth",
-            )
-        return decode_depth_mm(code, self.depth_range_mm)
+        return read_depth_mm(self.depth_files[index], self.numbers[index], self.depth_range_mm)
 
     def files(self, indices: list[int] | range | None = None) -> list[Path]:
         """Every file that reading these frames looks at, sorted."""
         chosen = range(len(self)) if indices is None else indices
         fixed = [
             self.folder / name
-            for name in ("pose.txt", "coverage_mesh.obj", "calibration.json")
+            for name in (POSE_FILE, "coverage_mesh.obj", "calibration.json")
             if (self.folder / name).is_file()
         ]
         frames = [self.colour_files[k] for k in chosen]
@@ -192,8 +191,32 @@ def is_video(folder: Path) -> bool:
         _numbered(folder / "rgb", _FOLDERED, "rgb", checked=False)
     )
     depth = any(_numbered(place, _DEPTH, "depth", checked=False) for place in (folder / "depth", folder))
-    poses = (folder / "pose.txt").is_file()
+    poses = (folder / POSE_FILE).is_file()
     return (frames and (poses or depth)) or (poses and (depth or (folder / "coverage_mesh.obj").is_file()))
+
+
+def read_depth_mm(file: Path, frame: object, depth_range_mm: float) -> Float[np.ndarray, "h w"]:
+    """z-depth of a depth file in mm; 0 where unknown.
+
+    Args:
+        file: 16-bit codes.
+        frame: named in errors.
+        depth_range_mm: what the largest code stands for.
+
+    Raises:
+        SourceError: a damaged file, or an 8-bit copy.
+    """
+    code = read_depth(file, frame=frame)
+    largest = float(code.max(initial=0))
+    if largest <= _LARGEST_8_BIT_CODE and largest > 0:
+        raise SourceError(
+            f"no code is above {largest:.0f}, which is {largest / CLIP_CODE * depth_range_mm:.2g} "
+            "mm; expected 16-bit codes. Was the file converted to 8 bits?",
+            file=file,
+            frame=frame,
+            field="depth",
+        )
+    return decode_depth_mm(code, depth_range_mm)
 
 
 def decode_depth_mm(
@@ -320,7 +343,7 @@ def _camera(folder: Path, flat: bool, calibration: CalibrationName | None) -> tu
         return camera_from_json(content, file=file), "calibration.json"
     known = find_recording(folder.resolve().name)
     if calibration is None and known is not None:
-        calibration = datasets()[known.dataset].calibration
+        calibration = published_sets()[known.dataset].calibration
     name: CalibrationName = calibration or ("c3vd" if flat else "c3vdv2")
     return CALIBRATIONS[name], f"as published with {name}"
 

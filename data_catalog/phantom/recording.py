@@ -25,7 +25,6 @@ from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["Phantom", "record"]
 
-RECORDINGS = ("a", "b")
 EVALUATES, TRAINS = 0, 1
 _SCENE_GAIN_TARGET = 0.14
 

@@ -15,6 +15,7 @@ from pydantic import Field, ValidationError
 from extrags.config.base import StageConfig
 from extrags.config.restorer import EnhanceConfig
 from extrags.config.settings import settings_of, unknown_setting
+from extrags.thresholds import HOLE_ALPHA
 
 __all__ = [
     "AssessConfig",
@@ -228,7 +229,7 @@ class AssessConfig(StageConfig):
     probe_views: int = Field(24, ge=1, description="views in the fan round the training views")
     probe_offset: float = Field(0.35, gt=0, description="sideways offset of a probe, in median depths")
     probe_turn_deg: float = Field(35.0, ge=0, description="turn of a probe")
-    hole_alpha: float = Field(0.5, gt=0, lt=1, description="a pixel below this alpha is a hole")
+    hole_alpha: float = Field(HOLE_ALPHA, gt=0, lt=1, description="a pixel below this alpha is a hole")
     min_hole_share: float = Field(
         0.002,
         ge=0,

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 
 from extrags.cameras import Cameras, pixel_rays
 from extrags.illumination import NearFieldLight
+from extrags.thresholds import HOLE_ALPHA
 
 __all__ = ["dark_direction", "illumination_weight", "lit_luminance", "luminance"]
 
@@ -73,7 +74,7 @@ def dark_direction(
     depth_mm: Float[np.ndarray, "h w"],
     light: NearFieldLight | None,
     *,
-    min_alpha: float = 0.5,
+    min_alpha: float = HOLE_ALPHA,
 ) -> Float[np.ndarray, "3"]:
     """World-space unit ray through the centre of the darkest patch of a view.
 

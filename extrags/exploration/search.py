@@ -23,12 +23,11 @@ from extrags.exploration.score import Candidates, score
 from extrags.freespace import FREE, FreeSpace
 from extrags.scene import Scene
 from extrags.store.storable import Storable
+from extrags.thresholds import HOLE_ALPHA
 from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["Branch", "SearchContext", "grow_branch", "prepare_search"]
 
-HOLE_ALPHA = 0.5
-"""A pixel below this alpha is a hole."""
 NEAR_SHARE = 0.5
 """A candidate is too near when more than this share of its surface pixels is inside the safety margin."""
 FOLD_STEPS = 3

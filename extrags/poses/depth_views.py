@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_erosion, gaussian_filter
 
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["LEVELS", "DepthView", "depth_view"]
 
@@ -19,7 +19,6 @@ NEIGHBOURHOOD_PX = 12.0
 so brightness belongs to the view and not to the tissue."""
 MIN_SPREAD = 0.02
 """Spread of the logarithm below which there is only noise."""
-SATURATED = 250
 EDGE_SHARE = 0.05
 """A step in depth larger than this share of it is an edge, where points mix two surfaces."""
 SAMPLES = 3000
@@ -84,9 +83,7 @@ def depth_view(sequence: EndoscopicSequence, frame: int, max_width: int) -> Dept
     spread = np.unique(np.linspace(0, len(usable) - 1, min(SAMPLES, len(usable))).round().astype(np.int64))
     blocks = sequence.rgb[frame][: height * step, : width * step]
     colour = blocks.reshape(height, step, width, step, 3).mean(axis=(1, 3))
-    told = sequence.mask[frame] & (sequence.rgb[frame].max(-1) < SATURATED)
-    if sequence.specular is not None:
-        told &= ~sequence.specular[frame]
+    told = sequence.supervised_mask(frame) & ~saturated_mask(sequence.rgb[frame])
     # A block with one bad pixel is bad: highlights move with the scope.
     told = told[: height * step, : width * step].reshape(height, step, width, step).all(axis=(1, 3))
     texture, textured = _textures(colour, told)

@@ -50,9 +50,7 @@ def landmarks(sequence: EndoscopicSequence, frame: int) -> Landmarks:
     if sequence.depth_mm is None:
         return nothing
     depth = sequence.depth_mm[frame]
-    told = sequence.mask[frame] & (depth > 0) & np.isfinite(depth)
-    if sequence.specular is not None:
-        told = told & ~sequence.specular[frame]
+    told = sequence.supervised_mask(frame) & (depth > 0) & np.isfinite(depth)
     grey = cv2.cvtColor(np.ascontiguousarray(sequence.rgb[frame]), cv2.COLOR_RGB2GRAY)
     # Mucosa is pale and unevenly lit: contrast is raised block by block.
     grey = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)

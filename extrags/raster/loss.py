@@ -18,6 +18,7 @@ from torch import Tensor
 
 from extrags.errors import ShapeError
 from extrags.raster import native
+from extrags.thresholds import HOLE_ALPHA
 
 __all__ = ["inverse_depth_loss", "l1_ssim_loss", "l1_ssim_loss_reference"]
 
@@ -96,14 +97,14 @@ def inverse_depth_loss(
 
     Args:
         depth: rendered z-depth; the only one to get a gradient.
-        alpha: rendered opacity; pixels at 0.5 or below do not count.
+        alpha: rendered opacity; pixels at `HOLE_ALPHA` or below do not count.
         target: true z-depth, 0 where it is not known.
         scale: the typical depth.
 
     Returns:
         The loss; zero where nothing can be compared.
     """
-    valid = (target > 0) & (alpha.detach() > 0.5) & (depth.detach() > 1e-3 * scale)
+    valid = (target > 0) & (alpha.detach() > HOLE_ALPHA) & (depth.detach() > 1e-3 * scale)
     if not bool(valid.any()):
         return depth.sum() * 0
     difference = scale / depth[valid] - scale / target.detach()[valid]

@@ -25,12 +25,12 @@ from extrags.report.image_table import (
 from extrags.report.inputs import PseudoLike, RendersLike, ReportInputs
 from extrags.report.wording import metric_of, number, shown_metrics
 from extrags.sequence import EndoscopicSequence
+from extrags.thresholds import HOLE_ALPHA
 
 __all__ = ["depth_rows", "held_out_rows", "virtual_rows"]
 
 DEPTH_COLORMAP = "viridis"
 UNCERTAINTY_COLORMAP = "cividis"
-SURFACE_ALPHA = 0.5
 CHANGED_LEVELS = 8
 """A pixel counts as changed when a channel differs by more than this, of 255."""
 
@@ -175,7 +175,7 @@ def _renders(inputs: ReportInputs) -> list[tuple[str, RendersLike]]:
 def _surface_depth(renders: RendersLike, chosen: np.ndarray) -> Float[np.ndarray, "n h w"]:
     """Depth where the render holds a surface, 0 elsewhere."""
     depth, alpha = (np.asarray(part[chosen], dtype=np.float64) for part in (renders.depth_mm, renders.alpha))
-    return np.where((alpha >= SURFACE_ALPHA) & np.isfinite(depth), depth, 0.0)
+    return np.where((alpha >= HOLE_ALPHA) & np.isfinite(depth), depth, 0.0)
 
 
 def _view_note(inputs: ReportInputs, index: int) -> str:

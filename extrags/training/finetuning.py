@@ -13,15 +13,13 @@ from extrags.gaussians import Gaussians
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.thresholds import HOLE_ALPHA
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent
 from extrags.training.starting import median_depth, surface_normals, thin_out
 from extrags.training.views import View, epochs, real_views
 
 __all__ = ["finetune", "hole_gaussians", "virtual_steps", "virtual_views"]
-
-HOLE_ALPHA = 0.5
-"""A virtual pixel below this alpha shows a hole that new Gaussians may fill."""
 
 UNKNOWN = 0.5
 """Uncertainty of a pixel from which its restored depth supervises."""

@@ -11,12 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrags.cameras import Cameras
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, saturated_mask
 
-__all__ = ["SATURATED", "View", "epochs", "real_views"]
-
-SATURATED = 250
-"""A channel at or above this (of 255) carries no information on albedo; such pixels do not supervise."""
+__all__ = ["View", "epochs", "real_views"]
 
 
 @dataclass(frozen=True)
@@ -47,9 +44,8 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
     for position, frame in enumerate(frames):
         index = int(frame)
         mask = sequence.mask[index]
-        weight = mask & (sequence.rgb[index].max(axis=-1) < SATURATED)
-        if sequence.specular is not None:
-            weight &= ~sequence.specular[index]
+        # A saturated channel says nothing about albedo.
+        weight = sequence.supervised_mask(index) & ~saturated_mask(sequence.rgb[index])
         depth = None
         if sequence.depth_mm is not None:
             depth = torch.from_numpy(np.where(mask, sequence.depth_mm[index], 0).astype(np.float32))

@@ -19,6 +19,7 @@ from extrags.errors import ShapeError
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.raster import rasterize
 from extrags.scene import Scene
+from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.filling import completed_depth, push_pull
 from extrags.view_synthesis.references import SEEN_WEIGHT, LightTransfer, ReferenceViews
 from extrags.view_synthesis.warp import warp_references
@@ -183,7 +184,7 @@ def _observe_one(
         expected = rendering.depth[:, None]
         median = rendering.median_depth[:, None]
         # The expected depth floats between a fold and what is behind it, the median sits on one of them.
-        depth = torch.where((median > 0) & (alpha > 0.5), median, expected)
+        depth = torch.where((median > 0) & (alpha > HOLE_ALPHA), median, expected)
         depth = torch.where(alpha > 0.02, depth, torch.zeros(()))
         complete = completed_depth(depth, alpha, scale)
         warped = warp_references(references, camera, complete, count=count, exposure=exposure)

@@ -15,7 +15,7 @@ from extrags.errors import CaptureError, ShapeError
 from extrags.illumination import NearFieldLight
 from extrags.raster import Rendering
 from extrags.scene import Scene
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["SEEN_WEIGHT", "LightTransfer", "ReferenceViews"]
 
@@ -23,8 +23,6 @@ SEEN_WEIGHT = 0.02
 """A Gaussian counts as seen in a view when its largest blending weight there exceeds this."""
 FEATHER_PX = 4.0
 """Trust in a real view rises over so many pixels from the border of its valid area."""
-SATURATED = 250
-"""At or above this (of 255) a channel no longer follows the brightness."""
 SOLID_ALPHA = 0.9
 """Rendered depth is taken for the real view's where the rendering is at least this opaque."""
 
@@ -233,6 +231,5 @@ def _trust(sequence: EndoscopicSequence, frames: Int[np.ndarray, "r"]) -> Float[
         bordered = np.pad(sequence.mask[frame], 1)
         distance = distance_transform_edt(bordered)[1:-1, 1:-1]
         trust = np.clip((distance - 0.5) / FEATHER_PX, 0, 1)
-        saturated = sequence.rgb[frame].max(axis=-1) >= SATURATED
-        maps.append(np.where(saturated, 0.1 * trust, trust))
+        maps.append(np.where(saturated_mask(sequence.rgb[frame]), 0.1 * trust, trust))
     return np.stack(maps).astype(np.float32)

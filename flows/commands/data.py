@@ -11,7 +11,7 @@ from flows.commands.common import set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_settings, add_verb
 
 if TYPE_CHECKING:
-    from data_catalog.catalog import Descriptor
+    from data_catalog import Descriptor
     from extrags.config import IngestConfig
     from extrags.sequence import EndoscopicSequence
 
@@ -55,7 +55,7 @@ def list_all(given: argparse.Namespace) -> int:
     from rich.markup import escape
     from rich.table import Table
 
-    from data_catalog.catalog import list_sequences
+    from data_catalog import list_sequences
     from flows.terminal import console
 
     sequences = [
@@ -91,7 +91,7 @@ def show(given: argparse.Namespace) -> int:
     from rich.markup import escape
     from rich.table import Table
 
-    from data_catalog.catalog import resolve
+    from data_catalog import resolve
     from flows.terminal import console
 
     set_up_logging(debug=given.debug, terminal=True)
@@ -104,7 +104,7 @@ def show(given: argparse.Namespace) -> int:
         if found is None or given.picture:
             raise
     else:
-        from data_catalog.catalog import read
+        from data_catalog import read
         from data_catalog.inspection import facts
 
         sequence = read(source, _ingest(given))
@@ -167,7 +167,7 @@ def check(given: argparse.Namespace) -> int:
 
 def _known(name: str) -> Descriptor | None:
     """The catalogue's entry; None for a path."""
-    from data_catalog.catalog import describe
+    from data_catalog import describe
 
     try:
         return describe(name)

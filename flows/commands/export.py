@@ -60,8 +60,8 @@ def _scene(given: argparse.Namespace) -> int:
 
 def _sequence(given: argparse.Namespace) -> int:
     from data_catalog.catalog import read
-    from data_catalog.colmap_model import points_of, write_colmap
-    from data_catalog.transforms_json import write_transforms
+    from data_catalog.readers.colmap_model import points_of, write_colmap
+    from data_catalog.readers.transforms_json import write_transforms
     from extrags.sequence import EndoscopicSequence
 
     target = Path(given.output)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from data_catalog.colmap_files import read_model, write_model
+from data_catalog.readers.colmap_files import read_model, write_model
 from extrags.cameras import invert_poses
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from data_catalog.c3vd.coverage import Surface, align, read_coverage_mesh
-from data_catalog.c3vd.datasets import datasets
 from data_catalog.c3vd.pinhole import PinholeResampling
+from data_catalog.c3vd.published import published_sets
 from data_catalog.c3vd.video import Video
 from data_catalog.catalog import (
     describe,
@@ -50,7 +50,7 @@ def data_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def only_here(data_root: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.setattr("data_catalog.catalog.data_roots", lambda: [data_root])
+    monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [data_root])
     return data_root
 
 
@@ -69,7 +69,7 @@ class TestCatalogue:
                 len([item for item in videos if item.name.startswith(f"{name}/")]),
                 sum(item.frames for item in videos if item.name.startswith(f"{name}/")),
             )
-            for name in datasets()
+            for name in published_sets()
         }
         assert counts == {"c3vdv2": (169, 67886), "c3vd": (22, 10015), "c3vdv2_sim": (2, 40)}
         one = listed["c3vdv2/c2_transverse2_t4_v3"]
@@ -77,7 +77,7 @@ class TestCatalogue:
         assert "debris" in one.description
 
     def test_every_scene_with_two_trajectories_has_both_settings(self) -> None:
-        dataset = datasets()["c3vdv2"]
+        dataset = published_sets()["c3vdv2"]
         both = {item.scene for item in dataset.recordings if item.video == "v1"} & {
             item.scene for item in dataset.recordings if item.video != "v1"
         }
@@ -89,7 +89,7 @@ class TestCatalogue:
     def test_the_paper_s_counts(self) -> None:
         for name, counts in (("c1_cecum_t1@sparse", (43, 218)), ("c1_ascending_t2@distanced", (42, 374))):
             scene, setting = name.split("@")
-            pair = datasets()["c3vdv2"].pair(scene, setting)
+            pair = published_sets()["c3vdv2"].pair(scene, setting)
             assert (len(pair.train_frames), pair.test.frames) == counts
             assert describe(f"c3vdv2/{name}").frames == sum(counts)
 
@@ -97,14 +97,14 @@ class TestCatalogue:
         assert resolve(SCENE) == resolve(f"{SCENE}@sparse")
         source = resolve(f"{SCENE}@distanced")
         assert source.path == str(only_here / "c3vdv2_sim" / "c9_transverse1_t3_v1")
-        assert source.test_path == str(only_here / "c3vdv2_sim" / "c9_transverse1_t3_v2")
-        assert resolve(f"{SCENE}_v2").path == source.test_path
+        assert source.paths[1] == str(only_here / "c3vdv2_sim" / "c9_transverse1_t3_v2")
+        assert resolve(f"{SCENE}_v2").path == source.paths[1]
         assert resolve(only_here / "c3vdv2_sim" / "c9_transverse1_t3_v2").name == f"{SCENE}_v2"
         assert describe(f"{SCENE}@sparse").available
         assert not describe("c3vdv2/c1_cecum_t1@sparse").available
 
     def test_videos_in_a_folder_of_their_own(self, own_root, monkeypatch) -> None:
-        monkeypatch.setattr("data_catalog.catalog.data_roots", list)
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", list)
         source = resolve(own_root / "c9_transverse1_t3@sparse")
         assert source.name == f"{SCENE}@sparse"
         assert source.path == str(own_root / "c9_transverse1_t3_v2")
@@ -127,7 +127,7 @@ class TestCatalogue:
                 question(name)
 
     def test_known_but_not_here(self, tmp_path, monkeypatch) -> None:
-        monkeypatch.setattr("data_catalog.catalog.data_roots", lambda: [tmp_path])
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [tmp_path])
         with pytest.raises(
             SourceNotFoundError, match=r"no folder c3vdv2/c1_cecum_t1_v2 in .*FOLDER/c1_cecum_t1@sparse"
         ):
@@ -173,7 +173,7 @@ class TestPairs:
         assert found.residual_mm < found.largest_residual_mm < 2e-4
 
     def test_every_tenth_frame_of_a_published_scene(self, tmp_path, monkeypatch) -> None:
-        monkeypatch.setattr("data_catalog.catalog.data_roots", lambda: [tmp_path])
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [tmp_path])
         for name, frames, phase in (("v1", 156, 0.0), ("v2", 117, 1.0)):
             write_video(
                 tmp_path / "C3VDv2" / f"c1_transverse1_t1_{name}",

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from data_catalog.catalog import (
-    Source,
     describe,
     list_sequences,
-    phantom_config,
     read,
     resolve,
     source_fingerprint,
 )
+from data_catalog.dataset import Source
+from data_catalog.phantom.dataset import phantom_config
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError, UnknownSequenceError
 
@@ -32,7 +32,7 @@ class TestNames:
 
     def test_phantom_beyond_the_list(self) -> None:
         source = resolve("phantom/1234@distanced")
-        assert (source.scene, source.setting, source.name) == (1234, "distanced", "phantom/1234@distanced")
+        assert (source.name, source.dataset, source.paths) == ("phantom/1234@distanced", "phantom", ())
         assert describe("phantom/1234@distanced").frames == 48
 
     def test_setting_defaults_to_sparse(self) -> None:
@@ -52,7 +52,7 @@ class TestNames:
             resolve("phantom/3@spars")
 
     def test_known_set_without_its_files(self, tmp_path, monkeypatch) -> None:
-        monkeypatch.setattr("data_catalog.catalog.data_roots", lambda: [tmp_path])
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [tmp_path])
         assert not describe("sinus/hopkins").available
         with pytest.raises(SourceNotFoundError, match="EXTRAGS_DATA"):
             resolve("sinus/hopkins")

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_catalog.colmap_model import write_colmap
 from data_catalog.inspection import inspect
-from data_catalog.transforms_json import write_transforms
+from data_catalog.readers.colmap_model import write_colmap
+from data_catalog.readers.transforms_json import write_transforms
 from extrags.cameras import invert_poses
 from tests.data_catalog.damage import (
     OPENGL,

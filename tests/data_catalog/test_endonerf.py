@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from data_catalog.catalog import read, resolve
-from data_catalog.endonerf import mask_polarity, polarity_of_images
 from data_catalog.inspection import inspect
+from data_catalog.readers.endonerf import mask_polarity, polarity_of_images
 from extrags.errors import SourceError
 from tests.data_catalog.layouts import carried_error_mm, with_tool, write_endonerf
 

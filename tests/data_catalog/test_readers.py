@@ -12,7 +12,7 @@ from PIL import Image
 from data_catalog.catalog import read
 from data_catalog.content import view_mask
 from data_catalog.images import Resampling, natural_key, spread
-from data_catalog.sinus import read_points, read_view_names
+from data_catalog.readers.sinus import read_points, read_view_names
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, PoseError, SourceError, SourceNotFoundError
 

@@ -8,7 +8,8 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read
-from data_catalog.specular import saturated_mask, specular_mask, specular_masks, with_specular
+from data_catalog.specular import specular_mask, specular_masks, with_specular
+from extrags.sequence import saturated_mask
 
 
 def mucosa(width: int = 320, height: int = 256) -> np.ndarray:

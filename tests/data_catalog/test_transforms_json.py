@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read, resolve
-from data_catalog.transforms_json import write_transforms
+from data_catalog.readers.transforms_json import write_transforms
 from extrags.config import IngestConfig
 from extrags.sequence import Split
 from tests.data_catalog.layouts import carried_error_mm, same_frames

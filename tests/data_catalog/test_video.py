@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from data_catalog.catalog import read, resolve, source_fingerprint
-from data_catalog.video import choose_frames, survey
+from data_catalog.readers.video import choose_frames, survey
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, subscribed

@@ -8,7 +8,7 @@ import pytest
 import zarr
 
 from extrags.errors import ShapeError
-from extrags.sequence import EndoscopicSequence, Split
+from extrags.sequence import EndoscopicSequence, Split, saturated_mask
 from extrags.store.manifest import content_digest
 
 
@@ -95,3 +95,20 @@ def test_the_training_part_holds_nothing_of_the_held_out_frames(tmp_path: Path) 
     for index, sequence in enumerate((whole, other)):
         sequence.training_part().save(tmp_path / str(index))
     assert content_digest(tmp_path / "0") == content_digest(tmp_path / "1")
+
+
+def test_highlights_do_not_supervise_and_saturation_is_told_apart() -> None:
+    sequence = small_sequence()
+    np.testing.assert_array_equal(sequence.supervised_mask(1), sequence.mask[1])
+    specular = np.zeros(sequence.mask.shape, bool)
+    specular[1, 2, 3] = True
+    marked = replace(sequence, specular=specular)
+    expected = sequence.mask.copy()
+    expected[1, 2, 3] = False
+    np.testing.assert_array_equal(marked.supervised_mask(1), expected[1])
+    np.testing.assert_array_equal(marked.supervised_mask(np.array([0, 1])), expected[:2])
+    # A copy: narrowing it further must not touch the sequence.
+    marked.supervised_mask(0)[:] = False
+    assert marked.mask[0].any()
+    pixels = np.array([[[249, 249, 249], [0, 250, 0]]], np.uint8)
+    np.testing.assert_array_equal(saturated_mask(pixels), [[False, True]])

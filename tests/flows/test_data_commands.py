@@ -12,9 +12,9 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read
-from data_catalog.colmap_model import write_colmap
 from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.recording import record
+from data_catalog.readers.colmap_model import write_colmap
 from flows.cli import main
 
 SMALL = ["--set", "ingest.width=48", "--set", "ingest.max_frames=8"]
@@ -80,7 +80,7 @@ class TestShow:
     def test_without_the_data(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        monkeypatch.setattr("data_catalog.catalog.data_roots", lambda: [tmp_path])
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", lambda: [tmp_path])
         assert main(["data", "show", "sinus/hopkins", "--json", "-"]) == 0
         shown = json.loads(capsys.readouterr().out)
         assert shown["available"] is False

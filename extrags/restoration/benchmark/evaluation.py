@@ -34,6 +34,7 @@ from extrags.restoration.training_data.augmentation import drop_references
 from extrags.restoration.uncertainty.reliability_diagram import calibration, cell_correlation
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import Layers, observe_views
 from extrags.view_synthesis.references import ReferenceViews
 
@@ -50,7 +51,6 @@ __all__ = [
 CLIP_VIEWS = 8
 """Views of a clip: about the length of an explored trajectory."""
 WELL_SEEN_ALPHA, WELL_SEEN_UNCERTAINTY = 0.9, 0.5
-HOLE_ALPHA = 0.5
 CHANGED = 4 / 255
 """A pixel is changed where a channel differs from the rendering by more than this."""
 SAME_SURFACE = 0.03

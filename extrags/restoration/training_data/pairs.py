@@ -21,13 +21,13 @@ from extrags.errors import CaptureError
 from extrags.events import Progress, emit
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, saturated_mask
 from extrags.training.optimise import optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent
 from extrags.training.starting import median_depth, starting_gaussians, surface_normals
 from extrags.training.views import epochs, real_views
 from extrags.view_synthesis.conditioning import Layers, observe_views
-from extrags.view_synthesis.references import SATURATED, ReferenceViews
+from extrags.view_synthesis.references import ReferenceViews
 
 __all__ = ["Pairs", "fold_pairs", "leave_out_folds", "make_pairs", "pair_views", "synthetic_pairs"]
 
@@ -352,9 +352,7 @@ def pair_views(
 ) -> Pairs:
     """Layers of frames with what the frames really show; every fifth training frame validates."""
     rgb = sequence.rgb[frames]
-    valid = sequence.mask[frames] & (rgb.max(axis=-1) < SATURATED)
-    if sequence.specular is not None:
-        valid &= ~sequence.specular[frames]
+    valid = sequence.supervised_mask(frames) & ~saturated_mask(rgb)
     depth = np.zeros(valid.shape, dtype=np.float32)
     if sequence.depth_mm is not None:
         depth = np.where(sequence.mask[frames], sequence.depth_mm[frames], 0).astype(np.float32)

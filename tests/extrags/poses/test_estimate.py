@@ -291,10 +291,10 @@ def test_a_process_that_dies_is_told_with_its_last_words(
 
 @pytest.mark.slow
 def test_human_sinus_at_a_quarter_of_its_size(shared_data: Path) -> None:
-    from data_catalog import sinus
+    from data_catalog.readers import sinus
     from extrags.config import IngestConfig
 
-    source = sinus.FORMAT.read(shared_data / "sinus_hopkins", IngestConfig(downscale=4), "sinus/hopkins")
+    source = sinus.READER.read(shared_data / "sinus_hopkins", IngestConfig(downscale=4), "sinus/hopkins")
     found = estimate_poses(source, PosesConfig())
     assert source.world_from_camera is not None
     chosen = found.registered

@@ -26,17 +26,18 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from data_catalog.colmap_files import ColmapImage, ColmapModel, read_model, write_model
-from data_catalog.formats import FolderFormat
-from data_catalog.images import COLOUR_SUFFIXES, natural_key
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
 from data_catalog.lens import Lens
-from data_catalog.posed_frames import PosedFrame, assembled, save_images
+from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
+from data_catalog.readers.frame_list import split_by_name
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FORMAT", "model_folder", "points_of", "read_depth_map", "write_colmap", "write_depth_map"]
+__all__ = ["READER", "model_folder", "points_of", "read_depth_map", "write_colmap", "write_depth_map"]
 
 logger = logging.getLogger(__name__)
 
@@ -105,7 +106,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(found)
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     place = model_folder(folder)
     if place is None:
         raise SourceNotFoundError("no COLMAP model in this folder", file=folder)
@@ -136,25 +137,25 @@ def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
                 frame=frame.name,
                 field="name",
             )
-    return assembled(
+    pose_file = next(file for file in (place / "images.bin", place / "images.txt") if file.is_file())
+    return SourceFrames(
         frames,
-        config,
-        name=name,
-        pose_file=next(file for file in (place / "images.bin", place / "images.txt") if file.is_file()),
+        pose_file=pose_file,
         metric=_is_metric(folder),
+        intrinsics_file=pose_file,
         read_depth=lambda file, frame: read_depth_map(file, frame=frame),
         points=model.points if len(model.points) else None,
         points_rgb=model.points_rgb if len(model.points) else None,
     )
 
 
-FORMAT = FolderFormat(
+READER = FolderReader(
     name="colmap",
-    version=1,
-    summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/colmap_model.py",
+    version=2,
+    summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/readers/colmap_model.py",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="COLMAP poses (camera from world, OpenCV axes, inverted on reading), pixel "
     "centres at +0.5; arbitrary unit unless length_unit.txt says mm",
 )
@@ -305,10 +306,9 @@ def _is_metric(folder: Path) -> bool:
 
 def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train", "test"]]:
     known = {image.name for image in images}
-    result: dict[str, Literal["train", "test"]] = {}
     file = folder / "test_list.txt"
     if not file.is_file():
-        return result
+        return {}
     held_out = set(file.read_text(encoding="utf-8").split("\n")) - {""}
     unknown = sorted(held_out - known, key=natural_key)
     if unknown:
@@ -321,17 +321,8 @@ def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train
         )
     listed = folder / "train_list.txt"
     training = set(listed.read_text(encoding="utf-8").split("\n")) if listed.is_file() else known - held_out
-    both = sorted(held_out & training, key=natural_key)
-    if both:
-        raise SourceError(
-            f"{len(both)} images both train and evaluate, this one is the first",
-            file=file,
-            frame=both[0],
-            field="split",
-        )
-    for name in known:
-        result[name] = "test" if name in held_out else "train"
-    return result
+    # The list may name more than the model holds.
+    return split_by_name(known - held_out | (training & held_out), held_out, file=file)
 
 
 def _tell_about_unposed(root: Path, posed: set[str]) -> None:

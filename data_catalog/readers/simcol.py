@@ -16,22 +16,25 @@ Source: Rau et al., "SimCol3D: 3D reconstruction during colonoscopy challenge", 
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.formats import FolderFormat
-from data_catalog.images import Resampling, natural_key, read_colour, read_depth, spread
+from data_catalog.dataset import Descriptor
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import image_size, natural_key, read_depth
+from data_catalog.lens import Lens
+from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.rotations import quaternion_rotation
-from data_catalog.splits import every_nth
-from data_catalog.visibility import observed_from_depth
-from extrags.cameras import Cameras, compose
+from data_catalog.sampling import LensSampling
+from data_catalog.visibility import observed_by_depth
+from extrags.cameras import compose
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import EndoscopicSequence
 
-__all__ = ["DEPTH_STEP_MM", "FORMAT", "decode_depth_mm", "intrinsics", "read_poses"]
+__all__ = ["DEPTH_STEP_MM", "READER", "decode_depth_mm", "intrinsics", "read_poses"]
 
 _USUAL_DOWNSCALE = 2
 _FOCAL_SHARE = 227.604 / 475
@@ -51,7 +54,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for pattern in patterns for file in folder.glob(pattern))
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     poses = read_poses(folder)
     files = sorted(folder.glob("FrameBuffer_*.png"), key=lambda file: natural_key(file.name))
     numbers = [file.stem.split("_")[-1] for file in files]
@@ -72,50 +75,52 @@ def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
             frame=f"{missing[0]:04d}",
             field="rgb",
         )
-    kept = spread(len(files), config.max_frames)
-    colours, depths = [], []
-    resampling: Resampling | None = None
-    for index in kept:
-        number = numbers[index]
-        colour = read_colour(files[index], frame=number)
-        if resampling is None:
-            resampling = Resampling.planned(colour.shape[1], colour.shape[0], config, _USUAL_DOWNSCALE)
-        depth_file = folder / f"Depth_{number}.png"
-        depth = decode_depth_mm(read_depth(depth_file, frame=number))
-        colours.append(resampling.colour(colour, file=files[index], frame=number))
-        depths.append(resampling.depth(depth, file=depth_file, frame=number))
-    if resampling is None:
-        raise SourceNotFoundError("no FrameBuffer_NNNN.png", file=folder)
-    K = resampling.intrinsics(intrinsics(resampling.source_width, resampling.source_height))
-    world_from_camera = poses[[int(numbers[index]) for index in kept]]
-    split = every_nth(len(kept), config.holdout_every, file=folder)
-    cameras = Cameras(
-        np.repeat(K[None], len(kept), axis=0), world_from_camera, resampling.width, resampling.height
-    )
-    depth_mm = np.stack(depths)
-    return EndoscopicSequence(
-        name=name,
-        rgb=np.stack(colours),
-        K=cameras.K,
-        mask=np.ones(depth_mm.shape, dtype=bool),
-        split=split,
-        world_from_camera=world_from_camera,
-        depth_mm=depth_mm,
-        recording=np.zeros(len(kept), dtype=np.int64),
-        frame_names=tuple(numbers[index] for index in kept),
+    width, height = image_size(files[0], frame=numbers[0])
+    lens = Lens.pinhole(intrinsics(width, height), width, height)
+    return SourceFrames(
+        frames=[
+            PosedFrame(
+                name=number,
+                file=file,
+                lens=lens,
+                world_from_camera=poses[int(number)],
+                depth_file=folder / f"Depth_{number}.png",
+            )
+            for number, file in zip(numbers, files, strict=True)
+        ],
+        pose_file=_pose_file(folder, "SavedPosition"),
         metric=True,
-        observed=observed_from_depth(cameras, depth_mm, split.train, split.test, tolerance_mm=DEPTH_STEP_MM),
+        read_depth=lambda file, frame: decode_depth_mm(read_depth(file, frame=frame)),
+        sampling=partial(LensSampling.planned, usual_downscale=_USUAL_DOWNSCALE),
+        observed=partial(observed_by_depth, tolerance_mm=DEPTH_STEP_MM),
     )
 
 
-FORMAT = FolderFormat(
+READER = FolderReader(
     name="simcol3d",
     version=1,
     summary="FrameBuffer_NNNN.png with Depth_NNNN.png and SavedPosition*.txt of SimCol3D",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="Unity axes (left-handed, y up), cm; turned into OpenCV's and mm on reading",
+    named_sets=(
+        Descriptor(
+            name="simcol3d/s1",
+            description="SimCol3D synthetic colon, first ten frames of S1, with depth and exact poses",
+            frames=10,
+            width=475,
+            height=475,
+            length_unit="mm (source: cm)",
+            axes="Unity (left-handed, y up); turned into OpenCV's on reading",
+            has_depth=True,
+            has_poses=True,
+            split="every n-th frame held out (ingest.holdout_every)",
+            licence="CC BY-NC-SA 4.0",
+            format="simcol3d",
+            folder="simcol3d_s1",
+        ),
+    ),
 )
 
 

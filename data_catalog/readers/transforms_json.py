@@ -25,15 +25,16 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from data_catalog.formats import FolderFormat
-from data_catalog.images import COLOUR_SUFFIXES, natural_key, read_depth
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import COLOUR_SUFFIXES, image_size, natural_key, read_depth, save_images
 from data_catalog.lens import LENS_PARAMETERS, Lens
-from data_catalog.posed_frames import PosedFrame, assembled, save_images
+from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.frame_list import load_frame_list, matrix_of, split_by_name
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FORMAT", "TRANSFORMS_FILE", "write_transforms"]
+__all__ = ["READER", "TRANSFORMS_FILE", "write_transforms"]
 
 TRANSFORMS_FILE = "transforms.json"
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -47,7 +48,7 @@ def _recognises(folder: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    content = _load(folder / TRANSFORMS_FILE)
+    content = load_frame_list(folder / TRANSFORMS_FILE, "file_path")
     found = {folder / TRANSFORMS_FILE}
     for entry in content["frames"]:
         for key in _FILE_KEYS:
@@ -58,9 +59,9 @@ def _files(folder: Path) -> list[Path]:
     return sorted(file for file in found if file.is_file() and file.is_relative_to(folder))
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / TRANSFORMS_FILE
-    content = _load(file)
+    content = load_frame_list(file, "file_path")
     unit = content.get("length_unit", "arbitrary")
     if unit not in _MM_PER_UNIT:
         raise SourceError(
@@ -97,29 +98,29 @@ def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
         )
     points, points_rgb = _points(folder, content, file)
 
-    def depth_of(depth_file: Path, frame: str) -> Float[np.ndarray, "h w"]:
+    def depth_of(depth_file: Path, frame: str | int) -> Float[np.ndarray, "h w"]:
         factor = _depth_factor(content, depth_file, file) * scale
         return (read_depth(depth_file, frame=frame) * factor).astype(np.float32)
 
-    return assembled(
+    return SourceFrames(
         frames,
-        config,
-        name=name,
         pose_file=file,
         metric=unit != "arbitrary",
+        intrinsics_file=file,
         read_depth=depth_of,
         points=None if points is None else points * scale,
         points_rgb=points_rgb,
     )
 
 
-FORMAT = FolderFormat(
+READER = FolderReader(
     name="transforms",
-    version=1,
-    summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in data_catalog/transforms_json.py",
+    version=2,
+    summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in "
+    "data_catalog/readers/transforms_json.py",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="OpenGL camera axes (y up, z backward, turned on reading), camera to world; "
     "depth in thousandths of the pose unit unless it says otherwise",
 )
@@ -181,29 +182,6 @@ def write_transforms(
     (folder / TRANSFORMS_FILE).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
-def _load(file: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise SourceError(f"not readable as JSON: {error}", file=file) from error
-    if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
-        raise SourceError("expected an object with a list `frames`", file=file, field="frames")
-    if not content["frames"]:
-        raise SourceError("the list of frames is empty", file=file, field="frames")
-    seen: set[str] = set()
-    for index, entry in enumerate(content["frames"]):
-        if not isinstance(entry, dict) or not isinstance(entry.get("file_path"), str):
-            raise SourceError(
-                "expected an object with `file_path`", file=file, frame=index, field="file_path"
-            )
-        if entry["file_path"] in seen:
-            raise SourceError(
-                "the frame is listed twice", file=file, frame=entry["file_path"], field="file_path"
-            )
-        seen.add(entry["file_path"])
-    return content
-
-
 def _with_suffix(file: Path) -> Path:
     """The image a path means: the synthetic NeRF scenes leave `.png` out."""
     if file.is_file() or file.suffix.lower() in COLOUR_SUFFIXES:
@@ -222,25 +200,10 @@ def _beside(folder: Path, entry: dict[str, Any], key: str, frame: str) -> Path |
 
 
 def _pose(entry: dict[str, Any], scale: float, file: Path, frame: str) -> Float[np.ndarray, "4 4"]:
-    if "transform_matrix" not in entry:
-        raise PoseError(
-            "no transform_matrix; expected 4 x 4 numbers", file=file, frame=frame, field="transform_matrix"
-        )
-    try:
-        matrix = np.asarray(entry["transform_matrix"], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise PoseError(
-            f"not a matrix of numbers: {error}", file=file, frame=frame, field="transform_matrix"
-        ) from error
-    if matrix.shape == (3, 4):
-        matrix = np.vstack([matrix, [0, 0, 0, 1.0]])
-    if matrix.shape != (4, 4):
-        raise PoseError(
-            f"found shape {matrix.shape}; expected 4 rows of 4 numbers",
-            file=file,
-            frame=frame,
-            field="transform_matrix",
-        )
+    rows = entry.get("transform_matrix")
+    if isinstance(rows, list) and len(rows) == 3:
+        entry = {**entry, "transform_matrix": [*rows, [0, 0, 0, 1.0]]}
+    matrix = matrix_of(entry, "transform_matrix", 4, file=file, frame=frame, error=PoseError)
     pose = matrix @ _OPENCV_FROM_OPENGL
     pose[:3, 3] *= scale
     return pose
@@ -260,7 +223,7 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
     if "w" in values and "h" in values:
         width, height = int(number("w")), int(number("h"))
     else:
-        width, height = _image_size(image)
+        width, height = image_size(image, frame=frame)
     if "fl_x" in values or "fl_y" in values:
         fx = number("fl_x") if "fl_x" in values else number("fl_y")
         fy = number("fl_y", fx)
@@ -314,13 +277,6 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
     return Lens(model, tuple(float(named[key]) for key in names), width, height)
 
 
-def _image_size(image: Path) -> tuple[int, int]:
-    from data_catalog.images import read_colour
-
-    height, width = read_colour(image, frame=image.name).shape[:2]
-    return width, height
-
-
 def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> float:
     if "depth_unit_scale_factor" in content:
         key = "depth_unit_scale_factor"
@@ -351,18 +307,7 @@ def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "
             raise SourceError(
                 "the split names this frame, but `frames` does not", file=file, frame=listed, field="split"
             )
-    both = sorted(set(held_out) & training, key=natural_key)
-    if both:
-        raise SourceError(
-            f"{len(both)} frames both train and evaluate, this one is the first",
-            file=file,
-            frame=both[0],
-            field="split",
-        )
-    result: dict[str, Literal["train", "test"]] = dict.fromkeys(held_out, "test")
-    for name in training:
-        result[name] = "train"
-    return result
+    return split_by_name(training, held_out, file=file)
 
 
 def _points(

@@ -1,9 +1,9 @@
 """Reader of a video file: picks frames by motion and sharpness, masks what is not tissue; poses come later.
 
 A file with one of `VIDEO_SUFFIXES`, or a folder that holds one such file and no images. Beside the file, both
-optional: `intrinsics.json` and `mask.png`, as in `data_catalog.frames_folder`; without the first a field of
-view of 90 degrees is assumed and said so, without the second the round picture, the dark frame and burnt-in
-text are found (`data_catalog.content`).
+optional: `intrinsics.json` and `mask.png`, as in `data_catalog.readers.frames_folder`; without the first a
+field of view of 90 degrees is assumed and said so, without the second the round picture, the dark frame and
+burnt-in text are found (`data_catalog.content`).
 
 The video is decoded twice. First, all frames at a small size: how far the picture has moved (median of a
 dense optical flow from a reference frame, as a share of the image width; the reference follows only when the
@@ -31,16 +31,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from data_catalog.content import content_mask
-from data_catalog.formats import FolderFormat
-from data_catalog.frames_folder import read_intrinsics
-from data_catalog.images import Resampling, colour_files, read_mask
-from data_catalog.splits import every_nth
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import colour_files
+from data_catalog.lens import Lens
+from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.frames_folder import read_intrinsics
+from data_catalog.sampling import Sampling
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.events import Progress, emit
-from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FORMAT", "MAX_FRAMES", "VIDEO_SUFFIXES", "VideoSurvey", "choose_frames", "survey", "video_file"]
+__all__ = ["MAX_FRAMES", "READER", "VIDEO_SUFFIXES", "VideoSurvey", "choose_frames", "survey", "video_file"]
 
 logger = logging.getLogger(__name__)
 
@@ -102,45 +103,59 @@ def _files(place: Path) -> list[Path]:
     return sorted([file, *(other for other in beside if other.is_file())])
 
 
-def _read(place: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(place: Path, config: IngestConfig) -> SourceFrames:
     file = video_file(place)
     if file is None:
         raise SourceNotFoundError("no video here", file=place)
     found = survey(file)
     chosen = choose_frames(found.path, found.sharpness, config.max_frames or MAX_FRAMES, file=file)
-    logger.info("%s: %d of %d frames chosen", name, len(chosen), len(found.path))
-    resampling = Resampling.planned(found.width, found.height, config)
+    logger.info("%s: %d of %d frames chosen", file.name, len(chosen), len(found.path))
+    lens = Lens.pinhole(read_intrinsics(file.parent, found.width, found.height), found.width, found.height)
     mask_file = file.parent / "mask.png"
-    mask = read_mask(mask_file) if mask_file.is_file() else _enlarged(found)
-    small_mask = resampling.mask(mask, file=mask_file)
-    K = resampling.intrinsics(read_intrinsics(file.parent, found.width, found.height))
-    colours = []
-    for index, image in _frames(file, chosen):
-        colours.append(resampling.colour(image, file=file, frame=index))
-        emit(Progress("ingest", len(found.path) + len(colours), len(found.path) + len(chosen)))
-    if len(colours) != len(chosen):
-        raise SourceError(
-            f"{len(chosen)} frames were wanted, {len(colours)} could be decoded the second time", file=file
-        )
-    return EndoscopicSequence(
-        name=name,
-        rgb=np.stack(colours),
-        K=np.repeat(K[None], len(chosen), axis=0),
-        mask=np.repeat(small_mask[None], len(chosen), axis=0),
-        split=every_nth(len(chosen), config.holdout_every, file=file),
-        recording=np.zeros(len(chosen), dtype=np.int64),
-        frame_names=tuple(f"{index:06d}" for index in chosen),
+    images = _decoded(file, chosen)
+    return SourceFrames(
+        frames=[
+            PosedFrame(
+                name=f"{index:06d}",
+                file=file,
+                lens=lens,
+                mask_file=mask_file if mask_file.is_file() else None,
+                number=index,
+            )
+            for index in chosen.tolist()
+        ],
+        pose_file=file,
         metric=False,
+        # No more frames were chosen than may be kept, so that each is asked for, in order.
+        read_colour=lambda frame: _next_image(images, frame),
+        masks=_SurveyedMask(found),
+        looked_at=len(found.path),
     )
 
 
-FORMAT = FolderFormat(
+class _SurveyedMask:
+    """What is tissue, found from the samples of the first pass."""
+
+    def __init__(self, found: VideoSurvey) -> None:
+        self._found = found
+
+    def see(
+        self, frame: PosedFrame, image: UInt8[np.ndarray, "h w 3"], sampled: UInt8[np.ndarray, "h2 w2 3"]
+    ) -> None:
+        """Nothing new: the first pass saw all frames."""
+
+    def mask(self, frame: PosedFrame, sampling: Sampling) -> Bool[np.ndarray, "h2 w2"]:
+        """The picture inside its dark frame, less burnt-in text."""
+        return sampling.mask(_enlarged(self._found), file=frame.file)
+
+
+READER = FolderReader(
     name="video",
     version=1,
     summary="a video file (mp4, avi, mov, mkv, ...), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
 )
 
@@ -281,7 +296,7 @@ def _enlarged(found: VideoSurvey) -> Bool[np.ndarray, "h w"]:
     return np.asarray(cv2.resize(small, size, interpolation=cv2.INTER_LINEAR) > 0.999, dtype=bool)
 
 
-def _frames(file: Path, chosen: Int[np.ndarray, "n"]) -> Iterator[tuple[int, UInt8[np.ndarray, "h w 3"]]]:
+def _decoded(file: Path, chosen: Int[np.ndarray, "n"]) -> Iterator[tuple[int, UInt8[np.ndarray, "h w 3"]]]:
     """The chosen frames at full size, in order."""
     import cv2
 
@@ -296,6 +311,17 @@ def _frames(file: Path, chosen: Int[np.ndarray, "n"]) -> Iterator[tuple[int, UIn
                 if not there:
                     return
                 yield index, np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+
+
+def _next_image(
+    images: Iterator[tuple[int, UInt8[np.ndarray, "h w 3"]]], frame: PosedFrame
+) -> UInt8[np.ndarray, "h w 3"]:
+    for index, image in images:
+        if index == frame.number:
+            return image
+    raise SourceError(
+        "the frame was chosen, but could not be decoded the second time", file=frame.file, frame=frame.label
+    )
 
 
 @contextmanager

@@ -16,18 +16,19 @@ import logging
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.checks import check_intrinsics
 from data_catalog.content import content_mask
-from data_catalog.formats import FolderFormat
-from data_catalog.images import Resampling, colour_files, read_colour, read_mask, spread
-from data_catalog.splits import every_nth
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import colour_files, image_size
+from data_catalog.lens import Lens
+from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.sampling import Sampling
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
-from extrags.sequence import EndoscopicSequence
 
-__all__ = ["ASSUMED_FIELD_OF_VIEW_DEG", "FORMAT", "read_intrinsics"]
+__all__ = ["ASSUMED_FIELD_OF_VIEW_DEG", "READER", "read_intrinsics"]
 
 logger = logging.getLogger(__name__)
 
@@ -35,7 +36,7 @@ ASSUMED_FIELD_OF_VIEW_DEG = 90.0
 _NOT_FRAMES = ("mask.png",)
 
 
-def _frames(folder: Path) -> list[Path]:
+def _images(folder: Path) -> list[Path]:
     for place in (folder, folder / "images", folder / "rgb"):
         if place.is_dir():
             found = [file for file in colour_files(place) if file.name not in _NOT_FRAMES]
@@ -45,51 +46,56 @@ def _frames(folder: Path) -> list[Path]:
 
 
 def _recognises(folder: Path) -> bool:
-    return bool(_frames(folder))
+    return bool(_images(folder))
 
 
 def _files(folder: Path) -> list[Path]:
     extra = [folder / "intrinsics.json", folder / "mask.png"]
-    return sorted([*_frames(folder), *(file for file in extra if file.is_file())])
+    return sorted([*_images(folder), *(file for file in extra if file.is_file())])
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
-    files = _frames(folder)
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
+    files = _images(folder)
     if not files:
         raise SourceNotFoundError("no image in this folder", file=folder)
-    kept = [files[index] for index in spread(len(files), config.max_frames)]
-    first = read_colour(kept[0], frame=kept[0].name)
-    resampling = Resampling.planned(first.shape[1], first.shape[0], config)
-    K = read_intrinsics(folder, first.shape[1], first.shape[0])
-    # Shrunk before they are stacked: a long video at full size would not fit into memory.
-    colours = np.stack(
-        [resampling.colour(read_colour(file, frame=file.name), file=file, frame=file.name) for file in kept]
-    )
+    width, height = image_size(files[0], frame=files[0].name)
+    lens = Lens.pinhole(read_intrinsics(folder, width, height), width, height)
     mask_file = folder / "mask.png"
-    mask = (
-        resampling.mask(read_mask(mask_file), file=mask_file)
-        if mask_file.is_file()
-        else content_mask(colours)
-    )
-    return EndoscopicSequence(
-        name=name,
-        rgb=colours,
-        K=np.repeat(resampling.intrinsics(K)[None], len(kept), axis=0),
-        mask=np.repeat(mask[None], len(kept), axis=0),
-        split=every_nth(len(kept), config.holdout_every, file=folder),
-        recording=np.zeros(len(kept), dtype=np.int64),
-        frame_names=tuple(file.stem for file in kept),
+    return SourceFrames(
+        frames=[
+            PosedFrame(file.name, file, lens, mask_file=mask_file if mask_file.is_file() else None)
+            for file in files
+        ],
+        pose_file=folder,
         metric=False,
+        masks=_ContentMask(),
     )
 
 
-FORMAT = FolderFormat(
+class _ContentMask:
+    """What is tissue, found from all frames as the sequence holds them."""
+
+    def __init__(self) -> None:
+        self._seen: list[UInt8[np.ndarray, "h w 3"]] = []
+
+    def see(
+        self, frame: PosedFrame, image: UInt8[np.ndarray, "h w 3"], sampled: UInt8[np.ndarray, "h2 w2 3"]
+    ) -> None:
+        """Keep the small image; long recordings would not fit into memory at full size."""
+        self._seen.append(sampled)
+
+    def mask(self, frame: PosedFrame, sampling: Sampling) -> Bool[np.ndarray, "h2 w2"]:
+        """The picture inside its dark frame, less burnt-in text."""
+        return content_mask(np.stack(self._seen))
+
+
+READER = FolderReader(
     name="frames",
     version=2,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
 )
 

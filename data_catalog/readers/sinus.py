@@ -13,22 +13,26 @@ IEEE TMI 2020 (data layout of the accompanying example set).
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from data_catalog.formats import FolderFormat
-from data_catalog.images import Resampling, read_colour, read_mask, spread
+from data_catalog.checks import check_intrinsics
+from data_catalog.dataset import Descriptor
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import read_mask
+from data_catalog.lens import Lens
+from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.rotations import quaternion_rotation
-from data_catalog.splits import every_nth
+from data_catalog.sampling import LensSampling
 from extrags.cameras import compose
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FORMAT", "read_points", "read_poses", "read_view_names"]
+__all__ = ["READER", "read_points", "read_poses", "read_view_names"]
 
 _USUAL_DOWNSCALE = 4
 
@@ -43,7 +47,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted([*(file for file in listed if file.is_file()), *(folder / "images").glob("*.jpg")])
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     views = read_view_names(folder)
     poses = read_poses(folder)
     if len(poses) != len(views):
@@ -52,41 +56,54 @@ def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
             file=folder / "motion.yaml",
             field="poses",
         )
-    mask = read_mask(folder / "undistorted_mask.bmp")
-    resampling = Resampling.planned(
-        mask.shape[1], mask.shape[0], config, _USUAL_DOWNSCALE, box=_bounding_box(mask, folder)
-    )
-    K = resampling.intrinsics(_intrinsics(folder))
-    kept = spread(len(views), config.max_frames)
-    colours = []
-    for index in kept:
-        file = folder / "images" / f"{views[index]}.jpg"
-        colours.append(
-            resampling.colour(read_colour(file, frame=views[index]), file=file, frame=views[index])
-        )
-    small_mask = resampling.mask(mask)
-    return EndoscopicSequence(
-        name=name,
-        rgb=np.stack(colours),
-        K=np.repeat(K[None], len(kept), axis=0),
-        mask=np.repeat(small_mask[None], len(kept), axis=0),
-        split=every_nth(len(kept), config.holdout_every, file=folder),
-        world_from_camera=poses[kept],
-        recording=np.zeros(len(kept), dtype=np.int64),
-        frame_names=tuple(views[index] for index in kept),
+    mask_file = folder / "undistorted_mask.bmp"
+    mask = read_mask(mask_file)
+    lens = _lens(folder, mask.shape[1], mask.shape[0])
+    return SourceFrames(
+        frames=[
+            PosedFrame(
+                name=view,
+                file=folder / "images" / f"{view}.jpg",
+                lens=lens,
+                world_from_camera=pose,
+                mask_file=mask_file,
+            )
+            for view, pose in zip(views, poses, strict=True)
+        ],
+        pose_file=folder / "motion.yaml",
         metric=False,
+        sampling=partial(
+            LensSampling.planned, usual_downscale=_USUAL_DOWNSCALE, box=_bounding_box(mask, mask_file)
+        ),
         points=read_points(folder),
     )
 
 
-FORMAT = FolderFormat(
+READER = FolderReader(
     name="sinus",
     version=1,
     summary="motion.yaml, structure.ply and images/ of the Hopkins sinus set",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="OpenCV camera axes, camera to world; arbitrary unit",
+    named_sets=(
+        Descriptor(
+            name="sinus/hopkins",
+            description="Human sinus endoscopy, 35 undistorted frames with COLMAP-like poses and 570 points",
+            frames=35,
+            width=1920,
+            height=1080,
+            length_unit="arbitrary (structure from motion)",
+            axes="OpenCV camera axes, camera-to-world; used as they are",
+            has_depth=False,
+            has_poses=True,
+            split="every n-th frame held out (ingest.holdout_every)",
+            licence="GPL-3.0",
+            format="sinus",
+            folder="sinus_hopkins",
+        ),
+    ),
 )
 
 
@@ -143,19 +160,20 @@ def read_points(folder: Path) -> Float[np.ndarray, "p 3"]:
     return np.asarray(rows, dtype=np.float64)
 
 
-def _intrinsics(folder: Path) -> Float[np.ndarray, "3 3"]:
+def _lens(folder: Path, width: int, height: int) -> Lens:
     file = folder / "camera_intrinsics_per_view"
     values = [float(value) for value in _text(file).split()]
     if len(values) < 4:
         raise SourceError(f"{len(values)} numbers; expected fx, fy, cx, cy", file=file, field="K")
-    fx, fy, cx, cy = values[:4]
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+    lens = Lens("PINHOLE", tuple(values[:4]), width, height)
+    check_intrinsics(lens.K, width, height, file=file)
+    return lens
 
 
-def _bounding_box(mask: Bool[np.ndarray, "h w"], folder: Path) -> tuple[int, int, int, int]:
+def _bounding_box(mask: Bool[np.ndarray, "h w"], file: Path) -> tuple[int, int, int, int]:
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     if not rows.size:
-        raise SourceError("the mask leaves no pixel", file=folder / "undistorted_mask.bmp", field="mask")
+        raise SourceError("the mask leaves no pixel", file=file, field="mask")
     return (
         int(columns[0]),
         int(rows[0]),

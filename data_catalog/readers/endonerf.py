@@ -30,15 +30,14 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from data_catalog.formats import FolderFormat
-from data_catalog.images import colour_files, read_colour, read_depth, read_mask, spread
+from data_catalog.folder_reader import FolderReader
+from data_catalog.images import colour_files, read_colour, read_mask, spread
 from data_catalog.lens import Lens
-from data_catalog.posed_frames import PosedFrame, assembled
+from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FORMAT", "POSES_FILE", "MaskPolarity", "mask_polarity", "polarity_of_images", "read_llff"]
+__all__ = ["POSES_FILE", "READER", "MaskPolarity", "mask_polarity", "polarity_of_images", "read_llff"]
 
 logger = logging.getLogger(__name__)
 
@@ -79,7 +78,7 @@ def _files(folder: Path) -> list[Path]:
     return sorted([folder / POSES_FILE, *(file for part in parts for file in part)])
 
 
-def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / POSES_FILE
     images = _part(folder, _IMAGE_FOLDERS)
     poses, sizes, _ = read_llff(file)
@@ -96,7 +95,7 @@ def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
     if masks:
         polarity = mask_polarity(folder)
         white_is_tissue = polarity.white_is_tissue
-        logger.info("%s: masks: %s", name, polarity.because)
+        logger.info("%s: masks: %s", folder.name, polarity.because)
     frames = []
     for index, image in enumerate(images):
         height, width, focal = (float(value) for value in sizes[index])
@@ -110,14 +109,8 @@ def _read(folder: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
                 depth_file=depths[index] if depths else None,
             )
         )
-    return assembled(
-        frames,
-        config,
-        name=name,
-        pose_file=file,
-        metric=True,
-        read_depth=lambda depth_file, frame: read_depth(depth_file, frame=frame),
-        white_is_tissue=white_is_tissue,
+    return SourceFrames(
+        frames, pose_file=file, metric=True, intrinsics_file=file, white_is_tissue=white_is_tissue
     )
 
 
@@ -125,13 +118,13 @@ def _notes(folder: Path) -> tuple[str, ...]:
     return (f"masks: {mask_polarity(folder).because}",) if _part(folder, _MASK_FOLDERS) else ()
 
 
-FORMAT = FolderFormat(
+READER = FolderReader(
     name="endonerf",
-    version=1,
+    version=2,
     summary=f"{POSES_FILE} with images/ (and depth/, masks/) as EndoNeRF and StereoMIS have them",
     recognises=_recognises,
     files=_files,
-    read=_read,
+    frames=_frames,
     conventions="LLFF camera axes (down, right, backward), camera to world; mm; masks of detected polarity",
     notes=_notes,
 )

@@ -24,14 +24,14 @@ from data_catalog.c3vd.scaramuzza import CalibrationName
 from extrags.errors import UnknownSequenceError
 
 __all__ = [
-    "Dataset",
+    "PublishedSet",
     "Recording",
     "RecordingPair",
     "SplitManifest",
-    "datasets",
     "find",
     "find_recording",
     "find_scene",
+    "published_sets",
 ]
 
 _HERE = Path(__file__).parent
@@ -110,7 +110,7 @@ class SplitManifest(_Model):
     scenes: dict[str, _Roles]
 
 
-class Dataset(_Model):
+class PublishedSet(_Model):
     """What all videos of a dataset share."""
 
     name: str
@@ -180,8 +180,8 @@ class Dataset(_Model):
 
 
 @lru_cache(maxsize=1)
-def datasets() -> dict[str, Dataset]:
-    """The datasets by name, C3VDv2 first."""
+def published_sets() -> dict[str, PublishedSet]:
+    """The sets by name, C3VDv2 first."""
     content: dict[str, dict[str, Any]] = json.loads((_HERE / "videos.json").read_text())
     found = {}
     for name, entry in content.items():
@@ -194,7 +194,7 @@ def datasets() -> dict[str, Dataset]:
             if frames is not None
         )
         splits = json.loads((_HERE / "splits" / f"{name}.json").read_text())
-        found[name] = Dataset(name=name, recordings=recordings, splits=splits, **entry)
+        found[name] = PublishedSet(name=name, recordings=recordings, splits=splits, **entry)
     return found
 
 
@@ -208,7 +208,7 @@ def find(name: str) -> Recording | RecordingPair | None:
         UnknownSequenceError: a scene or setting that a dataset does not have.
     """
     dataset_name, slash, rest = name.partition("/")
-    dataset = datasets().get(dataset_name)
+    dataset = published_sets().get(dataset_name)
     if dataset is None or not slash:
         return None
     scene, at, setting = rest.partition("@")
@@ -222,7 +222,7 @@ def find(name: str) -> Recording | RecordingPair | None:
 
 def find_recording(stem: str) -> Recording | None:
     """The video that a folder of this name holds, in whichever dataset knows it."""
-    for dataset in datasets().values():
+    for dataset in published_sets().values():
         for recording in dataset.recordings:
             if stem in dataset.stems(recording):
                 return recording
@@ -238,7 +238,7 @@ def find_scene(stem: str) -> RecordingPair | None:
     scene, at, setting = stem.partition("@")
     if not at:
         return None
-    for dataset in datasets().values():
+    for dataset in published_sets().values():
         if any(item.scene == scene for item in dataset.recordings):
             return dataset.pair(scene, setting)
     return None

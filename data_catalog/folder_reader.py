@@ -1,0 +1,79 @@
+"""What a reader of one layout on disk tells the catalogue."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from data_catalog.dataset import Descriptor, file_digests
+from data_catalog.posed_frames import SourceFrames, assembled
+from extrags.config import IngestConfig
+from extrags.sequence import EndoscopicSequence
+
+__all__ = ["FolderReader"]
+
+
+@dataclass(frozen=True)
+class FolderReader:
+    """One way in which a sequence lies in a folder (or is a file).
+
+    Args:
+        name: identifier, part of cache keys.
+        version: raised by hand when the same files are read into other arrays; part of cache keys.
+        summary: one line for messages.
+        recognises: whether a path holds this layout, from file names only.
+        files: every file that `frames` and its result may look at, as a sorted list.
+        frames: what there is, poses in OpenCV axes (x right, y down, z forward), camera to world. Thinning,
+            split, masks, undistortion, resizing and checks are done behind it. Raises `SourceError` naming
+            file, frame and field.
+        conventions: axes and units on disk, in one line.
+        notes: what reading has to find out about this folder, as sentences; raises what `frames` raises.
+        named_sets: sequences of the catalogue in this layout, each a folder below a data root.
+        known_name: the catalogue's name for a folder, where it has one; None goes by `named_sets`.
+    """
+
+    name: str
+    version: int
+    summary: str
+    recognises: Callable[[Path], bool]
+    files: Callable[[Path], list[Path]]
+    frames: Callable[[Path, IngestConfig], SourceFrames]
+    conventions: str = ""
+    notes: Callable[[Path], tuple[str, ...]] | None = None
+    named_sets: tuple[Descriptor, ...] = ()
+    known_name: Callable[[Path], str | None] | None = None
+
+    def read(self, place: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
+        """The sequence in a folder, under a name.
+
+        Raises:
+            SourceError: a file is wrong; names file, frame and field.
+            ConfigError: a size that the source cannot give.
+        """
+        return assembled(self.frames(place, config), config, name)
+
+    def fingerprint(self, place: Path) -> dict[str, Any]:
+        """What a folder or file contributes to a cache key: reader, and content of each file it looks at.
+
+        Raises:
+            SourceError: not readable as a sequence.
+        """
+        root = place if place.is_dir() else place.parent
+        # Of a single file the content counts, not what it is called.
+        listed = [
+            (f"source{file.suffix}" if file == place else file.relative_to(root).as_posix(), file)
+            for file in self.files(place)
+        ]
+        return {"format": self.name, "version": self.version, "files": file_digests(listed)}
+
+    def name_of(self, place: Path) -> str:
+        """What the catalogue calls a folder or file: a set's name where it is one, else its own."""
+        resolved = place.resolve()
+        known = (
+            self.known_name(resolved)
+            if self.known_name is not None
+            else next((item.name for item in self.named_sets if item.folder == resolved.name), None)
+        )
+        return known or (place.stem if place.is_file() else resolved.name)

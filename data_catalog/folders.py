@@ -1,0 +1,146 @@
+"""Folders and video files as a dataset: whatever a reader recognises, and the named sets that readers know.
+
+To add a reader: one module in `data_catalog/readers` with a `READER`, and one line in `READERS`. A reader of
+another package is handed to `register_reader`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from data_catalog.c3vd import reader as c3vd
+from data_catalog.dataset import Descriptor, Source
+from data_catalog.folder_reader import FolderReader
+from data_catalog.named_folders import find_folder, not_on_this_machine
+from data_catalog.readers import (
+    colmap_model,
+    endonerf,
+    frames_folder,
+    posed_folder,
+    simcol,
+    sinus,
+    transforms_json,
+    video,
+)
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError, SourceError, SourceNotFoundError
+from extrags.sequence import EndoscopicSequence
+
+__all__ = ["READERS", "FolderDataset", "find_reader", "readers", "register_reader"]
+
+READERS: tuple[FolderReader, ...] = (
+    posed_folder.READER,
+    sinus.READER,
+    simcol.READER,
+    c3vd.READER,
+    transforms_json.READER,
+    endonerf.READER,
+    colmap_model.READER,
+    video.READER,
+    frames_folder.READER,
+)
+"""The most specific first: a folder is read by the first that recognises it."""
+
+_registered: list[FolderReader] = []
+
+
+def readers() -> tuple[FolderReader, ...]:
+    """All readers in the order they are asked: registered ones, then `READERS`."""
+    return (*_registered, *READERS)
+
+
+def register_reader(reader: FolderReader) -> None:
+    """Add a reader from outside; it is asked before those of the catalogue.
+
+    It is known in this process only: workers that read sources register it too.
+
+    Raises:
+        ConfigError: a reader of that name exists already.
+    """
+    if find_reader(reader.name) is not None:
+        raise ConfigError(f"there is a reader {reader.name!r} already; give the new one another name")
+    _registered.append(reader)
+
+
+def find_reader(name: str) -> FolderReader | None:
+    """The reader of a name, or None."""
+    return next((reader for reader in readers() if reader.name == name), None)
+
+
+class FolderDataset:
+    """Any folder or video file, and named sets below a data root."""
+
+    name = "folders"
+
+    @property
+    def spelling(self) -> str:
+        """How its named sets are called."""
+        return ", ".join(item.name for item in _named_sets())
+
+    def entries(self) -> Iterator[Descriptor]:
+        """The named sets."""
+        for item in _named_sets():
+            there = find_folder([str(item.folder)]) is not None
+            yield item.model_copy(update={"available": there})
+
+    def describe(self, name: str) -> Descriptor | None:
+        """The descriptor of a named set, by its name or its folder's."""
+        return next((item for item in self.entries() if name in (item.name, item.folder)), None)
+
+    def resolve(self, name_or_path: str) -> Source | None:
+        """A path that exists, else a named set by its name or its folder's."""
+        path = Path(name_or_path).expanduser()
+        if path.exists():
+            return self._source(path, _recognised(path))
+        item = self.describe(name_or_path)
+        if item is None:
+            return None
+        folder = find_folder([str(item.folder)])
+        if folder is None:
+            raise not_on_this_machine(item.name, str(item.folder), "its path")
+        return Source(name=item.name, dataset=self.name, format=item.format, paths=(str(folder),))
+
+    def fingerprint(self, source: Source, config: IngestConfig) -> dict[str, Any]:
+        """Reader, and content of each file it looks at."""
+        return _reader(source).fingerprint(Path(source.paths[0]))
+
+    def read(self, source: Source, config: IngestConfig) -> EndoscopicSequence:
+        """Whatever its reader makes of it."""
+        return _reader(source).read(Path(source.paths[0]), config, source.name)
+
+    def _source(self, path: Path, reader: FolderReader) -> Source:
+        return Source(
+            name=reader.name_of(path),
+            dataset=self.name,
+            format=reader.name,
+            paths=(str(path.resolve()),),
+        )
+
+
+def _named_sets() -> tuple[Descriptor, ...]:
+    return tuple(item for reader in readers() for item in reader.named_sets)
+
+
+def _recognised(path: Path) -> FolderReader:
+    for reader in readers():
+        if reader.recognises(path):
+            return reader
+    if not path.is_dir():
+        raise SourceError(
+            "this is a file; expected a folder that holds a sequence, or a video "
+            f"({', '.join(video.VIDEO_SUFFIXES)})",
+            file=path,
+        )
+    kinds = "; ".join(f"{reader.name}: {reader.summary}" for reader in readers())
+    empty = "the folder is empty" if not any(path.iterdir()) else "no sequence recognised in this folder"
+    raise SourceNotFoundError(f"{empty}; expected one of: {kinds}", file=path)
+
+
+def _reader(source: Source) -> FolderReader:
+    reader = find_reader(source.format)
+    if reader is None:
+        known = ", ".join(item.name for item in readers())
+        raise ConfigError(f"no reader for the format {source.format!r}; known: {known}")
+    return reader
