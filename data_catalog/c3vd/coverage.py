@@ -43,12 +43,6 @@ class CoverageMesh:
     observed: Bool[np.ndarray, "t"]
 
     @property
-    def areas_mm2(self) -> Float[np.ndarray, "t"]:
-        """Area of each face."""
-        a, b, c = (self.vertices[self.triangles[:, k]] for k in range(3))
-        return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
-
-    @property
     def observed_share(self) -> float:
         """Share of the faces that the video saw."""
         return float(self.observed.mean())

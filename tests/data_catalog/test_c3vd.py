@@ -349,4 +349,3 @@ class TestMesh:
         mesh = read_coverage_mesh(pristine.folder / "coverage_mesh.obj")
         np.testing.assert_array_equal(mesh.observed, pristine.observed)
         assert 0 < mesh.observed_share < 1
-        assert mesh.areas_mm2.min() >= 0
