@@ -91,6 +91,30 @@ class _Images:
         filled = native.compiled_kernels().Images(**outputs, means2d=means2d, radius=radius_px)
         return cls(tensors, arrays, filled)
 
+    def compared(
+        self,
+        target: Target,
+        *,
+        dssim_weight: float,
+        rgb_weight: float,
+        depth_weight: float,
+        depth_scale: float,
+    ) -> tuple[float, Any]:
+        """The loss, and the kernels' struct of its gradients."""
+        kernels, image = native.compiled_kernels(), self.arrays
+        loss: float = kernels.l1_ssim(
+            image["rgb"], target.rgb, target.weight, image["v_rgb"], dssim_weight, rgb_weight
+        )
+        gradients = {"rgb": image["v_rgb"]}
+        if target.depth is not None and depth_weight > 0:
+            depth_loss, compared = kernels.inverse_depth(
+                image["depth"], image["alpha"], target.depth, image["v_depth"], depth_scale, depth_weight
+            )
+            loss += depth_loss
+            if compared:
+                gradients |= {"depth": image["v_depth"], "depth_image": image["depth"]}
+        return loss, kernels.ImageGradients(**gradients)
+
 
 class DirectStep:
     """Renders, compares and carries back one view after the other, into the same arrays.
@@ -191,26 +215,16 @@ class DirectStep:
             light=light,
         )
         frame = kernels.render(self._gaussians, camera, images.filled, degree=sh_degree)
-        image = images.arrays
-        loss: float = kernels.l1_ssim(
-            image["rgb"], target.rgb, target.weight, image["v_rgb"], dssim_weight, loss_weight * target.scale
+        loss, image_gradients = images.compared(
+            target,
+            dssim_weight=dssim_weight,
+            rgb_weight=loss_weight * target.scale,
+            depth_weight=loss_weight * depth_weight,
+            depth_scale=depth_scale,
         )
-        cotangents = {"rgb": image["v_rgb"]}
-        if target.depth is not None and depth_weight > 0:
-            depth_loss, compared = kernels.inverse_depth(
-                image["depth"],
-                image["alpha"],
-                target.depth,
-                image["v_depth"],
-                depth_scale,
-                loss_weight * depth_weight,
-            )
-            loss += depth_loss
-            if compared:
-                cotangents |= {"depth": image["v_depth"], "depth_image": image["depth"]}
         frame.backward(
             self._gaussians,
-            kernels.ImageGradients(**cotangents),
+            image_gradients,
             self._gaussian_gradients,
             kernels.CameraGradients(
                 viewmat=self.viewmat_gradient if pose else None,
