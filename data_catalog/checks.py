@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-from extrags.cameras import as_rotation, invert_poses
+from extrags.cameras import as_rotation, invert_poses, project_points, transform_points, unproject_pixels
 from extrags.errors import PoseError, SourceError
 from extrags.sequence import EndoscopicSequence
 
@@ -283,20 +283,15 @@ def _reprojection_error(
     stride = max(1, int(np.sqrt(height * width / _CHECKED_POINTS)))
     v, u = (part.ravel() for part in np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride])
     for first, second in pairs:
-        K = sequence.K[first]
         z = sequence.depth_mm[first][v, u].astype(np.float64)
         known = (z > 0) & sequence.mask[first][v, u]
-        x = (u[known] + 0.5 - K[0, 2]) / K[0, 0]
-        y = (v[known] + 0.5 - K[1, 2]) / K[1, 1]
-        local = np.stack([x, y, np.ones_like(x)], axis=1) * z[known, None]
+        rays = unproject_pixels(np.stack([u[known], v[known]], axis=1) + 0.5, sequence.K[first])
         relative = invert_poses(poses[second][None])[0] @ poses[first]
-        carried = local @ relative[:3, :3].T + relative[:3, 3]
-        K = sequence.K[second]
-        depth = np.maximum(carried[:, 2], 1e-9)
-        column = np.floor(K[0, 0] * carried[:, 0] / depth + K[0, 2])
-        row = np.floor(K[1, 1] * carried[:, 1] / depth + K[1, 2])
-        inside = (carried[:, 2] > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        found = sequence.depth_mm[second][row[inside].astype(int), column[inside].astype(int)]
+        carried = transform_points(relative, rays * z[known, None])
+        pixels = project_points(carried, sequence.K[second])
+        inside = sequence.cameras.contains(pixels)
+        column, row = pixels[inside].astype(np.int64).T
+        found = sequence.depth_mm[second][row, column]
         comparable = found > 0
         if comparable.sum() < _MIN_INSIDE_SHARE * max(1, known.sum()):
             errors.append(1.0)

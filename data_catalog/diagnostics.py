@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict
 from data_catalog.checks import axis_readings, reading_name
 from data_catalog.images import natural_key
 from data_catalog.matches import match_neighbours, pose_support
-from extrags.cameras import invert_poses, rotation_angle_deg
+from extrags.cameras import Cameras, invert_poses, rotation_angle_deg
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "diagnose"]
@@ -353,12 +353,10 @@ def _seen_share(sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"])
     if sequence.points is None:
         return 0.0
     shares = []
-    for K, viewmat in zip(sequence.K, invert_poses(poses), strict=True):
-        local = sequence.points @ viewmat[:3, :3].T + viewmat[:3, 3]
-        z = np.maximum(local[:, 2], 1e-12)
-        u, v = K[0, 0] * local[:, 0] / z + K[0, 2], K[1, 1] * local[:, 1] / z + K[1, 2]
-        inside = (local[:, 2] > 0) & (u >= 0) & (u < sequence.width) & (v >= 0) & (v < sequence.height)
-        shares.append(float(inside.mean()))
+    cameras = Cameras(sequence.K, poses, sequence.width, sequence.height)
+    for index in range(len(cameras)):
+        pixels, _ = cameras[index].project(sequence.points)
+        shares.append(float(cameras.contains(pixels).mean()))
     return float(np.mean(shares))
 
 
@@ -469,10 +467,5 @@ def _scene_distance(sequence: EndoscopicSequence) -> float | None:
         return float(np.median(sequence.depth_mm[known])) if known.any() else None
     if sequence.points is None or not len(sequence.points):
         return None
-    z = np.concatenate(
-        [
-            (sequence.points @ viewmat[:3, :3].T + viewmat[:3, 3])[:, 2]
-            for viewmat in sequence.cameras.viewmats
-        ]
-    )
+    _, z = sequence.cameras.project(sequence.points)
     return float(np.median(z[z > 0])) if (z > 0).any() else None

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from data_catalog.checks import axis_readings, neighbouring_frames, reading_name
-from extrags.cameras import invert_poses
+from extrags.cameras import invert_poses, unproject_pixels
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["FrameMatches", "PoseSupport", "match_neighbours", "pose_support"]
@@ -136,8 +136,8 @@ def _supporting(
         relative = invert_poses(poses[match.second][None])[0] @ poses[match.first]
         rotation, shift = relative[:3, :3], relative[:3, 3]
         K_first, K_second = sequence.K[match.first], sequence.K[match.second]
-        here = _rays(match.first_px, K_first)
-        there = _rays(match.second_px, K_second)
+        here = unproject_pixels(match.first_px, K_first)
+        there = unproject_pixels(match.second_px, K_second)
         length = float(np.linalg.norm(shift))
         if length < 1e-12:
             continue
@@ -161,9 +161,3 @@ def _supporting(
         count += int(supports.sum())
         depths.append(first_depth[supports])
     return count, np.concatenate(depths) if depths else np.zeros(0)
-
-
-def _rays(pixels: Float[np.ndarray, "m 2"], K: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "m 3"]:
-    return np.column_stack(
-        [(pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(pixels))]
-    )

@@ -93,20 +93,16 @@ class RayCaster:
         distance = np.linalg.norm(cameras.centers - np.median(points, axis=0), axis=1)
         for index in np.argsort(distance, kind="stable"):
             left = np.flatnonzero(~seen)
-            pose, K = cameras.world_from_camera[index], cameras.K[index]
-            local = (points[left] - pose[:3, 3]) @ pose[:3, :3]
-            z = np.maximum(local[:, 2], 1e-9)
-            column = np.floor(K[0, 0] * local[:, 0] / z + K[0, 2])
-            row = np.floor(K[1, 1] * local[:, 1] / z + K[1, 2])
-            inside = (local[:, 2] > 0) & (column >= 0) & (column < cameras.width)
-            inside &= (row >= 0) & (row < cameras.height)
+            (pixels,), _ = cameras[int(index)].project(points[left])
+            inside = cameras.contains(pixels)
             if mask is not None:
-                inside[inside] = mask[index][row[inside].astype(int), column[inside].astype(int)]
+                column, row = pixels[inside].astype(np.int64).T
+                inside[inside] = mask[index][row, column]
             candidates = left[inside]
             if candidates.size:
-                toward = points[candidates] - pose[:3, 3]
+                toward = points[candidates] - cameras.centers[index]
                 length = np.linalg.norm(toward, axis=1)
-                hits = self.cast(pose[:3, 3], toward / length[:, None])
+                hits = self.cast(cameras.centers[index], toward / length[:, None])
                 seen[candidates[hits.distance >= length - _SEEN_TOLERANCE_MM]] = True
         return seen
 

@@ -70,18 +70,14 @@ def _in_front(
     tolerance_share: float,
     tolerance_mm: float,
 ) -> Bool[np.ndarray, "p"]:
-    pose, K = camera.world_from_camera[0], camera.K[0]
-    local = (points - pose[:3, 3]) @ pose[:3, :3]
-    z = local[:, 2]
-    safe = np.maximum(z, 1e-9)
-    u = K[0, 0] * local[:, 0] / safe + K[0, 2]
-    v = K[1, 1] * local[:, 1] / safe + K[1, 2]
-    inside = (z > 0) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    farthest = np.zeros(int(inside.sum()))
+    (pixels,), (z,) = camera.project(points)
+    inside = camera.contains(pixels)
+    u, v = pixels[inside].T
+    farthest = np.zeros(len(u))
     for dy in (-0.5, 0.5):
         for dx in (-0.5, 0.5):
-            row = np.clip(np.floor(v[inside] + dy).astype(int), 0, camera.height - 1)
-            column = np.clip(np.floor(u[inside] + dx).astype(int), 0, camera.width - 1)
+            row = np.clip(np.floor(v + dy).astype(int), 0, camera.height - 1)
+            column = np.clip(np.floor(u + dx).astype(int), 0, camera.width - 1)
             farthest = np.maximum(farthest, depth_mm[row, column])
     result = np.zeros(len(points), dtype=bool)
     result[inside] = z[inside] <= farthest * (1 + tolerance_share) + tolerance_mm * (farthest > 0)

@@ -18,7 +18,6 @@ from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, emit
 from extrags.exploration.coverage import direction_counts, training_coverage
 from extrags.exploration.waves import start_views
-from extrags.raster import rasterize
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
@@ -128,7 +127,7 @@ def measure(
             f"{sequence.name}: nothing to assess with {len(scene.gaussians)} Gaussians "
             f"and {len(cameras)} training views"
         )
-    small = _small(cameras, coverage.render_width)
+    small = cameras.at_most_width(coverage.render_width)
     depth_unit_mm, training_holes = _training_view_measurements(scene, small, settings)
     covered = training_coverage(
         scene,
@@ -233,27 +232,14 @@ def _lacking_pixels(
     scene: Scene, probes: Cameras, poorly_seen: np.ndarray, config: AssessConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Which pixels of the probes are holes, and which others show mostly poorly seen Gaussians."""
-    gaussians = scene.gaussians
-    flag = torch.from_numpy(poorly_seen.astype(np.float32))[:, None].expand(-1, 3).contiguous()
+    flag = torch.from_numpy(poorly_seen.astype(np.float32))[:, None]
     holes, poor = [], []
     with torch.no_grad():
         for start in range(0, len(probes), PROBES_PER_BATCH):
-            batch = probes[start : start + PROBES_PER_BATCH]
-            rendering = rasterize(
-                gaussians.means,
-                gaussians.quats,
-                gaussians.scales.exp(),
-                gaussians.opacities.sigmoid(),
-                None,
-                torch.from_numpy(batch.viewmats.astype(np.float32)),
-                torch.from_numpy(batch.K.astype(np.float32)),
-                batch.width,
-                batch.height,
-                colors=flag,
-            )
-            hole = rendering.alpha < config.hole_alpha
+            shares, alpha = scene.render_attributes(probes[start : start + PROBES_PER_BATCH], flag)
+            hole = alpha < config.hole_alpha
             holes.append(hole.numpy())
-            poor.append(((rendering.rgb[..., 0] > 0.5 * rendering.alpha) & ~hole).numpy())
+            poor.append(((shares[..., 0] > 0.5 * alpha) & ~hole).numpy())
     return np.concatenate(holes), np.concatenate(poor)
 
 
@@ -322,8 +308,3 @@ def _decisions(lacking: float, config: PipelineConfig) -> tuple[Decision, ...]:
         ),
         line("finetune", f"on at most {views} virtual views", iterations=config.finetune.iterations),
     )
-
-
-def _small(cameras: Cameras, width: int) -> Cameras:
-    width = min(width, cameras.width)
-    return cameras.resized(width, max(1, round(cameras.height * width / cameras.width)))

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from extrags.errors import PoseError, ShapeError
 
@@ -18,12 +18,14 @@ __all__ = [
     "Cameras",
     "as_rotation",
     "compose",
-    "interpolate_poses",
     "invert_poses",
     "look_at",
     "pixel_rays",
+    "project_points",
     "rotation_about",
     "rotation_angle_deg",
+    "transform_points",
+    "unproject_pixels",
 ]
 
 # Quaternions printed with six digits give rotations that are off by about 1e-6; a frame that is
@@ -88,6 +90,32 @@ class Cameras:
         K[:, 0] *= width / self.width
         K[:, 1] *= height / self.height
         return Cameras(K, self.world_from_camera, width, height)
+
+    def at_most_width(self, width: int) -> Cameras:
+        """The same views no wider than so many pixels, the height in proportion."""
+        if self.width <= width:
+            return self
+        return self.resized(width, max(1, round(self.height * width / self.width)))
+
+    def project(
+        self, points: Float[np.ndarray, "*p 3"]
+    ) -> tuple[Float[np.ndarray, "c *p 2"], Float[np.ndarray, "c *p"]]:
+        """Where every camera sees world points, whatever stands in between.
+
+        Args:
+            points: in world coordinates.
+
+        Returns:
+            Pixels (u, v), NaN for points that are not in front of the camera, and z-depths. Both float64.
+        """
+        local = np.stack([transform_points(viewmat, points) for viewmat in self.viewmats])
+        pixels = np.stack([project_points(part, K) for part, K in zip(local, self.K, strict=True)])
+        return pixels, local[..., 2]
+
+    def contains(self, pixels: Float[np.ndarray, "*p 2"]) -> Bool[np.ndarray, "*p"]:
+        """Which positions lie in the image; NaN lies nowhere."""
+        u, v = pixels[..., 0], pixels[..., 1]
+        return np.asarray((u >= 0) & (u < self.width) & (v >= 0) & (v < self.height))
 
     @staticmethod
     def concatenated(parts: Sequence[Cameras]) -> Cameras:
@@ -197,15 +225,34 @@ def look_at(
     return compose(np.stack([right, down, forward], axis=1), np.asarray(center, dtype=np.float64))
 
 
-def interpolate_poses(
-    first: Float[np.ndarray, "4 4"], second: Float[np.ndarray, "4 4"], t: float
-) -> Float[np.ndarray, "4 4"]:
-    """Straight line between centres, shortest rotation between orientations."""
-    from scipy.spatial.transform import Rotation
+def transform_points(
+    motion: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*p 3"]
+) -> Float[np.ndarray, "*p 3"]:
+    """Points after a rigid motion.
 
-    between = Rotation.from_matrix(first[:3, :3].T @ second[:3, :3]).as_rotvec() * t
-    rotation = first[:3, :3] @ Rotation.from_rotvec(between).as_matrix()
-    return compose(rotation, (1 - t) * first[:3, 3] + t * second[:3, 3])
+    Without BLAS, whose last bits depend on the number of threads and of points.
+    """
+    x, y, z = np.moveaxis(points, -1, 0)
+    return np.stack([a * x + b * y + c * z + shift for a, b, c, shift in motion[:3]], axis=-1)
+
+
+def project_points(
+    points: Float[np.ndarray, "*p 3"], K: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "*p 2"]:
+    """Pixels (u, v) of points in a camera's own frame; NaN where z is not positive."""
+    z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+    u = K[0, 0] * points[..., 0] / z + K[0, 2]
+    v = K[1, 1] * points[..., 1] / z + K[1, 2]
+    return np.stack([u, v], axis=-1)
+
+
+def unproject_pixels(
+    pixels: Float[np.ndarray, "*p 2"], K: Float[np.ndarray, "3 3"]
+) -> Float[np.ndarray, "*p 3"]:
+    """Rays through pixels (u, v) in a camera's own frame, with unit z: the inverse of `project_points`."""
+    x = (pixels[..., 0] - K[0, 2]) / K[0, 0]
+    y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
 def pixel_rays(cameras: Cameras) -> Float[np.ndarray, "c h w 3"]:

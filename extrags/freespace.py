@@ -255,15 +255,15 @@ def voxel_visibility(
         A value in [0, 1]; NaN where no view can tell. Fewer views than `top_views` are averaged over
         as many as there are, so that a single recording's ends do not count as occupied.
     """
-    if cameras.width > config.render_width:
-        height = max(1, round(cameras.height * config.render_width / cameras.width))
-        cameras = cameras.resized(config.render_width, height)
+    cameras = cameras.at_most_width(config.render_width)
     # Running top-k: -1 marks "not seen by so many views".
     best = np.full((config.top_views, len(points)), -1.0, dtype=np.float32)
     with torch.no_grad():
         for index in range(len(cameras)):
             view = cameras[index]
-            inside, row, column = _pixels_of(view, points)
+            (pixels,), _ = view.project(points)
+            inside = view.contains(pixels)
+            column, row = pixels[inside].astype(np.int64).T
             queries = torch.from_numpy(points[inside].astype(np.float32))
             rendering = scene.render(view, query_points=queries)
             transmittance = cast("torch.Tensor", rendering.transmittance)[0].numpy()
@@ -278,19 +278,6 @@ def voxel_visibility(
     count = (best >= 0).sum(axis=0)
     total = np.where(best >= 0, best, 0).sum(axis=0)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
-
-
-def _pixels_of(
-    view: Cameras, points: Float[np.ndarray, "q 3"]
-) -> tuple[Bool[np.ndarray, "q"], Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
-    """Which points project into the image, and the row and column of those."""
-    viewmat, K = view.viewmats[0], view.K[0]
-    local = _rotated(points, viewmat[:3, :3]) + viewmat[:3, 3]
-    z = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-    u = np.floor(K[0, 0] * local[:, 0] / z + K[0, 2])
-    v = np.floor(K[1, 1] * local[:, 1] / z + K[1, 2])
-    inside = (local[:, 2] > 0) & (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
-    return inside, v[inside].astype(np.int64), u[inside].astype(np.int64)
 
 
 def _bounding_volume(

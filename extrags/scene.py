@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from extrags.cameras import Cameras
 from extrags.gaussians import Gaussians
@@ -50,20 +51,56 @@ class Scene(Storable):
         Returns:
             Renderings of all cameras in one batch.
         """
+        degree = self.gaussians.sh_degree
+        return self._rasterized(
+            cameras,
+            self.gaussians.sh,
+            viewmats=viewmats,
+            sh_degree=degree if sh_degree is None else min(sh_degree, degree),
+            light=self._carried_light(len(cameras), exposure),
+            **options,
+        )
+
+    def render_attributes(
+        self, cameras: Cameras, attributes: Float[Tensor, "n k"]
+    ) -> tuple[Float[Tensor, "c h w k"], Float[Tensor, "c h w"]]:
+        """Blend one value or more of each Gaussian as colours are blended, without light.
+
+        Args:
+            cameras: the views.
+            attributes: of each Gaussian.
+
+        Returns:
+            The sum of the attributes with the blending weights, and the sum of the weights, the opacity.
+        """
+        parts = []
+        alpha = torch.zeros(len(cameras), cameras.height, cameras.width)
+        for part in attributes.split(3, dim=1):
+            colors = functional.pad(part, (0, 3 - part.shape[1]))
+            rendering = self._rasterized(cameras, None, colors=colors)
+            parts.append(rendering.rgb[..., : part.shape[1]])
+            alpha = rendering.alpha
+        return torch.cat(parts, dim=-1), alpha
+
+    def _rasterized(
+        self,
+        cameras: Cameras,
+        sh: Float[Tensor, "n k 3"] | None,
+        *,
+        viewmats: Float[Tensor, "c 4 4"] | None = None,
+        **options: Any,
+    ) -> Rendering:
         gaussians = self.gaussians
-        degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
         return rasterize(
             gaussians.means,
             gaussians.quats,
             gaussians.scales.exp(),
             gaussians.opacities.sigmoid(),
-            gaussians.sh,
+            sh,
             torch.from_numpy(cameras.viewmats.astype(np.float32)) if viewmats is None else viewmats,
             torch.from_numpy(cameras.K.astype(np.float32)),
             cameras.width,
             cameras.height,
-            sh_degree=degree,
-            light=self._carried_light(len(cameras), exposure),
             **options,
         )
 

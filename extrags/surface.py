@@ -115,10 +115,7 @@ def rendered_depth(
     Returns:
         The cameras at the size rendered, and their depth.
     """
-    if cameras.width > config.max_width:
-        cameras = cameras.resized(
-            config.max_width, max(1, round(cameras.height * config.max_width / cameras.width))
-        )
+    cameras = cameras.at_most_width(config.max_width)
     batches = []
     with torch.no_grad():
         for start in range(0, len(cameras), VIEWS_PER_BATCH):

@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
 from data_catalog.images import Resampling
 from data_catalog.lens import sample_depth
+from extrags.cameras import unproject_pixels
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 
@@ -172,8 +173,7 @@ def _source_pixels(
     """Fisheye pixels of a regular grid of points in the pinhole's image."""
     u = (np.arange(width * supersample) + 0.5) / supersample
     v = (np.arange(height * supersample) + 0.5) / supersample
-    x, y = np.meshgrid((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1])
-    return camera.project(np.stack([x, y, np.ones_like(x)], axis=-1))
+    return camera.project(unproject_pixels(np.stack(np.meshgrid(u, v), axis=-1), K))
 
 
 def _all_of_block(fine: Bool[np.ndarray, "hs ws"], block: int) -> Bool[np.ndarray, "h w"]:

@@ -15,7 +15,6 @@ from extrags.raster import Rendering
 from extrags.scene import Scene
 
 __all__ = [
-    "bin_centers",
     "count_pairs",
     "coverage_gain",
     "direction_bin",
@@ -54,22 +53,6 @@ def direction_bin(unit: Float[np.ndarray, "*b 3"], n_directions: int) -> Int[np.
     turn = np.arctan2(unit[..., 1], unit[..., 0]) / (2 * np.pi) % 1.0
     within = np.minimum((turn * cells[collar]).astype(np.int64), cells[collar] - 1)
     return np.asarray(first[collar] + within)
-
-
-def bin_centers(n_directions: int) -> Float[np.ndarray, "d 3"]:
-    """A unit vector in the middle of every cell of `direction_bin`."""
-    z_edges, cells, _ = _collars(n_directions)
-    z = np.concatenate([[1.0], z_edges, [-1.0]])
-    centers: list[np.ndarray] = []
-    for collar, n in enumerate(cells):
-        if n == 1:
-            centers.append(np.array([[0.0, 0.0, 1.0 if collar == 0 else -1.0]]))
-            continue
-        height = (z[collar] + z[collar + 1]) / 2
-        turn = 2 * np.pi * (np.arange(n) + 0.5) / n
-        ring = np.sqrt(1 - height**2)
-        centers.append(np.stack([ring * np.cos(turn), ring * np.sin(turn), np.full(n, height)], axis=1))
-    return np.concatenate(centers)
 
 
 @lru_cache(maxsize=MAX_DIRECTIONS)

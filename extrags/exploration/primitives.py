@@ -8,7 +8,7 @@ from jaxtyping import Float
 from extrags.cameras import compose, rotation_about
 from extrags.errors import ConfigError
 
-__all__ = ["PRIMITIVES", "apply_primitives", "inverse_of", "orthonormalised", "primitive_motions"]
+__all__ = ["PRIMITIVES", "apply_primitives", "orthonormalised", "primitive_motions"]
 
 PRIMITIVES: tuple[str, ...] = (
     "move_right",
@@ -27,11 +27,6 @@ PRIMITIVES: tuple[str, ...] = (
     "orbit_down",
 )
 """Six translations, four rotations about the camera's centre, four about the look-at point."""
-
-
-def inverse_of(primitive: int) -> int:
-    """Index of the move that undoes a move."""
-    return primitive ^ 1
 
 
 def primitive_motions(

@@ -71,7 +71,7 @@ class SearchContext:
 
     def scoring_cameras(self, poses: Float[np.ndarray, "c 4 4"]) -> Cameras:
         """Cameras at the small size candidates are scored at."""
-        return _scoring_size(self.full_cameras(poses), self.config)
+        return self.full_cameras(poses).at_most_width(self.config.render_width)
 
     def full_cameras(self, poses: Float[np.ndarray, "c 4 4"]) -> Cameras:
         """Cameras at the size the sequence has."""
@@ -207,7 +207,7 @@ def prepare_search(
     """
     if len(cameras) == 0:
         raise CaptureError("there is no training view to explore from")
-    small = _scoring_size(cameras, config)
+    small = cameras.at_most_width(config.render_width)
     depths = []
     with torch.no_grad():
         for start in range(0, len(small), VIEWS_PER_BATCH):
@@ -424,8 +424,3 @@ def _look_at_distance(
     seen = depth_mm[centre][surface[centre]]
     unit = context.depth_unit_mm
     return float(np.clip(np.median(seen), 0.25 * unit, 2.0 * unit)) if seen.size else unit
-
-
-def _scoring_size(cameras: Cameras, config: ExploreConfig) -> Cameras:
-    width = min(config.render_width, cameras.width)
-    return cameras.resized(width, max(1, round(cameras.height * width / cameras.width)))

@@ -192,10 +192,11 @@ def start_exploration(context: SearchContext, cameras: Cameras) -> WaveState:
     """
     config = context.config
     anchors = start_views(cameras, config.trajectories, context.depth_unit_mm)
-    width = min(config.render_width, cameras.width)
-    small = cameras.resized(width, max(1, round(cameras.height * width / cameras.width)))
     covered = training_coverage(
-        context.scene, small, visible_weight=config.visible_weight, n_directions=config.directions
+        context.scene,
+        cameras.at_most_width(config.render_width),
+        visible_weight=config.visible_weight,
+        n_directions=config.directions,
     )
     pairs = len(covered) * config.directions
     return WaveState(

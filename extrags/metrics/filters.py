@@ -42,11 +42,12 @@ def filter_separable(
     return down @ (maps @ across.T)
 
 
+@lru_cache(maxsize=128)
 def gaussian_weights(sigma_px: float, radius_px: int) -> tuple[float, ...]:
     """Gaussian of `2 * radius_px + 1` weights that sum to one."""
-    offsets = torch.arange(-radius_px, radius_px + 1, dtype=torch.float64)
-    weights = torch.exp(-0.5 * (offsets / sigma_px).square())
-    return tuple((weights / weights.sum()).tolist())
+    from kornia.filters import get_gaussian_kernel1d
+
+    return tuple(get_gaussian_kernel1d(2 * radius_px + 1, sigma_px, dtype=torch.float64)[0].tolist())
 
 
 # A cached tensor outlives an inference-mode block it was made in, and must serve autograd afterwards.

@@ -75,6 +75,8 @@ def flip_map(
         ShapeError: when the images differ in shape.
         ConfigError: for a resolution that is not positive.
     """
+    from kornia.color import rgb_to_linear_rgb
+
     if render.shape != target.shape or render.shape[-1:] != (3,):
         raise ShapeError(
             f"FLIP compares images [..., H, W, 3]; found {tuple(render.shape)} and {tuple(target.shape)}"
@@ -82,8 +84,10 @@ def flip_map(
     if not pixels_per_degree > 0:
         raise ConfigError(f"pixels_per_degree must be positive, found {pixels_per_degree}")
     batch = render.shape[:-1]
-    first = _opponent_from_linear(_linear_from_srgb(_channels_first(render)))
-    second = _opponent_from_linear(_linear_from_srgb(_channels_first(target)))
+    first, second = (
+        _opponent_from_linear(rgb_to_linear_rgb(_channels_first(image).clamp(0, 1)))
+        for image in (render, target)
+    )
     color = _color_difference(first, second, pixels_per_degree)
     feature = _feature_difference(first[:, 0], second[:, 0], pixels_per_degree)
     # Section 4.3; 0 ** 0 is 1 in torch, but equal colours are no error whatever the features say.
@@ -238,11 +242,6 @@ def _xyz_from_linear() -> Float[Tensor, "3 3"]:
 def _white_xyz() -> Float[Tensor, "3"]:
     x, y = _WHITE_XY
     return torch.tensor([x / y, 1.0, (1 - x - y) / y], dtype=torch.float64)
-
-
-def _linear_from_srgb(encoded: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
-    encoded = encoded.clamp(0, 1)
-    return torch.where(encoded > 0.04045, ((encoded + 0.055) / 1.055) ** 2.4, encoded / 12.92)
 
 
 def _mixed(channels: Float[Tensor, "n 3 h w"], matrix: Float[Tensor, "3 3"]) -> Float[Tensor, "n 3 h w"]:

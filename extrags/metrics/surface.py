@@ -276,19 +276,16 @@ def seen_by(
     seen = np.zeros(len(points), dtype=bool)
     for index in range(len(cameras)):
         left = np.flatnonzero(~seen)
-        pose, K = cameras.world_from_camera[index], cameras.K[index]
-        local = (points[left] - pose[:3, 3]) @ pose[:3, :3]
-        z = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-        u = K[0, 0] * local[:, 0] / z + K[0, 2]
-        v = K[1, 1] * local[:, 1] / z + K[1, 2]
-        inside = (z <= far_mm) & (u >= 0) & (u < cameras.width) & (v >= 0) & (v < cameras.height)
-        inside[inside] = mask[index][np.floor(v[inside]).astype(int), np.floor(u[inside]).astype(int)]
+        (pixels,), (z,) = cameras[index].project(points[left])
+        inside = cameras.contains(pixels) & (z <= far_mm)
+        column, row = pixels[inside].astype(np.int64).T
+        inside[inside] = mask[index][row, column]
         candidates = left[inside]
         if not candidates.size:
             continue
         rays = np.empty((len(candidates), 6), dtype=np.float32)
-        rays[:, :3] = pose[:3, 3]
-        rays[:, 3:] = points[candidates] - pose[:3, 3]
+        rays[:, :3] = cameras.centers[index]
+        rays[:, 3:] = points[candidates] - cameras.centers[index]
         hit = scene.cast_rays(_tensor(rays))["t_hit"].numpy()
         seen[candidates[hit >= 1 - _HIDDEN_SHARE]] = True
     return seen

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from extrags.cameras import invert_poses
+from extrags.cameras import invert_poses, project_points
 from extrags.poses.depth_views import LEVELS, DepthView
 
 __all__ = ["Agreement", "Posed", "agreement", "align", "moved", "pair_equations", "solve_twists"]
@@ -243,11 +243,9 @@ def _met(moving: Posed, reference: Posed, reach: float, level: int) -> _Met | No
     samples = view.samples[:: STRIDES[level]]
     points = view.points.reshape(-1, 3)[samples] @ between[:3, :3].T + between[:3, 3]
     z = points[:, 2]
-    ahead = z > NEAR_SHARE * other.median_depth
-    depth = np.where(ahead, z, 1)
-    u = other.K[0, 0] * points[:, 0] / depth + other.K[0, 2]
-    v = other.K[1, 1] * points[:, 1] / depth + other.K[1, 2]
-    inside = ahead & (u >= 1) & (u < width - 1) & (v >= 1) & (v < height - 1)
+    u, v = project_points(points, other.K).T
+    inside = z > NEAR_SHARE * other.median_depth
+    inside &= (u >= 1) & (u < width - 1) & (v >= 1) & (v < height - 1)
     rows = np.flatnonzero(inside)
     pixel = np.floor(v[rows]).astype(np.int64) * width + np.floor(u[rows]).astype(np.int64)
     surface = other.points.reshape(-1, 3)[pixel]

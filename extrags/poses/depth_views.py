@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.ndimage import binary_erosion, gaussian_filter
 
+from extrags.cameras import unproject_pixels
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["LEVELS", "DepthView", "depth_view"]
@@ -73,9 +74,8 @@ def depth_view(sequence: EndoscopicSequence, frame: int, max_width: int) -> Dept
     depth = sequence.depth_mm[frame][picked].astype(np.float64)
     valid = sequence.mask[frame][picked] & np.isfinite(depth) & (depth > 0)
     depth = np.where(valid, depth, 0)
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
-    points = depth[..., None] * rays
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)
+    points = depth[..., None] * unproject_pixels(pixels, K)
     normals = _normals(points, depth, valid)
     usable = np.flatnonzero(valid & (np.abs(normals).sum(-1) > 0))
     if len(usable) < SAMPLES // 20:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from extrags.cameras import invert_poses
+from extrags.cameras import invert_poses, unproject_pixels
 from extrags.metrics.pose import umeyama
 from extrags.sequence import EndoscopicSequence
 
@@ -65,11 +65,8 @@ def landmarks(sequence: EndoscopicSequence, frame: int) -> Landmarks:
     # Threads find features in any order.
     order = np.lexsort((descriptors[:, 0], descriptors[:, 1], pixels[:, 0], pixels[:, 1]))
     order = order[kept[order]]
-    K = sequence.K[frame]
     z = depth[row, column].astype(np.float64)
-    points = np.stack(
-        [(pixels[:, 0] - K[0, 2]) / K[0, 0] * z, (pixels[:, 1] - K[1, 2]) / K[1, 1] * z, z], axis=1
-    )
+    points = unproject_pixels(pixels, sequence.K[frame]) * z[:, None]
     roots = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
     return Landmarks(points[order], roots[order].astype(np.float32))
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from extrags.cameras import project_points
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
@@ -262,9 +263,7 @@ class _Alignment:
             chosen = spread_evenly(view.samples, each)
             local = view.points.reshape(-1, 3)[chosen]
             points.append(local @ pose[:3, :3].T + pose[:3, 3])
-            K = self.sequence.K[frame]
-            column = np.floor(local[:, 0] / local[:, 2] * K[0, 0] + K[0, 2]).astype(np.int64)
-            row = np.floor(local[:, 1] / local[:, 2] * K[1, 1] + K[1, 2]).astype(np.int64)
+            column, row = np.floor(project_points(local, self.sequence.K[frame])).astype(np.int64).T
             colours.append(
                 self.sequence.rgb[frame][
                     np.clip(row, 0, self.sequence.height - 1), np.clip(column, 0, self.sequence.width - 1)
@@ -311,12 +310,10 @@ def _overlap(moving: Posed, reference: Posed, stride: int = 8) -> float:
     world = view.points.reshape(-1, 3)[samples] @ moving.world_from_camera[:3, :3].T
     world += moving.world_from_camera[:3, 3]
     local = (world - reference.world_from_camera[:3, 3]) @ reference.world_from_camera[:3, :3]
-    z = np.where(local[:, 2] > 0, local[:, 2], np.inf)
-    u = other.K[0, 0] * local[:, 0] / z + other.K[0, 2]
-    v = other.K[1, 1] * local[:, 1] / z + other.K[1, 2]
-    rows = np.flatnonzero(np.isfinite(z) & (u >= 0) & (u < width) & (v >= 0) & (v < height))
+    u, v = project_points(local, other.K).T
+    rows = np.flatnonzero((u >= 0) & (u < width) & (v >= 0) & (v < height))
     pixel = v[rows].astype(np.int64) * width + u[rows].astype(np.int64)
-    there = other.points.reshape(-1, 3)[pixel, 2]
+    there, z = other.points.reshape(-1, 3)[pixel, 2], local[rows, 2]
     # A guess may be off by a good deal: only what is clearly hidden is left out.
-    seen = other.valid.reshape(-1)[pixel] & (np.abs(there - z[rows]) < 0.25 * z[rows])
+    seen = other.valid.reshape(-1)[pixel] & (np.abs(there - z) < 0.25 * z)
     return float(seen.sum() / len(samples))

@@ -76,15 +76,44 @@ class _Images:
 
     tensors: dict[str, Tensor]
     arrays: dict[str, np.ndarray]
+    filled: Any
+    """The kernels' struct of the images and of the projected centres."""
 
     @classmethod
-    def empty(cls, width: int, height: int) -> _Images:
+    def empty(cls, width: int, height: int, means2d: np.ndarray, radius_px: np.ndarray) -> _Images:
         shapes = {"rgb": 3, "v_rgb": 3, "alpha": 0, "depth": 0, "v_depth": 0}
         tensors = {
             name: torch.empty(1, height, width, *([channels] if channels else []))
             for name, channels in shapes.items()
         }
-        return cls(tensors, {name: value.numpy() for name, value in tensors.items()})
+        arrays = {name: value[0].numpy() for name, value in tensors.items()}
+        outputs = {name: arrays[name] for name in ("rgb", "alpha", "depth")}
+        filled = native.compiled_kernels().Images(**outputs, means2d=means2d, radius=radius_px)
+        return cls(tensors, arrays, filled)
+
+    def compared(
+        self,
+        target: Target,
+        *,
+        dssim_weight: float,
+        rgb_weight: float,
+        depth_weight: float,
+        depth_scale: float,
+    ) -> tuple[float, Any]:
+        """The loss, and the kernels' struct of its gradients."""
+        kernels, image = native.compiled_kernels(), self.arrays
+        loss: float = kernels.l1_ssim(
+            image["rgb"], target.rgb, target.weight, image["v_rgb"], dssim_weight, rgb_weight
+        )
+        gradients = {"rgb": image["v_rgb"]}
+        if target.depth is not None and depth_weight > 0:
+            depth_loss, compared = kernels.inverse_depth(
+                image["depth"], image["alpha"], target.depth, image["v_depth"], depth_scale, depth_weight
+            )
+            loss += depth_loss
+            if compared:
+                gradients |= {"depth": image["v_depth"], "depth_image": image["depth"]}
+        return loss, kernels.ImageGradients(**gradients)
 
 
 class DirectStep:
@@ -108,9 +137,9 @@ class DirectStep:
         self._renderings: dict[tuple[int, int], Rendering] = {}
         self._values: dict[str, Tensor] = {}
         self._linear: dict[str, Tensor] = {}
-        self._arguments: tuple[np.ndarray, ...] = ()
         self._checked: tuple[tuple[str, Tensor, np.ndarray], ...] = ()
-        self._arrays: dict[str, np.ndarray | None] = {}
+        self._gaussians: Any = None
+        self._gaussian_gradients: Any = None
         self._means2d = self._radius_px = torch.empty(0)
 
     def bind(self, parameters: Mapping[str, Tensor]) -> None:
@@ -125,21 +154,23 @@ class DirectStep:
         self._linear = {name: torch.empty_like(values[name]) for name in ("scales", "opacities")}
         rendered = {**values, **self._linear}
         names = ("means", "quats", "scales", "opacities", "sh")
-        self._arguments = tuple(rendered[name].numpy() for name in names)
-        self._checked = tuple((name, rendered[name], rendered[name].numpy()) for name in names)
+        arrays = {name: rendered[name].numpy() for name in names}
+        self._checked = tuple((name, rendered[name], arrays[name]) for name in names)
         self.gradients = {name: torch.empty_like(values[name]) for name in names}
         self.visible = torch.empty(n, dtype=torch.bool)
         self._means2d, self._radius_px = torch.empty(1, n, 2), torch.empty(1, n)
         self._means2d.grad = torch.empty(1, n, 2)
-        arrays: dict[str, np.ndarray | None] = {name: g.numpy() for name, g in self.gradients.items()}
-        arrays |= {"means2d": self._means2d[0].numpy(), "radius_px": self._radius_px[0].numpy()}
-        arrays |= {"v_means2d": self._means2d.grad[0].numpy(), "absolute": None}
-        if self._absgrad:
-            absolute = torch.empty(1, n, 2)
+        absolute = torch.empty(1, n, 2) if self._absgrad else None
+        if absolute is not None:
             self._means2d.absgrad = absolute  # type: ignore[attr-defined]
-            arrays["absolute"] = absolute[0].numpy()
-        self._arrays = arrays
-        self._renderings = {}
+        kernels = native.compiled_kernels()
+        self._gaussians = kernels.Gaussians(**arrays)
+        self._gaussian_gradients = kernels.GaussianGradients(
+            **{name: value.numpy() for name, value in self.gradients.items()},
+            means2d=self._means2d.grad[0].numpy(),
+            absolute2d=None if absolute is None else absolute[0].numpy(),
+        )
+        self._images, self._renderings = {}, {}
 
     def run(
         self,
@@ -174,79 +205,31 @@ class DirectStep:
         torch.exp(self._values["scales"], out=self._linear["scales"])
         torch.sigmoid(self._values["opacities"], out=self._linear["opacities"])
         self._refuse_nonfinite(kernels, light)
-        size = target.width, target.height
-        images = self._images.get(size)
-        if images is None:
-            images = self._images[size] = _Images.empty(*size)
-        image, arrays = images.arrays, self._arrays
-        means, quats, scales, opacities, sh = self._arguments
-        frame = kernels.render(
-            means,
-            quats,
-            scales,
-            opacities,
-            sh,
-            sh_degree,
-            None,
-            target.viewmat,
-            target.K,
-            None,
-            *size,
-            near,
-            image["rgb"],
-            image["alpha"],
-            image["depth"],
-            arrays["means2d"],
-            arrays["radius_px"],
-            None,
-            None,
-            None,
-            light,
+        images = self._images_of(target)
+        camera = kernels.Camera(
+            viewmat=target.viewmat,
+            K=target.K,
+            width=target.width,
+            height=target.height,
+            near=near,
+            light=light,
         )
-        loss: float = kernels.l1_ssim(
-            image["rgb"],
-            target.rgb,
-            target.weight,
-            image["v_rgb"],
-            target.height,
-            target.width,
-            dssim_weight,
-            loss_weight * target.scale,
+        frame = kernels.render(self._gaussians, camera, images.filled, degree=sh_degree)
+        loss, image_gradients = images.compared(
+            target,
+            dssim_weight=dssim_weight,
+            rgb_weight=loss_weight * target.scale,
+            depth_weight=loss_weight * depth_weight,
+            depth_scale=depth_scale,
         )
-        compared = 0
-        if target.depth is not None and depth_weight > 0:
-            depth_loss, compared = kernels.inverse_depth(
-                image["depth"],
-                image["alpha"],
-                target.depth,
-                image["v_depth"],
-                depth_scale,
-                loss_weight * depth_weight,
-            )
-            loss += depth_loss
         frame.backward(
-            means,
-            quats,
-            scales,
-            opacities,
-            sh,
-            sh_degree,
-            None,
-            image["v_rgb"],
-            None,
-            image["v_depth"] if compared else None,
-            image["depth"] if compared else None,
-            False,
-            arrays["means"],
-            arrays["quats"],
-            arrays["scales"],
-            arrays["opacities"],
-            arrays["sh"],
-            None,
-            self.viewmat_gradient if pose else None,
-            arrays["v_means2d"],
-            arrays["absolute"],
-            self.light_gradient if self._lit else None,
+            self._gaussians,
+            image_gradients,
+            self._gaussian_gradients,
+            kernels.CameraGradients(
+                viewmat=self.viewmat_gradient if pose else None,
+                light=self.light_gradient if self._lit else None,
+            ),
         )
         self._carry_activations()
         torch.gt(self._radius_px[0], 0, out=self.visible)
@@ -256,7 +239,7 @@ class DirectStep:
         """The images of the last `run`, whose target this must be, in the arrays the next one overwrites."""
         size = target.width, target.height
         if size not in self._renderings:
-            images = self._images[size].tensors
+            images = self._images_of(target).tensors
             self._renderings[size] = Rendering(
                 rgb=images["rgb"],
                 alpha=images["alpha"],
@@ -265,6 +248,13 @@ class DirectStep:
                 radius_px=self._radius_px,
             )
         return self._renderings[size]
+
+    def _images_of(self, target: Target) -> _Images:
+        size = target.width, target.height
+        if size not in self._images:
+            means2d, radius_px = self._means2d[0].numpy(), self._radius_px[0].numpy()
+            self._images[size] = _Images.empty(*size, means2d, radius_px)
+        return self._images[size]
 
     def _carry_activations(self) -> None:
         """From gradients of scales and opacities to those of their logarithms and logits."""

@@ -112,22 +112,23 @@ def inverse_depth_loss(
 
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:
-    offsets = torch.arange(-WINDOW_RADIUS_PX, WINDOW_RADIUS_PX + 1, dtype=torch.float64)
-    taps = torch.exp(-0.5 * (offsets / WINDOW_SIGMA_PX) ** 2)
-    taps = (taps / taps.sum()).to(dtype=x.dtype, device=x.device)
-
-    def blur(image: Tensor) -> Tensor:
-        flat = image.reshape(-1, 1, *image.shape[-2:])
-        flat = torch.nn.functional.conv2d(flat, taps.reshape(1, 1, -1, 1), padding=(WINDOW_RADIUS_PX, 0))
-        flat = torch.nn.functional.conv2d(flat, taps.reshape(1, 1, 1, -1), padding=(0, WINDOW_RADIUS_PX))
-        return flat.reshape(image.shape)
-
-    mean_x, mean_y = blur(x), blur(y)
-    variance_x = blur(x * x) - mean_x * mean_x
-    variance_y = blur(y * y) - mean_y * mean_y
-    covariance = blur(x * y) - mean_x * mean_y
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = window_means(x, y)
+    variance_x = mean_xx - mean_x * mean_x
+    variance_y = mean_yy - mean_y * mean_y
+    covariance = mean_xy - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + SSIM_C1) / (mean_x * mean_x + mean_y * mean_y + SSIM_C1)
     return luminance * (2 * covariance + SSIM_C2) / (variance_x + variance_y + SSIM_C2)
+
+
+def window_means(x: Float[Tensor, "n 3 h w"], y: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
+    """Of x, y, x x, y y and x y inside the window of SSIM, zeros outside the images, each [N, 3, H, W]."""
+    from kornia.filters import filter2d_separable, get_gaussian_kernel1d
+
+    taps = get_gaussian_kernel1d(
+        2 * WINDOW_RADIUS_PX + 1, WINDOW_SIGMA_PX, dtype=torch.float64, device=x.device
+    ).to(x.dtype)
+    moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
+    return tuple(filter2d_separable(moments, taps, taps, border_type="constant").split(3, dim=1))
 
 
 def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:

@@ -174,6 +174,22 @@ def _of_camera(values: Tensor | None, camera: int) -> Tensor | None:
     return None if values is None else values[camera]
 
 
+class _Gaussians:
+    """The kernels' struct of the Gaussians, one for all cameras unless each has colours of its own."""
+
+    def __init__(self, *arrays: Tensor | None) -> None:
+        names = ("means", "quats", "scales", "opacities", "sh", "colors")
+        self._arrays = dict(zip(names, arrays, strict=True))
+        colors = self._arrays["colors"]
+        self._colors = colors if colors is not None and colors.ndim == 3 else None
+        self._shared = None if self._colors is not None else compiled_kernels().Gaussians(**self._arrays)
+
+    def of_camera(self, camera: int) -> Any:
+        if self._colors is None:
+            return self._shared
+        return compiled_kernels().Gaussians(**{**self._arrays, "colors": self._colors[camera]})
+
+
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -194,92 +210,88 @@ class _Rasterize(torch.autograd.Function):
             None if value is None else value.detach().contiguous()
             for value in (means, quats, scales, opacities, sh, colors, viewmats, background, light)
         ]
-        means, quats, scales, opacities, sh, colors, viewmats, background, light = arrays  # type: ignore[assignment]
+        *scene, viewmats, background, light = arrays  # type: ignore[assignment]
+        gaussians = _Gaussians(*scene)
         c = len(viewmats)
         rgb = torch.empty(c, options.height, options.width, 3)
         alpha = torch.empty(c, options.height, options.width)
         depth = torch.empty_like(alpha)
         differentiable = any(ctx.needs_input_grad)
-        for camera in range(c):
-            frame = kernels.render(
-                means,
-                quats,
-                scales,
-                opacities,
-                sh,
-                options.sh_degree,
-                colors if colors is None or colors.ndim == 2 else colors[camera],
-                viewmats[camera],
-                call.Ks[camera],
-                _of_camera(background, camera),
-                options.width,
-                options.height,
-                options.near,
-                rgb[camera],
-                alpha[camera],
-                depth[camera],
-                call.means2d[camera],
-                call.radius_px[camera],
-                _of_camera(call.median_depth, camera),
-                _of_camera(call.visibility_max, camera),
-                _of_camera(call.visibility_sum, camera),
-                _of_camera(light, camera),
+        for index in range(c):
+            camera = kernels.Camera(
+                viewmat=viewmats[index],
+                K=call.Ks[index],
+                width=options.width,
+                height=options.height,
+                near=options.near,
+                background=_of_camera(background, index),
+                light=_of_camera(light, index),
             )
+            images = kernels.Images(
+                rgb=rgb[index],
+                alpha=alpha[index],
+                depth=depth[index],
+                means2d=call.means2d[index],
+                radius=call.radius_px[index],
+                median_depth=_of_camera(call.median_depth, index),
+                visibility_max=_of_camera(call.visibility_max, index),
+                visibility_sum=_of_camera(call.visibility_sum, index),
+            )
+            frame = kernels.render(gaussians.of_camera(index), camera, images, degree=options.sh_degree)
             if call.query_points is not None and call.transmittance is not None:
-                frame.query(call.query_points, call.transmittance[camera])
+                frame.query(call.query_points, call.transmittance[index])
             if differentiable:
                 call.frames.append(frame)
         ctx.call = call
-        ctx.save_for_backward(*arrays, alpha, depth)
+        ctx.save_for_backward(*scene, viewmats, alpha, depth)
         return rgb, alpha, depth
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_rgb: Tensor, v_alpha: Tensor, v_depth: Tensor) -> tuple[Tensor | None, ...]:
+        kernels = compiled_kernels()
         call: _Call = ctx.call
-        means, quats, scales, opacities, sh, colors, viewmats, _, _, alpha, depth = ctx.saved_tensors
+        *scene, viewmats, alpha, depth = ctx.saved_tensors
+        gaussians = _Gaussians(*scene)
         needs = ctx.needs_input_grad[1:]
         v_rgb, v_alpha, v_depth = (value.contiguous() for value in (v_rgb, v_alpha, v_depth))
-        c, n = len(viewmats), len(means)
-        shared = [
-            torch.empty_like(value) if needed else None
-            for value, needed in zip((means, quats, scales, opacities, sh), needs, strict=False)
-        ]
+        c, n = len(viewmats), len(scene[0])
+        names = ("means", "quats", "scales", "opacities", "sh")
+        shared = {
+            name: torch.empty_like(value) if needed else None
+            for name, value, needed in zip(names, scene, needs, strict=False)
+        }
         if c == 0:
-            shared = [None if value is None else value.zero_() for value in shared]
+            shared = {name: None if value is None else value.zero_() for name, value in shared.items()}
         g_colors = torch.empty(c, n, 3) if needs[5] else None
         g_viewmats = torch.empty(c, 4, 4) if needs[6] else None
         g_light = torch.empty(c, 12) if needs[8] else None
         g_means2d = torch.empty(c, n, 2)
         g_absolute = torch.empty(c, n, 2) if call.options.absgrad else None
-        for camera in range(c):
-            call.frames[camera].backward(
-                means,
-                quats,
-                scales,
-                opacities,
-                sh,
-                call.options.sh_degree,
-                colors if colors is None or colors.ndim == 2 else colors[camera],
-                v_rgb[camera],
-                v_alpha[camera],
-                v_depth[camera],
-                depth[camera],
-                camera > 0,
-                *shared,
-                _of_camera(g_colors, camera),
-                _of_camera(g_viewmats, camera),
-                g_means2d[camera],
-                _of_camera(g_absolute, camera),
-                _of_camera(g_light, camera),
+        for index in range(c):
+            call.frames[index].backward(
+                gaussians.of_camera(index),
+                kernels.ImageGradients(
+                    rgb=v_rgb[index], alpha=v_alpha[index], depth=v_depth[index], depth_image=depth[index]
+                ),
+                kernels.GaussianGradients(
+                    **shared,
+                    colors=_of_camera(g_colors, index),
+                    means2d=g_means2d[index],
+                    absolute2d=_of_camera(g_absolute, index),
+                ),
+                kernels.CameraGradients(
+                    viewmat=_of_camera(g_viewmats, index), light=_of_camera(g_light, index)
+                ),
+                add=index > 0,
             )
         call.take_gradients(g_means2d, g_absolute)
-        if g_colors is not None and colors.ndim == 2:
+        if g_colors is not None and scene[5].ndim == 2:
             g_colors = g_colors[0] if c == 1 else g_colors.sum(0)
         g_background = None
         if needs[7]:
             g_background = (v_rgb * (1 - alpha)[..., None]).sum((1, 2))
-        return (None, *shared, g_colors, g_viewmats, g_background, g_light)
+        return (None, *shared.values(), g_colors, g_viewmats, g_background, g_light)
 
 
 def l1_ssim_loss_native(image: Tensor, target: Tensor, dssim_weight: float, mask: Tensor | None) -> Tensor:
@@ -306,8 +318,6 @@ class _L1Ssim(torch.autograd.Function):
                 y[index],
                 _of_camera(m, index),
                 gradient[index],
-                height,
-                width,
                 dssim_weight,
                 scale,
             )

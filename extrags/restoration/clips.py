@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn import functional
 
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference, image_confidence, pixel_confidence
@@ -119,6 +118,8 @@ def keep_known(
     Raises:
         ShapeError: when the sizes differ.
     """
+    from kornia.morphology import dilation
+
     if rendered.shape != restored.shape or uncertainty.shape != rendered.shape[:-1]:
         raise ShapeError(
             f"images {rendered.shape}, {restored.shape} and uncertainty {uncertainty.shape} do not fit"
@@ -126,7 +127,7 @@ def keep_known(
     raw = torch.from_numpy(np.ascontiguousarray(uncertainty, dtype=np.float32))[:, None]
     # Widened first: blurring alone would let the dark rim of a hole through.
     side = 2 * int(FEATHER_SIGMA_PX) + 1
-    wide = functional.max_pool2d(raw, side, stride=1, padding=side // 2)
+    wide = dilation(raw, torch.ones(side, side))
     window = gaussian_weights(FEATHER_SIGMA_PX, FEATHER_RADIUS_PX)
     feathered = torch.maximum(raw, filter_separable(wide, window, window)).clamp(0, 1)[:, 0].numpy()
     u = feathered[..., None]

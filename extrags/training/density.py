@@ -204,9 +204,20 @@ class DefaultStrategy(DensityStrategy):
             useless_child |= wide | (largest / SPLIT_SHRINK > limit)
             useless |= wide | (largest > limit)
         copies = _chosen(parameters, clones & ~useless)
-        children = self._children(parameters, splits & ~useless_child)
+        children = self.children(parameters, splits & ~useless_child)
         new_gaussians = {name: torch.cat([copies[name], children[name]]) for name in parameters}
         return DensityRound(~(useless | splits), new_gaussians)
+
+    def children(self, parameters: dict[str, Tensor], chosen: Bool[Tensor, "n"]) -> dict[str, Tensor]:
+        """Two smaller Gaussians in place of each chosen one, drawn from it; all first ones in front."""
+        parents = _chosen(parameters, chosen)
+        scales = parents["scales"].exp()
+        twice = {name: value.repeat(2, *[1] * (value.ndim - 1)) for name, value in parents.items()}
+        noise = torch.randn(2 * len(scales), 3, generator=self._generator)
+        offset = torch.einsum("nij,nj->ni", rotation_matrices(twice["quats"]), noise * scales.repeat(2, 1))
+        twice["means"] = twice["means"] + offset
+        twice["scales"] = (scales.repeat(2, 1) / SPLIT_SHRINK).log()
+        return twice
 
     def reset_statistics(self, n_gaussians: int) -> None:
         """Start collecting anew."""
@@ -240,16 +251,6 @@ class DefaultStrategy(DensityStrategy):
         size = torch.where(wide, self._radius, torch.zeros(()))
         widest = torch.argsort(size, descending=True, stable=True)[:room]
         return torch.zeros_like(wide).index_fill_(0, widest, True)
-
-    def _children(self, parameters: dict[str, Tensor], chosen: Bool[Tensor, "n"]) -> dict[str, Tensor]:
-        parents = _chosen(parameters, chosen)
-        scales = parents["scales"].exp()
-        twice = {name: value.repeat(2, *[1] * (value.ndim - 1)) for name, value in parents.items()}
-        noise = torch.randn(2 * len(scales), 3, generator=self._generator)
-        offset = torch.einsum("nij,nj->ni", rotation_matrices(twice["quats"]), noise * scales.repeat(2, 1))
-        twice["means"] = twice["means"] + offset
-        twice["scales"] = (scales.repeat(2, 1) / SPLIT_SHRINK).log()
-        return twice
 
 
 def _chosen(parameters: dict[str, Tensor], index: Bool[Tensor, "n"]) -> dict[str, Tensor]:

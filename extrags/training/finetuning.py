@@ -230,15 +230,10 @@ def _in_front_of_real_surface(
     cameras = sequence.cameras[sequence.train]
     for index, frame in enumerate(sequence.train):
         depth = _real_depth(scene, sequence, int(frame))
-        viewmat = cameras.viewmats[index]
-        local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-        z = np.where(local[:, 2] > 1e-6, local[:, 2], np.inf)
-        column = np.floor(local[:, 0] / z * cameras.K[index, 0, 0] + cameras.K[index, 0, 2])
-        row = np.floor(local[:, 1] / z * cameras.K[index, 1, 1] + cameras.K[index, 1, 2])
-        inside = (
-            np.isfinite(z) & (column >= 0) & (column < cameras.width) & (row >= 0) & (row < cameras.height)
-        )
-        seen = depth[row[inside].astype(np.int64), column[inside].astype(np.int64)]
+        (pixels,), (z,) = cameras[index].project(points)
+        inside = cameras.contains(pixels)
+        column, row = pixels[inside].astype(np.int64).T
+        seen = depth[row, column]
         hides[inside] |= (seen > 0) & (z[inside] < (1 - CARVED_MARGIN) * seen)
     return hides
 

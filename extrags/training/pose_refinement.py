@@ -71,6 +71,8 @@ class RefinedPoses(Storable):
 class PoseRefinement:
     """Holds the corrections of all training frames and moves one of them along its gradient.
 
+    `corrections` [M, 6] are turns in radians and shifts in depths, all zero at the start.
+
     Args:
         cameras: training frames as they were given, in the order of `View.frame`.
         config: rates and prior.
@@ -84,7 +86,7 @@ class PoseRefinement:
         self._given = cameras.world_from_camera.astype(np.float64)
         count = len(cameras)
         # Turns in radians and shifts in depths: one rate serves both.
-        self._x = np.zeros((count, 6))
+        self.corrections = np.zeros((count, 6))
         self._mean, self._square = np.zeros((count, 6)), np.zeros((count, 6))
         self._steps = np.zeros(count, dtype=np.int64)
         self._gauge = _gauge(cameras.centers / depth)
@@ -108,7 +110,7 @@ class PoseRefinement:
         config = self._config
         scale = np.repeat([PRIOR_TURN_RAD, PRIOR_SHIFT_SHARE], 3)
         gradient = self.gradient(frame, viewmat_gradient)
-        gradient += 2 * config.prior * self._x[frame] / scale**2 / 6
+        gradient += 2 * config.prior * self.corrections[frame] / scale**2 / 6
         self._steps[frame] += 1
         first, second = BETAS
         self._mean[frame] += (1 - first) * (gradient - self._mean[frame])
@@ -118,8 +120,8 @@ class PoseRefinement:
         done = int(self._steps[frame])
         mean = self._mean[frame] / (1 - first**done)
         square = self._square[frame] / (1 - second**done)
-        self._x[frame] -= self._rate(iteration) * mean / (np.sqrt(square) + EPSILON)
-        self._x -= (self._gauge @ (self._gauge.T @ self._x.reshape(-1))).reshape(-1, 6)
+        self.corrections[frame] -= self._rate(iteration) * mean / (np.sqrt(square) + EPSILON)
+        self.corrections -= (self._gauge @ (self._gauge.T @ self.corrections.reshape(-1))).reshape(-1, 6)
 
     def gradient(self, frame: int, viewmat_gradient: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "6"]:
         """From the view matrix to turn (radians) and shift (depths) of a frame."""
@@ -134,20 +136,20 @@ class PoseRefinement:
         )
         turn = np.cross(centre, pushed) - vee
         # exp(x + dx) = exp(J dx) exp(x).
-        turn = _left_jacobian(self._x[frame, :3]).T @ turn
+        turn = _left_jacobian(self.corrections[frame, :3]).T @ turn
         return np.concatenate([turn, -pushed * self._depth])
 
     def refined(self) -> RefinedPoses:
         """All poses as they stand now."""
         return RefinedPoses(
-            world_from_camera=self._corrected(np.arange(len(self._x))),
-            mean_shift=float(np.linalg.norm(self._x[:, 3:], axis=1).mean() * self._depth),
-            mean_turn_deg=float(np.degrees(np.linalg.norm(self._x[:, :3], axis=1)).mean()),
+            world_from_camera=self._corrected(np.arange(len(self.corrections))),
+            mean_shift=float(np.linalg.norm(self.corrections[:, 3:], axis=1).mean() * self._depth),
+            mean_turn_deg=float(np.degrees(np.linalg.norm(self.corrections[:, :3], axis=1)).mean()),
         )
 
     def _corrected(self, frames: np.ndarray) -> np.ndarray:
         poses = self._given[frames].copy()
-        x = self._x[frames]
+        x = self.corrections[frames]
         poses[:, :3, :3] = Rotation.from_rotvec(x[:, :3]).as_matrix() @ poses[:, :3, :3]
         poses[:, :3, 3] += x[:, 3:] * self._depth
         return np.asarray(poses)

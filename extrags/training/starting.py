@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 
 from extrags.cameras import pixel_rays
@@ -34,8 +34,7 @@ def median_depth(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> 
         if valid.any():
             return float(np.median(depth[valid]))
     if sequence.points is not None and len(sequence.points):
-        viewmats = sequence.cameras[frames].viewmats
-        z = np.einsum("cj,nj->cn", viewmats[:, 2, :3], sequence.points) + viewmats[:, 2, 3:4]
+        _, z = sequence.cameras[frames].project(sequence.points)
         if (z > 0).any():
             return float(np.median(z[z > 0]))
     raise CaptureError(
@@ -178,15 +177,10 @@ def depth_from_points(
     u, v = np.meshgrid(np.arange(sequence.width) + 0.5, np.arange(sequence.height) + 0.5)
     used = 0
     for frame in frames:
-        pixels, z = _visible_points(points, cameras.viewmats[frame], sequence.K[frame])
-        inside = (
-            (z > 0)
-            & (pixels[:, 0] >= 0)
-            & (pixels[:, 0] < sequence.width)
-            & (pixels[:, 1] >= 0)
-            & (pixels[:, 1] < sequence.height)
-        )
-        inside[inside] = _mask_at(sequence.mask[frame], pixels[inside])
+        (pixels,), (z,) = cameras[int(frame)].project(points)
+        inside = cameras.contains(pixels)
+        column, row = pixels[inside].astype(np.int64).T
+        inside[inside] = sequence.mask[frame][row, column]
         if inside.sum() < MIN_POINTS_PER_VIEW:
             continue
         used += 1
@@ -201,21 +195,3 @@ def depth_from_points(
             f"{len(points)} sparse points; are poses and points in the same frame and scale?"
         )
     return depth
-
-
-def _visible_points(
-    points: Float[np.ndarray, "p 3"], viewmat: Float[np.ndarray, "4 4"], K: Float[np.ndarray, "3 3"]
-) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "p"]]:
-    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    z = local[:, 2]
-    safe = np.where(np.abs(z) > 1e-9, z, 1e-9)
-    pixels = np.stack(
-        [K[0, 0] * local[:, 0] / safe + K[0, 2], K[1, 1] * local[:, 1] / safe + K[1, 2]], axis=1
-    )
-    return pixels, z
-
-
-def _mask_at(mask: Bool[np.ndarray, "h w"], pixels: Float[np.ndarray, "n 2"]) -> Bool[np.ndarray, "n"]:
-    column = pixels[:, 0].astype(np.int64)
-    row = pixels[:, 1].astype(np.int64)
-    return np.asarray(mask[row, column])

@@ -137,6 +137,9 @@ class AutogradStep:
 class NativeStep:
     """The step as the native kernels do it: no graph, no new arrays while the number of Gaussians stays.
 
+    `direct` holds the last view's gradients, once there was one; `light_fit` the light, if the scene has one;
+    `targets` what the kernels need of each view that is still alive, by its identity.
+
     Args:
         scene: float32 on the CPU; it is copied.
         schedule: rates and weights.
@@ -145,18 +148,18 @@ class NativeStep:
     def __init__(self, scene: Scene, schedule: Schedule) -> None:
         self._schedule = schedule
         self._sh_degree = scene.gaussians.sh_degree
-        self._light = None if scene.light is None else LightFit(scene.light, schedule.light)
+        self.light_fit = None if scene.light is None else LightFit(scene.light, schedule.light)
         self.adam = SelectiveAdam(
             _leaves(scene.gaussians), schedule.learning_rates(0), joined={"sh": ("sh0", "shN")}
         )
-        self._direct: DirectStep | None = None
+        self.direct: DirectStep | None = None
         self._bound: list[Tensor] = []
-        self._targets: dict[int, tuple[weakref.ref[View], Target]] = {}
+        self.targets: dict[int, tuple[weakref.ref[View], Target]] = {}
 
     @property
     def light(self) -> NearFieldLight | None:
         """See `TrainingStep.light`."""
-        return None if self._light is None else self._light.light
+        return None if self.light_fit is None else self.light_fit.light
 
     def differentiate(
         self, view: View, iteration: int, density: DensityStrategy, viewmat: np.ndarray | None = None
@@ -170,15 +173,15 @@ class NativeStep:
         loss = direct.run(
             target,
             sh_degree=min(iteration // schedule.sh_every, self._sh_degree),
-            light=None if self._light is None else self._light.row(view.frame),
+            light=None if self.light_fit is None else self.light_fit.row(view.frame),
             dssim_weight=schedule.dssim_weight,
             loss_weight=view.loss_weight,
             depth_weight=schedule.depth_weight_at(iteration),
             depth_scale=schedule.depth_scale,
             pose=viewmat is not None,
         )
-        if self._light is not None:
-            loss += self._light.prior()
+        if self.light_fit is not None:
+            loss += self.light_fit.prior()
         penalty = density.penalty(self.adam.parameters)
         if penalty is not None:
             self._add_penalty(penalty, direct.gradients)
@@ -188,24 +191,24 @@ class NativeStep:
 
     def update(self, observation: Observation) -> None:
         """See `TrainingStep.update`."""
-        if self._direct is None:
+        if self.direct is None:
             raise RuntimeError("update before the first differentiate")
-        self.adam.step(visible=observation.visible, gradients=self._direct.gradients)
-        if self._light is not None:
-            self._light.step(self._direct.light_gradient)
+        self.adam.step(visible=observation.visible, gradients=self.direct.gradients)
+        if self.light_fit is not None:
+            self.light_fit.step(self.direct.light_gradient)
 
     def _bound_step(self, density: DensityStrategy) -> DirectStep:
         """The kernels' arrays, made anew where densification has replaced the parameters."""
-        if self._direct is None:
-            self._direct = DirectStep(absgrad=density.needs_absgrad, lit=self._light is not None)
+        if self.direct is None:
+            self.direct = DirectStep(absgrad=density.needs_absgrad, lit=self.light_fit is not None)
         leaves = list(self.adam.parameters.values())
         if len(leaves) != len(self._bound) or any(
             a is not b for a, b in zip(leaves, self._bound, strict=True)
         ):
             joined = {name: array.values for name, array in self.adam.joined.items()}
-            self._direct.bind({**self.adam.parameters, **joined})
+            self.direct.bind({**self.adam.parameters, **joined})
             self._bound = leaves
-        return self._direct
+        return self.direct
 
     def _add_penalty(self, penalty: Tensor, gradients: dict[str, Tensor]) -> None:
         """A penalty depends on the parameters alone: autograd costs little there."""
@@ -219,8 +222,8 @@ class NativeStep:
     def _target(self, view: View) -> Target:
         """What the kernels need of a view, kept as long as the view lives."""
         key = id(view)
-        if key in self._targets:
-            return self._targets[key][1]
+        if key in self.targets:
+            return self.targets[key][1]
         camera = view.camera
         target = Target(
             camera.viewmats[0].astype(np.float32),
@@ -229,7 +232,7 @@ class NativeStep:
             weight=view.weight,
             depth=view.depth_mm if self._schedule.depth_weight > 0 else None,
         )
-        targets = self._targets
+        targets = self.targets
         # An identity may be given again once its view is gone.
         targets[key] = (weakref.ref(view, lambda _: targets.pop(key, None)), target)
         return target

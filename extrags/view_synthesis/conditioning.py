@@ -17,7 +17,6 @@ from torch import Tensor
 from extrags.cameras import Cameras, pixel_rays
 from extrags.errors import ShapeError
 from extrags.metrics.filters import filter_separable, gaussian_weights
-from extrags.raster import rasterize
 from extrags.scene import Scene
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.filling import completed_depth, push_pull
@@ -233,20 +232,8 @@ def _known_and_spread(
     viewmat = torch.from_numpy(camera.viewmats[0].astype(np.float32))
     scale = references.transfer.scale_mm
     z = (means @ viewmat[2, :3] + viewmat[2, 3]) / scale
-    attributes = torch.stack([known, z.square(), torch.zeros_like(z)], dim=-1)
-    gaussians = scene.gaussians
-    blended = rasterize(
-        means,
-        gaussians.quats,
-        gaussians.scales.exp(),
-        gaussians.opacities.sigmoid(),
-        None,
-        viewmat[None],
-        torch.from_numpy(camera.K.astype(np.float32)),
-        camera.width,
-        camera.height,
-        colors=attributes,
-    ).rgb[:, None]
+    blended, _ = scene.render_attributes(camera, torch.stack([known, z.square()], dim=-1))
+    blended = blended[:, None]
     share = blended[..., 0].clamp(0, 1)
     mean = expected / scale
     second = blended[..., 1] / alpha.clamp_min(1e-6)

@@ -8,12 +8,14 @@ from extrags.cameras import (
     Cameras,
     as_rotation,
     compose,
-    interpolate_poses,
     invert_poses,
     look_at,
     pixel_rays,
+    project_points,
     rotation_about,
     rotation_angle_deg,
+    transform_points,
+    unproject_pixels,
 )
 from extrags.errors import PoseError, ShapeError
 
@@ -29,6 +31,21 @@ def random_poses(count: int, seed: int = 0) -> np.ndarray:
 def cameras(count: int = 3) -> Cameras:
     K = np.array([[50.0, 0, 32], [0, 50.0, 24], [0, 0, 1]])
     return Cameras(np.tile(K, (count, 1, 1)), random_poses(count), 64, 48)
+
+
+def test_unprojected_pixels_project_back() -> None:
+    K = np.array([[50.0, 0, 30], [0, 45.0, 25], [0, 0, 1]])
+    pixels = np.random.default_rng(0).uniform(-20, 90, size=(4, 5, 2))
+    rays = unproject_pixels(pixels, K)
+    np.testing.assert_array_equal(rays[..., 2], 1)
+    np.testing.assert_allclose(project_points(3 * rays, K), pixels, atol=1e-12)
+
+
+def test_transformed_points_are_those_of_the_matrix() -> None:
+    (motion,) = random_poses(1)
+    points = np.random.default_rng(0).normal(size=(6, 2, 3))
+    expected = points @ motion[:3, :3].T + motion[:3, 3]
+    np.testing.assert_allclose(transform_points(motion, points), expected, atol=1e-12)
 
 
 class TestCameras:
@@ -54,11 +71,42 @@ class TestCameras:
     def test_rays_project_back_to_their_pixel_centres(self) -> None:
         batch = cameras(2)
         points = batch.centers[:, None, None] + 7.5 * pixel_rays(batch)
-        local = np.einsum("cij,chwj->chwi", batch.viewmats[:, :3, :3], points)
-        local += batch.viewmats[:, None, None, :3, 3]
-        np.testing.assert_allclose(local[..., 2], 7.5, atol=1e-9)
-        u = 50 * local[..., 0] / local[..., 2] + 32
-        np.testing.assert_allclose(u[0, 5], np.arange(64) + 0.5, atol=1e-9)
+        pixels, depth = batch.project(points)
+        assert pixels.shape == (2, 2, 48, 64, 2)
+        columns, rows = np.meshgrid(np.arange(64) + 0.5, np.arange(48) + 0.5)
+        for camera in range(2):
+            np.testing.assert_allclose(depth[camera, camera], 7.5, atol=1e-9)
+            np.testing.assert_allclose(pixels[camera, camera, ..., 0], columns, atol=1e-9)
+            np.testing.assert_allclose(pixels[camera, camera, ..., 1], rows, atol=1e-9)
+            assert batch.contains(pixels[camera, camera]).all()
+
+    def test_projection_is_the_matrix_product(self) -> None:
+        batch = cameras(3)
+        points = np.random.default_rng(1).normal(size=(200, 3)) * 30
+        homogeneous = np.concatenate([points, np.ones((200, 1))], axis=1)
+        pixels, depth = batch.project(points)
+        for camera in range(3):
+            image = batch.K[camera] @ (batch.viewmats[camera] @ homogeneous.T)[:3]
+            np.testing.assert_allclose(depth[camera], image[2], atol=1e-9)
+            front = image[2] > 0
+            assert 0 < front.sum() < 200
+            np.testing.assert_allclose(pixels[camera, front], (image[:2] / image[2]).T[front], rtol=1e-9)
+            assert np.isnan(pixels[camera, ~front]).all()
+            assert not batch.contains(pixels[camera, ~front]).any()
+
+    def test_the_image_ends_at_its_edges(self) -> None:
+        pixels = np.array(
+            [[0.0, 0.0], [63.999, 47.999], [64.0, 10.0], [10.0, 48.0], [-1e-9, 3.0], [3.0, -1.0]]
+        )
+        np.testing.assert_array_equal(cameras(1).contains(pixels), [True, True, False, False, False, False])
+
+    @pytest.mark.parametrize(
+        ("width", "size"), [(100, (64, 48)), (64, (64, 48)), (32, (32, 24)), (1, (1, 1))]
+    )
+    def test_at_most_width(self, width: int, size: tuple[int, int]) -> None:
+        small = cameras(2).at_most_width(width)
+        assert (small.width, small.height) == size
+        np.testing.assert_allclose(small.K[:, 0, 0], 50 * size[0] / 64)
 
     @pytest.mark.usefixtures("unchecked")
     def test_wrong_shapes_are_refused(self) -> None:
@@ -105,11 +153,6 @@ class TestRotations:
     def test_look_at_itself_is_refused(self) -> None:
         with pytest.raises(PoseError):
             look_at(np.zeros(3), np.zeros(3), np.array([0.0, -1, 0]))
-
-    def test_interpolation_ends_where_it_should(self) -> None:
-        first, second = random_poses(2)
-        np.testing.assert_allclose(interpolate_poses(first, second, 0.0), first, atol=1e-12)
-        np.testing.assert_allclose(interpolate_poses(first, second, 1.0), second, atol=1e-12)
 
     def test_inverting_twice_gives_the_pose(self) -> None:
         poses = random_poses(5)

@@ -116,6 +116,7 @@ SpareViews& spare_views() {
 struct Frame {
   ViewPointer view = spare_views().take();
   const KernelTable* kernels = active();
+  int degree = 0;
   Frame() = default;
   Frame(Frame&&) = default;
   ~Frame() {
@@ -132,117 +133,168 @@ void expect(bool ok, const char* what) {
   if (!ok) throw std::invalid_argument(std::string(what) + " has an unexpected size");
 }
 
-Scene make_scene(const In& means, const In& quats, const In& scales, const In& opacities,
-                 const std::optional<In>& sh, int degree, const std::optional<In>& colors) {
-  Scene scene{};
-  scene.n = static_cast<int>(means.shape(0));
-  const size_t n = means.shape(0);
-  expect(n < (size_t{1} << 28) && means.size() == 3 * n, "means");
-  expect(quats.size() == 4 * n, "quats");
-  expect(scales.size() == 3 * n, "scales");
-  expect(opacities.size() == n, "opacities");
-  expect(sh.has_value() != colors.has_value(), "sh or colors");
-  if (sh) {
-    scene.coefficients = static_cast<int>(sh->shape(1));
-    expect(sh->size() == 3 * n * sh->shape(1) && (degree + 1) * (degree + 1) <= scene.coefficients, "sh");
-    scene.sh = sh->data();
-  }
-  if (colors) {
-    expect(colors->size() == 3 * n, "colors");
-    scene.colors = colors->data();
-  }
-  scene.means = means.data();
-  scene.quats = quats.data();
-  scene.scales = scales.data();
-  scene.opacities = opacities.data();
-  scene.degree = degree;
-  return scene;
-}
+// The structs Python hands over. Their arrays live as long as they do, so that one made once serves every step;
+// shapes are checked where a struct is made, sizes that two structs must share where they meet.
 
-void set_camera(View* view, const In& viewmat, const In& K) {
-  expect(viewmat.size() == 16, "viewmat");
-  expect(K.size() == 9, "K");
-  const float* v = viewmat.data();
-  for (int i = 0; i < 3; ++i) {
-    for (int j = 0; j < 3; ++j) view->camera.rotation[3 * i + j] = v[4 * i + j];
-    view->camera.translation[i] = v[4 * i + 3];
-  }
-  const float* k = K.data();
-  view->camera.fx = k[0];
-  view->camera.fy = k[4];
-  view->camera.cx = k[2];
-  view->camera.cy = k[5];
-}
+struct GaussianArrays {
+  In means, quats, scales, opacities;
+  std::optional<In> sh, colors;
 
-std::unique_ptr<Frame> render(const In& means, const In& quats, const In& scales, const In& opacities,
-                              std::optional<In> sh, int degree, std::optional<In> colors, const In& viewmat,
-                              const In& K, std::optional<In> background, int width, int height, float near,
-                              Out rgb, Out alpha, Out depth, Out means2d, Out radius,
-                              std::optional<Out> median_depth, std::optional<Out> visibility_max,
-                              std::optional<Out> visibility_sum, std::optional<In> light) {
-  const Scene scene = make_scene(means, quats, scales, opacities, sh, degree, colors);
+  void check() const {
+    const size_t n = count();
+    expect(n < (size_t{1} << 28) && means.size() == 3 * n, "means");
+    expect(quats.size() == 4 * n, "quats");
+    expect(scales.size() == 3 * n, "scales");
+    expect(opacities.size() == n, "opacities");
+    expect(sh.has_value() != colors.has_value(), "sh or colors");
+    expect(!sh || (sh->ndim() == 3 && sh->size() == 3 * n * sh->shape(1)), "sh");
+    expect(!colors || colors->size() == 3 * n, "colors");
+  }
+
+  size_t count() const { return means.shape(0); }
+
+  Scene scene(int degree) const {
+    const int coefficients = sh ? static_cast<int>(sh->shape(1)) : 0;
+    expect(!sh || (degree + 1) * (degree + 1) <= coefficients, "sh");
+    return Scene{static_cast<int>(count()), means.data(), quats.data(), scales.data(), opacities.data(),
+                 data_or_null(sh), coefficients, degree, data_or_null(colors)};
+  }
+};
+
+// Copied from the arrays when it is made.
+struct CameraSettings {
+  Camera camera{};
+  int width, height;
+  float near;
+  float background[3]{};
+  bool lit;
+  CameraLight light{};
+
+  CameraSettings(const In& viewmat, const In& K, int width, int height, float near,
+                 const std::optional<In>& background, const std::optional<In>& light)
+      : width(width), height(height), near(near), lit(light.has_value()) {
+    expect(viewmat.size() == 16, "viewmat");
+    expect(K.size() == 9, "K");
+    expect(!background || background->size() == 3, "background");
+    expect(!light || light->size() == 12, "light");
+    const float* v = viewmat.data();
+    for (int i = 0; i < 3; ++i) {
+      for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = v[4 * i + j];
+      camera.translation[i] = v[4 * i + 3];
+    }
+    const float* k = K.data();
+    camera.fx = k[0];
+    camera.fy = k[4];
+    camera.cx = k[2];
+    camera.cy = k[5];
+    if (background) std::copy_n(background->data(), 3, this->background);
+    if (light) std::memcpy(&this->light, light->data(), sizeof this->light);
+  }
+
+  void apply(View* view) const {
+    view->width = width;
+    view->height = height;
+    view->near = near;
+    view->camera = camera;
+    std::copy_n(background, 3, view->background);
+    view->lit = lit;
+    if (lit) view->light = light;
+  }
+};
+
+struct ImageArrays {
+  Out rgb, alpha, depth, means2d, radius;
+  std::optional<Out> median_depth, visibility_max, visibility_sum;
+
+  void check(size_t pixels, size_t n) const {
+    expect(rgb.size() == 3 * pixels, "rgb");
+    expect(alpha.size() == pixels && depth.size() == pixels, "alpha or depth");
+    expect(!median_depth || median_depth->size() == pixels, "median_depth");
+    expect(means2d.size() == 2 * n && radius.size() == n, "means2d or radius");
+    expect(visibility_max.has_value() == visibility_sum.has_value(), "visibility");
+    expect(!visibility_max || (visibility_max->size() == n && visibility_sum->size() == n), "visibility");
+  }
+
+  Images pointers() const {
+    return Images{rgb.data(), alpha.data(), depth.data(), data_or_null(median_depth), means2d.data(),
+                  radius.data(), data_or_null(visibility_max), data_or_null(visibility_sum)};
+  }
+};
+
+struct ImageGradientArrays {
+  std::optional<In> rgb, alpha, depth, depth_image;
+
+  void check(size_t pixels) const {
+    expect(!rgb || rgb->size() == 3 * pixels, "gradient of rgb");
+    expect(!alpha || alpha->size() == pixels, "gradient of alpha");
+    expect(!depth || (depth->size() == pixels && depth_image && depth_image->size() == pixels),
+           "gradient of depth");
+  }
+
+  ImageGradients pointers() const {
+    return ImageGradients{data_or_null(rgb), data_or_null(alpha), data_or_null(depth),
+                          data_or_null(depth_image)};
+  }
+};
+
+struct GaussianGradientArrays {
+  std::optional<Out> means, quats, scales, opacities, sh, colors, means2d, absolute2d;
+
+  void check(const GaussianArrays& of) const {
+    const size_t n = of.count();
+    expect(!means || means->size() == 3 * n, "gradient of means");
+    expect(!quats || quats->size() == 4 * n, "gradient of quats");
+    expect(!scales || scales->size() == 3 * n, "gradient of scales");
+    expect(!opacities || opacities->size() == n, "gradient of opacities");
+    expect(!sh || (of.sh && sh->size() == of.sh->size()), "gradient of sh");
+    expect(!colors || colors->size() == 3 * n, "gradient of colors");
+    expect(!means2d || means2d->size() == 2 * n, "gradient of means2d");
+    expect(!absolute2d || absolute2d->size() == 2 * n, "absolute gradient of means2d");
+  }
+};
+
+struct CameraGradientArrays {
+  std::optional<Out> viewmat, light;
+
+  void check(bool lit) const {
+    expect(!viewmat || viewmat->size() == 16, "gradient of viewmat");
+    expect(!light || (lit && light->size() == 12), "gradient of light");
+  }
+};
+
+std::unique_ptr<Frame> render(const GaussianArrays& gaussians, const CameraSettings& camera,
+                              const ImageArrays& images, int degree) {
+  const Scene scene = gaussians.scene(degree);
+  images.check(static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height), gaussians.count());
   auto frame = std::make_unique<Frame>();
-  View* view = frame->view.get();
-  view->width = width;
-  view->height = height;
-  view->near = near;
-  set_camera(view, viewmat, K);
-  if (background) expect(background->size() == 3, "background");
-  expect(!light || light->size() == 12, "light");
-  view->lit = light.has_value();
-  if (light) std::memcpy(&view->light, light->data(), sizeof view->light);
-  for (int k = 0; k < 3; ++k) view->background[k] = background ? background->data()[k] : 0.f;
-  const size_t pixels = static_cast<size_t>(width) * static_cast<size_t>(height), n = means.shape(0);
-  expect(rgb.size() == 3 * pixels, "rgb");
-  expect(alpha.size() == pixels && depth.size() == pixels, "alpha or depth");
-  expect(!median_depth || median_depth->size() == pixels, "median_depth");
-  expect(means2d.size() == 2 * n && radius.size() == n, "means2d or radius");
-  expect(visibility_max.has_value() == visibility_sum.has_value(), "visibility");
-  expect(!visibility_max || (visibility_max->size() == n && visibility_sum->size() == n), "visibility");
-  const Images images{rgb.data(), alpha.data(), depth.data(), data_or_null(median_depth), means2d.data(),
-                      radius.data(), data_or_null(visibility_max), data_or_null(visibility_sum)};
+  frame->degree = degree;
+  camera.apply(frame->view.get());
+  const Images out = images.pointers();
   nb::gil_scoped_release release_gil;
-  frame->kernels->forward(view, &scene, &images);
+  frame->kernels->forward(frame->view.get(), &scene, &out);
   return frame;
 }
 
-void frame_backward(Frame& frame, const In& means, const In& quats, const In& scales, const In& opacities,
-                    std::optional<In> sh, int degree, std::optional<In> colors, std::optional<In> v_rgb,
-                    std::optional<In> v_alpha, std::optional<In> v_depth, std::optional<In> depth, bool add,
-                    std::optional<Out> g_means, std::optional<Out> g_quats, std::optional<Out> g_scales,
-                    std::optional<Out> g_opacities, std::optional<Out> g_sh, std::optional<Out> g_colors,
-                    std::optional<Out> g_viewmat, std::optional<Out> g_means2d,
-                    std::optional<Out> g_absolute2d, std::optional<Out> g_light) {
-  const Scene scene = make_scene(means, quats, scales, opacities, sh, degree, colors);
+void frame_backward(Frame& frame, const GaussianArrays& gaussians, const ImageGradientArrays& images,
+                    const GaussianGradientArrays& gradients, const CameraGradientArrays& camera, bool add) {
+  const Scene scene = gaussians.scene(frame.degree);
   View* view = frame.view.get();
-  const size_t pixels = static_cast<size_t>(view->width) * static_cast<size_t>(view->height), n = means.shape(0);
-  expect(static_cast<size_t>(view->n) == n, "means");
-  expect(!v_rgb || v_rgb->size() == 3 * pixels, "gradient of rgb");
-  expect(!v_alpha || v_alpha->size() == pixels, "gradient of alpha");
-  expect(!v_depth || (v_depth->size() == pixels && depth && depth->size() == pixels), "gradient of depth");
-  expect(!g_means || g_means->size() == means.size(), "gradient of means");
-  expect(!g_quats || g_quats->size() == quats.size(), "gradient of quats");
-  expect(!g_scales || g_scales->size() == scales.size(), "gradient of scales");
-  expect(!g_opacities || g_opacities->size() == n, "gradient of opacities");
-  expect(!g_sh || (sh && g_sh->size() == sh->size()), "gradient of sh");
-  expect(!g_colors || g_colors->size() == 3 * n, "gradient of colors");
-  expect(!g_viewmat || g_viewmat->size() == 16, "gradient of viewmat");
-  expect(!g_means2d || g_means2d->size() == 2 * n, "gradient of means2d");
-  expect(!g_absolute2d || g_absolute2d->size() == 2 * n, "absolute gradient of means2d");
-  expect(!g_light || (view->lit && g_light->size() == 12), "gradient of light");
-  const ImageGradients in{data_or_null(v_rgb), data_or_null(v_alpha), data_or_null(v_depth),
-                          data_or_null(depth)};
+  expect(view->n == scene.n, "means");
+  images.check(static_cast<size_t>(view->width) * static_cast<size_t>(view->height));
+  gradients.check(gaussians);
+  camera.check(view->lit);
+  const ImageGradients in = images.pointers();
   const SceneGradients out{add,
-                           data_or_null(g_means),
-                           data_or_null(g_quats),
-                           data_or_null(g_scales),
-                           data_or_null(g_opacities),
-                           data_or_null(g_sh),
-                           data_or_null(g_colors),
-                           data_or_null(g_viewmat),
-                           data_or_null(g_light),
-                           data_or_null(g_means2d),
-                           data_or_null(g_absolute2d)};
+                           data_or_null(gradients.means),
+                           data_or_null(gradients.quats),
+                           data_or_null(gradients.scales),
+                           data_or_null(gradients.opacities),
+                           data_or_null(gradients.sh),
+                           data_or_null(gradients.colors),
+                           data_or_null(camera.viewmat),
+                           data_or_null(camera.light),
+                           data_or_null(gradients.means2d),
+                           data_or_null(gradients.absolute2d)};
   nb::gil_scoped_release release_gil;
   frame.kernels->backward(view, &scene, &in, &out);
 }
@@ -283,14 +335,15 @@ Buffer* thread_working() {
   return &working.buffer;
 }
 
-double l1_ssim(const In& image, const In& target, std::optional<In> mask, Out gradient, int height, int width,
-               float dssim_weight, double scale) {
-  const size_t pixels = static_cast<size_t>(width) * static_cast<size_t>(height);
-  expect(image.size() == 3 * pixels && target.size() == 3 * pixels, "image or target");
-  expect(gradient.size() == 3 * pixels, "gradient");
-  expect(!mask || mask->size() == pixels, "mask");
-  const LossImages images{height, width, image.data(), target.data(), data_or_null(mask), gradient.data(),
-                          dssim_weight, scale};
+double l1_ssim(const In& image, const In& target, std::optional<In> mask, Out gradient, float dssim_weight,
+               double scale) {
+  expect(image.ndim() == 3 && image.shape(2) == 3, "image");
+  const size_t height = image.shape(0), width = image.shape(1);
+  expect(target.size() == image.size(), "target");
+  expect(gradient.size() == image.size(), "gradient");
+  expect(!mask || mask->size() == height * width, "mask");
+  const LossImages images{static_cast<int>(height), static_cast<int>(width), image.data(), target.data(),
+                          data_or_null(mask), gradient.data(), dssim_weight, scale};
   nb::gil_scoped_release release_gil;
   return active()->loss(&images, thread_working());
 }
@@ -362,30 +415,57 @@ NB_MODULE(_native, m) {
   // Frames may well be alive, in graphs nobody walked back, when the interpreter ends.
   nb::set_leak_warnings(false);
   m.doc() = "Compiled kernels of extrags.raster; use them through extrags.raster.";
+  nb::class_<GaussianArrays>(m, "Gaussians", "A scene's Gaussians; `sh` or `colors`, not both.")
+      .def("__init__",
+           [](GaussianArrays* self, const In& means, const In& quats, const In& scales, const In& opacities,
+              const std::optional<In>& sh, const std::optional<In>& colors) {
+             new (self) GaussianArrays{means, quats, scales, opacities, sh, colors};
+             self->check();
+           },
+           nb::kw_only(), nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
+           nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(),
+           nb::arg("sh").none().noconvert() = nb::none(), nb::arg("colors").none().noconvert() = nb::none());
+  nb::class_<CameraSettings>(m, "Camera", "A pinhole camera, the light it carries and what it sees behind all.")
+      .def(nb::init<const In&, const In&, int, int, float, const std::optional<In>&, const std::optional<In>&>(),
+           nb::kw_only(), nb::arg("viewmat"), nb::arg("K"), nb::arg("width"), nb::arg("height"),
+           nb::arg("near"), nb::arg("background").none() = nb::none(), nb::arg("light").none() = nb::none());
+  nb::class_<ImageArrays>(m, "Images", "What a forward pass fills.")
+      .def(nb::init<Out, Out, Out, Out, Out, std::optional<Out>, std::optional<Out>, std::optional<Out>>(),
+           nb::kw_only(), nb::arg("rgb").noconvert(), nb::arg("alpha").noconvert(),
+           nb::arg("depth").noconvert(), nb::arg("means2d").noconvert(), nb::arg("radius").noconvert(),
+           nb::arg("median_depth").none().noconvert() = nb::none(),
+           nb::arg("visibility_max").none().noconvert() = nb::none(),
+           nb::arg("visibility_sum").none().noconvert() = nb::none());
+  nb::class_<ImageGradientArrays>(m, "ImageGradients",
+                                  "Of the loss; that of the depth needs the forward's depth image too.")
+      .def(nb::init<std::optional<In>, std::optional<In>, std::optional<In>, std::optional<In>>(),
+           nb::kw_only(), nb::arg("rgb").none() = nb::none(), nb::arg("alpha").none() = nb::none(),
+           nb::arg("depth").none() = nb::none(), nb::arg("depth_image").none() = nb::none());
+  nb::class_<GaussianGradientArrays>(m, "GaussianGradients", "What a backward pass fills; None is left out.")
+      .def(nb::init<std::optional<Out>, std::optional<Out>, std::optional<Out>, std::optional<Out>,
+                    std::optional<Out>, std::optional<Out>, std::optional<Out>, std::optional<Out>>(),
+           nb::kw_only(), nb::arg("means").none().noconvert() = nb::none(),
+           nb::arg("quats").none().noconvert() = nb::none(), nb::arg("scales").none().noconvert() = nb::none(),
+           nb::arg("opacities").none().noconvert() = nb::none(),
+           nb::arg("sh").none().noconvert() = nb::none(), nb::arg("colors").none().noconvert() = nb::none(),
+           nb::arg("means2d").none().noconvert() = nb::none(),
+           nb::arg("absolute2d").none().noconvert() = nb::none());
+  nb::class_<CameraGradientArrays>(m, "CameraGradients", "What a backward pass fills; None is left out.")
+      .def(nb::init<std::optional<Out>, std::optional<Out>>(), nb::kw_only(),
+           nb::arg("viewmat").none().noconvert() = nb::none(),
+           nb::arg("light").none().noconvert() = nb::none());
   nb::class_<Frame>(m, "Frame", "What the forward pass of one camera leaves for the backward pass.")
-      .def("backward", &frame_backward, nb::arg("means"), nb::arg("quats"), nb::arg("scales"),
-           nb::arg("opacities"), nb::arg("sh").none(), nb::arg("degree"), nb::arg("colors").none(),
-           nb::arg("v_rgb").none(), nb::arg("v_alpha").none(), nb::arg("v_depth").none(),
-           nb::arg("depth").none(), nb::arg("add"), nb::arg("g_means").none().noconvert(),
-           nb::arg("g_quats").none().noconvert(), nb::arg("g_scales").none().noconvert(),
-           nb::arg("g_opacities").none().noconvert(), nb::arg("g_sh").none().noconvert(),
-           nb::arg("g_colors").none().noconvert(), nb::arg("g_viewmat").none().noconvert(),
-           nb::arg("g_means2d").none().noconvert(), nb::arg("g_absolute2d").none().noconvert(),
-           nb::arg("g_light").none().noconvert() = nb::none())
+      .def("backward", &frame_backward, nb::arg("gaussians"), nb::arg("images"), nb::arg("gradients"),
+           nb::arg("camera"), nb::kw_only(), nb::arg("add") = false,
+           "Fill the gradients, or add to those of the Gaussians' own arrays.")
       .def("entries", &frame_entries, "How many (Gaussian, 4 x 4 pixel block) entries were composited.")
       .def("seconds", &frame_seconds,
            "Of the projection, the tiles, the tiles backward and the projection backward.")
       .def("query", &frame_query, nb::arg("points"), nb::arg("transmittance").noconvert());
-  m.def("render", &render, nb::arg("means"), nb::arg("quats"), nb::arg("scales"), nb::arg("opacities"),
-        nb::arg("sh").none(), nb::arg("degree"), nb::arg("colors").none(), nb::arg("viewmat"), nb::arg("K"),
-        nb::arg("background").none(), nb::arg("width"), nb::arg("height"), nb::arg("near"),
-        nb::arg("rgb").noconvert(), nb::arg("alpha").noconvert(), nb::arg("depth").noconvert(),
-        nb::arg("means2d").noconvert(), nb::arg("radius").noconvert(),
-        nb::arg("median_depth").none().noconvert(), nb::arg("visibility_max").none().noconvert(),
-        nb::arg("visibility_sum").none().noconvert(), nb::arg("light").none() = nb::none());
+  m.def("render", &render, nb::arg("gaussians"), nb::arg("camera"), nb::arg("images"), nb::kw_only(),
+        nb::arg("degree"), "Render one camera; `degree` is that of the harmonics used.");
   m.def("l1_ssim", &l1_ssim, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(),
-        nb::arg("gradient").noconvert(), nb::arg("height"), nb::arg("width"), nb::arg("dssim_weight"),
-        nb::arg("scale"));
+        nb::arg("gradient").noconvert(), nb::arg("dssim_weight"), nb::arg("scale"));
   m.def("inverse_depth", &inverse_depth, nb::arg("depth"), nb::arg("alpha"), nb::arg("target"),
         nb::arg("gradient").noconvert(), nb::arg("scale"), nb::arg("weight"));
   m.def("adam", &adam, nb::arg("parameters"), nb::arg("steps").noconvert(), nb::arg("bias1"),

@@ -410,17 +410,14 @@ def _motion(
 ) -> _Motion:
     here, before = cameras[view], cameras[view - 1]
     points = here.centers[0] + pixel_rays(here)[0] * depth_mm[view][..., None].astype(np.float64)
-    viewmat, K = before.viewmats[0], before.K[0]
-    local = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-    z = local[..., 2]
-    ahead = np.where(z > 1e-9, z, 1.0)
-    u = local[..., 0] / ahead * K[0, 0] + K[0, 2]
-    v = local[..., 1] / ahead * K[1, 1] + K[1, 2]
+    (pixels,), (z,) = before.project(points)
+    pixels = np.where(z[..., None] > 0, pixels, -1)
+    u, v = pixels[..., 0], pixels[..., 1]
     width, height = cameras.width, cameras.height
     # Half a pixel inside the border: nothing is sampled from beyond it.
-    inside = (z > 1e-9) & (u >= 0.5) & (u <= width - 0.5) & (v >= 0.5) & (v <= height - 0.5)
-    row = np.clip(np.floor(v).astype(np.int64), 0, height - 1)
-    column = np.clip(np.floor(u).astype(np.int64), 0, width - 1)
+    inside = (u >= 0.5) & (u <= width - 0.5) & (v >= 0.5) & (v <= height - 0.5)
+    row = np.clip(v, 0, height - 1).astype(np.int64)
+    column = np.clip(u, 0, width - 1).astype(np.int64)
     there = depth_mm[view - 1][row, column]
     same = (there > 0) & (depth_mm[view] > 0) & (np.abs(z - there) < SAME_SURFACE * np.maximum(there, 1e-9))
     common = inside & same & mask[view] & mask[view - 1][row, column]

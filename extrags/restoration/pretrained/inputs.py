@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from torch.nn import functional
 
 from extrags.restoration.protocol import Clip
 from extrags.view_synthesis.conditioning import condition
@@ -26,12 +25,15 @@ def clip_inputs(
     Returns:
         Light-compensated real views over the rendering, with holes filled, [T, H, W, 3]; and the mask.
     """
+    from kornia.morphology import dilation
+
     with torch.no_grad():
         base = condition(clip.layers, clip.transfer).base
         sure = torch.maximum(1 - clip.layers.get("uncertainty"), clip.layers.get("blend_weight"))
         unknown = (sure < threshold).to(torch.float32)
         if dilation_px:
-            unknown = functional.max_pool2d(unknown, 2 * dilation_px + 1, stride=1, padding=dilation_px)
+            side = 2 * dilation_px + 1
+            unknown = dilation(unknown, torch.ones(side, side))
     return base.permute(0, 2, 3, 1).contiguous().numpy(), unknown[:, 0].numpy() > 0.5
 
 

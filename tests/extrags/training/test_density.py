@@ -16,8 +16,10 @@ from tests.extrags.training.conftest import tube_gaussians
 EXTENT = 20.0
 
 
-def strategy(n: int, **changes: object) -> DefaultStrategy:
+def strategy(n: int, *, cap: int | None = None, **changes: object) -> DefaultStrategy:
     config = DensifyConfig(**changes)  # type: ignore[arg-type]
+    if cap is not None:  # smaller than a configuration allows
+        config = config.model_copy(update={"max_gaussians": cap})
     return DefaultStrategy(config, EXTENT, 1000, n, seed=0)
 
 
@@ -109,16 +111,14 @@ class TestDefaultStrategy:
     @pytest.mark.parametrize(("cap", "kept"), [(11, [9]), (12, [8, 9]), (10, [])])
     def test_the_cap_takes_the_strongest(self, cap: int, kept: list[int]) -> None:
         parameters = small_ones(10)
-        density = strategy(10)
-        density._config = DensifyConfig().model_copy(update={"max_gaussians": cap})
+        density = strategy(10, cap=cap)
         density.observe(seen(torch.arange(10.0)[None, :, None].expand(1, 10, 2)))
         decision = density.decide(parameters, 100)
         assert torch.equal(decision.new_gaussians["means"], parameters["means"][kept])
 
     def test_the_cap_holds_for_sizes_in_the_image_too(self) -> None:
         parameters = small_ones(10)
-        density = strategy(10, refine_scale2d_stop_share=1.0, prune_scale2d=10.0)
-        density._config = density._config.model_copy(update={"max_gaussians": 12})
+        density = strategy(10, refine_scale2d_stop_share=1.0, prune_scale2d=10.0, cap=12)
         density.observe(seen(torch.zeros(1, 10, 2), radius_px=torch.arange(10.0)[None]))
         decision = density.decide(parameters, 100)
         # Three reach beyond a twentieth of 48 pixels and more; there is room for two.

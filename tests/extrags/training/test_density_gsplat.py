@@ -150,7 +150,7 @@ class TestDefault:
         torch.manual_seed(11)
         ops.split(theirs.parameters, theirs.optimisers, {}, mask)
         density = DefaultStrategy(DensifyConfig(), EXTENT, 100, 50, seed=11)
-        children = density._children(start, mask)
+        children = density.children(start, mask)
         for name, value in children.items():
             torch.testing.assert_close(value, theirs.parameters[name].detach()[-2 * int(mask.sum()) :])
 

@@ -78,14 +78,14 @@ def test_gradient_of_turn_and_shift_against_differences(
     poses = PoseRefinement(cameras, PoseRefinementConfig(), DEPTH_MM, 100)
     # Away from zero, where the order of turns matters.
     start = np.array([0.02, -0.03, 0.01, 0.01, 0.02, -0.015])
-    poses._x[1] = start
+    poses.corrections[1] = start
     _, gradient = loss_from(step, view, np.linalg.inv(poses.viewmat(1)))
     analytic = poses.gradient(1, gradient)
     numeric = np.zeros(6)
     for axis in range(6):
         sides = []
         for sign in (1, -1):
-            poses._x[1] = start + sign * 2e-3 * np.eye(6)[axis]
+            poses.corrections[1] = start + sign * 2e-3 * np.eye(6)[axis]
             sides.append(loss_from(step, view, np.linalg.inv(poses.viewmat(1)))[0])
         numeric[axis] = (sides[0] - sides[1]) / 4e-3
     # The image is made of edges: differences over a finite step are rough.
@@ -142,7 +142,7 @@ def test_the_path_as_a_whole_stays() -> None:
 
 def test_the_prior_draws_back() -> None:
     poses = refinement(prior=1.0, learning_rate=4e-3)
-    poses._x[:, 3] = np.array([0.05, -0.05, 0.05, -0.05, 0.05, -0.05])
+    poses.corrections[:, 3] = np.array([0.05, -0.05, 0.05, -0.05, 0.05, -0.05])
     before = poses.refined().mean_shift
     for iteration in range(60):
         poses.step(iteration % 6, np.zeros((4, 4)), iteration)

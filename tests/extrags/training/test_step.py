@@ -99,8 +99,8 @@ class TestOneStep:
         own = native_step.differentiate(view, iteration, density)
         other = expected.differentiate(view, iteration, density)
         assert own.loss == pytest.approx(other.loss, rel=1e-6)
-        assert native_step._direct is not None
-        gradients = dict(native_step._direct.gradients)
+        assert native_step.direct is not None
+        gradients = dict(native_step.direct.gradients)
         gradients |= {"sh0": gradients["sh"][:, :1], "shN": gradients["sh"][:, 1:]}
         for name, value in expected.adam.parameters.items():
             assert value.grad is not None
@@ -112,16 +112,16 @@ class TestOneStep:
         moved, expected_moved = getattr(own.rendering.means2d, name), getattr(other.rendering.means2d, name)
         assert _relative(moved, expected_moved) < 1e-5
         if lit:
-            assert native_step._light is not None
+            assert native_step.light_fit is not None
             assert expected.light is not None
-            row = native_step._direct.light_gradient
-            common = native_step._light.common_gradient(row)
+            row = native_step.direct.light_gradient
+            common = native_step.light_fit.common_gradient(row)
             names = ("log_softening", "log_exponent", "spread", "cosine", "offset", "log_shoulder")
             flat = [expected.light.parameters()[name].grad for name in names]
             joined = torch.cat([value.reshape(-1) for value in flat if value is not None])
             assert _relative(torch.from_numpy(common), joined) < 1e-5
             if view.frame is not None:
-                exposure = torch.from_numpy(native_step._light.exposure_gradient(row))
+                exposure = torch.from_numpy(native_step.light_fit.exposure_gradient(row))
                 assert expected.light.log_exposure.grad is not None
                 assert _relative(exposure, expected.light.log_exposure.grad) < 1e-5
 
@@ -228,10 +228,10 @@ class TestNativeStep:
         views = real_views(tube_sequence, tube_sequence.train)
         for view in views:
             step.differentiate(view, 0, density)
-        assert len(step._targets) == len(views)
+        assert len(step.targets) == len(views)
         del views, view
         gc.collect()
-        assert not step._targets
+        assert not step.targets
 
     def test_nonfinite_parameters_are_refused(self, tube_sequence: EndoscopicSequence) -> None:
         scene = _scene()

@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from extrags.cameras import Cameras
+from extrags.gaussians import Gaussians
+from extrags.raster import rasterize
+from extrags.scene import Scene
+
+
+def _scene_and_cameras() -> tuple[Scene, Cameras]:
+    generator = np.random.default_rng(0)
+    points = generator.uniform(-1, 1, size=(40, 3)) + np.array([0, 0, 4])
+    gaussians = Gaussians.from_points(points, generator.uniform(size=(40, 3)), np.full(40, 0.3))
+    K = np.array([[30.0, 0, 16], [0, 30.0, 12], [0, 0, 1]])
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 0.5
+    return Scene(gaussians), Cameras(np.tile(K, (2, 1, 1)), poses, 32, 24)
+
+
+def test_attributes_are_blended_as_colours_are() -> None:
+    scene, cameras = _scene_and_cameras()
+    attributes = torch.randn(40, 5, generator=torch.Generator().manual_seed(0))
+    blended, alpha = scene.render_attributes(cameras, attributes)
+    assert blended.shape == (2, 24, 32, 5)
+    gaussians = scene.gaussians
+    for first in (0, 2):
+        expected = rasterize(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales.exp(),
+            gaussians.opacities.sigmoid(),
+            None,
+            torch.from_numpy(cameras.viewmats.astype(np.float32)),
+            torch.from_numpy(cameras.K.astype(np.float32)),
+            32,
+            24,
+            colors=attributes[:, first : first + 3].contiguous(),
+        )
+        assert torch.equal(blended[..., first : first + 3], expected.rgb)
+        assert torch.equal(alpha, expected.alpha)
+
+
+def test_an_attribute_of_one_gives_the_opacity() -> None:
+    scene, cameras = _scene_and_cameras()
+    blended, alpha = scene.render_attributes(cameras, torch.ones(40, 1))
+    torch.testing.assert_close(blended[..., 0], alpha)
+    assert 0 < float(alpha.mean()) < 1
