@@ -23,10 +23,10 @@ from extrags.events import Progress, emit
 from extrags.metrics.image import ssim_map
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetwork
+from extrags.restoration.training_data.augmentation import Batch
 from extrags.view_synthesis.conditioning import COLOR_CENTER, COLOR_SCALE, Conditioning
 
 __all__ = [
-    "Batch",
     "Predicted",
     "Sampled",
     "TrainingSettings",
@@ -53,38 +53,6 @@ LOG_ERROR_LIMIT = 4.0
 WARM_UP = 30
 GRADIENT_LIMIT = 1.0
 REPORT_EVERY = 10
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Crops to learn from.
-
-    Args:
-        conditioning: network input, base image and completed depth.
-        clean: what the view really looked like, in [0, 1], [N, 3, H, W].
-        weight: of each pixel's error, [N, 1, H, W].
-        depth_mm: true z-depth, 0 where unknown, [N, 1, H, W].
-    """
-
-    conditioning: Conditioning
-    clean: Float[Tensor, "n 3 h w"]
-    weight: Float[Tensor, "n 1 h w"]
-    depth_mm: Float[Tensor, "n 1 h w"]
-
-    @staticmethod
-    def concatenated(parts: list[Batch]) -> Batch:
-        """Join crops of the same size."""
-        conditionings = [part.conditioning for part in parts]
-        return Batch(
-            Conditioning(
-                torch.cat([part.channels for part in conditionings]),
-                torch.cat([part.base for part in conditionings]),
-                torch.cat([part.depth_mm for part in conditionings]),
-            ),
-            torch.cat([part.clean for part in parts]),
-            torch.cat([part.weight for part in parts]),
-            torch.cat([part.depth_mm for part in parts]),
-        )
 
 
 @dataclass(frozen=True)

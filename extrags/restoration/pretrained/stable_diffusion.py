@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from extrags.restoration.pretrained.adapter import Adapter, Window, pictures, seeded
+from extrags.restoration.pretrained.enhancer import DiffusersBackend
 from extrags.restoration.pretrained.model import PipelineRule
 
-__all__ = ["StableDiffusionImageToImage", "StableDiffusionInpaint"]
+__all__ = ["IMAGE_TO_IMAGE", "INPAINT", "StableDiffusionImageToImage", "StableDiffusionInpaint"]
 
 IMAGES_AT_ONCE = 4
 _TEXT = ("text_encoder", "tokenizer")
@@ -118,3 +119,7 @@ class StableDiffusionInpaint(_StableDiffusion):
             "height": window.height,
             "width": window.width,
         }
+
+
+IMAGE_TO_IMAGE = DiffusersBackend(StableDiffusionImageToImage)
+INPAINT = DiffusersBackend(StableDiffusionInpaint)

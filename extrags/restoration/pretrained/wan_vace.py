@@ -8,9 +8,10 @@ import numpy as np
 from torch import Tensor
 
 from extrags.restoration.pretrained.adapter import Adapter, Window, pictures, seeded
+from extrags.restoration.pretrained.enhancer import DiffusersBackend
 from extrags.restoration.pretrained.model import PipelineRule
 
-__all__ = ["WanVace"]
+__all__ = ["WAN_VACE", "WanVace"]
 
 GREY = 0.5
 """What VACE was trained to see where something is to be made."""
@@ -77,3 +78,6 @@ class WanVace(Adapter):
         if guided:
             encoded["negative_prompt_embeds"] = negative
         return encoded
+
+
+WAN_VACE = DiffusersBackend(WanVace)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,13 +11,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrags.errors import ConfigError
-from extrags.restoration.diffusion.network import SIZE_MULTIPLE
-from extrags.restoration.diffusion.rectified_flow import Batch
 from extrags.restoration.training_data.pairs import Pairs
-from extrags.view_synthesis.conditioning import Layers, condition
+from extrags.view_synthesis.conditioning import Conditioning, Layers, condition
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["CropSampler", "MixedSampler", "cut_out", "drop_references"]
+__all__ = ["Batch", "CropSampler", "MixedSampler", "cut_out", "drop_references"]
 
 PASTED_HOLES = 0.5
 """Probability of another pair's holes."""
@@ -31,6 +30,38 @@ nearer to the wall than real ones: the restorer shall keep the colour it is give
 SMALLEST_CROP_PX = 32
 
 
+@dataclass(frozen=True)
+class Batch:
+    """Crops to train on.
+
+    Args:
+        conditioning: network input, base image and completed depth.
+        clean: the true view, in [0, 1], [N, 3, H, W].
+        weight: of each pixel's error, [N, 1, H, W].
+        depth_mm: true z-depth, 0 where unknown, [N, 1, H, W].
+    """
+
+    conditioning: Conditioning
+    clean: Float[Tensor, "n 3 h w"]
+    weight: Float[Tensor, "n 1 h w"]
+    depth_mm: Float[Tensor, "n 1 h w"]
+
+    @staticmethod
+    def concatenated(parts: list[Batch]) -> Batch:
+        """Join crops of the same size."""
+        conditionings = [part.conditioning for part in parts]
+        return Batch(
+            Conditioning(
+                torch.cat([part.channels for part in conditionings]),
+                torch.cat([part.base for part in conditionings]),
+                torch.cat([part.depth_mm for part in conditionings]),
+            ),
+            torch.cat([part.clean for part in parts]),
+            torch.cat([part.weight for part in parts]),
+            torch.cat([part.depth_mm for part in parts]),
+        )
+
+
 class CropSampler:
     """Draws batches of augmented crops, the same sequence for the same seed.
 
@@ -39,18 +70,28 @@ class CropSampler:
         transfer: how brightness changes with distance in this scene.
         batch: crops per batch.
         crop_px: side of a crop; images smaller than that give smaller crops.
-        seed: of everything random.
+        side_multiple: of which a crop's side must be a multiple; the network's.
+        seed: of all random draws.
 
     Raises:
         ConfigError: when the images are too small for any crop, or no pair is left to train on.
     """
 
-    def __init__(self, pairs: Pairs, transfer: LightTransfer, *, batch: int, crop_px: int, seed: int) -> None:
+    def __init__(
+        self,
+        pairs: Pairs,
+        transfer: LightTransfer,
+        *,
+        batch: int,
+        crop_px: int,
+        side_multiple: int,
+        seed: int,
+    ) -> None:
         self._pairs = pairs.subset(np.flatnonzero(~pairs.validation))
         if len(self._pairs) == 0:
             raise ConfigError("all pairs are kept back for validation; none is left to train on")
         height, width = pairs.target.shape[-2:]
-        side = min(crop_px, height, width) // SIZE_MULTIPLE * SIZE_MULTIPLE
+        side = min(crop_px, height, width) // side_multiple * side_multiple
         if side < SMALLEST_CROP_PX:
             raise ConfigError(
                 f"images of {width}x{height} px are too small to train a restorer on; "

@@ -70,6 +70,11 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.frame)
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the images in pixels."""
+        return int(self.target.shape[-2]), int(self.target.shape[-1])
+
     def subset(self, chosen: Int[np.ndarray, "m"]) -> Pairs:
         """Chosen pairs."""
         index = torch.from_numpy(np.asarray(chosen, dtype=np.int64))

@@ -11,15 +11,15 @@ from importlib.resources import files
 from pathlib import Path
 
 from extrags.errors import WeightsError
+from extrags.restoration.description import DESCRIPTION
 
-__all__ = ["BUNDLED", "DESCRIPTION", "NONE", "WEIGHTS", "find_weights", "weights_digest"]
+__all__ = ["BUNDLED", "NONE", "WEIGHTS", "find_weights", "weights_digest"]
 
 BUNDLED = "bundled"
 """Setting: the weights of the package."""
 NONE = "none"
 """Setting: no weights; the restorer of a scene is trained from nothing."""
 WEIGHTS = "restorer.safetensors"
-DESCRIPTION = "restorer.json"
 
 
 def find_weights(setting: str) -> Path | None:
