@@ -23,10 +23,10 @@ _ABSENT = ("safety_checker", "feature_extractor", "image_encoder")
 
 
 class _StableDiffusion(Adapter):
-    """What both share: no time axis, so all frames share their noise, which keeps flicker down."""
+    """Base of both: without a time axis, all frames share their noise, which reduces flicker."""
 
     def _restored(self, window: Window, seed: int) -> np.ndarray:
-        # The real view is there for the video models; nothing of it needs to be restored.
+        # The real view is for the video models; it needs no restoration.
         parts = [window.frames[:1]]
         for first in range(1, len(window), IMAGES_AT_ONCE):
             chosen = slice(first, first + IMAGES_AT_ONCE)
@@ -93,7 +93,7 @@ class StableDiffusionImageToImage(_StableDiffusion):
 
 
 class StableDiffusionInpaint(_StableDiffusion):
-    """`StableDiffusionInpaintPipeline`: only masked pixels are made anew.
+    """`StableDiffusionInpaintPipeline`: only masked pixels are generated.
 
     Takes inpainting checkpoints (a network of nine input channels) and plain ones (four).
 

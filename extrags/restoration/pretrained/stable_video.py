@@ -22,7 +22,7 @@ MOTION = 127
 
 
 class StableVideo(Adapter):
-    """`StableVideoDiffusionPipeline`: made to animate one image, here led along a clip.
+    """`StableVideoDiffusionPipeline`: made to animate one image, here guided by a clip.
 
     The real view is its image. Frames start from the clip's latents with noise (`strength` of the
     schedule, as SDEdit does), and after every step the latents of known pixels are set back to the

@@ -366,7 +366,7 @@ class TestWithoutReferences:
     def test_saving(self, tmp_path) -> None:
         WithoutReferences(ClassicalEnhancer()).save(tmp_path)
         assert (tmp_path / "restorer.json").exists()
-        with pytest.raises(ConfigError, match="no restorer"):
+        with pytest.raises(ConfigError, match="cannot be saved"):
             AsRendered().save(tmp_path)
 
 
