@@ -17,7 +17,7 @@ from extrags.errors import ConfigError
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, has_fast_half_precision
 from extrags.restoration.diffusion.error_fit import with_error_model
-from extrags.restoration.diffusion.network import SIZE_MULTIPLE, build_network
+from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetwork, build_network
 from extrags.restoration.diffusion.rectified_flow import TrainingSettings, train_network
 from extrags.restoration.diffusion.validation import validation_scores
 from extrags.restoration.training_data.augmentation import CropSampler, MixedSampler
@@ -79,33 +79,10 @@ def pretrain(
             f"{config.validation_scenes} are for validation"
         )
     perceptual = Lpips.load(net="squeeze") if config.perceptual else None
-    samplers = []
-    for number, file in enumerate(files[: -config.validation_scenes]):
-        scene = PretrainingScene.load(file)
-        # In half precision, as in the file: in full precision a hundred scenes would take ten gigabytes.
-        pairs = replace(scene.pairs, layers=Layers(scene.pairs.layers.data.half()))
-        seed = _scene_seed(config, number)
-        samplers.append(
-            CropSampler(
-                pairs,
-                scene.transfer,
-                batch=1,
-                crop_px=config.crop,
-                side_multiple=SIZE_MULTIPLE,
-                seed=seed,
-            )
-        )
+    samplers = [_sampler(file, config, n) for n, file in enumerate(files[: -config.validation_scenes])]
     mixed = MixedSampler(samplers, batch=config.batch, seed=config.seed)
     generator = torch.Generator().manual_seed(config.seed)
-    if start is None:
-        network = build_network(CONDITION_CHANNELS, config.channels, generator)
-    else:
-        if start.network.widths != config.channels or start.deterministic != config.deterministic:
-            raise ConfigError(
-                f"the weights to start from have channels {start.network.widths}, deterministic is "
-                f"{start.deterministic}; the settings say {config.channels} and {config.deterministic}"
-            )
-        network = copy.deepcopy(start.network)
+    network = _starting_network(config, start, generator)
     half = has_fast_half_precision()
     settings = TrainingSettings(
         config.iterations,
@@ -130,6 +107,33 @@ def pretrain(
     return _scored(trained, files[-config.validation_scenes :])
 
 
+def _sampler(file: Path, config: PretrainingConfig, number: int) -> CropSampler:
+    scene = PretrainingScene.load(file)
+    # In half precision, as in the file: in full precision a hundred scenes would take ten gigabytes.
+    pairs = replace(scene.pairs, layers=Layers(scene.pairs.layers.data.half()))
+    return CropSampler(
+        pairs,
+        scene.transfer,
+        batch=1,
+        crop_px=config.crop,
+        side_multiple=SIZE_MULTIPLE,
+        seed=config.seed * 100_003 + number,
+    )
+
+
+def _starting_network(
+    config: PretrainingConfig, start: EmbeddedEnhancer | None, generator: torch.Generator
+) -> RestorationNetwork:
+    if start is None:
+        return build_network(CONDITION_CHANNELS, config.channels, generator)
+    if start.network.widths != config.channels or start.deterministic != config.deterministic:
+        raise ConfigError(
+            f"the weights to start from have channels {start.network.widths}, deterministic is "
+            f"{start.deterministic}; the settings say {config.channels} and {config.deterministic}"
+        )
+    return copy.deepcopy(start.network)
+
+
 def _scored(enhancer: EmbeddedEnhancer, files: Sequence[Path]) -> EmbeddedEnhancer:
     """The restorer with error model, calibration and scores from the validation scenes.
 
@@ -150,7 +154,3 @@ def _scored(enhancer: EmbeddedEnhancer, files: Sequence[Path]) -> EmbeddedEnhanc
         means[name] = {key: round(float(np.mean(found)), 4) for key, found in known.items() if found}
     record = {**enhancer.record, "validation_scores": means}
     return with_error_model(replace(enhancer, record=record), [(one.pairs, one.transfer) for one in loaded])
-
-
-def _scene_seed(config: PretrainingConfig, number: int) -> int:
-    return config.seed * 100_003 + number
