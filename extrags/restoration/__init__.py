@@ -2,7 +2,7 @@
 
 Layers, bottom to top, each importing from those below it only: `protocol` and `description` (what a
 restorer is and how it is saved); `clips`, `uncertainty` and `training_data`; `classical`; `diffusion`;
-`pretrained`; `backends` (restorers by name); `benchmark`.
+`pretrained`; `backends` (restorers by name); `trajectories` and `benchmark`.
 
 To add a backend: a module with a `protocol.Backend`, and its entry in `extrags.config.backends.BACKENDS`.
 """
