@@ -7,12 +7,11 @@ its backend is implemented, and `extrags.restoration.backends.backend_of` import
 from __future__ import annotations
 
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
-from extrags.errors import ConfigError
+from extrags.config.base import KeyOf
 
-__all__ = ["BACKENDS", "BackendEntry", "backend_schema", "backend_summaries", "check_backend_name"]
+__all__ = ["BACKENDS", "BACKEND_NAME", "BackendEntry", "backend_schema", "backend_summaries"]
 
 
 @dataclass(frozen=True)
@@ -56,18 +55,8 @@ BACKENDS: dict[str, BackendEntry] = {
     ),
 }
 
-
-def check_backend_name(name: str) -> str:
-    """The name itself, if a backend has it.
-
-    Raises:
-        ConfigError: for an unknown name; gives the nearest known one.
-    """
-    if name not in BACKENDS:
-        near = get_close_matches(name, BACKENDS, n=1)
-        hint = f"; did you mean {near[0]}?" if near else "."
-        raise ConfigError(f"no restorer backend {name!r}{hint} Known: {', '.join(BACKENDS)}")
-    return name
+BACKEND_NAME = KeyOf(BACKENDS)
+"""Annotation of a setting that names a backend."""
 
 
 def backend_summaries() -> str:

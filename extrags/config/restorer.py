@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
-from extrags.config.backends import backend_schema, backend_summaries, check_backend_name
+from extrags.config.backends import BACKEND_NAME, backend_schema, backend_summaries
 from extrags.config.base import StageConfig
 
 __all__ = ["CaptionConfig", "CheckpointConfig", "EnhanceConfig", "PretrainedConfig"]
@@ -101,7 +101,7 @@ class CheckpointConfig(StageConfig):
 class EnhanceConfig(StageConfig):
     """Restoration of the virtual views."""
 
-    backend: Annotated[str, AfterValidator(check_backend_name)] = Field(
+    backend: Annotated[str, BACKEND_NAME] = Field(
         "embedded",
         description=backend_summaries(),
         json_schema_extra=backend_schema,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from extrags.config import CoarseConfig, EnhanceConfig
-from extrags.config.backends import BACKENDS, BackendEntry, check_backend_name
+from extrags.config.backends import BACKEND_NAME, BACKENDS, BackendEntry
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.description import DESCRIPTION, read_description
 from extrags.restoration.pretrained.captions import check_source
@@ -33,7 +33,7 @@ def backend_of(name: str) -> Backend:
     Raises:
         ConfigError: for an unknown name; gives the nearest known one.
     """
-    found: Any = BACKENDS[check_backend_name(name)].implementation
+    found: Any = BACKENDS[BACKEND_NAME.check(name)].implementation
     if isinstance(found, str):
         module, _, attribute = found.partition(":")
         found = getattr(importlib.import_module(module), attribute)
