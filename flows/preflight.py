@@ -31,6 +31,6 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
 
     lpips_weights(config.evaluate)
     if "enhance" not in leave_out:
-        from extrags.restoration.preflight import check_restorer
+        from extrags.restoration import check_restorer
 
         check_restorer(config.enhance)

@@ -59,6 +59,6 @@ def restorer_digest(config: EnhanceConfig) -> str | None:
     Raises:
         ExtragsError: when it is not there; says how to get it.
     """
-    from extrags.restoration.preflight import model_digest
+    from extrags.restoration import backends
 
-    return model_digest(config)
+    return backends.restorer_digest(config)

@@ -36,6 +36,8 @@ NOT_COUNTED = (
     "tasks.progress",
     "tasks.stage",
 )
+COUNTED = ("extrags.config.backends",)
+"""Of the settings: where the restorers are named that `enhance-train` looks up."""
 NATIVE = "extrags.raster._native"
 
 Symbol = tuple[str, str]
@@ -136,7 +138,8 @@ def reached(start: Symbol) -> dict[Symbol, str]:
     waiting = [start]
     while waiting:
         symbol = waiting.pop()
-        if symbol not in found and not symbol[0].startswith(NOT_COUNTED):
+        counts = symbol[0] in COUNTED or not symbol[0].startswith(NOT_COUNTED)
+        if symbol not in found and counts:
             found[symbol], named = examined(symbol)
             waiting += named
     return found

@@ -56,6 +56,11 @@ class TestReached:
         assert ("extrags.scene", "Scene") in found
         assert not any(module.startswith("extrags.restoration") for module, _ in found)
 
+    def test_restorers_are_reached_by_their_entries(self) -> None:
+        found = reached(stages()["enhance-train"][0])
+        assert ("extrags.restoration.diffusion.scene_training", "train_on_scene") in found
+        assert ("extrags.restoration.pretrained.wan_vace", "WanVace") in found
+
     def test_a_leaf_rests_on_little(self) -> None:
         assert len(reached(stages()["training-frames"][0])) < 40
 

@@ -1,11 +1,12 @@
-"""Settings of the restoration: the embedded restorer, those that others trained, and their captions."""
+"""Settings of the restoration: the embedded restorer, pretrained models, and captions."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
+from extrags.config.backends import BACKEND_NAME, backend_schema, backend_summaries
 from extrags.config.base import StageConfig
 
 __all__ = ["CaptionConfig", "CheckpointConfig", "EnhanceConfig", "PretrainedConfig"]
@@ -100,19 +101,10 @@ class CheckpointConfig(StageConfig):
 class EnhanceConfig(StageConfig):
     """Restoration of the virtual views."""
 
-    backend: Literal[
+    backend: Annotated[str, BACKEND_NAME] = Field(
         "embedded",
-        "classical",
-        "wan-vace",
-        "stable-video",
-        "ltx",
-        "sd-img2img",
-        "sd-inpaint",
-        "dynamicrafter",
-    ] = Field(
-        "embedded",
-        description="embedded: the conditional diffusion; classical: blend and fill; dynamicrafter: a "
-        "checkpoint run by its own code; the others: pretrained diffusers pipelines",
+        description=backend_summaries(),
+        json_schema_extra=backend_schema,
     )
     pretrained_weights: str = Field(
         "bundled",
@@ -131,8 +123,8 @@ class EnhanceConfig(StageConfig):
     )
     judge: bool = Field(
         True,
-        description="the embedded restorer must not be worse than blending and filling on leave-out pairs of "
-        "the scene, else that serves",
+        description="compare the embedded restorer with blending and filling on leave-out pairs of the "
+        "scene, and use the latter where the former is worse",
     )
     batch: int = Field(4, ge=1, description="crops per step")
     crop: int = Field(96, ge=32, description="crop size in pixels, a multiple of 8")

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, TypeGuard, Union, get_args, get_orig
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
+from extrags.config.base import KeyOf
 from extrags.errors import ConfigError, did_you_mean
 
 __all__ = ["Setting", "groups_of", "settings_of", "unknown_setting"]
@@ -72,7 +73,15 @@ class Setting:
 
     def refused(self, found: str) -> ConfigError:
         """The error for a value that it does not take."""
-        return ConfigError(f"setting {self.name} is {found or 'empty'}; expected {self.expected}")
+        meant = did_you_mean(found.strip("'"), self.choices)
+        return ConfigError(f"setting {self.name} is {found or 'empty'}; expected {self.expected}{meant}")
+
+    @property
+    def choices(self) -> list[str]:
+        """The names it takes, where they are a closed list or the keys of a table."""
+        tables = [item.table for item in self.limits if isinstance(item, KeyOf)]
+        literals = [get_args(kind) for kind in self._kinds if get_origin(kind) is Literal]
+        return [str(name) for names in (*literals, *tables) for name in names]
 
     @property
     def _kinds(self) -> tuple[Any, ...]:
@@ -80,8 +89,8 @@ class Setting:
         return get_args(self.annotation) if union else (self.annotation,)
 
     def _words(self, kind: Any) -> list[str]:
-        if get_origin(kind) is Literal:
-            return [str(value) for value in get_args(kind)]
+        if get_origin(kind) is Literal or (kind is str and self.choices):
+            return self.choices
         if get_origin(kind) is tuple:
             return [f"{len(get_args(kind))} whole numbers with commas between"]
         if kind in (int, float):

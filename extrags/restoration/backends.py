@@ -1,42 +1,116 @@
-"""Which restorer a scene gets, and how a saved one comes back."""
+"""Restorers by the name of their backend: registered, checked, prepared for a scene, loaded again."""
 
 from __future__ import annotations
 
-import json
-import logging
-from dataclasses import replace
+import hashlib
+import importlib
 from pathlib import Path
-
-import numpy as np
-import torch
+from typing import Any
 
 from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.config.backends import BACKEND_NAME, BACKENDS, BackendEntry
 from extrags.errors import ConfigError, WeightsError
-from extrags.events import MetricRecorded, emit
-from extrags.restoration.classical import ClassicalEnhancer
-from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, validation_scores
-from extrags.restoration.diffusion.weights import find_weights
-from extrags.restoration.pretrained.checkpoint import CheckpointEnhancer
-from extrags.restoration.pretrained.enhancer import ADAPTERS, PretrainedEnhancer
-from extrags.restoration.protocol import Enhancer
-from extrags.restoration.training_data.pairs import MIN_FRAMES, Pairs, make_pairs
+from extrags.restoration.description import DESCRIPTION, read_description
+from extrags.restoration.pretrained.captions import check_source
+from extrags.restoration.pretrained.fingerprint import files_fingerprint
+from extrags.restoration.protocol import Backend, Enhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.view_synthesis.gamut import Gamut
-from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 
-__all__ = ["judged", "load_enhancer", "scene_gamut", "starting_restorer", "train_enhancer"]
+__all__ = [
+    "backend_of",
+    "check_restorer",
+    "load_enhancer",
+    "register_backend",
+    "restorer_digest",
+    "train_enhancer",
+]
 
-MAX_LOSS_DB = 0.5
-"""Leave-out views lie near the path, where there is little to restore: so much behind is not yet harm."""
 
-logger = logging.getLogger(__name__)
+def backend_of(name: str) -> Backend:
+    """The backend of a name; its code is imported now.
+
+    Raises:
+        ConfigError: for an unknown name; gives the nearest known one.
+    """
+    found: Any = BACKENDS[BACKEND_NAME.check(name)].implementation
+    if isinstance(found, str):
+        module, _, attribute = found.partition(":")
+        found = getattr(importlib.import_module(module), attribute)
+    backend: Backend = found
+    return backend
+
+
+def register_backend(backend: Backend | Any, summary: str) -> None:
+    """Make a backend of another program known; `enhance.backend` takes its name from now on.
+
+    The registration holds for this process. Where stages run in other processes, each of them has to
+    register the backend.
+
+    Args:
+        backend: of the protocol `Backend`; its `name` must be free.
+        summary: what it is, in a few words, for help texts.
+
+    Raises:
+        ConfigError: when a part of the protocol is missing, or the name is taken.
+    """
+    if not isinstance(backend, Backend):
+        parts = ("name", "check", "digest", "needs_text", "prepare", "load")
+        missing = [part for part in parts if not hasattr(backend, part)]
+        raise ConfigError(f"{type(backend).__name__} is no restorer backend: it lacks {', '.join(missing)}")
+    if backend.name in BACKENDS:
+        raise ConfigError(f"there is a restorer backend {backend.name} already; choose another name")
+    BACKENDS[backend.name] = BackendEntry(summary, backend)
+
+
+def check_restorer(config: EnhanceConfig) -> None:
+    """Look for everything that the backend needs besides the scene.
+
+    A model that may be downloaded (`enhance.pretrained.local_files_only=false`) is downloaded here.
+
+    Args:
+        config: backend, model and caption.
+
+    Raises:
+        WeightsError: when weights are missing or do not fit; says how to get them.
+        MissingDependencyError: when a package is missing; says how to install it.
+        ConfigError: when settings do not fit each other, the model or the machine.
+        SourceNotFoundError: when the file of captions is missing.
+        ExtragsError: when the clone of a checkpoint's code does not start.
+    """
+    backend = backend_of(config.backend)
+    if backend.needs_text(config):
+        check_source(config.caption)
+    backend.check(config)
+
+
+def restorer_digest(config: EnhanceConfig) -> str | None:
+    """Digest of the pretrained model that a scene's restorer starts from, and of its file of captions.
+
+    Where they are stored does not change it.
+
+    Args:
+        config: backend, model and caption.
+
+    Returns:
+        None for a backend that starts from nothing.
+
+    Raises:
+        ExtragsError: as `check_restorer`.
+    """
+    backend = backend_of(config.backend)
+    model = backend.digest(config)
+    texts = check_source(config.caption) if backend.needs_text(config) else None
+    if texts is None:
+        return model
+    parts = f"{model} {files_fingerprint({'texts': texts})}"
+    return hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()
 
 
 def train_enhancer(
     scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
 ) -> Enhancer:
-    """The restorer of a scene: trained on the scene's own pairs, or prepared where nothing is trained.
+    """The restorer of a scene: trained on the scene's own pairs, or prepared from a pretrained model.
 
     Args:
         scene: the coarse scene, trained on `sequence.train`.
@@ -47,98 +121,24 @@ def train_enhancer(
     Raises:
         CaptureError: with too few training frames for the embedded backend.
         DivergedError: when a reconstruction or the training does not stay finite.
-        WeightsError: when a pretrained model is not there; says how to get it.
+        WeightsError: when a pretrained model is missing; says how to get it.
         MissingDependencyError: when a pretrained backend lacks a package.
         ConfigError: when its settings do not fit.
     """
-    if config.backend == "classical":
-        return ClassicalEnhancer()
-    if config.backend == CheckpointEnhancer.name:
-        return CheckpointEnhancer.prepare(scene, sequence, config)
-    if config.backend in ADAPTERS:
-        return PretrainedEnhancer.prepare(scene, sequence, config)
-    start = starting_restorer(config)
-    transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
-    if start is not None and config.train_iterations == 0:
-        pretrained = start.with_settings(config, scene_gamut(sequence))
-        if not config.judge or len(sequence.train) < MIN_FRAMES:
-            return pretrained
-        # Nothing is trained: all pairs judge, and torn ones would flatter who fills holes.
-        fresh = make_pairs(scene, sequence, config.model_copy(update={"synthetic_views": 0}), coarse)
-        pairs = replace(fresh, validation=np.ones(len(fresh), dtype=bool))
-        return judged(pretrained, pairs, transfer)
-    pairs = make_pairs(scene, sequence, config, coarse)
-    trained = EmbeddedEnhancer.train(pairs, transfer, config, start)
-    return judged(trained, pairs, transfer) if config.judge else trained
-
-
-def judged(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> Enhancer:
-    """The restorer, unless blending and filling does better on the scene's leave-out pairs.
-
-    A network far from what it has learned from does harm: on such a scene the classical restorer serves,
-    and says why.
-
-    Args:
-        enhancer: ready for the scene.
-        pairs: those that validate were not trained on.
-        transfer: how brightness changes with distance.
-    """
-    scores = validation_scores(enhancer, pairs, transfer, (enhancer.steps,))
-    restored, filled = scores[f"embedded_{enhancer.steps}"]["psnr"], scores["classical"]["psnr"]
-    emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
-    if restored < filled - MAX_LOSS_DB:
-        reason = (
-            f"on leave-out pairs of this scene the embedded restorer reaches {restored:.2f} dB, blending and "
-            f"filling {filled:.2f} dB"
-        )
-        logger.warning("%s; the scene is restored by blending and filling", reason)
-        return ClassicalEnhancer(reason)
-    found = {**enhancer.record.get("validation", {}), **scores}
-    return replace(enhancer, record={**enhancer.record, "validation": found})
-
-
-def starting_restorer(config: EnhanceConfig) -> EmbeddedEnhancer | None:
-    """What the embedded backend starts from; None where it learns from the scene's pairs alone.
-
-    Args:
-        config: weights and budget.
-
-    Raises:
-        WeightsError: when the weights are not there, or do not fit.
-        ConfigError: when there would be neither weights nor training.
-    """
-    weights = find_weights(config.pretrained_weights)
-    if weights is None and config.train_iterations == 0:
-        raise ConfigError(
-            "enhance.train_iterations is 0 and enhance.pretrained_weights is none: nothing would restore"
-        )
-    return None if weights is None else EmbeddedEnhancer.load(weights)
-
-
-def scene_gamut(sequence: EndoscopicSequence) -> Gamut:
-    """Hues of the training frames' valid tissue."""
-    images = torch.from_numpy(sequence.rgb[sequence.train].astype(np.float32) / 255).permute(0, 3, 1, 2)
-    weight = torch.from_numpy(sequence.mask[sequence.train].astype(np.float32))[:, None]
-    return Gamut.of_images(images, weight)
+    return backend_of(config.backend).prepare(scene, sequence, config, coarse)
 
 
 def load_enhancer(path: Path) -> Enhancer:
     """Read a restorer that `Enhancer.save` wrote.
 
+    Args:
+        path: its folder.
+
     Raises:
-        WeightsError: when there is none, or it does not fit this version.
+        WeightsError: when a file is missing, damaged, or does not fit this version.
     """
-    description = path / "restorer.json"
-    if not description.exists():
-        raise WeightsError(f"{description}: no such file; train the restorer first (stage enhance)")
-    backend = json.loads(description.read_text()).get("backend")
-    if backend == ClassicalEnhancer.name:
-        return ClassicalEnhancer(json.loads(description.read_text()).get("reason", ""))
-    if backend == EmbeddedEnhancer.name:
-        return EmbeddedEnhancer.load(path)
-    if backend == CheckpointEnhancer.name:
-        return CheckpointEnhancer.load(path)
-    if backend in ADAPTERS:
-        return PretrainedEnhancer.load(path)
-    known = ["classical", "embedded", *sorted(ADAPTERS), CheckpointEnhancer.name]
-    raise WeightsError(f"{description}: unknown backend {backend!r}; known: {', '.join(known)}")
+    file = path / DESCRIPTION
+    backend = read_description(file).get("backend")
+    if backend not in BACKENDS:
+        raise WeightsError(f"{file}: unknown backend {backend!r}; known: {', '.join(BACKENDS)}")
+    return backend_of(backend).load(path)

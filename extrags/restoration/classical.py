@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
+from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.restoration.description import (
+    DESCRIPTION,
+    description_fields,
+    read_description,
+    text_field,
+    write_description,
+)
 from extrags.restoration.protocol import Clip, Restoration
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
 from extrags.view_synthesis.conditioning import condition
 
-__all__ = ["ClassicalEnhancer"]
+__all__ = ["CLASSICAL", "ClassicalEnhancer"]
 
 
 @dataclass(frozen=True)
 class ClassicalEnhancer:
     """Multi-view blend where real views see the surface, the rendering elsewhere, holes filled.
 
-    The base image of the embedded diffusion, by itself: its baseline, and what serves where the diffusion
-    would do harm.
+    It is the base image of the embedded diffusion: the baseline it is compared with, and its replacement on
+    scenes where it does worse.
 
     Args:
-        reason: why it serves although another restorer was asked for; empty where it was asked for.
+        reason: why it replaces another restorer; empty where it was asked for.
     """
 
     reason: str = ""
@@ -34,13 +43,48 @@ class ClassicalEnhancer:
         with torch.no_grad():
             base = condition(clip.layers, clip.transfer).base
         rgb = base.permute(0, 2, 3, 1).contiguous().numpy()
-        return Restoration(rgb, None, self._about)
+        return Restoration(rgb, None, self._description)
 
     def save(self, path: Path) -> None:
         """Write `restorer.json`; there are no weights."""
-        path.mkdir(parents=True, exist_ok=True)
-        (path / "restorer.json").write_text(json.dumps(self._about, indent=2) + "\n")
+        write_description(path, self._description)
 
     @property
-    def _about(self) -> dict[str, str]:
+    def _description(self) -> dict[str, str]:
         return {"backend": self.name, **({"reason": self.reason} if self.reason else {})}
+
+
+class ClassicalBackend:
+    """`enhance.backend=classical`: nothing to check, nothing to prepare."""
+
+    name = ClassicalEnhancer.name
+
+    def check(self, config: EnhanceConfig) -> None:
+        """Nothing is needed."""
+
+    def digest(self, config: EnhanceConfig) -> None:
+        """There is no pretrained model."""
+
+    def needs_text(self, config: EnhanceConfig) -> bool:
+        """No text is read."""
+        return False
+
+    def prepare(
+        self, scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
+    ) -> ClassicalEnhancer:
+        """The same for every scene."""
+        return ClassicalEnhancer()
+
+    def load(self, path: Path) -> ClassicalEnhancer:
+        """Read what `ClassicalEnhancer.save` wrote.
+
+        Raises:
+            WeightsError: when `restorer.json` is missing or damaged.
+        """
+        file = path / DESCRIPTION
+        description = read_description(file)
+        with description_fields(file):
+            return ClassicalEnhancer(text_field(description, "reason") if "reason" in description else "")
+
+
+CLASSICAL = ClassicalBackend()

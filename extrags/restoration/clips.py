@@ -1,4 +1,4 @@
-"""From trajectories to pseudo-observations: clips rendered, restored, blended with what is known."""
+"""Pseudo-observations of trajectories: clips rendered, restored, and blended with the rendering."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def render_clips(
     count: int,
     first_index: int = 0,
 ) -> list[Clip]:
-    """Render trajectories at the mean exposure and gather what real views say about them.
+    """Render trajectories at the mean exposure, and warp real views into them.
 
     Args:
         scene: the coarse scene.
@@ -108,9 +108,9 @@ def keep_known(
     """`u * restored + (1 - u) * rendered`, with u feathered so that no seam is left.
 
     Args:
-        rendered: what the scene shows.
-        restored: what the enhancer made of it.
-        uncertainty: 1 where the scene knows nothing.
+        rendered: of the scene.
+        restored: of the enhancer.
+        uncertainty: 1 in the holes of the scene.
 
     Returns:
         The blend, and the feathered uncertainty. Feathering never lowers the uncertainty of a hole.
@@ -139,7 +139,7 @@ def pseudo_observations(
     restorations: Sequence[Restoration],
     measure: PerceptualDifference,
 ) -> PseudoViews:
-    """Restored clips with everything the fine-tuning needs.
+    """Targets, weights and depth for the fine-tuning from restored clips.
 
     Args:
         clips: at least one.
@@ -219,7 +219,7 @@ def _pseudo_observation(clip: Clip, restoration: Restoration, measure: Perceptua
 
 
 def as_images(colors: Float[Tensor, "t 3 h w"]) -> Float[np.ndarray, "t h w 3"]:
-    """Colours with the channels last, as everything outside the network has them."""
+    """Colours with the channels last."""
     return np.asarray(colors.permute(0, 2, 3, 1).contiguous().numpy())
 
 

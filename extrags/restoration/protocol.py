@@ -1,4 +1,4 @@
-"""What every restorer is given and what it gives back."""
+"""The protocols of the restoration: `Enhancer` restores clips, `Backend` makes and loads enhancers."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras
+from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.errors import ShapeError
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
 from extrags.view_synthesis.conditioning import Layers
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["Clip", "Enhancer", "Restoration", "restore_clips"]
+__all__ = ["Backend", "Clip", "Enhancer", "Restoration", "restore_clips"]
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class Clip:
     Args:
         index: of the clip in the scene; its noise is drawn from it.
         cameras: the views, [T].
-        layers: what is known about them, [T].
+        layers: renderings and warped real views of them, [T].
         transfer: how brightness changes with distance in this scene.
         reference: position among the training frames of the one that sees most of the same surface, [T].
         image_confidence: U_img of each view, [T].
@@ -57,7 +60,7 @@ class Restoration:
     Args:
         rgb: in [0, 1], [T, H, W, 3].
         expected_error: expected absolute error of a pixel, mean of the channels, or None where the restorer
-            has no idea of it, [T, H, W].
+            predicts none, [T, H, W].
         provenance: backend, steps, seed, ...; ready for JSON.
         depth_mm: z-depth without gaps, where the restorer completes it better than smooth filling does,
             or None, [T, H, W].
@@ -71,19 +74,92 @@ class Restoration:
 
 @runtime_checkable
 class Enhancer(Protocol):
-    """Turns degraded renderings into images the tissue could have given."""
+    """Restores renderings of one scene: removes artefacts and fills holes.
 
-    name: str
+    `name` is that of the backend that loads it again.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
 
     def restore(self, clip: Clip) -> Restoration:
         """Restore all views of a clip; the same clip always gives the same result."""
         ...
 
     def save(self, path: Path) -> None:
-        """Write whatever `extrags.restoration.load_enhancer` needs into a folder."""
+        """Write a folder that the backend's `load` reads.
+
+        It holds a `restorer.json` with an entry `backend`: see
+        `extrags.restoration.description.write_description`.
+        """
+        ...
+
+
+@runtime_checkable
+class Backend(Protocol):
+    """A kind of restorer: checks its settings, makes the enhancer of a scene, and loads a saved one.
+
+    Entered in `extrags.config.backends.BACKENDS`, or registered by
+    `extrags.restoration.backends.register_backend`. A backend holds no state: everything comes from the
+    settings.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+
+    def check(self, config: EnhanceConfig) -> None:
+        """Look for everything that is needed besides the scene, before a run begins.
+
+        Args:
+            config: settings with this backend.
+
+        Raises:
+            ExtragsError: when a setting, a package or a file is missing or wrong; says what to do.
+        """
+        ...
+
+    def digest(self, config: EnhanceConfig) -> str | None:
+        """Digest of the pretrained model: weights and code, but not where they are stored.
+
+        It is part of the key of a scene's restorer: another digest makes another restorer.
+
+        Returns:
+            None without a pretrained model.
+
+        Raises:
+            ExtragsError: when the model is not there.
+        """
+        ...
+
+    def needs_text(self, config: EnhanceConfig) -> bool:
+        """Whether a caption of the scene is used; its source is then checked and part of the digest."""
+        ...
+
+    def prepare(
+        self, scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
+    ) -> Enhancer:
+        """Make the enhancer of a scene.
+
+        Args:
+            scene: the coarse scene, trained on `sequence.train`.
+            sequence: posed frames; only training frames are used.
+            config: settings with this backend.
+            coarse: settings for further reconstructions of the scene.
+
+        Raises:
+            ExtragsError: when it cannot be made.
+        """
+        ...
+
+    def load(self, path: Path) -> Enhancer:
+        """Read an enhancer that its `save` wrote.
+
+        Raises:
+            WeightsError: when a file is missing, damaged, or of another version; names the file.
+        """
         ...
 
 
 def restore_clips(enhancer: Enhancer, clips: Iterable[Clip]) -> list[Restoration]:
-    """Restore clips one after the other; they are independent, so that batches may run anywhere."""
+    """Restore clips one after the other; each is independent of the others."""
     return [enhancer.restore(clip) for clip in clips]

@@ -254,7 +254,13 @@ def _explain(given: argparse.Namespace) -> int:
             default = default[part]
         print(f"  --{setting.name} {shlex.quote(setting.text(default))}")
         text = f"{setting.description} ({setting.expected})"
-        print(textwrap.fill(text, _columns(), initial_indent=" " * 6, subsequent_indent=" " * 6))
+        indent = " " * 6
+        # Names like sd-inpaint are not broken: they are there to be copied.
+        print(
+            textwrap.fill(
+                text, _columns(), initial_indent=indent, subsequent_indent=indent, break_on_hyphens=False
+            )
+        )
     print(f"\nThe values shown are those of the profile {profile}.")
     return 0
 

@@ -38,7 +38,7 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--scenes", type=int, metavar="N", help="pretraining scenes (default: 86)")
     parser.add_argument(
-        "--validation-scenes", type=int, metavar="N", help="how many of them only judge (default: 6)"
+        "--validation-scenes", type=int, metavar="N", help="how many of them validate only (default: 6)"
     )
     parser.add_argument("--iterations", type=int, metavar="N", help="optimisation steps (default: 13500)")
     parser.add_argument("--batch", type=int, metavar="N", help="crops per step (default: 4)")

@@ -48,7 +48,6 @@ from extrags.raster import set_num_threads
 from extrags.raster.bench import machine
 from extrags.restoration.backends import load_enhancer
 from extrags.restoration.benchmark.comparison import (
-    METHODS,
     check_methods,
     coarse_scene,
     compare_methods,
@@ -311,7 +310,7 @@ def realism(
     cases: list[Case] = []
     lpips = perceptual(config)
     benchmark = laparoscopy_benchmark(frames, config.enhance.seed, lpips)
-    simple = [name for name in methods if METHODS[name].recipe in ("none", "classical")]
+    simple = [name for name in methods if name in ("none", "classical")]
     scene, posed = coarse_scene(loaded(trained_on, config), config.coarse)
     wanted = simple if restorer is not None else methods
     strangers: list[tuple[str, Enhancer]] = []

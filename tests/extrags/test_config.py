@@ -91,6 +91,8 @@ SETTINGS = settings_of(PipelineConfig)
 
 def values(setting: Setting) -> st.SearchStrategy[Any]:
     """Anything a setting takes."""
+    if setting.choices and setting.annotation is str:
+        return st.sampled_from(setting.choices)
     union = get_origin(setting.annotation) in (Union, UnionType)
     kinds: tuple[Any, ...] = get_args(setting.annotation) if union else (setting.annotation,)
     limited = (Annotated[kind, setting.name, *setting.limits] for kind in kinds if kind in (int, float, str))

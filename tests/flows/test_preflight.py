@@ -12,7 +12,6 @@ import pytest
 
 from extrags.config import EnhanceConfig
 from extrags.errors import ConfigError, WeightsError
-from extrags.restoration.pretrained.enhancer import ADAPTERS
 from extrags.store import Ref, Store
 from flows.benchmark import benchmark
 from flows.cli import main
@@ -26,6 +25,7 @@ from tasks.enhance import train
 from tasks.stage import stage_key
 from tasks.weights import restorer_digest
 from tests.extrags.restoration.pretrained.fake_clone import write_clone
+from tests.extrags.restoration.pretrained.tiny_pipelines import ADAPTERS
 from tests.flows.tiny import SEQUENCE, tiny_config
 
 MISSING = {"enhance.pretrained_weights": "no/such.safetensors"}

@@ -1,1 +1,1 @@
-"""Restorers judged where the truth is known."""
+"""Evaluation and comparison of restorers on views whose truth is known."""

@@ -1,4 +1,4 @@
-"""Restorers beside each other on held-out views: `extrags bench enhance`."""
+"""Comparison of restorers on held-out views: `extrags bench enhance`."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from extrags.config import CoarseConfig, EnhanceConfig, PipelineConfig
+from extrags.config.backends import BACKENDS
 from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, emit
 from extrags.metrics.lpips import Lpips
@@ -22,9 +23,10 @@ from extrags.restoration.benchmark.evaluation import (
     TrueViews,
     WithoutReferences,
     held_out_clips,
+    restore_views,
 )
-from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.protocol import Enhancer
 from extrags.restoration.training_data.pairs import make_pairs
 from extrags.scene import Scene
@@ -62,12 +64,6 @@ def _unrestored(
     return AsRendered()
 
 
-def _classical(
-    _scene: Scene, _sequence: EndoscopicSequence, _config: EnhanceConfig, _coarse: CoarseConfig
-) -> Enhancer:
-    return ClassicalEnhancer()
-
-
 def _learning(config: EnhanceConfig) -> EnhanceConfig:
     """Settings that train on the scene's pairs, whatever the profile says of that."""
     if config.train_iterations > 0:
@@ -75,14 +71,14 @@ def _learning(config: EnhanceConfig) -> EnhanceConfig:
     return config.model_copy(update={"train_iterations": SCENE_ITERATIONS})
 
 
-def _embedded(*, learning: bool = False, **changes: Any) -> Recipe:
-    """The embedded restorer with changed settings; with `learning` it trains on the scene's pairs."""
+def _of_backend(name: str, *, learning: bool = False, **changes: Any) -> Recipe:
+    """A backend's restorer with changed settings; with `learning` it trains on the scene's pairs."""
 
     def recipe(
         scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
     ) -> Enhancer:
         config = _learning(config) if learning else config
-        settings = EnhanceConfig.model_validate({**config.model_dump(), "backend": "embedded", **changes})
+        settings = EnhanceConfig.model_validate({**config.model_dump(), "backend": name, **changes})
         return train_enhancer(scene, sequence, settings, coarse)
 
     return recipe
@@ -94,21 +90,19 @@ def _deterministic(
     """The same network from the same pairs, trained as a plain regression from nothing."""
     pairs = make_pairs(scene, sequence, config, coarse)
     transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
-    return EmbeddedEnhancer.train(pairs, transfer, _learning(config), deterministic=True)
+    return train_on_scene(pairs, transfer, _learning(config), deterministic=True)
 
 
 RECIPES: dict[str, Recipe] = {
     "none": _unrestored,
-    "classical": _classical,
-    "embedded": _embedded(),
-    # Each for itself, also where the judge would have it replaced.
-    "unjudged": _embedded(judge=False),
-    "scene-trained": _embedded(learning=True, judge=False),
-    "scratch": _embedded(learning=True, judge=False, pretrained_weights="none"),
-    "zero-shot": _embedded(judge=False, train_iterations=0),
+    # Without `judge`: the restorer itself, also where the classical one would replace it.
+    "unreplaced": _of_backend("embedded", judge=False),
+    "scene-trained": _of_backend("embedded", learning=True, judge=False),
+    "scratch": _of_backend("embedded", learning=True, judge=False, pretrained_weights="none"),
+    "zero-shot": _of_backend("embedded", judge=False, train_iterations=0),
     "deterministic": _deterministic,
 }
-"""What is made for a scene. What takes long is made once, however many methods start from it."""
+"""How a restorer is made for a scene, beside the backends as they are."""
 
 
 @dataclass(frozen=True)
@@ -116,8 +110,8 @@ class Method:
     """A row of the table.
 
     Args:
-        recipe: of `RECIPES`.
-        adjust: what is changed about the restorer that comes out; None leaves it.
+        recipe: a key of `RECIPES`, or the name of a backend.
+        adjust: changes the restorer after it was made; None leaves it.
     """
 
     recipe: str
@@ -135,16 +129,14 @@ def _in_steps(steps: int) -> Callable[[Enhancer], Enhancer]:
 
 METHODS: dict[str, Method] = {
     "none": Method("none"),
-    "classical": Method("classical"),
-    "embedded": Method("embedded"),
-    "embedded-1": Method("unjudged", _in_steps(1)),
-    "embedded-4": Method("unjudged", _in_steps(4)),
+    "embedded-1": Method("unreplaced", _in_steps(1)),
+    "embedded-4": Method("unreplaced", _in_steps(4)),
     "scene-trained": Method("scene-trained"),
     "scratch": Method("scratch"),
     "zero-shot": Method("zero-shot"),
     "deterministic": Method("deterministic"),
 }
-"""By name; each also with the suffix `/no-references`."""
+"""Methods beside the backends as they are; every one also with the suffix `/no-references`."""
 
 
 def check_methods(names: Iterable[str]) -> list[str]:
@@ -154,10 +146,11 @@ def check_methods(names: Iterable[str]) -> list[str]:
         ConfigError: for an unknown one, or none at all.
     """
     chosen = list(dict.fromkeys(names))
-    unknown = [name for name in chosen if name.removesuffix(NO_REFERENCES) not in METHODS]
+    known = [*METHODS, *BACKENDS]
+    unknown = [name for name in chosen if name.removesuffix(NO_REFERENCES) not in known]
     if unknown or not chosen:
         raise ConfigError(
-            f"unknown methods {', '.join(unknown) or '(none named)'}; expected {', '.join(METHODS)}, "
+            f"unknown methods {', '.join(unknown) or '(none named)'}; expected {', '.join(known)}, "
             f"each also with {NO_REFERENCES} behind it"
         )
     return chosen
@@ -180,18 +173,20 @@ def prepared(
         coarse: settings of leave-out reconstructions.
 
     Yields:
-        Name, restorer, and the seconds its recipe took; equal recipes are followed once, and each of the
-        methods that start from one is charged with all of it.
+        Name, restorer, and the seconds its recipe took. Methods that share a recipe share its restorer, and
+        each counts all of its seconds.
 
     Raises:
         ConfigError: for an unknown method.
     """
     made: dict[str, tuple[Enhancer, float]] = {}
     for name in check_methods(names):
-        method = METHODS[name.removesuffix(NO_REFERENCES)]
+        plain = name.removesuffix(NO_REFERENCES)
+        method = METHODS.get(plain, Method(plain))
         if method.recipe not in made:
+            recipe = RECIPES.get(method.recipe) or _of_backend(method.recipe)
             begun = time.perf_counter()
-            enhancer = RECIPES[method.recipe](scene, sequence, config, coarse)
+            enhancer = recipe(scene, sequence, config, coarse)
             made[method.recipe] = enhancer, time.perf_counter() - begun
         enhancer, seconds = made[method.recipe]
         if method.adjust is not None:
@@ -214,7 +209,7 @@ def compare_methods(
     methods: Sequence[str],
     lpips: Lpips | None,
 ) -> list[dict[str, Any]]:
-    """Judge methods on the held-out views of a sequence.
+    """Compare methods on the held-out views of a sequence.
 
     Args:
         scene: its coarse scene.
@@ -241,13 +236,14 @@ def compare_methods(
     cases = []
     restorers = prepared(methods, scene, training, config.enhance, config.coarse)
     for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
-        figures = benchmark.judge(enhancer)
+        restored = restore_views(enhancer, clips)
+        figures = benchmark.figures(restored)
         cases.append(
             {
                 "sequence": sequence.name,
                 "seed": config.enhance.seed,
                 "method": name,
-                "steps": _steps(enhancer),
+                "steps": restored.provenance.get("steps"),
                 **figures,
                 "prepare_seconds": seconds,
                 "pixel_share": benchmark.pixel_share,
@@ -266,12 +262,12 @@ def bench_enhance(
     methods: Sequence[str] = ("none", "classical", "embedded"),
     lpips: Lpips | None = None,
 ) -> dict[str, Any]:
-    """Reconstruct each sequence and judge restorers on its held-out views.
+    """Reconstruct each sequence and compare restorers on its held-out views.
 
     Args:
         sequences: with poses and held-out frames.
         config: settings of `coarse` and `enhance`, seeds included.
-        methods: names of `METHODS`, possibly with `/no-references`.
+        methods: names of `METHODS` or of backends, possibly with `/no-references`.
         lpips: the metric; None leaves it out.
 
     Returns:
@@ -290,15 +286,10 @@ def bench_enhance(
                 "colmap` writes a folder that has them"
             )
         if len(sequence.test) == 0:
-            raise CaptureError(f"{sequence.name}: no held-out frames to judge a restorer on")
+            raise CaptureError(f"{sequence.name}: no held-out frames to compare restorers on")
         begun = time.perf_counter()
         scene, posed = coarse_scene(sequence, config.coarse)
         seconds = time.perf_counter() - begun
         found = compare_methods(scene, posed, config, methods, lpips)
         cases += [{**case, "coarse_seconds": seconds} for case in found]
     return {"machine": machine(), "cases": cases}
-
-
-def _steps(enhancer: Enhancer) -> int | None:
-    inner = enhancer.enhancer if isinstance(enhancer, WithoutReferences) else enhancer
-    return inner.steps if isinstance(inner, EmbeddedEnhancer) else None

@@ -1,8 +1,8 @@
-"""Restorers judged where the truth is known: off-trajectory views of a sequence, restored and compared.
+"""Evaluation of restorers where the truth is known: off-trajectory views of a sequence, restored.
 
-A `RestorerBenchmark` holds one list of clips with what their views really look like; every restorer is
-given the same clips. Figures inside a region are means over the views in which the region is not too small to
-tell, as in `extrags.metrics.protocol`. What cannot be had is None.
+A `RestorerBenchmark` holds one list of clips with the photographs of their views; every restorer gets the
+same clips. Figures inside a region are means over the views in which the region is large enough, as in
+`extrags.metrics.protocol`. A figure that is not available is None.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ SAME_SURFACE = 0.03
 
 @dataclass(frozen=True)
 class TrueViews:
-    """What V views really look like.
+    """Photographs of V views.
 
     Args:
         rgb: photographs in [0, 1], [V, H, W, 3].
         mask: which pixels count, [V, H, W].
-        observed: whose surface some training frame saw, [V, H, W]; None where nobody knows.
+        observed: whose surface some training frame saw, [V, H, W]; None where unknown.
         depth_mm: z-depth, 0 where unknown, [V, H, W]; None without depth.
 
     Raises:
@@ -87,7 +87,7 @@ class TrueViews:
 
     @classmethod
     def of_sequence(cls, sequence: EndoscopicSequence, frames: Int[np.ndarray, "v"]) -> TrueViews:
-        """The truth about held-out frames of a sequence."""
+        """Held-out frames of a sequence."""
         return cls(
             sequence.rgb[frames].astype(np.float32) / 255,
             np.ascontiguousarray(sequence.mask[frames]),
@@ -124,7 +124,7 @@ def held_out_clips(
     """
     frames = np.asarray(frames, dtype=np.int64)
     if len(frames) == 0:
-        raise CaptureError(f"{sequence.name}: no held-out frames to judge a restorer on")
+        raise CaptureError(f"{sequence.name}: no held-out frames to evaluate a restorer on")
     if length < 1:
         raise ConfigError(f"clips of {length} views; expected 1 or more")
     recording = np.zeros(len(sequence), int) if sequence.recording is None else sequence.recording
@@ -146,7 +146,7 @@ def held_out_clips(
 
 
 class AsRendered:
-    """The restorer that restores nothing: what any other must beat."""
+    """The restorer that changes nothing: the baseline of all others."""
 
     name = "none"
 
@@ -155,16 +155,16 @@ class AsRendered:
         return Restoration(as_images(clip.layers.get("rendered").clamp(0, 1)), None, {"backend": self.name})
 
     def save(self, path: Path) -> None:
-        """There is nothing to keep.
+        """Not possible: there is nothing to save.
 
         Raises:
             ConfigError: always.
         """
-        raise ConfigError(f"{path}: the rendering as it is is no restorer that could be saved")
+        raise ConfigError(f"{path}: the baseline without restoration cannot be saved")
 
 
 class WithoutReferences:
-    """A restorer that is not told what real views see; for what they are worth.
+    """A restorer without its reference views, to measure their contribution.
 
     Args:
         enhancer: the restorer.
@@ -175,13 +175,13 @@ class WithoutReferences:
         self.name = f"{enhancer.name}/no-references"
 
     def restore(self, clip: Clip) -> Restoration:
-        """Restore a clip with its references taken away; the clip itself stays as it is."""
+        """Restore a clip with its references removed; the clip itself is not changed."""
         alone = drop_references(Layers(clip.layers.data.clone()))
         restoration = self.enhancer.restore(replace(clip, layers=alone))
         return replace(restoration, provenance={**restoration.provenance, "references": False})
 
     def save(self, path: Path) -> None:
-        """Save the restorer behind it."""
+        """Save the wrapped restorer."""
         self.enhancer.save(path)
 
 
@@ -190,8 +190,8 @@ class RestoredViews:
     """Clips after restoration, all views in a row.
 
     Args:
-        rgb: what the restorer made, in [0, 1], [V, H, W, 3].
-        target: the same with known texture kept; what the fine-tuning is given, [V, H, W, 3].
+        rgb: restored images in [0, 1], [V, H, W, 3].
+        target: the same with known texture kept: the target of the fine-tuning, [V, H, W, 3].
         predicted_error: `Restoration.expected_error`, [V, H, W]; None where the restorer predicts none.
         seconds_per_frame: median over the clips.
         provenance: of the first clip.
@@ -205,7 +205,7 @@ class RestoredViews:
 
 
 def restore_views(enhancer: Enhancer, clips: Sequence[Clip]) -> RestoredViews:
-    """Restore clips, and time it.
+    """Restore clips and measure the time.
 
     Raises:
         ShapeError: without any clip.
@@ -237,7 +237,7 @@ class _Motion:
     Args:
         before: index of the view before.
         view: index of the view.
-        grid: positions as `grid_sample` wants them, [1, H, W, 2].
+        grid: positions as `grid_sample` takes them, [1, H, W, 2].
         common: pixels that both views see, [H, W].
     """
 
@@ -249,7 +249,7 @@ class _Motion:
 
 @dataclass(frozen=True)
 class RestorerBenchmark:
-    """One list of clips with its truth, for any number of restorers.
+    """Clips with their true views, on which any number of restorers is compared.
 
     Args:
         clips: rendered views.
@@ -272,7 +272,7 @@ class RestorerBenchmark:
                 f"{views} views of {sorted(sizes)} px in the clips, truth of {self.truth.mask.shape}"
             )
 
-    def judge(self, enhancer: Enhancer) -> dict[str, Any]:
+    def evaluate(self, enhancer: Enhancer) -> dict[str, Any]:
         """Restore all clips and compare; see `figures`."""
         return self.figures(restore_views(enhancer, self.clips))
 
@@ -373,11 +373,11 @@ class RestorerBenchmark:
         return {**tree.pop("valid"), **tree}
 
     def _flicker(self, images: Float[Tensor, "v h w 3"]) -> dict[str, float | None]:
-        r"""Unsteadiness along the surface, mean over the pixels that two neighbouring views share.
+        r"""Temporal inconsistency along the surface, mean over the pixels that two neighbouring views share.
 
         `flicker` is :math:`|r_t - W r_{t-1}|` less the same of the photographs, W the warp by true depth:
-        0 for what is as steady as reality, and below for what is blurred. `error_flicker` is that of the
-        error :math:`r - p`: 0 only for what errs in the same way in both views.
+        0 for images as consistent as the photographs, and negative for blurred ones. `error_flicker` is that
+        of the error :math:`r - p`: 0 only where the error is the same in both views.
         """
         if not self._motions:
             return {"flicker": None, "error_flicker": None}

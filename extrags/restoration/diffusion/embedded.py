@@ -1,11 +1,7 @@
-"""The default restorer: a pretrained conditional diffusion, and may learn from a scene."""
+"""The default restorer: a conditional diffusion whose pretrained weights come with the package."""
 
 from __future__ import annotations
 
-import copy
-import json
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,34 +13,24 @@ from torch import Tensor
 
 from extrags.config import EnhanceConfig
 from extrags.errors import WeightsError
-from extrags.events import MetricRecorded, emit
-from extrags.metrics.image import psnr_per_image, ssim_map
+from extrags.restoration.description import description_fields, read_description, write_description
 from extrags.restoration.diffusion.network import RestorationNetwork, build_network
-from extrags.restoration.diffusion.rectified_flow import Sampled, TrainingSettings, sample, train_network
-from extrags.restoration.diffusion.weights import DESCRIPTION, WEIGHTS
+from extrags.restoration.diffusion.rectified_flow import Sampled, sample
+from extrags.restoration.diffusion.weights import WEIGHTS
 from extrags.restoration.protocol import Clip, Restoration
-from extrags.restoration.training_data.augmentation import CropSampler
-from extrags.restoration.training_data.pairs import Pairs
-from extrags.restoration.uncertainty.calibration import Calibration, cell_means
+from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, condition
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["EmbeddedEnhancer", "has_fast_half_precision", "validation_scores"]
+__all__ = ["EmbeddedEnhancer", "has_fast_half_precision"]
 
 FORMAT = 2
 """Raised when a saved restorer cannot be read by newer code."""
 CANDIDATE_STEPS = (1, 4)
 """More steps never gained on held-out pairs; which of these does differs from scene to scene."""
 VIEWS_AT_ONCE = 4
-MOSTLY_VALID = 0.5
-"""Cells with a smaller share of valid pixels judge nothing."""
-SHORTEST_PROBED = 200
-PROBE_PART = 5
-"""A training on a scene of so many steps and more is tried out with a part of them."""
-MIN_GAIN_DB = 0.1
-"""Training on a scene must gain so much on validation pairs; less is chance."""
 
 
 def has_fast_half_precision() -> bool:
@@ -54,7 +40,7 @@ def has_fast_half_precision() -> bool:
 
 @dataclass(frozen=True)
 class EmbeddedEnhancer:
-    """A trained restorer.
+    """Diffusion network of a scene, with its settings, error model and calibration.
 
     Args:
         network: in evaluation mode.
@@ -65,7 +51,7 @@ class EmbeddedEnhancer:
         gamut: hues of the scene's real frames, bounds of the restored ones.
         record: how it was trained and what it reached on validation pairs.
         error_model: the expected error, from the network's own and from what it was given.
-        calibration: from the expected error to the one it makes.
+        calibration: curve from the expected error to the error it makes.
         deterministic: trained as a plain regression: no noise, one step.
     """
 
@@ -81,85 +67,6 @@ class EmbeddedEnhancer:
     deterministic: bool = False
 
     name = "embedded"
-
-    @classmethod
-    def train(
-        cls,
-        pairs: Pairs,
-        transfer: LightTransfer,
-        config: EnhanceConfig,
-        start: EmbeddedEnhancer | None = None,
-        *,
-        deterministic: bool = False,
-    ) -> EmbeddedEnhancer:
-        """Train on a scene's pairs, and keep what the validation pairs show to be better.
-
-        With `start`, its network is trained on; where that does not help on the validation pairs, the
-        network stays as it came. The same pairs and settings give the same weights, for one number of
-        threads.
-
-        Args:
-            pairs: what the pipeline made.
-            transfer: how brightness changes with distance in this scene.
-            config: budget, widths and seed.
-            start: a restorer that was pretrained on other scenes.
-            deterministic: train a plain regression instead of a diffusion.
-
-        Raises:
-            ConfigError: when nothing is left to train on, or the images are too small.
-            DivergedError: when the loss stops being finite.
-        """
-        generator = torch.Generator().manual_seed(config.seed)
-        chosen = pairs.subset(np.flatnonzero(~pairs.validation))
-        gamut = Gamut.of_images(chosen.target, chosen.weight)
-        if start is None:
-            network = build_network(CONDITION_CHANNELS, config.channels, generator)
-            rate = config.learning_rate
-            base = cls(network, 1, 1, config.seed, False, gamut, {}, deterministic=deterministic)
-        else:
-            base = start
-            rate = config.scene_learning_rate
-            deterministic = start.deterministic
-        base = base.with_settings(config, gamut)
-        candidates = base.candidate_steps(config)
-        before = {} if start is None else validation_scores(base, pairs, transfer, candidates)
-
-        def trained_for(iterations: int) -> tuple[EmbeddedEnhancer, list[dict[str, float]], float]:
-            """Trained on the scene, and by how much that helped."""
-            learner = replace(base, network=copy.deepcopy(base.network))
-            sampler = CropSampler(pairs, transfer, batch=config.batch, crop_px=config.crop, seed=config.seed)
-            settings = TrainingSettings(iterations, rate, base.half_precision, deterministic=deterministic)
-            _, history = train_network(learner.network, sampler.draw, settings, generator)
-            after.update(validation_scores(learner, pairs, transfer, candidates))
-            gain = _best(after, candidates)[1] - (_best(before, candidates)[1] if before else -math.inf)
-            return learner, history, gain
-
-        after: dict[str, dict[str, float]] = {}
-        iterations = config.train_iterations
-        if start is not None and iterations >= SHORTEST_PROBED:
-            # A short training first: where it brings nothing, the long one is not worth its time.
-            trained, history, gain = trained_for(iterations // PROBE_PART)
-            iterations = config.train_iterations if gain > 0 else iterations // PROBE_PART
-        if start is None or iterations == config.train_iterations:
-            trained, history, gain = trained_for(iterations)
-        scores = {**after, **{f"untrained_{name}": value for name, value in _embedded_only(before).items()}}
-        # Without validation pairs nothing can be said, and the pretrained network is trusted.
-        helped = gain > MIN_GAIN_DB and (start is None or _validation_pairs(pairs) is not None)
-        kept = trained if helped else base
-        steps = _best(after if helped else before, candidates)[0]
-        for method, values in scores.items():
-            emit(MetricRecorded("enhance", f"validation_psnr_{method}", values["psnr"]))
-        record = {
-            **base.record,
-            "training_pairs": int((~pairs.validation).sum()),
-            "validation_pairs": int(pairs.validation.sum()),
-            "iterations": iterations,
-            "history": history,
-            "validation": scores,
-            "scene_training_kept": helped,
-        }
-        kept = replace(kept, steps=steps, record=record)
-        return kept.calibrated(pairs, transfer)
 
     def with_settings(self, config: EnhanceConfig, gamut: Gamut) -> EmbeddedEnhancer:
         """The same network under a scene's settings."""
@@ -179,68 +86,6 @@ class EmbeddedEnhancer:
             return (1,)
         return CANDIDATE_STEPS if config.steps == "auto" else (config.steps,)
 
-    def calibrated(self, pairs: Pairs, transfer: LightTransfer) -> EmbeddedEnhancer:
-        """With the curve that the validation pairs show; the present one where they are too few.
-
-        The line below it stays: a few pairs of one scene are enough for a curve, not for six weights.
-
-        Args:
-            pairs: all pairs.
-            transfer: how brightness changes with distance.
-        """
-        kept = _validation_pairs(pairs)
-        if kept is None:
-            return self
-        calibration = Calibration.fitted(*self.cell_errors(kept, transfer))
-        return replace(self, calibration=calibration) if calibration.predicted else self
-
-    def with_error_model(self, scenes: Sequence[tuple[Pairs, LightTransfer]]) -> EmbeddedEnhancer:
-        """With line and curve of the expected error fitted to pairs of many scenes.
-
-        Args:
-            scenes: pairs that were not trained on, and how brightness changes with distance in each.
-        """
-        plain = replace(self, error_model=ErrorModel(), calibration=Calibration())
-        features, errors = [], []
-        for pairs, transfer in scenes:
-            for view in range(len(pairs)):
-                layers, weight = pairs.layers[view], pairs.weight[view : view + 1]
-                noise = plain._noise((int(weight.shape[-2]), int(weight.shape[-1])), view, 0)
-                restored = plain.restored_layers(layers, transfer, noise, steps=plain.steps)
-                error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
-                mean, share = cell_means(error, weight)
-                each = error_features(layers, restored.rgb, restored.error)
-                columns = [cell_means(each[:, [k]], weight)[0] for k in range(each.shape[1])]
-                features.append(np.stack(columns, axis=1)[share > MOSTLY_VALID])
-                errors.append(mean[share > MOSTLY_VALID])
-        lined = replace(
-            plain, error_model=ErrorModel.fitted(np.concatenate(features), np.concatenate(errors))
-        )
-        cells = [lined.cell_errors(pairs, transfer) for pairs, transfer in scenes]
-        expected, true = (np.concatenate(part) for part in zip(*cells, strict=True))
-        return replace(lined, calibration=Calibration.fitted(expected, true))
-
-    def cell_errors(
-        self, pairs: Pairs, transfer: LightTransfer
-    ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
-        """Expected (not calibrated) and true absolute errors of cells that are mostly valid.
-
-        Args:
-            pairs: with the truth.
-            transfer: how brightness changes with distance.
-        """
-        size = (int(pairs.target.shape[-2]), int(pairs.target.shape[-1]))
-        expected, true = [], []
-        for view in range(len(pairs)):
-            noise = self._noise(size, view, 0)
-            restored = self.restored_layers(pairs.layers[view], transfer, noise, steps=self.steps)
-            weight = pairs.weight[view : view + 1]
-            error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
-            predicted, share = cell_means(restored.error, weight)
-            expected.append(predicted[share > MOSTLY_VALID])
-            true.append(cell_means(error, weight)[0][share > MOSTLY_VALID])
-        return np.concatenate(expected), np.concatenate(true)
-
     def restore(self, clip: Clip) -> Restoration:
         """Restore all views of a clip.
 
@@ -249,7 +94,7 @@ class EmbeddedEnhancer:
         size = (clip.cameras.height, clip.cameras.width)
         draws = []
         for index in range(self.samples):
-            noise = self._noise(size, clip.index, index)
+            noise = self.noise(size, clip.index, index)
             draws.append(self.restored_layers(clip.layers, clip.transfer, noise, steps=self.steps))
         colors = torch.stack([draw.rgb for draw in draws])
         spread = colors.std(dim=0, correction=0).mean(dim=1, keepdim=True)
@@ -296,14 +141,23 @@ class EmbeddedEnhancer:
             torch.cat([part.error for part in parts]),
         )
 
-    def _noise(self, size: tuple[int, int], clip: int, index: int) -> Float[Tensor, "1 3 h w"]:
+    def noise(self, size: tuple[int, int], clip: int, index: int) -> Float[Tensor, "1 3 h w"]:
+        """Where the sampler starts: zero for a plain regression.
+
+        Args:
+            size: height and width in pixels.
+            clip: index of the clip.
+            index: of the sample.
+        """
+        height, width = size
         if self.deterministic:
-            return torch.zeros(1, 3, *size)
-        return _noise(size, self.seed, clip, index)
+            return torch.zeros(1, 3, height, width)
+        generator = np.random.default_rng([self.seed, 3, clip, index])
+        return torch.from_numpy(generator.standard_normal((1, 3, height, width), dtype=np.float32))
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """What restored views came from."""
+        """Settings behind restored views, ready for JSON."""
         return {
             "backend": self.name,
             "steps": self.steps,
@@ -344,7 +198,7 @@ class EmbeddedEnhancer:
             "deterministic": self.deterministic,
             "record": self.record,
         }
-        (path / DESCRIPTION).write_text(json.dumps(description, indent=2) + "\n")
+        write_description(path, description)
 
     @classmethod
     def load(cls, path: Path) -> EmbeddedEnhancer:
@@ -361,22 +215,19 @@ class EmbeddedEnhancer:
 
         weights_file = path / WEIGHTS if path.is_dir() or path.suffix != ".safetensors" else path
         description_file = weights_file.with_suffix(".json")
-        for file in (weights_file, description_file):
-            if not file.exists():
-                raise WeightsError(f"{file}: no such file; train the restorer first (stage enhance)")
-        try:
-            description = dict(json.loads(description_file.read_text()))
-        except (ValueError, TypeError) as error:
-            raise WeightsError(f"{description_file}: not readable as a JSON object ({error})") from error
+        if not weights_file.exists():
+            raise WeightsError(f"{weights_file}: no such file; train the restorer first (stage enhance)")
+        description = read_description(description_file)
         if description.get("format") != FORMAT or description.get("condition_channels") != CONDITION_CHANNELS:
             raise WeightsError(
                 f"{description_file}: format {description.get('format')} with "
                 f"{description.get('condition_channels')} channels, this version reads format {FORMAT} "
                 f"with {CONDITION_CHANNELS}; train the restorer again"
             )
-        try:
+        with description_fields(description_file):
             first, second, third = description["widths"]
             network = build_network(CONDITION_CHANNELS, (first, second, third), torch.Generator())
+            error_model = description["error_model"]
             enhancer = cls(
                 network.eval(),
                 int(description["steps"]),
@@ -384,17 +235,11 @@ class EmbeddedEnhancer:
                 int(description["seed"]),
                 bool(description["half_precision"]),
                 Gamut(**description["gamut"]),
-                description["record"],
-                ErrorModel(
-                    tuple(description["error_model"]["weights"]), float(description["error_model"]["offset"])
-                ),
+                dict(description["record"]),
+                ErrorModel(tuple(error_model["weights"]), float(error_model["offset"])),
                 Calibration(**{k: tuple(v) for k, v in description["calibration"].items()}),
                 bool(description["deterministic"]),
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise WeightsError(
-                f"{description_file}: not the description of a restorer ({error!r})"
-            ) from error
         try:
             network.load_state_dict(
                 {name: value.float() for name, value in load_file(str(weights_file)).items()}
@@ -402,80 +247,6 @@ class EmbeddedEnhancer:
         except (OSError, RuntimeError, SafetensorError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return enhancer
-
-
-def validation_scores(
-    enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer, candidates: tuple[int, ...]
-) -> dict[str, dict[str, float]]:
-    """PSNR and SSIM inside the mask on leave-out pairs that were kept back.
-
-    Where leave-out pairs are among the validation pairs, synthetic ones are not counted: their artefacts are
-    not those of an optimised scene.
-
-    Args:
-        enhancer: trained.
-        pairs: all pairs.
-        transfer: how brightness changes with distance.
-        candidates: numbers of sampling steps.
-
-    Returns:
-        Of `none` (the rendering), `classical` (blend and fill) and `embedded_N`: `{psnr, ssim}`, and
-        `psnr_hole` where a validation pair has pixels of alpha below one half.
-    """
-    kept = _validation_pairs(pairs) or pairs
-    with torch.no_grad():
-        conditioning = condition(kept.layers, transfer)
-    size = (int(kept.target.shape[-2]), int(kept.target.shape[-1]))
-    images = {"none": kept.layers.get("rendered").clamp(0, 1), "classical": conditioning.base}
-    for steps in candidates:
-        parts = [
-            enhancer.restored_layers(
-                kept.layers[view], transfer, enhancer._noise(size, view, 0), steps=steps
-            ).rgb
-            for view in range(len(kept))
-        ]
-        images[f"embedded_{steps}"] = torch.cat(parts)
-    return {name: _score(image, kept) for name, image in images.items()}
-
-
-def _validation_pairs(pairs: Pairs) -> Pairs | None:
-    """Validation pairs; the leave-out ones alone where there are any. None where nothing was kept back."""
-    chosen = np.flatnonzero(pairs.validation & ~pairs.synthetic)
-    if len(chosen) == 0:
-        chosen = np.flatnonzero(pairs.validation)
-    return pairs.subset(chosen) if len(chosen) else None
-
-
-def _embedded_only(scores: dict[str, dict[str, float]]) -> dict[str, dict[str, float]]:
-    return {name: value for name, value in scores.items() if name.startswith("embedded_")}
-
-
-def _best(scores: dict[str, dict[str, float]], candidates: tuple[int, ...]) -> tuple[int, float]:
-    """The best number of steps and its PSNR."""
-    steps = max(candidates, key=lambda count: scores[f"embedded_{count}"]["psnr"])
-    return steps, scores[f"embedded_{steps}"]["psnr"]
-
-
-def _score(image: Float[Tensor, "n 3 h w"], pairs: Pairs) -> dict[str, float]:
-    render = image.permute(0, 2, 3, 1)
-    target = pairs.target.permute(0, 2, 3, 1)
-    mask = pairs.weight[:, 0] > 0
-    hole = mask & (pairs.layers.get("alpha")[:, 0] < 0.5)
-    known = [value for value in psnr_per_image(render, target, mask) if value is not None]
-    score = {
-        "psnr": float(np.mean(known)),
-        "ssim": float(ssim_map(render, target)[mask].mean()),
-    }
-    if bool(hole.any()):
-        error = (render - target)[hole].square().mean()
-        score["psnr_hole"] = float(-10 * error.clamp_min(1e-10).log10())
-    return score
-
-
-def _noise(size: tuple[int, int], seed: int, clip: int, index: int) -> Float[Tensor, "1 3 h w"]:
-    generator = np.random.default_rng([seed, 3, clip, index])
-    height, width = size
-    return torch.from_numpy(generator.standard_normal((1, 3, height, width), dtype=np.float32))
 
 
 def _half_precision(config: EnhanceConfig) -> bool:

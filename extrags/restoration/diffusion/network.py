@@ -1,9 +1,9 @@
 """The restorer's network: a small conditional U-Net that predicts the clean view.
 
-It answers with a residual to the base image, a residual to the logarithm of the completed depth, and the
-logarithm of how wrong it expects its colours to be.
+Its outputs are a residual to the base image, a residual to the logarithm of the completed depth, and the
+logarithm of the expected error of its colours.
 
-Two-by-two pixel blocks become channels at the entrance (full resolution costs most and says least),
+Two-by-two pixel blocks become channels at the entrance (full resolution costs most and gains least),
 group normalisation and SiLU, the diffusion time by feature-wise scale and shift, attention at the
 coarsest level only. All residual branches and the output start at zero, so that an untrained network
 returns its base image.
@@ -112,7 +112,7 @@ class RestorationNetwork(nn.Module):
         noisy: Float[Tensor, "n 3 h w"],
         time: Float[Tensor, "n"],
     ) -> Float[Tensor, "n 5 h w"]:
-        """What to add to the base image in the normalised colours of `noisy`, to log-depth, and log-error."""
+        """Residual colours, normalised as `noisy`; residual log-depth; log-error."""
         embedded = self.time(_sinusoids(time))
         packed = functional.pixel_unshuffle(torch.cat([condition, noisy], dim=1), UNSHUFFLE)
         entered = self.entrance(packed.contiguous(memory_format=torch.channels_last))
@@ -129,7 +129,7 @@ class RestorationNetwork(nn.Module):
         return functional.pixel_shuffle(hidden, UNSHUFFLE)
 
     def initialise(self, generator: torch.Generator) -> None:
-        """Draw all weights from one generator; zero what must not act at the start."""
+        """Draw all weights from one generator; residual branches and output start at zero."""
         for module in self.modules():
             if isinstance(module, nn.Conv2d | nn.Linear):
                 fan_in = module.weight[0].numel()

@@ -1,4 +1,4 @@
-r"""Conditional diffusion on a straight path, and its training.
+r"""Conditional diffusion along straight paths (rectified flow): training and sampling.
 
 With the clean image z_0 and noise e, both normalised, :math:`z_t = (1 - t) z_0 + t e` for t from 0 to 1,
 and the network predicts z_0 as a residual to the base image. This is the diffusion prior of [ExtraGS, eq. 4
@@ -23,10 +23,10 @@ from extrags.events import Progress, emit
 from extrags.metrics.image import ssim_map
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetwork
+from extrags.restoration.training_data.augmentation import Batch
 from extrags.view_synthesis.conditioning import COLOR_CENTER, COLOR_SCALE, Conditioning
 
 __all__ = [
-    "Batch",
     "Predicted",
     "Sampled",
     "TrainingSettings",
@@ -36,55 +36,23 @@ __all__ = [
 ]
 
 PURE_NOISE_SHARE = 0.7
-"""Share of training samples at t = 1 exactly: they alone make the one-step result."""
+"""Share of training samples at t = 1 exactly, on which the one-step result depends alone."""
 TIME_LOGIT_MEAN = 0.3
 TIME_LOGIT_DEVIATION = 1.2
 STRUCTURE_WEIGHT = 0.1
 DEPTH_WEIGHT = 0.1
 CHARBONNIER_EPS = 1e-3
 DEPTH_LIMIT = 1.5
-"""Log-depths are corrected by no more than this; larger errors count no more either."""
+"""Largest correction of a log-depth, and largest error that counts in the loss."""
 DEPTH_TRUST = 0.5
-"""Alone each is wrong by 14 % in the holes of virtual views, with errors of their own; between them lies the
-better depth."""
+"""Weight of the network's depth against the smooth filling. In the holes of virtual views each is wrong by
+14 %, with different errors; their mean is better."""
 TYPICAL_ERROR = 0.05
 LOG_ERROR_LIMIT = 4.0
-"""The expected error starts at the typical one and stays within e to this power of it."""
+"""The expected error starts at the typical one and stays within a factor of e to this power."""
 WARM_UP = 30
 GRADIENT_LIMIT = 1.0
 REPORT_EVERY = 10
-
-
-@dataclass(frozen=True)
-class Batch:
-    """Crops to learn from.
-
-    Args:
-        conditioning: network input, base image and completed depth.
-        clean: what the view really looked like, in [0, 1], [N, 3, H, W].
-        weight: of each pixel's error, [N, 1, H, W].
-        depth_mm: true z-depth, 0 where unknown, [N, 1, H, W].
-    """
-
-    conditioning: Conditioning
-    clean: Float[Tensor, "n 3 h w"]
-    weight: Float[Tensor, "n 1 h w"]
-    depth_mm: Float[Tensor, "n 1 h w"]
-
-    @staticmethod
-    def concatenated(parts: list[Batch]) -> Batch:
-        """Join crops of the same size."""
-        conditionings = [part.conditioning for part in parts]
-        return Batch(
-            Conditioning(
-                torch.cat([part.channels for part in conditionings]),
-                torch.cat([part.base for part in conditionings]),
-                torch.cat([part.depth_mm for part in conditionings]),
-            ),
-            torch.cat([part.clean for part in parts]),
-            torch.cat([part.weight for part in parts]),
-            torch.cat([part.depth_mm for part in parts]),
-        )
 
 
 @dataclass(frozen=True)
@@ -95,7 +63,7 @@ class TrainingSettings:
         iterations: steps.
         learning_rate: the peak, after the warm-up.
         half_precision: convolutions in bfloat16.
-        perceptual: a perceptual distance that counts beside the pixels' errors; None without.
+        perceptual: a perceptual distance added to the loss; None without.
         perceptual_weight: of that distance.
         error_weight: of the expected error's likelihood.
         deterministic: no noise, one step only: the same network as a plain regression.
@@ -114,7 +82,7 @@ class TrainingSettings:
 
 @dataclass(frozen=True)
 class Predicted:
-    """The network's answer.
+    """Output of the network.
 
     Args:
         rgb: clean colours, about [0, 1], [N, 3, H, W].
@@ -134,7 +102,7 @@ class Sampled:
     Args:
         rgb: in [0, 1], [N, 3, H, W].
         depth_mm: z-depth without gaps, [N, 1, H, W].
-        error: expected absolute error of a pixel's colours, as the network has learned it, [N, 1, H, W].
+        error: expected absolute error of a pixel's colours, as predicted by the network, [N, 1, H, W].
     """
 
     rgb: Float[Tensor, "n 3 h w"]
@@ -221,17 +189,17 @@ def _diffusion_loss(
 
 
 def restoration_loss(predicted: Predicted, batch: Batch, settings: TrainingSettings) -> Float[Tensor, ""]:
-    r"""What a prediction costs, averaged over weighted pixels.
+    r"""Loss of a prediction, averaged over weighted pixels.
 
     Charbonnier on normalised colours, a tenth of 1 - SSIM, the absolute error of the log-depth, and for
     the expected error :math:`b` of a pixel with error :math:`e` the negative log-likelihood
-    :math:`e / b + \log b` of Laplace; :math:`e` is taken as it is, so that the colours do not follow their
-    own expected error. A perceptual distance may be added.
+    :math:`e / b + \log b` of Laplace; no gradient reaches the colours through :math:`e`. A perceptual
+    distance may be added.
 
     Args:
-        predicted: the network's answer.
+        predicted: output of the network.
         batch: the truth.
-        settings: the perceptual distance, if there is one, and the weights.
+        settings: the perceptual distance, if any, and the weights.
 
     Source: for the expected error, Kendall and Gal: What Uncertainties Do We Need in Bayesian Deep
     Learning for Computer Vision?, NeurIPS 2017, equation 5 with a Laplace likelihood.
@@ -251,7 +219,7 @@ def restoration_loss(predicted: Predicted, batch: Batch, settings: TrainingSetti
     ) / total
     loss = loss + DEPTH_WEIGHT * depth.sum() / known.sum().clamp_min(1e-6)
     if settings.perceptual is not None:
-        # Where nothing is known of the truth, nothing shall differ from it.
+        # Where the truth is unknown, both images are made equal.
         shown = (weight * predicted.rgb + (1 - weight) * clean).clamp(0, 1)
         distance = settings.perceptual.distance(shown.permute(0, 2, 3, 1), clean.permute(0, 2, 3, 1))
         loss = loss + settings.perceptual_weight * distance.mean()
@@ -294,7 +262,7 @@ def sample(
             # The noise implied by the prediction, at the next point of the path.
             clean = (answers[-1].rgb - COLOR_CENTER) / COLOR_SCALE
             state = (then / now) * state + (1 - then / now) * clean
-    # Later steps take their own texture for evidence: only the first one knows what is not known.
+    # Later steps treat texture they drew themselves as observed: depth and error are those of the first.
     return Sampled(
         answers[-1].rgb[..., :height, :width].clamp(0, 1),
         _between(whole.depth_mm, answers[0].log_depth)[..., :height, :width],
@@ -303,7 +271,7 @@ def sample(
 
 
 def _between(filled_mm: Tensor, log_depth: Tensor) -> Tensor:
-    """Depth a share of the way from the smooth filling to the network's, in the logarithm."""
+    """Weighted geometric mean of the smooth filling and the network's depth."""
     filled = filled_mm.clamp_min(1e-6).log()
     return (filled + DEPTH_TRUST * (log_depth - filled)).exp()
 

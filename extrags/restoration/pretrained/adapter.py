@@ -1,4 +1,4 @@
-"""What every diffusers adapter shares: one window in, one window out, text encoded beforehand."""
+"""Base class of the diffusers adapters: one window in, one window out, text encoded beforehand."""
 
 from __future__ import annotations
 
@@ -25,9 +25,8 @@ class Window:
     """Frames for one call of a pipeline, at its size and in a number it takes.
 
     Args:
-        frames: the first is a real view, the others the best images there are without a model, in
-            [0, 1], [T, H, W, 3].
-        unknown: pixels to be made anew; none in the first frame, [T, H, W].
+        frames: the first is a real view, the others base images of the clip, in [0, 1], [T, H, W, 3].
+        unknown: pixels to generate; none in the first frame, [T, H, W].
         references: real views that see most of the same surface, best first, [R, H, W, 3].
     """
 
@@ -60,7 +59,7 @@ class Adapter(ABC):
 
     rule: ClassVar[PipelineRule]
     float32_parts: ClassVar[tuple[str, ...]] = ()
-    """Components that lose too much in half precision."""
+    """Components kept in float32: they are too inaccurate in half precision."""
 
     def __init__(self, pipeline: Any, text: Mapping[str, Tensor], settings: PretrainedConfig) -> None:
         self.pipeline = pipeline
@@ -69,7 +68,7 @@ class Adapter(ABC):
 
     @classmethod
     def open(cls, folder: Path, text: Mapping[str, Tensor], settings: PretrainedConfig) -> Adapter:
-        """Load the pipeline's parts that make images.
+        """Load the pipeline without its text parts.
 
         Raises:
             ConfigError: when a setting does not fit the machine.
@@ -85,7 +84,7 @@ class Adapter(ABC):
     def encode_text(
         cls, folder: Path, text: str, negative_text: str, settings: PretrainedConfig
     ) -> dict[str, Tensor]:
-        """Encode a caption once; the text encoder, often the largest part, is dropped again.
+        """Encode a caption once; the text encoder, often the largest part, is then released.
 
         Args:
             folder: of the saved pipeline.
@@ -94,8 +93,8 @@ class Adapter(ABC):
             settings: device and number format.
 
         Returns:
-            Tensors by the names the pipeline takes them, on the processor; empty for pipelines that
-            read no text.
+            Tensors by the pipeline's argument names, in main memory; empty for pipelines that read no
+            text.
 
         Raises:
             WeightsError: when the folder has no text encoder.
@@ -147,7 +146,7 @@ class Adapter(ABC):
         return images.clip(0, 1)
 
     def encoded_text(self) -> dict[str, Tensor]:
-        """The encoded caption where the pipeline computes: it takes embeddings as they are."""
+        """The encoded caption on the pipeline's device."""
         device = self.pipeline._execution_device
         return {name: value.to(device) for name, value in self.text.items()}
 
@@ -166,17 +165,17 @@ class Adapter(ABC):
 
     @classmethod
     def _encoded(cls, pipeline: Any, text: str, negative_text: str, *, guided: bool) -> dict[str, Tensor]:
-        """Text as the pipeline's own encoder gives it."""
+        """Embeddings of the pipeline's own text encoder."""
         raise NotImplementedError
 
 
 def seeded(seed: int) -> torch.Generator:
-    """Noise drawn on the processor, so that it is the same on every device."""
+    """A generator on the CPU, so that the noise is the same for every device."""
     return torch.Generator("cpu").manual_seed(seed)
 
 
 def pictures(images: Float[np.ndarray, "t h w 3"] | Bool[np.ndarray, "t h w"]) -> list[Any]:
-    """PIL images: what every pipeline takes."""
+    """Images as PIL images, which every pipeline takes."""
     from PIL import Image
 
     # A mask becomes a grey image of 0 and 255.

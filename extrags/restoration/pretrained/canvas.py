@@ -1,4 +1,4 @@
-"""From a clip's image size to one that a model takes, and back."""
+"""Resizing and padding from a clip's image size to a model's, and back."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch.nn import functional
 __all__ = ["Canvas"]
 
 TOUCHED = 0.01
-"""A resized mask covers every pixel that the original touches by this share: too large does no harm."""
+"""A resized mask holds every pixel whose share of the original is at least this; too large is harmless."""
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""A line of text about a scene, for the pretrained pipelines that read one.
+"""Captions of scenes, for the pretrained pipelines that read text.
 
 Constant by default. A text per scene comes from a file, or from any server that speaks OpenAI's chat
 completions: its address and key are read from EXTRAGS_CAPTION_URL (up to and including `/v1`) and
-EXTRAGS_CAPTION_KEY. It is shown training frames only. Answers are kept on disk under the digest of what
-was asked, so that the same frames are paid for once.
+EXTRAGS_CAPTION_KEY. It receives training frames only. Answers are cached on disk under the digest of the
+request, so that the same frames are paid for once.
 """
 
 from __future__ import annotations
@@ -44,25 +44,25 @@ INSTRUCTION = (
     "model: organ, surface, colour, texture, light, anything lying on it. One line, under {tokens} tokens, "
     "no patient, no diagnosis, no introduction."
 )
-PASSING = frozenset({408, 409, 429, 500, 502, 503, 504, 529})
-"""HTTP states that may be gone at the next try."""
-LONGEST_WAIT_S = 60.0
+RETRIED_STATUS = frozenset({408, 409, 429, 500, 502, 503, 504, 529})
+"""HTTP status codes after which a request is tried again."""
+MAX_WAIT_S = 60.0
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Caption:
-    """What a pipeline is told.
+    """Text prompt of a pipeline, and its source.
 
     Args:
         text: one line.
         source: constant, file or endpoint.
-        model: that the endpoint was asked for; empty otherwise.
+        model: of the endpoint; empty otherwise.
         prompt_tokens: sent, when it was asked.
         completion_tokens: received.
         cost: in the currency of the configured prices.
-        cached: whether the answer was there already and nothing was spent this time.
+        cached: whether the answer was in the cache and cost nothing.
     """
 
     text: str
@@ -74,7 +74,7 @@ class Caption:
     cached: bool = False
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON; without `cached`, on which no artefact shall depend."""
+        """For JSON; without `cached`, which differs between runs."""
         values = asdict(self)
         del values["cached"]
         return values
@@ -102,7 +102,7 @@ def caption_of(sequence: EndoscopicSequence, config: CaptionConfig) -> Caption:
 
 
 def check_source(config: CaptionConfig) -> Path | None:
-    """Look whether settings and environment have what the source of captions needs; nothing is asked.
+    """Check settings and environment of the source of captions; no request is sent.
 
     Returns:
         The file of texts, where they come from one.
@@ -226,7 +226,7 @@ def _keep(file: Path, caption: Caption) -> None:
 
 
 def _ask(address: str, key: str, question: dict[str, Any], config: CaptionConfig) -> dict[str, Any]:
-    """The endpoint's answer, tried again with growing pauses while the fault may pass."""
+    """The endpoint's answer; transient faults are retried with growing pauses."""
     headers = {"Content-Type": "application/json"}
     if key:
         headers["Authorization"] = f"Bearer {key}"
@@ -234,7 +234,7 @@ def _ask(address: str, key: str, question: dict[str, Any], config: CaptionConfig
     wait_s, problem = config.retry_wait_s, ""
     for attempt in range(config.retries + 1):
         if attempt:
-            time.sleep(min(wait_s, LONGEST_WAIT_S))
+            time.sleep(min(wait_s, MAX_WAIT_S))
             wait_s *= 2
         try:
             with urllib.request.urlopen(request, timeout=config.timeout_s) as reply:
@@ -243,7 +243,7 @@ def _ask(address: str, key: str, question: dict[str, Any], config: CaptionConfig
             with error:
                 problem = f"HTTP {error.code} {error.reason}: {error.read(300).decode(errors='replace')}"
                 wait_s = max(wait_s, _asked_wait(error.headers.get("Retry-After")))
-            if error.code not in PASSING:
+            if error.code not in RETRIED_STATUS:
                 raise ExtragsError(f"caption endpoint {address} refused: {problem}") from error
         except (OSError, HTTPException) as error:
             problem = f"{type(error).__name__}: {error}"
@@ -261,7 +261,7 @@ def _ask(address: str, key: str, question: dict[str, Any], config: CaptionConfig
 
 
 def _asked_wait(value: str | None) -> float:
-    """Seconds a server asks for; dates are not waited for."""
+    """Seconds of a Retry-After header; dates are ignored."""
     try:
         return max(0.0, float(value or 0))
     except ValueError:

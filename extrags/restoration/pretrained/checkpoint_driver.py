@@ -7,8 +7,8 @@ imported here, and the syntax is that of Python 3.8. It reads one .npz and write
         nothing is known), `poses` [W, T, 4, 4] relative to the first frame, `seeds` [W]
     result: `frames` [W, T, 3, H, W] in [0, 1]
 
-or, after a failure that it understands, a .json `{kind, message}` in the result's place and exit code 2.
-With `--check` it only looks whether the clone's modules can be imported.
+or, after a known failure, a .json `{kind, message}` in the result's place and exit code 2.
+With `--check` it only imports the clone's modules.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MODULES = ("torch", "numpy", "omegaconf", "utils.utils", "lvdm.models.samplers.d
 
 
 class Failure(Exception):
-    """Something the user can mend; `kind` is weights, dependency or config."""
+    """A failure the user can mend; `kind` is weights, dependency or config."""
 
     def __init__(self, kind: str, message: str) -> None:
         super().__init__(message)

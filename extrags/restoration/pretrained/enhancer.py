@@ -1,4 +1,4 @@
-"""The restorer of a scene by a pretrained diffusers pipeline."""
+"""Restoration by a pretrained diffusers pipeline: the enhancer of a scene, and the backend that makes it."""
 
 from __future__ import annotations
 
@@ -14,105 +14,51 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from extrags.config import EnhanceConfig, PretrainedConfig
+from extrags.config import CoarseConfig, EnhanceConfig, PretrainedConfig
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.clips import keep_known
+from extrags.restoration.description import DESCRIPTION, description_fields, text_field
 from extrags.restoration.pretrained.adapter import Adapter, Window
 from extrags.restoration.pretrained.canvas import Canvas
 from extrags.restoration.pretrained.captions import caption_of
 from extrags.restoration.pretrained.fingerprint import fingerprint
 from extrags.restoration.pretrained.inputs import clip_inputs, ranked_references, window_seed
-from extrags.restoration.pretrained.ltx import LtxCondition
 from extrags.restoration.pretrained.model import check_device, find_model
+from extrags.restoration.pretrained.prepared import PreparedEnhancer, load_prepared
 from extrags.restoration.pretrained.real_views import RealViews
-from extrags.restoration.pretrained.stable_diffusion import (
-    StableDiffusionImageToImage,
-    StableDiffusionInpaint,
-)
-from extrags.restoration.pretrained.stable_video import StableVideo
-from extrags.restoration.pretrained.wan_vace import WanVace
 from extrags.restoration.pretrained.windows import cross_faded, padded_to, plan_windows, valid_frame_count
 from extrags.restoration.protocol import Clip, Restoration
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["ADAPTERS", "PretrainedEnhancer", "check_pipeline"]
+__all__ = ["DiffusersBackend", "PretrainedEnhancer"]
 
 FORMAT = 1
 """Raised when a saved restorer cannot be read by newer code."""
-
-ADAPTERS: dict[str, type[Adapter]] = {
-    adapter.rule.backend: adapter
-    for adapter in (
-        WanVace,
-        StableVideo,
-        LtxCondition,
-        StableDiffusionImageToImage,
-        StableDiffusionInpaint,
-    )
-}
+TEXT = "text.safetensors"
 
 # Pipelines keep state while they run and hold gigabytes: one at a time in a process, kept between clips.
 _LOCK = threading.Lock()
 _OPEN: dict[str, Adapter] = {}
 
 
-@dataclass(eq=False)
-class PretrainedEnhancer:
+@dataclass(frozen=True, eq=False)
+class PretrainedEnhancer(PreparedEnhancer):
     """A pretrained pipeline, a scene's encoded caption and its real views.
 
     Args:
-        name: backend, a key of `ADAPTERS`.
-        settings: of the user.
-        seed: of the noise, together with clip and window.
-        text: the caption as the pipeline's encoder gave it.
-        views: training frames.
-        model_digest: fingerprint of the weights the restorer was prepared with.
-        record: caption and versions, for the provenance.
+        adapter: of the pipeline.
+        text: the caption as encoded by the pipeline; empty where it reads none.
     """
 
-    name: str
     settings: PretrainedConfig
-    seed: int
+    adapter: type[Adapter]
     text: dict[str, Tensor]
-    views: RealViews
-    model_digest: str
-    record: dict[str, Any]
 
-    @classmethod
-    def prepare(cls, scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig) -> PretrainedEnhancer:
-        """Find the model, encode the scene's caption, gather its real views. Nothing is trained.
-
-        Args:
-            scene: the coarse scene, trained on `sequence.train`.
-            sequence: posed frames; only training frames are used.
-            config: backend, model and caption.
-
-        Raises:
-            WeightsError: when the model is not there; says how to get it.
-            MissingDependencyError: without diffusers.
-            ConfigError: when a setting does not fit the machine.
-        """
-        adapter = ADAPTERS[config.backend]
-        folder = check_pipeline(config)
-        text: dict[str, Tensor] = {}
-        record: dict[str, Any] = {
-            "model": config.pretrained.model or adapter.rule.usual_model,
-            "diffusers": importlib.metadata.version("diffusers"),
-        }
-        if adapter.rule.text_parts:
-            caption = caption_of(sequence, config.caption)
-            text = adapter.encode_text(folder, caption.text, config.caption.negative_text, config.pretrained)
-            record["caption"] = caption.as_dict()
-        return cls(
-            config.backend,
-            config.pretrained,
-            config.seed,
-            text,
-            RealViews.gather(scene, sequence),
-            fingerprint(folder),
-            record,
-        )
+    @property
+    def name(self) -> str:
+        """Of the backend."""
+        return self.adapter.rule.backend
 
     def restore(self, clip: Clip) -> Restoration:
         """Restore all views of a clip.
@@ -138,8 +84,7 @@ class PretrainedEnhancer:
         return Restoration(rgb, None, provenance)
 
     def _opened(self) -> Adapter:
-        adapter = ADAPTERS[self.name]
-        folder = find_model(adapter.rule, self.settings)
+        folder = find_model(self.adapter.rule, self.settings)
         key = json.dumps(
             [self.name, str(folder), self.model_digest, self.settings.model_dump(), _digest(self.text)]
         )
@@ -151,7 +96,7 @@ class PretrainedEnhancer:
                 )
             # The old one goes first: two would not fit.
             _OPEN.clear()
-            _OPEN[key] = adapter.open(folder, self.text, self.settings)
+            _OPEN[key] = self.adapter.open(folder, self.text, self.settings)
         return _OPEN[key]
 
     def _restored(self, adapter: Adapter, clip: Clip) -> Float[np.ndarray, "t h w 3"]:
@@ -186,81 +131,121 @@ class PretrainedEnhancer:
         """Write `restorer.json`, `text.safetensors` and `references/`; the model stays where it is."""
         from safetensors.torch import save_file
 
-        path.mkdir(parents=True, exist_ok=True)
-        save_file(self.text, str(path / "text.safetensors"))
-        self.views.save(path / "references")
-        description = {
-            "backend": self.name,
-            "format": FORMAT,
-            "settings": self.settings.model_dump(mode="json"),
-            "seed": self.seed,
-            "model_digest": self.model_digest,
-            "record": self.record,
-        }
-        (path / "restorer.json").write_text(json.dumps(description, indent=2) + "\n")
+        self.save_common(path, backend=self.name, format_number=FORMAT)
+        save_file(self.text, str(path / TEXT))
 
-    @classmethod
-    def load(cls, path: Path) -> PretrainedEnhancer:
-        """Read what `save` wrote; the model itself is loaded with the first clip.
+
+@dataclass(frozen=True)
+class DiffusersBackend:
+    """The backend of one diffusers pipeline: nothing is trained, the scene's caption is encoded.
+
+    Args:
+        adapter: of the pipeline.
+    """
+
+    adapter: type[Adapter]
+
+    @property
+    def name(self) -> str:
+        """As in `enhance.backend`."""
+        return self.adapter.rule.backend
+
+    def check(self, config: EnhanceConfig) -> None:
+        """Look for model and packages, and for settings that would fail with the first window.
 
         Raises:
-            WeightsError: when a file is missing, or does not fit this version.
+            WeightsError: when the model is missing; says how to get it.
+            MissingDependencyError: without diffusers.
+            ConfigError: when a setting does not fit the pipeline or the machine.
         """
+        self._checked(config)
+
+    def digest(self, config: EnhanceConfig) -> str:
+        """Fingerprint of the saved pipeline.
+
+        Raises:
+            ExtragsError: as `check`.
+        """
+        return fingerprint(self._checked(config))
+
+    def needs_text(self, config: EnhanceConfig) -> bool:
+        """Whether the pipeline has a text encoder."""
+        return bool(self.adapter.rule.text_parts)
+
+    def prepare(
+        self, scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
+    ) -> PretrainedEnhancer:
+        """Find the model, encode the scene's caption, gather its real views.
+
+        Raises:
+            ExtragsError: as `check`, or when there is no caption.
+        """
+        adapter = self.adapter
+        folder = self._checked(config)
+        text: dict[str, Tensor] = {}
+        record: dict[str, Any] = {
+            "model": config.pretrained.model or adapter.rule.usual_model,
+            "diffusers": importlib.metadata.version("diffusers"),
+        }
+        if adapter.rule.text_parts:
+            caption = caption_of(sequence, config.caption)
+            text = adapter.encode_text(folder, caption.text, config.caption.negative_text, config.pretrained)
+            record["caption"] = caption.as_dict()
+        return PretrainedEnhancer(
+            settings=config.pretrained,
+            seed=config.seed,
+            views=RealViews.gather(scene, sequence),
+            model_digest=fingerprint(folder),
+            record=record,
+            adapter=adapter,
+            text=text,
+        )
+
+    def load(self, path: Path) -> PretrainedEnhancer:
+        """Read what `PretrainedEnhancer.save` wrote; the pipeline is loaded with the first clip.
+
+        Raises:
+            WeightsError: when a file is missing, damaged, or does not fit this version.
+        """
+        from safetensors import SafetensorError
         from safetensors.torch import load_file
 
-        description_file, text_file = path / "restorer.json", path / "text.safetensors"
-        for file in (description_file, text_file, path / "references"):
-            if not file.exists():
-                raise WeightsError(f"{file}: not there; prepare the restorer first (stage enhance)")
-        description = json.loads(description_file.read_text())
-        if description.get("format") != FORMAT:
-            raise WeightsError(
-                f"{description_file}: format {description.get('format')}, this version reads {FORMAT}; "
-                "prepare the restorer again"
+        description, views = load_prepared(path, format_number=FORMAT, files=(TEXT,))
+        try:
+            text = load_file(str(path / TEXT))
+        except (OSError, SafetensorError) as error:
+            raise WeightsError(f"{path / TEXT}: not readable as safetensors ({error})") from error
+        with description_fields(path / DESCRIPTION):
+            return PretrainedEnhancer(
+                settings=PretrainedConfig.model_validate(description["settings"]),
+                seed=int(description["seed"]),
+                views=views,
+                model_digest=text_field(description, "model_digest"),
+                record=dict(description["record"]),
+                adapter=self.adapter,
+                text=text,
             )
-        return cls(
-            description["backend"],
-            PretrainedConfig.model_validate(description["settings"]),
-            int(description["seed"]),
-            load_file(str(text_file)),
-            RealViews.load(path / "references"),
-            description["model_digest"],
-            description["record"],
-        )
+
+    def _checked(self, config: EnhanceConfig) -> Path:
+        """The folder of the saved pipeline, after all checks."""
+        rule, settings = self.adapter.rule, config.pretrained
+        frames = settings.frames or rule.frames
+        if (frames - 1) % rule.frame_step:
+            near = valid_frame_count(frames, rule.frame_step)
+            raise ConfigError(
+                f"enhance.pretrained.frames={frames}: {rule.pipeline} takes "
+                f"{rule.frame_step}k+1 frames, {near} for example"
+            )
+        if frames - 1 <= settings.overlap:
+            raise ConfigError(
+                f"enhance.pretrained.overlap={settings.overlap} leaves no new frame in windows of {frames}, "
+                "the first of which is a real view"
+            )
+        check_device(settings)
+        return find_model(rule, settings)
 
 
 def _digest(text: dict[str, Tensor]) -> str:
     from safetensors.torch import save
 
     return hashlib.blake2b(save(text), digest_size=16).hexdigest()
-
-
-def check_pipeline(config: EnhanceConfig) -> Path:
-    """Look for everything a backend needs, and for settings that would fail with the first window.
-
-    Args:
-        config: with a backend of `ADAPTERS`.
-
-    Returns:
-        The folder of the saved pipeline.
-
-    Raises:
-        WeightsError: when the model is not there; says how to get it.
-        MissingDependencyError: without diffusers.
-        ConfigError: when a setting does not fit the pipeline or the machine.
-    """
-    rule, settings = ADAPTERS[config.backend].rule, config.pretrained
-    frames = settings.frames or rule.frames
-    if (frames - 1) % rule.frame_step:
-        near = valid_frame_count(frames, rule.frame_step)
-        raise ConfigError(
-            f"enhance.pretrained.frames={frames}: {rule.pipeline} takes "
-            f"{rule.frame_step}k+1 frames, {near} for example"
-        )
-    if frames - 1 <= settings.overlap:
-        raise ConfigError(
-            f"enhance.pretrained.overlap={settings.overlap} leaves no new frame in windows of {frames}, "
-            "the first of which is a real view"
-        )
-    check_device(settings)
-    return find_model(rule, settings)

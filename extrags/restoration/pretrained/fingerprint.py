@@ -1,4 +1,4 @@
-"""Which model a folder holds, told by its files without reading gigabytes."""
+"""Digests of model files, without reading gigabytes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from pathlib import Path
 __all__ = ["files_fingerprint", "fingerprint"]
 
 EDGE_BYTES = 1 << 20
-"""Of each file so much is read at both ends: weights are gigabytes, and hardly change in the middle alone."""
+"""Bytes read at both ends of each file: large weight files hardly change in the middle alone."""
 
 
 def fingerprint(folder: Path) -> str:
     """Digest of a saved pipeline: names and sizes of its files, small ones whole, weights at both ends.
 
-    Enough to notice that a folder holds another model than when its restorer was prepared.
+    This detects that a folder holds another model than when its restorer was prepared.
     """
     found = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
     return files_fingerprint(
@@ -31,7 +31,7 @@ def files_fingerprint(files: Mapping[str, Path]) -> str:
     """As `fingerprint`, of chosen files.
 
     Args:
-        files: by the names that count; where the files lie does not.
+        files: by the names that enter the digest; their folders do not.
     """
     digest = hashlib.blake2b(digest_size=16)
     for name, file in sorted(files.items()):

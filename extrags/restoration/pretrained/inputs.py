@@ -1,4 +1,4 @@
-"""What a clip gives a pretrained model: images, the mask, real views in order, a seed per window."""
+"""Inputs of a pretrained model from a clip: images, mask, ranked real views, a seed per window."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["clip_inputs", "ranked_references", "window_seed"]
 def clip_inputs(
     clip: Clip, threshold: float, dilation_px: int
 ) -> tuple[Float[np.ndarray, "t h w 3"], Bool[np.ndarray, "t h w"]]:
-    """The best images of a clip without a model, and where neither scene nor real views know enough.
+    """Base images of a clip, and the mask of what neither scene nor real views show well enough.
 
     Args:
         clip: rendered views.
@@ -47,5 +47,5 @@ def ranked_references(reference: Int[np.ndarray, "t"]) -> Int[np.ndarray, "r"]:
 
 
 def window_seed(seed: int, clip: int, window: int) -> int:
-    """A seed of its own for every window, the same whoever restores it."""
+    """Seed of a window; independent of process and order."""
     return int(np.random.SeedSequence([seed, 5, clip, window]).generate_state(1, np.uint64)[0] >> 1)

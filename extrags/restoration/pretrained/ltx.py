@@ -9,9 +9,10 @@ import numpy as np
 from torch import Tensor
 
 from extrags.restoration.pretrained.adapter import Adapter, Window, pictures, seeded
+from extrags.restoration.pretrained.enhancer import DiffusersBackend
 from extrags.restoration.pretrained.model import PipelineRule
 
-__all__ = ["LtxCondition"]
+__all__ = ["LTX", "LtxCondition"]
 
 FRAME_RATE = 25
 DECODE_TIMESTEP = 0.05
@@ -84,3 +85,6 @@ class LtxCondition(Adapter):
                 "negative_prompt_attention_mask": negative_mask,
             }
         return encoded
+
+
+LTX = DiffusersBackend(LtxCondition)

@@ -1,4 +1,4 @@
-"""Where a pretrained pipeline lies, that it is the right one, and how it is loaded."""
+"""Locating, checking and loading a saved diffusers pipeline."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ _HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 
 @dataclass(frozen=True)
 class PipelineRule:
-    """What a diffusers pipeline takes, and its usual values.
+    """Requirements of a diffusers pipeline, and its usual settings.
 
     Args:
         backend: its name in `enhance.backend`.
         pipeline: class in diffusers.
         accepts: classes a saved pipeline may name; they share their parts.
         usual_model: hub id.
-        size: of the download, for people.
+        size: of the download, for messages.
         frame_step: valid numbers of frames are k * step + 1.
         size_multiple: both image sides must be multiples of this.
         frames: of one window.
@@ -56,10 +56,9 @@ class PipelineRule:
         steps: of denoising.
         strength: share of the noise that known pixels start from.
         guidance_scale: weight of the text.
-        text_parts: components that only read the text; not loaded to restore.
+        text_parts: components that only encode the text; not loaded to restore.
         image_parts: all others that hold weights; not loaded to encode the text.
-        masked: only unknown pixels are its work; known ones are taken from what it was given, since its
-            autoencoder blurs them.
+        masked: only unknown pixels are taken from its output; its autoencoder blurs the known ones.
         absent: components that are never loaded.
     """
 
@@ -112,7 +111,7 @@ def find_model(rule: PipelineRule, settings: PretrainedConfig) -> Path:
         settings: which model; whether it may be downloaded.
 
     Raises:
-        WeightsError: when it is not there, not whole, or another pipeline; says how to get it.
+        WeightsError: when it is not there, not complete, or another pipeline; says how to get it.
         MissingDependencyError: without diffusers.
     """
     check_packages()
@@ -257,7 +256,7 @@ def load_pipeline(
 
 @contextmanager
 def _without_bars() -> Iterator[None]:
-    """No progress bars on the terminal: a library is silent."""
+    """No progress bars on the terminal."""
     switches = [importlib.import_module(f"{name}.utils.logging") for name in ("diffusers", "transformers")]
     for switch in switches:
         switch.disable_progress_bar()

@@ -1,4 +1,4 @@
-"""Whether a saved pipeline is whole: a broken download shall not be found out after the reconstruction."""
+"""Completeness of a saved pipeline: an interrupted download is found before the reconstruction."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ STEMS = {"diffusers": "diffusion_pytorch_model", "transformers": "model"}
 
 
 def missing_part(
-    folder: Path, index: Mapping[str, Any], weighty: Collection[str], absent: Collection[str]
+    folder: Path, index: Mapping[str, Any], with_weights: Collection[str], absent: Collection[str]
 ) -> str | None:
-    """The first part of a saved pipeline that is not there, or not whole.
+    """The first part of a saved pipeline that is missing or incomplete.
 
     Args:
         folder: of the pipeline.
         index: content of its `model_index.json`: `{part: [library, class]}` among other things.
-        weighty: parts that hold weights, if they have a `config.json`; tokenizers have none.
+        with_weights: parts that hold weights, if they have a `config.json`; tokenizers have none.
         absent: parts that are never loaded.
 
     Returns:
@@ -32,7 +32,7 @@ def missing_part(
             continue
         if not (folder / part).is_dir() or not any((folder / part).iterdir()):
             return f"{part}/"
-        if part in weighty and (folder / part / "config.json").is_file() and described[0] in STEMS:
+        if part in with_weights and (folder / part / "config.json").is_file() and described[0] in STEMS:
             missing = _missing_weights(folder / part, f"{STEMS[described[0]]}.safetensors")
             if missing is not None:
                 return f"{part}/{missing}"

@@ -1,4 +1,4 @@
-"""Training frames that pretrained models are shown, kept with the restorer."""
+"""Training frames as reference images of pretrained models, saved with the restorer."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class RealViews:
         """The frames a scene was trained on.
 
         Args:
-            scene: the reconstruction; its light knows each frame's exposure.
+            scene: the reconstruction; its light has each frame's exposure.
             sequence: posed frames; training frames only are taken.
 
         Raises:

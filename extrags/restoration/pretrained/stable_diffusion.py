@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from extrags.restoration.pretrained.adapter import Adapter, Window, pictures, seeded
+from extrags.restoration.pretrained.enhancer import DiffusersBackend
 from extrags.restoration.pretrained.model import PipelineRule
 
-__all__ = ["StableDiffusionImageToImage", "StableDiffusionInpaint"]
+__all__ = ["IMAGE_TO_IMAGE", "INPAINT", "StableDiffusionImageToImage", "StableDiffusionInpaint"]
 
 IMAGES_AT_ONCE = 4
 _TEXT = ("text_encoder", "tokenizer")
@@ -22,10 +23,10 @@ _ABSENT = ("safety_checker", "feature_extractor", "image_encoder")
 
 
 class _StableDiffusion(Adapter):
-    """What both share: no time axis, so all frames share their noise, which keeps flicker down."""
+    """Base of both: without a time axis, all frames share their noise, which reduces flicker."""
 
     def _restored(self, window: Window, seed: int) -> np.ndarray:
-        # The real view is there for the video models; nothing of it needs to be restored.
+        # The real view is for the video models; it needs no restoration.
         parts = [window.frames[:1]]
         for first in range(1, len(window), IMAGES_AT_ONCE):
             chosen = slice(first, first + IMAGES_AT_ONCE)
@@ -92,7 +93,7 @@ class StableDiffusionImageToImage(_StableDiffusion):
 
 
 class StableDiffusionInpaint(_StableDiffusion):
-    """`StableDiffusionInpaintPipeline`: only masked pixels are made anew.
+    """`StableDiffusionInpaintPipeline`: only masked pixels are generated.
 
     Takes inpainting checkpoints (a network of nine input channels) and plain ones (four).
 
@@ -118,3 +119,7 @@ class StableDiffusionInpaint(_StableDiffusion):
             "height": window.height,
             "width": window.width,
         }
+
+
+IMAGE_TO_IMAGE = DiffusersBackend(StableDiffusionImageToImage)
+INPAINT = DiffusersBackend(StableDiffusionInpaint)

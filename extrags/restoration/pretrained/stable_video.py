@@ -11,9 +11,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrags.restoration.pretrained.adapter import Adapter, Window, pictures, seeded
+from extrags.restoration.pretrained.enhancer import DiffusersBackend
 from extrags.restoration.pretrained.model import PipelineRule
 
-__all__ = ["StableVideo"]
+__all__ = ["STABLE_VIDEO", "StableVideo"]
 
 FRAME_RATE = 7
 MOTION = 127
@@ -21,7 +22,7 @@ MOTION = 127
 
 
 class StableVideo(Adapter):
-    """`StableVideoDiffusionPipeline`: made to animate one image, here led along a clip.
+    """`StableVideoDiffusionPipeline`: made to animate one image, here guided by a clip.
 
     The real view is its image. Frames start from the clip's latents with noise (`strength` of the
     schedule, as SDEdit does), and after every step the latents of known pixels are set back to the
@@ -108,3 +109,6 @@ class StableVideo(Adapter):
         holes = torch.from_numpy(unknown.astype(np.float32))[:, None]
         reduced = functional.adaptive_max_pool2d(holes, (int(latents.shape[-2]), int(latents.shape[-1])))
         return (1 - reduced)[None]
+
+
+STABLE_VIDEO = DiffusersBackend(StableVideo)

@@ -8,16 +8,17 @@ import numpy as np
 from torch import Tensor
 
 from extrags.restoration.pretrained.adapter import Adapter, Window, pictures, seeded
+from extrags.restoration.pretrained.enhancer import DiffusersBackend
 from extrags.restoration.pretrained.model import PipelineRule
 
-__all__ = ["WanVace"]
+__all__ = ["WAN_VACE", "WanVace"]
 
 GREY = 0.5
-"""What VACE was trained to see where something is to be made."""
+"""Colour of the pixels to generate, as in the training of VACE."""
 
 
 class WanVace(Adapter):
-    """`WanVACEPipeline`: known pixels are kept, masked ones made anew after video, references and text.
+    """`WanVACEPipeline`: known pixels are kept, masked ones generated from video, references and text.
 
     Of the pretrained pipelines the one whose inputs fit the task. `strength` has no meaning here.
 
@@ -47,7 +48,7 @@ class WanVace(Adapter):
 
     @property
     def strength(self) -> float:
-        """Always 1: what is kept is said by the mask."""
+        """Always 1: the mask says what is kept."""
         return 1.0
 
     def _restored(self, window: Window, seed: int) -> np.ndarray:
@@ -77,3 +78,6 @@ class WanVace(Adapter):
         if guided:
             encoded["negative_prompt_embeds"] = negative
         return encoded
+
+
+WAN_VACE = DiffusersBackend(WanVace)

@@ -1,4 +1,4 @@
-"""Long clips in windows a model can take: where they lie, and how their results are joined."""
+"""Long clips cut into windows that fit a model, and joined by cross-fading."""
 
 from __future__ import annotations
 

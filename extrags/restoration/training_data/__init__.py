@@ -1,1 +1,1 @@
-"""Pairs of degraded and true views to train restorers on."""
+"""Training data of restorers: pairs of degraded and true views."""

@@ -1,8 +1,9 @@
-"""Crops for the training: from few pairs, the variety that virtual views will show."""
+"""Random augmented crops of training pairs."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,47 +11,88 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrags.errors import ConfigError
-from extrags.restoration.diffusion.network import SIZE_MULTIPLE
-from extrags.restoration.diffusion.rectified_flow import Batch
 from extrags.restoration.training_data.pairs import Pairs
-from extrags.view_synthesis.conditioning import Layers, condition
+from extrags.view_synthesis.conditioning import Conditioning, Layers, condition
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["CropSampler", "MixedSampler", "cut_out", "drop_references"]
+__all__ = ["Batch", "CropSampler", "MixedSampler", "cut_out", "drop_references"]
 
 PASTED_HOLES = 0.5
 """Probability of another pair's holes."""
 HALF_PLANE = 0.35
-"""Probability that one side of a line was never seen."""
+"""Probability that one side of a random line is a hole."""
 REFERENCE_DROPOUT = 0.35
-"""Probability that no real view is there to help."""
+"""Probability that all real views are removed."""
 EXPOSURE_JITTER = 0.3
 COLOR_JITTER = 0.1
-"""Deviations of the logarithm of a common and a per-channel gain. Large, because virtual views come
-nearer to the wall than real ones: the restorer shall keep the colour it is given, not the scene's mean."""
+"""Standard deviations of the logarithm of a common and a per-channel gain. They are large because virtual
+views are nearer to the wall than real ones: the restorer has to keep the colour of its input, not the mean
+of the scene."""
 SMALLEST_CROP_PX = 32
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Crops to train on.
+
+    Args:
+        conditioning: network input, base image and completed depth.
+        clean: the true view, in [0, 1], [N, 3, H, W].
+        weight: of each pixel's error, [N, 1, H, W].
+        depth_mm: true z-depth, 0 where unknown, [N, 1, H, W].
+    """
+
+    conditioning: Conditioning
+    clean: Float[Tensor, "n 3 h w"]
+    weight: Float[Tensor, "n 1 h w"]
+    depth_mm: Float[Tensor, "n 1 h w"]
+
+    @staticmethod
+    def concatenated(parts: list[Batch]) -> Batch:
+        """Join crops of the same size."""
+        conditionings = [part.conditioning for part in parts]
+        return Batch(
+            Conditioning(
+                torch.cat([part.channels for part in conditionings]),
+                torch.cat([part.base for part in conditionings]),
+                torch.cat([part.depth_mm for part in conditionings]),
+            ),
+            torch.cat([part.clean for part in parts]),
+            torch.cat([part.weight for part in parts]),
+            torch.cat([part.depth_mm for part in parts]),
+        )
 
 
 class CropSampler:
     """Draws batches of augmented crops, the same sequence for the same seed.
 
     Args:
-        pairs: what to learn from; validation pairs are left out.
+        pairs: of the scene; validation pairs are left out.
         transfer: how brightness changes with distance in this scene.
         batch: crops per batch.
         crop_px: side of a crop; images smaller than that give smaller crops.
-        seed: of everything random.
+        side_multiple: of which a crop's side must be a multiple; the network's.
+        seed: of all random draws.
 
     Raises:
         ConfigError: when the images are too small for any crop, or no pair is left to train on.
     """
 
-    def __init__(self, pairs: Pairs, transfer: LightTransfer, *, batch: int, crop_px: int, seed: int) -> None:
+    def __init__(
+        self,
+        pairs: Pairs,
+        transfer: LightTransfer,
+        *,
+        batch: int,
+        crop_px: int,
+        side_multiple: int,
+        seed: int,
+    ) -> None:
         self._pairs = pairs.subset(np.flatnonzero(~pairs.validation))
         if len(self._pairs) == 0:
-            raise ConfigError("all pairs are kept back for validation; none is left to train on")
+            raise ConfigError("all pairs are for validation; none is left to train on")
         height, width = pairs.target.shape[-2:]
-        side = min(crop_px, height, width) // SIZE_MULTIPLE * SIZE_MULTIPLE
+        side = min(crop_px, height, width) // side_multiple * side_multiple
         if side < SMALLEST_CROP_PX:
             raise ConfigError(
                 f"images of {width}x{height} px are too small to train a restorer on; "
@@ -89,13 +131,13 @@ class CropSampler:
             alpha = pairs.layers.get("alpha")[
                 other : other + 1, :, row : row + self._side, column : column + self._side
             ]
-            # Half of the holes hide from the renderer only; real views may still see the surface.
-            layers = cut_out(layers, _turned(alpha, generator), unseen=generator.random() < 0.5)
+            # In half of the holes real views may still see the surface.
+            layers = cut_out(layers, _random_symmetry(alpha, generator), unseen=generator.random() < 0.5)
         if generator.random() < HALF_PLANE:
             layers = cut_out(layers, self._half_plane(), unseen=True)
         if generator.random() < REFERENCE_DROPOUT:
             layers = drop_references(layers)
-        everything = _turned(torch.cat([layers.data, clean, weight, depth], dim=1), generator)
+        everything = _random_symmetry(torch.cat([layers.data, clean, weight, depth], dim=1), generator)
         data, clean, weight, depth = everything.split((layers.data.shape[1], 3, 1, 1), dim=1)
         return data, clean, weight, depth
 
@@ -124,7 +166,7 @@ class CropSampler:
 
 
 class MixedSampler:
-    """Batches whose crops come from many scenes, each with its own light.
+    """Batches of crops from many scenes, each with its own light.
 
     Args:
         samplers: one per scene; each gives one crop at a time.
@@ -144,7 +186,7 @@ class MixedSampler:
 
 
 def cut_out(layers: Layers, kept: Float[Tensor, "1 1 h w"], *, unseen: bool) -> Layers:
-    """Holes as the renderer would show them.
+    """Cut holes into layers as a rendering would show them.
 
     Args:
         layers: changed in place.
@@ -164,13 +206,13 @@ def cut_out(layers: Layers, kept: Float[Tensor, "1 1 h w"], *, unseen: bool) -> 
 
 
 def drop_references(layers: Layers) -> Layers:
-    """As if no real view saw anything of it; changed in place."""
+    """Layers without any real view; changed in place."""
     for name in ("nearest_weight", "blend_weight", "log_ratio"):
         layers.get(name).zero_()
     return layers
 
 
-def _turned(images: Tensor, generator: np.random.Generator) -> Tensor:
+def _random_symmetry(images: Tensor, generator: np.random.Generator) -> Tensor:
     """One of the eight symmetries of the square."""
     choice = int(generator.integers(8))
     if choice & 1:

@@ -1,9 +1,9 @@
-"""Pairs to learn restoration from, made of the scene's own training frames.
+"""Training pairs for restorers, made of the scene's own training frames.
 
-*Leave-out pairs*: the scene is reconstructed briefly without some training frames, and those are
-rendered: real artefacts, real targets. Each is rendered a second time with holes torn into the scene.
-*Cheap pairs*: Gaussians straight from the depth of a few frames, perturbed and never optimised, rendered
-in others. Held-out frames are never touched.
+*Leave-out pairs*: the scene is reconstructed briefly without some training frames, which are then rendered
+twice: from that scene, and from a perturbed copy with holes.
+*Synthetic pairs*: Gaussians from the depth of a few frames, perturbed and not optimised, rendered in other
+frames. Held-out frames are never used.
 """
 
 from __future__ import annotations
@@ -32,22 +32,22 @@ from extrags.view_synthesis.references import ReferenceViews
 __all__ = ["Pairs", "fold_pairs", "leave_out_folds", "make_pairs", "pair_views", "synthetic_pairs"]
 
 MIN_FRAMES = 4
-"""With fewer training frames there is nothing to leave out."""
+"""With fewer training frames none can be left out."""
 BLOCKS_PER_FOLD = 3
-"""Each fold leaves out so many runs of neighbouring frames: gaps like those of a new trajectory."""
+"""Runs of neighbouring frames that a fold leaves out, so that gaps are like those of a new trajectory."""
 VALIDATION_EVERY = 5
-"""Every n-th training frame is never a target of the training, only of the validation."""
+"""Every n-th training frame is a target of the validation only."""
 TARGETS_PER_SUBSET = 4
 SYNTHETIC_GAUSSIANS = 8000
 FLAT = 0.1
 """Thickness of synthetic Gaussians, as a share of their radius."""
 MIN_GAIN = 0.05
-"""Darker places are treated as if they received this much light: noise is not albedo."""
+"""Lower bound of the received light when albedo is computed: in the dark, noise would dominate."""
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """P degraded views with what they really looked like.
+    """P degraded views with their true images.
 
     Args:
         layers: of the degraded views, [P].
@@ -55,8 +55,8 @@ class Pairs:
         weight: 1 where the target is valid tissue and not saturated, [P, 1, H, W].
         depth_mm: true z-depth, 0 where unknown, [P, 1, H, W].
         frame: frame of the sequence, [P].
-        synthetic: which pairs come from unoptimised or torn Gaussians, [P].
-        validation: which pairs are kept back from the training, [P].
+        synthetic: which pairs come from unoptimised or perturbed Gaussians, [P].
+        validation: which pairs are for validation, [P].
     """
 
     layers: Layers
@@ -69,6 +69,11 @@ class Pairs:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the images in pixels."""
+        return int(self.target.shape[-2]), int(self.target.shape[-1])
 
     def subset(self, chosen: Int[np.ndarray, "m"]) -> Pairs:
         """Chosen pairs."""
@@ -151,10 +156,10 @@ def leave_out_folds(
 def fold_pairs(
     scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig, fold: int
 ) -> Pairs:
-    """Reconstruct without the frames of a fold, and render them: as it is, and torn.
+    """Reconstruct without the frames of a fold, and render them, from the scene and from a perturbed copy.
 
     Args:
-        scene: the coarse scene; its light tells the exposure of the left-out frames.
+        scene: the coarse scene; its light gives the exposure of the left-out frames.
         sequence: posed frames.
         config: folds, iterations, seed.
         coarse: settings of the reconstruction.
@@ -170,13 +175,13 @@ def fold_pairs(
     # In the partial scene the mean over the kept frames is one.
     gain = (_log_exposures(scene, sequence, left) - _log_exposures(scene, sequence, kept).mean()).exp()
     generator = np.random.default_rng([config.seed, 4, fold])
-    torn = _torn(partial, generator)
+    perturbed = _perturbed(partial, generator)
     parts = []
-    for degraded, views in ((partial, references), (torn, references.of_scene(torn))):
+    for degraded, views in ((partial, references), (perturbed, references.of_scene(perturbed))):
         observation = observe_views(
             degraded, views, sequence.cameras[left], count=config.references, exposure=gain
         )
-        parts.append(pair_views(sequence, observation.layers, left, synthetic=degraded is torn))
+        parts.append(pair_views(sequence, observation.layers, left, synthetic=degraded is perturbed))
     return Pairs.concatenated(parts)
 
 
@@ -190,8 +195,8 @@ def _partial_scene(
 ) -> Scene:
     """A brief reconstruction from the kept frames, under the coarse scene's light.
 
-    The light takes longer to learn than a fold has; started anew it would teach the restorer errors of
-    brightness that the coarse scene does not have.
+    A fold is too short to learn the light: with a new one, the pairs would have errors of brightness that the
+    coarse scene does not have.
     """
     light = scene.light
     if light is not None:
@@ -220,8 +225,8 @@ def _partial_scene(
     return optimise(Scene(start, light), lambda _: views[next(order)], schedule).scene
 
 
-def _torn(scene: Scene, generator: np.random.Generator) -> Scene:
-    """The scene with holes torn into it and its Gaussians shaken: what lies farther off the path."""
+def _perturbed(scene: Scene, generator: np.random.Generator) -> Scene:
+    """The scene with holes and displaced Gaussians, as it looks from farther off the trajectory."""
     means = scene.gaussians.means.numpy()
     keep = generator.random(len(means)) > generator.uniform(0, 0.3)
     keep &= _outside_random_balls(means, float(np.ptp(means, axis=0).min()), generator)
@@ -322,9 +327,9 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
     signal = views.transfer.signal(torch.from_numpy(packed[chosen, :3])).numpy()
     albedo = signal / np.maximum(falloff, MIN_GAIN)[:, None]
     albedo = albedo / views.exposure.numpy()[view, None]
-    # Without a light the colour of a distance cannot be divided out twice: it stays as it was seen.
+    # Without a light the fall-off cannot be divided out: the colour stays as it was seen.
     colors = albedo if views.transfer.light is not None else packed[chosen, :3]
-    # The area each point stands for, as the deviation of a Gaussian.
+    # Standard deviation of a Gaussian that covers the area of one point.
     pitch = np.sqrt(len(usable) / count) / views.cameras.K[view, 0, 0]
     radius = 0.6 * depth * pitch * np.exp(generator.normal(0, 0.25, count))
     noise = generator.normal(0, generator.uniform(0.003, 0.04), count)
@@ -333,7 +338,7 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
     inward = generator.uniform(0.3, 0.95, count)
     points = np.where(floats[:, None], views.cameras.centers[view] + offsets * inward[:, None], points)
     colors = np.where(floats[:, None], generator.uniform(0, 1.2, (count, 3)), colors)
-    # What floats near the lens must not look larger than what it was taken from.
+    # A floater near the lens must not look larger than the surface it was taken from.
     radius = np.where(floats, radius * inward, radius)
     keep = _outside_random_balls(points, float(np.median(depth)), generator)
     opacity = float(generator.uniform(0.4, 0.95))
@@ -350,7 +355,7 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
 def pair_views(
     sequence: EndoscopicSequence, layers: Layers, frames: Int[np.ndarray, "m"], *, synthetic: bool
 ) -> Pairs:
-    """Layers of frames with what the frames really show; every fifth training frame validates."""
+    """Layers of frames with their true images; every fifth training frame is for validation."""
     rgb = sequence.rgb[frames]
     valid = sequence.supervised_mask(frames) & ~saturated_mask(rgb)
     depth = np.zeros(valid.shape, dtype=np.float32)

@@ -1,8 +1,8 @@
-"""Pretraining data: real renderings of views far off the path, paired with the truth.
+"""Pretraining data: renderings of views far off the trajectory, paired with the truth.
 
-A pretraining scene is reconstructed like any other, in a number of steps drawn for it; then views that no
-training frame comes near are rendered, and what they really look like is known. Pairs of a scene and the
-light they need travel as one safetensors file.
+A pretraining scene is reconstructed like any other, with a random number of iterations; then views far from
+all training frames are rendered, whose true images are known. The pairs of a scene and its light are one
+safetensors file.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ __all__ = ["PretrainingScene", "make_pretraining_scene"]
 PRETRAINING_DATA_VERSION = 1
 """Raised by hand whenever the same scene and settings give other pairs."""
 ITERATIONS = (400, 2000)
-"""A pretraining scene is trained for a number of steps between these: renderings good and less good."""
+"""Range of the random number of iterations, so that renderings of different quality occur."""
 GAUSSIANS = (0.35, 1.0)
-"""Share of the starting points and of the limit on Gaussians, drawn between these."""
+"""Range of the random share of the starting points and of the limit on Gaussians."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class PretrainingScene:
     """Pairs of one scene.
 
     Args:
-        pairs: renderings with the truth; none validates.
+        pairs: renderings with the truth; none is for validation.
         transfer: how brightness changes with distance in this scene.
     """
 
@@ -50,7 +50,7 @@ class PretrainingScene:
 
         Args:
             path: the file.
-            origin: what the scene was made from, given back by `made_from`.
+            origin: what the scene was made from, read by `made_from`.
         """
         from safetensors.torch import save_file
 
@@ -96,7 +96,7 @@ class PretrainingScene:
         """Read what `save` wrote.
 
         Raises:
-            WeightsError: when the file is not one of ours.
+            WeightsError: when the file holds no pretraining scene.
         """
         from safetensors import SafetensorError, safe_open
 

@@ -1,1 +1,1 @@
-"""The error a restorer makes: expected, calibrated, and shown."""
+"""The error a restorer expects of its images: model, calibration, reliability diagram."""

@@ -1,8 +1,7 @@
-"""From the error a restorer expects to the error it makes, measured on pairs it has not learned from.
+"""Calibration of the expected error by isotonic regression on validation pairs.
 
-A network knows where it errs long before it knows by how much. Errors of cells of pixels, predicted and
-true, are put in order; a curve through their means that never falls turns one into the other. It turns no
-order round; where it is level, different predictions become equal.
+Networks rank their errors well before they predict their size. The means of predicted and true errors over
+cells of pixels give a non-decreasing curve, which maps one to the other and keeps the ranking.
 """
 
 from __future__ import annotations
@@ -17,20 +16,20 @@ from torch.nn import functional
 __all__ = ["CELL_PX", "Calibration", "cell_means"]
 
 CELL_PX = 8
-"""Predicted and true errors are compared in squares of this side: single pixels are noise."""
+"""Side of the square cells in which errors are compared; errors of single pixels are too noisy."""
 KNOTS = 17
 MIN_CELLS = 2000
-"""Fewer cells say nothing about a curve."""
+"""With fewer cells no curve is fitted."""
 SMALLEST_ERROR = 1e-4
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A curve that never falls.
+    """A non-decreasing, piecewise linear calibration curve; without knots, the identity.
 
     Args:
-        predicted: knots, rising.
-        true: mean error at the knots, not falling.
+        predicted: knots, increasing.
+        true: mean true error at the knots, non-decreasing.
     """
 
     predicted: tuple[float, ...] = ()
@@ -38,13 +37,13 @@ class Calibration:
 
     @classmethod
     def fitted(cls, predicted: Float[np.ndarray, "n"], true: Float[np.ndarray, "n"]) -> Calibration:
-        """The best curve (least squares) that never falls through means of cells; none where they are few.
+        """The least-squares non-decreasing curve through means of cells; the identity with too few cells.
 
-        Cells are put in order by prediction and averaged in equal shares, one per knot.
+        Cells are sorted by prediction and averaged in equal shares, one per knot.
 
         Args:
-            predicted: errors as the restorer expects them.
-            true: errors as they are.
+            predicted: expected errors of the cells.
+            true: true errors of the cells.
         """
         from scipy.optimize import isotonic_regression
 
@@ -75,7 +74,7 @@ class Calibration:
 def cell_means(
     values: Float[Tensor, "n 1 h w"], weight: Float[Tensor, "n 1 h w"]
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
-    """Weighted means of cells, and how much of each cell has weight, cells in order."""
+    """Weighted mean and mean weight of each cell, row by row."""
     share = functional.avg_pool2d(weight, CELL_PX)
     mean = functional.avg_pool2d(values * weight, CELL_PX) / share.clamp_min(1e-6)
     return mean.flatten().numpy(), share.flatten().numpy()

@@ -1,7 +1,7 @@
-r"""The error of a restored pixel, expected from what the network says and from what it was given.
+r"""Log-linear model of the error of a restored pixel.
 
-The network's own expectation :math:`b` is blind to fine texture and slow to follow the scene's uncertainty.
-A line through logarithms mends that:
+The network's own expectation :math:`b` misses fine texture and the scene's uncertainty, so it is combined
+with them by a linear model of logarithms:
 
 .. math:: \log \hat e = w_0 + w_1 \log b + w_2 \log(c + c_0) + w_3 u + w_4 u \log b + w_5 s
           + w_6 \log(d + d_0)
@@ -38,7 +38,7 @@ FEATURES = 6
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """The line.
+    """Weights of the model; by default the network's own expectation.
 
     Args:
         weights: w_1 to w_6.
@@ -50,10 +50,10 @@ class ErrorModel:
 
     @classmethod
     def fitted(cls, features: Float[np.ndarray, "n 6"], error: Float[np.ndarray, "n"]) -> ErrorModel:
-        """The line through cells, by least squares on logarithms.
+        """Least squares on the logarithms of cells.
 
         Args:
-            features: means over cells of what `error_features` gives.
+            features: means of `error_features` over cells.
             error: mean absolute errors of these cells.
         """
         table = np.column_stack([features, np.ones(len(features))])
@@ -74,12 +74,12 @@ class ErrorModel:
 def error_features(
     layers: Layers, rgb: Float[Tensor, "n 3 h w"], error: Float[Tensor, "n 1 h w"]
 ) -> Float[Tensor, "n 6 h w"]:
-    """What the expected error is made of.
+    """Features of each pixel, in the order of the weights.
 
     Args:
-        layers: what the restorer was given.
-        rgb: what it made of it, in [0, 1].
-        error: what the network itself expects.
+        layers: input of the restorer.
+        rgb: restored image in [0, 1].
+        error: the network's own expected error.
     """
     window = gaussian_weights(CONTRAST_SIGMA_PX, CONTRAST_RADIUS_PX)
     gray = rgb.mean(dim=1, keepdim=True)

@@ -1,4 +1,4 @@
-"""How well errors were predicted: a table of predicted against true ones, and how well they are ranked."""
+"""Reliability diagram of predicted errors, and their rank correlation with the true ones."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def calibration(
     *,
     bins: int = CALIBRATION_BINS,
 ) -> dict[str, Any]:
-    """How well an error was predicted, on means over cells of 8 x 8 pixels.
+    """Predicted against true error, on means over cells of 8 x 8 pixels.
 
     Args:
-        predicted: what the restorer expects its error to be.
+        predicted: the error the restorer expects.
         error: the true absolute error, mean of the channels.
         mask: which pixels count; a cell counts with at least half of its pixels.
         bins: of equal numbers of cells, by prediction.
@@ -92,7 +92,7 @@ def cell_correlation(
 
 def _cells(values: np.ndarray, mask: np.ndarray) -> Float[np.ndarray, "n"]:
     """Means over cells that lie wholly in the image and at least half in the mask."""
-    # `where` and not a product: what stands outside the mask must not leak in, be it NaN.
+    # `where` and not a product: pixels outside the mask may be NaN.
     inside = torch.from_numpy(np.where(mask, values, 0).astype(np.float32))[:, None]
     means, share = cell_means(inside, torch.from_numpy(mask.astype(np.float32))[:, None])
     return means[share >= 0.5].astype(np.float64)

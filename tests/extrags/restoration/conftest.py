@@ -1,8 +1,12 @@
-"""A small restorer's settings, and training pairs from the lit tube."""
+"""A small restorer's settings, training pairs from the lit tube, and tiny pretrained pipelines on disk."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -10,6 +14,10 @@ import torch
 from extrags.config import EnhanceConfig
 from extrags.restoration.training_data.pairs import Pairs, synthetic_pairs
 from tests.extrags.lit_tube import Tube
+from tests.extrags.restoration.pretrained.tiny_pipelines import BUILDERS
+
+# Before huggingface_hub is loaded: nothing in these tests may reach for the network.
+os.environ["HF_HUB_OFFLINE"] = "1"
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -37,3 +45,36 @@ SMALL = EnhanceConfig(
 @pytest.fixture(scope="session")
 def tube_pairs(tube: Tube) -> Pairs:
     return synthetic_pairs(tube.scene, tube.sequence, SMALL)
+
+
+@pytest.fixture(scope="session")
+def diffusers() -> ModuleType:
+    """The extra; its own deprecation warnings are not ours to mend."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name in ("transformers", "accelerate", "ftfy"):
+            pytest.importorskip(name, reason="needs extrags[diffusers]")
+        package = pytest.importorskip("diffusers", reason="needs extrags[diffusers]")
+        # Lazily imported parts warn as well, the first time they are touched.
+        for name in BUILDERS:
+            getattr(package, name)
+    return package
+
+
+@pytest.fixture(scope="session")
+def saved(diffusers: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Folder of a saved tiny pipeline, built when it is first asked for."""
+    root = tmp_path_factory.mktemp("pipelines")
+    folders: dict[str, Path] = {}
+
+    def folder(pipeline: str) -> Path:
+        if pipeline not in folders:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")
+                torch.manual_seed(0)
+                made = BUILDERS[pipeline](diffusers)
+                folders[pipeline] = root / pipeline
+                made.save_pretrained(str(folders[pipeline]))
+        return folders[pipeline]
+
+    return folder

@@ -9,20 +9,22 @@ import torch
 
 from extrags.config import CoarseConfig
 from extrags.errors import ConfigError, DivergedError, WeightsError
-from extrags.restoration.backends import judged, load_enhancer, train_enhancer
+from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import render_clips
+from extrags.restoration.diffusion.backend import better_of_both
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
 from extrags.restoration.diffusion.rectified_flow import (
-    Batch,
     Predicted,
     TrainingSettings,
     restoration_loss,
     sample,
     train_network,
 )
+from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.training_data.augmentation import Batch
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Conditioning
@@ -146,7 +148,7 @@ class TestTraining:
 
 @pytest.fixture(scope="module")
 def trained(tube: Tube, tube_pairs: Pairs) -> EmbeddedEnhancer:
-    return EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL)
+    return train_on_scene(tube_pairs, tube.references.transfer, SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +169,7 @@ class TestEmbedded:
     def test_training_twice_gives_the_same_bits(
         self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
     ) -> None:
-        again = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL)
+        again = train_on_scene(tube_pairs, tube.references.transfer, SMALL)
         for one, two in zip(
             again.network.state_dict().values(), trained.network.state_dict().values(), strict=True
         ):
@@ -198,7 +200,7 @@ class TestEmbedded:
         self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
     ) -> None:
         harmful = SMALL.model_copy(update={"scene_learning_rate": 0.5, "train_iterations": 3})
-        kept = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, harmful, trained)
+        kept = train_on_scene(tube_pairs, tube.references.transfer, harmful, trained)
         assert kept.record["scene_training_kept"] is False
         for one, two in zip(
             kept.network.state_dict().values(), trained.network.state_dict().values(), strict=True
@@ -208,11 +210,11 @@ class TestEmbedded:
     def test_training_that_helps_is_kept(
         self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
     ) -> None:
-        crude = EmbeddedEnhancer.train(
+        crude = train_on_scene(
             tube_pairs, tube.references.transfer, SMALL.model_copy(update={"train_iterations": 4})
         )
         more = SMALL.model_copy(update={"scene_learning_rate": 2e-3})
-        kept = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, more, crude)
+        kept = train_on_scene(tube_pairs, tube.references.transfer, more, crude)
         scores = kept.record["validation"]
         assert kept.record["scene_training_kept"] is True
         assert scores["embedded_1"]["psnr"] > scores["untrained_embedded_1"]["psnr"]
@@ -240,12 +242,12 @@ class TestEmbedded:
         self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, clip: Clip, tmp_path, caplog
     ) -> None:
         transfer = tube.references.transfer
-        kept = judged(trained, tube_pairs, transfer)
+        kept = better_of_both(trained, tube_pairs, transfer)
         assert isinstance(kept, EmbeddedEnhancer)
         assert f"embedded_{trained.steps}" in kept.provenance["validation"]
         network = copy.deepcopy(trained.network)
         torch.nn.init.normal_(network.exit.weight, std=0.3, generator=torch.Generator().manual_seed(3))
-        served = judged(replace(trained, network=network), tube_pairs, transfer)
+        served = better_of_both(replace(trained, network=network), tube_pairs, transfer)
         assert isinstance(served, ClassicalEnhancer)
         assert "restored by blending and filling" in caplog.text
         served.save(tmp_path)
@@ -253,7 +255,7 @@ class TestEmbedded:
         assert "on leave-out pairs of this scene" in loaded.restore(clip).provenance["reason"]
 
     def test_a_plain_regression_needs_no_noise(self, tube: Tube, tube_pairs: Pairs, clip: Clip) -> None:
-        plain = EmbeddedEnhancer.train(tube_pairs, tube.references.transfer, SMALL, deterministic=True)
+        plain = train_on_scene(tube_pairs, tube.references.transfer, SMALL, deterministic=True)
         assert plain.steps == 1
         assert plain.record["validation"].keys() == {"none", "classical", "embedded_1"}
         assert np.array_equal(plain.restore(clip).rgb, replace(plain, seed=5).restore(clip).rgb)
@@ -290,13 +292,3 @@ class TestGamut:
         image = torch.rand(1, 3, 8, 8, generator=torch.Generator().manual_seed(1))
         gamut = Gamut.of_images(dark, torch.ones(1, 1, 8, 8))
         torch.testing.assert_close(gamut.bounded(image), image, atol=2e-3, rtol=0)
-
-
-def test_classical_backend_needs_no_training(tube: Tube, clip: Clip, tmp_path) -> None:
-    config = SMALL.model_copy(update={"backend": "classical"})
-    enhancer = train_enhancer(tube.scene, tube.sequence, config, CoarseConfig())
-    enhancer.save(tmp_path)
-    loaded = load_enhancer(tmp_path)
-    assert isinstance(loaded, ClassicalEnhancer)
-    assert isinstance(loaded, Enhancer)
-    assert np.array_equal(loaded.restore(clip).rgb, enhancer.restore(clip).rgb)

@@ -102,5 +102,5 @@ class TestPretraining:
         assert not torch.equal(plain.network.exit.weight, seen.network.exit.weight)
 
     def test_the_number_of_scenes_is_checked(self, files: list[Path]) -> None:
-        with pytest.raises(ConfigError, match="2 pretraining scenes, 3 were announced"):
+        with pytest.raises(ConfigError, match="2 pretraining scenes found, settings say 3"):
             pretrain(files[:2], TINY)

@@ -1,7 +1,7 @@
-"""Weights of the embedded restorer that come with the package, and how others are found.
+"""Pretrained weights of the embedded restorer: those of the package, or a user's own.
 
-`restorer.safetensors` beside this file is what the project trained by itself; `restorer.json` says with
-which command, on what, and how good it is. A user's own pair of such files is taken by its path.
+`restorer.safetensors` beside this file was trained by this project; `restorer.json` records the command,
+the data and the scores. A user's own pair of such files is given by its path.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from importlib.resources import files
 from pathlib import Path
 
 from extrags.errors import WeightsError
+from extrags.restoration.description import DESCRIPTION
 
-__all__ = ["BUNDLED", "DESCRIPTION", "NONE", "WEIGHTS", "find_weights", "weights_digest"]
+__all__ = ["BUNDLED", "NONE", "WEIGHTS", "find_weights", "weights_digest"]
 
 BUNDLED = "bundled"
 """Setting: the weights of the package."""
 NONE = "none"
-"""Setting: no weights; the restorer of a scene is trained from nothing."""
+"""Setting: no weights; the restorer of a scene is trained from random ones."""
 WEIGHTS = "restorer.safetensors"
-DESCRIPTION = "restorer.json"
 
 
 def find_weights(setting: str) -> Path | None:
-    """Where the weights lie that a scene's restorer starts from.
+    """File of the weights that a scene's restorer starts from.
 
     Args:
         setting: `bundled`, `none`, or the path of a .safetensors file with its .json beside it, or of a
@@ -33,7 +33,7 @@ def find_weights(setting: str) -> Path | None:
         The .safetensors file, its description beside it with the suffix .json; None for `none`.
 
     Raises:
-        WeightsError: when a file is missing or another kind is named; says what can be done.
+        WeightsError: when a file is missing or another kind is named; says what to do.
     """
     if setting == NONE:
         return None
@@ -57,7 +57,7 @@ def find_weights(setting: str) -> Path | None:
 
 
 def weights_digest(setting: str) -> str | None:
-    """Digest of weights and description, wherever they lie; None without weights.
+    """Digest of weights and description, independent of their path; None without weights.
 
     Raises:
         WeightsError: as `find_weights`.

@@ -16,14 +16,13 @@ import torch
 from extrags.config import PretrainedConfig
 from extrags.errors import ConfigError, NonFiniteError, WeightsError
 from extrags.restoration.pretrained.adapter import Adapter, Window
-from extrags.restoration.pretrained.enhancer import ADAPTERS
 from extrags.restoration.pretrained.model import find_model
 from extrags.restoration.pretrained.stable_diffusion import (
     StableDiffusionImageToImage,
     StableDiffusionInpaint,
 )
 from extrags.restoration.pretrained.wan_vace import WanVace
-from tests.extrags.restoration.pretrained.conftest import moving_tube
+from tests.extrags.restoration.pretrained.tiny_pipelines import ADAPTERS, moving_tube
 
 # Of diffusers and of what it hands to numpy; nothing of ours.
 pytestmark = [

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from extrags.restoration.pretrained.canvas import Canvas
-from tests.extrags.restoration.pretrained.conftest import moving_tube
+from tests.extrags.restoration.pretrained.tiny_pipelines import moving_tube
 
 
 @pytest.mark.parametrize(("multiple", "short_side_px"), [(8, 96), (16, 100), (32, 64), (64, 128)])

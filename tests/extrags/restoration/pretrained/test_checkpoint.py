@@ -14,12 +14,8 @@ from extrags.errors import ConfigError, ExtragsError, MissingDependencyError, We
 from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.clips import render_clips
 from extrags.restoration.pretrained import checkpoint_driver
-from extrags.restoration.pretrained.checkpoint import (
-    CheckpointEnhancer,
-    check_clone,
-    clone_fingerprint,
-    relative_poses,
-)
+from extrags.restoration.pretrained.checkpoint import CheckpointEnhancer, relative_poses
+from extrags.restoration.pretrained.clone import check_clone, clone_fingerprint
 from extrags.restoration.pretrained.inputs import clip_inputs
 from extrags.restoration.pretrained.real_views import RealViews
 from extrags.restoration.protocol import Clip
@@ -54,7 +50,7 @@ def settings(clone: Path, **further: Any) -> CheckpointConfig:
 
 def unprepared(tube: Tube, config: CheckpointConfig, caption: str = "pink wall") -> CheckpointEnhancer:
     views = RealViews.gather(tube.scene, tube.sequence)
-    return CheckpointEnhancer(config, 4, views, caption, clone_fingerprint(config), {})
+    return CheckpointEnhancer(config, 4, views, clone_fingerprint(config), {}, caption)
 
 
 class TestDriver:

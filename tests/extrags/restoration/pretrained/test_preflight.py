@@ -13,11 +13,11 @@ import pytest
 
 from extrags.config import CaptionConfig, CheckpointConfig, EnhanceConfig, PretrainedConfig
 from extrags.errors import ConfigError, MissingDependencyError, SourceNotFoundError, WeightsError
-from extrags.restoration.preflight import check_restorer, model_digest
+from extrags.restoration.backends import check_restorer, restorer_digest
 from extrags.restoration.pretrained.captions import URL_VARIABLE
 from extrags.restoration.pretrained.checkpoint_driver import KNOWN_FAILURE
-from extrags.restoration.pretrained.enhancer import ADAPTERS
 from tests.extrags.restoration.pretrained.fake_clone import write_clone
+from tests.extrags.restoration.pretrained.tiny_pipelines import ADAPTERS
 
 
 def pretrained(backend: str, folder: Path, **further: Any) -> EnhanceConfig:
@@ -44,13 +44,13 @@ class TestPipelines:
     ) -> None:
         folder = saved(ADAPTERS[backend].rule.pipeline)
         check_restorer(pretrained(backend, folder))
-        first = model_digest(pretrained(backend, folder))
+        first = restorer_digest(pretrained(backend, folder))
         assert first
         copy = tmp_path / "copy"
         shutil.copytree(folder, copy)
-        assert model_digest(pretrained(backend, copy)) == first
+        assert restorer_digest(pretrained(backend, copy)) == first
         touch(next(copy.glob("scheduler/*.json")))
-        assert model_digest(pretrained(backend, copy)) != first
+        assert restorer_digest(pretrained(backend, copy)) != first
 
     @pytest.mark.parametrize(
         ("backend", "part"),
@@ -107,19 +107,19 @@ class TestTexts:
         file = tmp_path / "texts.yaml"
         caption = CaptionConfig(source="file", file=str(file))
         config = pretrained("wan-vace", saved("WanVACEPipeline"), caption=caption)
-        for look in (check_restorer, model_digest):
+        for look in (check_restorer, restorer_digest):
             with pytest.raises(SourceNotFoundError, match=r"texts\.yaml"):
                 look(config)
         digests = set()
         for text in ("a: pink", "a: pale"):
             file.write_text(text)
             check_restorer(config)
-            digests.add(model_digest(config))
+            digests.add(restorer_digest(config))
         assert len(digests) == 2
         # This one reads no text.
         silent = pretrained("stable-video", saved("StableVideoDiffusionPipeline"))
         told = silent.model_copy(update={"caption": caption})
-        assert model_digest(told) == model_digest(silent)
+        assert restorer_digest(told) == restorer_digest(silent)
 
     def test_an_endpoint_without_address_is_told(
         self, saved: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
@@ -133,13 +133,13 @@ class TestTexts:
 class TestCheckpoint:
     def test_checkpoint_config_and_code_make_the_model(self, tmp_path: Path) -> None:
         root = write_clone(tmp_path / "clone")
-        digests = {model_digest(checkpoint(root))}
+        digests = {restorer_digest(checkpoint(root))}
         moved = tmp_path / "moved"
         shutil.copytree(root, moved)
-        assert model_digest(checkpoint(moved)) in digests
+        assert restorer_digest(checkpoint(moved)) in digests
         for part in ("enhancer.ckpt", "configs/inference.yaml", "lvdm/models/samplers/ddim.py"):
             touch(root / part)
-            digests.add(model_digest(checkpoint(root)))
+            digests.add(restorer_digest(checkpoint(root)))
         assert len(digests) == 4
 
     def test_the_interpreter_is_tried_at_once(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,16 +166,16 @@ class TestOwn:
     def test_nothing_is_needed_for_the_classical_fill(self) -> None:
         config = EnhanceConfig(backend="classical", pretrained_weights="no/such/file")
         check_restorer(config)
-        assert model_digest(config) is None
+        assert restorer_digest(config) is None
 
     def test_weights_of_the_embedded_one(self, tmp_path: Path) -> None:
         missing = EnhanceConfig(pretrained_weights=str(tmp_path / "mine.safetensors"))
-        for look in (check_restorer, model_digest):
+        for look in (check_restorer, restorer_digest):
             with pytest.raises(WeightsError, match=r"there is no file .*mine\.safetensors"):
                 look(missing)
         (tmp_path / "mine.safetensors").write_bytes(b"weights")
         (tmp_path / "mine.json").write_text("{}")
-        assert model_digest(missing)
+        assert restorer_digest(missing)
         with pytest.raises(WeightsError, match=r"mine\.json: format None"):
             check_restorer(missing)
-        assert model_digest(EnhanceConfig(pretrained_weights="none")) is None
+        assert restorer_digest(EnhanceConfig(pretrained_weights="none")) is None

@@ -2,55 +2,22 @@
 
 from __future__ import annotations
 
-import os
-import warnings
 from collections.abc import Callable
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
-import pytest
-import torch
 
-# Before huggingface_hub is loaded: nothing in these tests may reach for the network.
-os.environ["HF_HUB_OFFLINE"] = "1"
+from extrags.config.backends import BACKENDS
+from extrags.restoration.backends import backend_of
+from extrags.restoration.pretrained.enhancer import DiffusersBackend
 
 WORDS = ["<pad>", "</s>", "<unk>", "pink", "wall", "of", "a", "tube", "blurry"]
 TEXT_WIDTH = 32
 
-
-@pytest.fixture(scope="session")
-def diffusers() -> ModuleType:
-    """The extra; its own deprecation warnings are not ours to mend."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for name in ("transformers", "accelerate", "ftfy"):
-            pytest.importorskip(name, reason="needs extrags[diffusers]")
-        package = pytest.importorskip("diffusers", reason="needs extrags[diffusers]")
-        # Lazily imported parts warn as well, the first time they are touched.
-        for name in BUILDERS:
-            getattr(package, name)
-    return package
-
-
-@pytest.fixture(scope="session")
-def saved(diffusers: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Folder of a saved tiny pipeline, built when it is first asked for."""
-    root = tmp_path_factory.mktemp("pipelines")
-    folders: dict[str, Path] = {}
-
-    def folder(pipeline: str) -> Path:
-        if pipeline not in folders:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                torch.manual_seed(0)
-                made = BUILDERS[pipeline](diffusers)
-                folders[pipeline] = root / pipeline
-                made.save_pretrained(str(folders[pipeline]))
-        return folders[pipeline]
-
-    return folder
+ADAPTERS = {
+    name: backend.adapter for name in BACKENDS if isinstance(backend := backend_of(name), DiffusersBackend)
+}
 
 
 def wan_vace(diffusers: ModuleType) -> Any:

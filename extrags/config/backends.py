@@ -1,0 +1,69 @@
+"""The restorer backends: the one dict where each is entered, by the name `enhance.backend` takes.
+
+Settings are checked and documented against these names, so nothing is imported here: an entry says where
+its backend is implemented, and `extrags.restoration.backends.backend_of` imports it when it is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from extrags.config.base import KeyOf
+
+__all__ = ["BACKENDS", "BACKEND_NAME", "BackendEntry", "backend_schema", "backend_summaries"]
+
+
+@dataclass(frozen=True)
+class BackendEntry:
+    """One restorer backend.
+
+    Args:
+        summary: what it is, in a few words, for help texts.
+        implementation: where its `extrags.restoration.protocol.Backend` is, as "module:attribute"; or that
+            object itself, for backends registered by a program.
+    """
+
+    summary: str
+    implementation: Any
+
+
+BACKENDS: dict[str, BackendEntry] = {
+    "embedded": BackendEntry(
+        "conditional diffusion, pretrained weights included",
+        "extrags.restoration.diffusion.backend:EMBEDDED",
+    ),
+    "classical": BackendEntry("blend and fill, no learning", "extrags.restoration.classical:CLASSICAL"),
+    "wan-vace": BackendEntry(
+        "diffusers video pipeline with mask and references",
+        "extrags.restoration.pretrained.wan_vace:WAN_VACE",
+    ),
+    "stable-video": BackendEntry(
+        "diffusers image-to-video pipeline", "extrags.restoration.pretrained.stable_video:STABLE_VIDEO"
+    ),
+    "ltx": BackendEntry("diffusers video pipeline", "extrags.restoration.pretrained.ltx:LTX"),
+    "sd-img2img": BackendEntry(
+        "diffusers image pipeline, whole images",
+        "extrags.restoration.pretrained.stable_diffusion:IMAGE_TO_IMAGE",
+    ),
+    "sd-inpaint": BackendEntry(
+        "diffusers image pipeline, holes only", "extrags.restoration.pretrained.stable_diffusion:INPAINT"
+    ),
+    "dynamicrafter": BackendEntry(
+        "a checkpoint run by the user's clone of its code",
+        "extrags.restoration.pretrained.checkpoint:DYNAMICRAFTER",
+    ),
+}
+
+BACKEND_NAME = KeyOf(BACKENDS)
+"""Annotation of a setting that names a backend."""
+
+
+def backend_summaries() -> str:
+    """All names with their summaries, for help texts."""
+    return "; ".join(f"{name}: {entry.summary}" for name, entry in BACKENDS.items())
+
+
+def backend_schema(schema: dict[str, Any]) -> None:
+    """Complete a JSON schema of the setting with the backends registered by now."""
+    schema.update(enum=list(BACKENDS), description=backend_summaries())

@@ -1,0 +1,88 @@
+"""The embedded restorer's expected error, fitted to the error it makes on pairs with a known truth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.validation import validation_pairs
+from extrags.restoration.training_data.pairs import Pairs
+from extrags.restoration.uncertainty.calibration import Calibration, cell_means
+from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
+from extrags.view_synthesis.references import LightTransfer
+
+__all__ = ["cell_errors", "with_calibration", "with_error_model"]
+
+MIN_VALID_SHARE = 0.5
+"""Cells with a smaller share of valid pixels are not counted."""
+
+
+def with_calibration(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> EmbeddedEnhancer:
+    """The restorer with the calibration curve of the validation pairs; unchanged where they are too few.
+
+    The error model stays: a few pairs of one scene determine a curve, but not six weights.
+
+    Args:
+        enhancer: trained.
+        pairs: all pairs.
+        transfer: how brightness changes with distance.
+    """
+    chosen = validation_pairs(pairs)
+    if chosen is None:
+        return enhancer
+    calibration = Calibration.fitted(*cell_errors(enhancer, chosen, transfer))
+    return replace(enhancer, calibration=calibration) if calibration.predicted else enhancer
+
+
+def with_error_model(
+    enhancer: EmbeddedEnhancer, scenes: Sequence[tuple[Pairs, LightTransfer]]
+) -> EmbeddedEnhancer:
+    """The restorer with error model and calibration curve fitted to pairs of many scenes.
+
+    Args:
+        enhancer: trained.
+        scenes: pairs that were not trained on, and how brightness changes with distance in each.
+    """
+    plain = replace(enhancer, error_model=ErrorModel(), calibration=Calibration())
+    features, errors = [], []
+    for pairs, transfer in scenes:
+        for view in range(len(pairs)):
+            layers, weight = pairs.layers[view], pairs.weight[view : view + 1]
+            noise = plain.noise(pairs.size, view, 0)
+            restored = plain.restored_layers(layers, transfer, noise, steps=plain.steps)
+            error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
+            mean, share = cell_means(error, weight)
+            each = error_features(layers, restored.rgb, restored.error)
+            columns = [cell_means(each[:, [k]], weight)[0] for k in range(each.shape[1])]
+            features.append(np.stack(columns, axis=1)[share > MIN_VALID_SHARE])
+            errors.append(mean[share > MIN_VALID_SHARE])
+    fitted = replace(plain, error_model=ErrorModel.fitted(np.concatenate(features), np.concatenate(errors)))
+    cells = [cell_errors(fitted, pairs, transfer) for pairs, transfer in scenes]
+    expected, true = (np.concatenate(part) for part in zip(*cells, strict=True))
+    return replace(fitted, calibration=Calibration.fitted(expected, true))
+
+
+def cell_errors(
+    enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer
+) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+    """Expected (not calibrated) and true absolute errors of cells that are mostly valid.
+
+    Args:
+        enhancer: trained.
+        pairs: with the truth.
+        transfer: how brightness changes with distance.
+    """
+    expected, true = [], []
+    for view in range(len(pairs)):
+        noise = enhancer.noise(pairs.size, view, 0)
+        restored = enhancer.restored_layers(pairs.layers[view], transfer, noise, steps=enhancer.steps)
+        weight = pairs.weight[view : view + 1]
+        error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
+        predicted, share = cell_means(restored.error, weight)
+        expected.append(predicted[share > MIN_VALID_SHARE])
+        true.append(cell_means(error, weight)[0][share > MIN_VALID_SHARE])
+    return np.concatenate(expected), np.concatenate(true)

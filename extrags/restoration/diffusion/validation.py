@@ -1,0 +1,73 @@
+"""Scores of the embedded restorer on pairs with a known truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrags.metrics.image import psnr_per_image, ssim_map
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.training_data.pairs import Pairs
+from extrags.view_synthesis.conditioning import condition
+from extrags.view_synthesis.references import LightTransfer
+
+__all__ = ["validation_pairs", "validation_scores"]
+
+
+def validation_scores(
+    enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer, candidates: tuple[int, ...]
+) -> dict[str, dict[str, float]]:
+    """PSNR and SSIM inside the mask on the validation pairs; on all pairs where there are none.
+
+    Where leave-out pairs are among the validation pairs, synthetic ones are not counted: their artefacts are
+    not those of an optimised scene.
+
+    Args:
+        enhancer: trained.
+        pairs: all pairs.
+        transfer: how brightness changes with distance.
+        candidates: numbers of sampling steps.
+
+    Returns:
+        Of `none` (the rendering), `classical` (blend and fill) and `embedded_N`: `{psnr, ssim}`, and
+        `psnr_hole` where a validation pair has pixels of alpha below one half.
+    """
+    chosen = validation_pairs(pairs) or pairs
+    with torch.no_grad():
+        conditioning = condition(chosen.layers, transfer)
+    images = {"none": chosen.layers.get("rendered").clamp(0, 1), "classical": conditioning.base}
+    for steps in candidates:
+        parts = [
+            enhancer.restored_layers(
+                chosen.layers[view], transfer, enhancer.noise(chosen.size, view, 0), steps=steps
+            ).rgb
+            for view in range(len(chosen))
+        ]
+        images[f"embedded_{steps}"] = torch.cat(parts)
+    return {name: _score(image, chosen) for name, image in images.items()}
+
+
+def validation_pairs(pairs: Pairs) -> Pairs | None:
+    """Validation pairs; the leave-out ones alone where there are any. None where there are none at all."""
+    chosen = np.flatnonzero(pairs.validation & ~pairs.synthetic)
+    if len(chosen) == 0:
+        chosen = np.flatnonzero(pairs.validation)
+    return pairs.subset(chosen) if len(chosen) else None
+
+
+def _score(image: Float[Tensor, "n 3 h w"], pairs: Pairs) -> dict[str, float]:
+    render = image.permute(0, 2, 3, 1)
+    target = pairs.target.permute(0, 2, 3, 1)
+    mask = pairs.weight[:, 0] > 0
+    hole = mask & (pairs.layers.get("alpha")[:, 0] < 0.5)
+    known = [value for value in psnr_per_image(render, target, mask) if value is not None]
+    score = {
+        "psnr": float(np.mean(known)),
+        "ssim": float(ssim_map(render, target)[mask].mean()),
+    }
+    if bool(hole.any()):
+        error = (render - target)[hole].square().mean()
+        score["psnr_hole"] = float(-10 * error.clamp_min(1e-10).log10())
+    return score
