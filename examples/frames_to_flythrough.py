@@ -8,7 +8,6 @@ sources name is read.
 
 from __future__ import annotations
 
-import itertools
 import sys
 from pathlib import Path
 
@@ -17,7 +16,6 @@ import torch
 from PIL import Image
 
 import extrags
-from extrags.cameras import interpolate_poses
 
 
 def reconstructed(source: str, config: extrags.PipelineConfig) -> tuple[extrags.Scene, extrags.Cameras]:
@@ -33,15 +31,8 @@ def flythrough(
     scene: extrags.Scene, cameras: extrags.Cameras, gif: Path, *, views_between: int = 5
 ) -> list[Image.Image]:
     """Render the way along the cameras, with views between them, and write it as a GIF."""
-    poses = cameras.world_from_camera
-    path = [
-        interpolate_poses(first, second, step / views_between)
-        for first, second in itertools.pairwise(poses)
-        for step in range(views_between)
-    ]
     frames = []
-    for pose in path:
-        camera = extrags.Cameras(cameras.K[:1], pose[None], cameras.width, cameras.height)
+    for camera in cameras.interpolated(views_between):
         with torch.no_grad():
             rgb = scene.render(camera).rgb[0].clamp(0, 1).numpy()
         frames.append(Image.fromarray(np.rint(rgb * 255).astype(np.uint8)))

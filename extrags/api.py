@@ -5,7 +5,7 @@ Reading belongs to the catalogue, a layer above the library: no other module of 
 
 from __future__ import annotations
 
-from data_catalog.catalog import read
+from data_catalog import read, register_reader
 from extrags.assessment import ScenePlan, assess
 from extrags.cameras import Cameras
 from extrags.config import (
@@ -36,6 +36,7 @@ from extrags.pipeline import STAGES, Result, run_pipeline
 from extrags.poses import estimate_poses, with_estimated_poses
 from extrags.pseudo_views import PseudoViews
 from extrags.raster import Rendering, rasterize
+from extrags.restoration.backends import register_backend
 from extrags.restoration.trajectories import restore
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
@@ -86,7 +87,9 @@ __all__ = [
     "rasterize",
     "read",
     "reconstruct",
+    "register_backend",
     "register_metric",
+    "register_reader",
     "render",
     "restore",
     "run_pipeline",

@@ -84,6 +84,34 @@ class Cameras:
         """Unit optical axes in world coordinates."""
         return self.world_from_camera[:, :3, 2]
 
+    def interpolated(self, steps: int) -> Cameras:
+        """The way along the cameras with views between them, as for a fly-through.
+
+        Centres move on straight lines, orientations by the shortest rotation; intrinsics change linearly.
+
+        Args:
+            steps: from each camera to the next; 1 gives the cameras themselves.
+
+        Returns:
+            `(C - 1) * steps + 1` cameras.
+        """
+        from scipy.spatial.transform import Rotation, Slerp
+
+        if len(self) < 2:
+            return self
+        known = np.arange(len(self))
+        at = np.arange((len(self) - 1) * steps + 1) / steps
+        poses = np.tile(np.eye(4), (len(at), 1, 1))
+        poses[:, :3, :3] = Slerp(known, Rotation.from_matrix(self.world_from_camera[:, :3, :3]))(
+            at
+        ).as_matrix()
+        before = np.minimum(at.astype(np.int64), len(self) - 2)
+        share = (at - before)[:, None]
+        poses[:, :3, 3] = (1 - share) * self.centers[before] + share * self.centers[before + 1]
+        share = share[..., None]
+        K = (1 - share) * self.K[before] + share * self.K[before + 1]
+        return Cameras(K, poses, self.width, self.height)
+
     def resized(self, width: int, height: int) -> Cameras:
         """The same views at another resolution (pixel edges stay where they are)."""
         K = self.K.copy()

@@ -11,6 +11,8 @@ from PIL import Image
 
 import extrags
 from extrags.events import Event, subscribed
+from extrags.metrics.registry import unregister_metric
+from extrags.restoration import backends
 from tests.flows.tiny import SEQUENCE, tiny_config
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -59,10 +61,10 @@ def test_frames_to_flythrough(tmp_path: Path) -> None:
     module = example("frames_to_flythrough")
     scene, cameras = module.reconstructed(SEQUENCE, tiny_config())
     frames = module.flythrough(scene, cameras[:3], tmp_path / "way.gif", views_between=2)
-    assert len(frames) == 4
+    assert len(frames) == 5
     with Image.open(tmp_path / "way.gif") as image:
         assert image.size == (48, 40)
-        assert image.n_frames == 4
+        assert image.n_frames == 5
 
 
 def test_explore_a_ply(finished: tuple[extrags.Result, Path], tmp_path: Path) -> None:
@@ -71,3 +73,33 @@ def test_explore_a_ply(finished: tuple[extrags.Result, Path], tmp_path: Path) ->
     found = module.explore_ply(ply, SEQUENCE, tmp_path / "views", tiny_config())
     assert len(found) > 0
     assert len(list((tmp_path / "views").glob("*.png"))) == len(found)
+
+
+def test_restore_with_another_model(
+    monkeypatch: pytest.MonkeyPatch, finished: tuple[extrags.Result, Path], tmp_path: Path
+) -> None:
+    module = example("restore_with_another_model")
+    # A registration lasts as long as the process: it is taken back after the test.
+    monkeypatch.setattr(backends, "BACKENDS", backends.BACKENDS)
+    monkeypatch.setitem(backends.BACKENDS, "telea", None)
+    monkeypatch.delitem(backends.BACKENDS, "telea")
+    extrags.register_backend(module.TeleaBackend(), "inpainting by fast marching")
+    result = module.restored_with_telea(SEQUENCE, tiny_config())
+    views, (known, _) = result.pseudo_views, finished
+    assert views is not None
+    assert known.pseudo_views is not None
+    assert len(views) == len(known.pseudo_views)
+    assert views.provenance["backend"] == "telea"
+    module.TeleaEnhancer().save(tmp_path)
+    assert isinstance(backends.load_enhancer(tmp_path), module.TeleaEnhancer)
+
+
+def test_custom_metric() -> None:
+    module = example("custom_metric")
+    extrags.register_metric(module.CHROMA_ERROR)
+    try:
+        result = module.evaluated(SEQUENCE, tiny_config())
+    finally:
+        unregister_metric(module.CHROMA_ERROR.key)
+    assert 0 < result.metrics["chroma_error"] < 0.2
+    assert 0 < result.metrics["aligned"]["chroma_error"] < 0.2

@@ -13,7 +13,7 @@ from extrags.restoration.clips import choose_views, make_pseudo_observations
 from extrags.restoration.protocol import Enhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.view_synthesis.references import ReferenceViews
+from extrags.view_synthesis.gather import gather_references
 
 __all__ = ["restore", "restore_batch"]
 
@@ -80,7 +80,7 @@ def restore_batch(
     chosen = range(first, min(first + config.clips_per_batch, len(trajectories)))
     return make_pseudo_observations(
         scene,
-        ReferenceViews.gather(scene, sequence, sequence.train),
+        gather_references(scene, sequence, sequence.train),
         [trajectories[index][views[index]] for index in chosen],
         enhancer,
         measure,

@@ -68,7 +68,8 @@ from extrags.training import finetune
 from extrags.training.finetuning import virtual_steps
 from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
-from extrags.view_synthesis.references import LightTransfer, ReferenceViews
+from extrags.view_synthesis.gather import gather_references
+from extrags.view_synthesis.references import LightTransfer
 from flows.commands.common import parsed_settings
 from flows.settings import pipeline_config
 from tasks.weights import lpips_weights
@@ -236,7 +237,7 @@ def _arms(sequence: EndoscopicSequence, arms: list[str], config: PipelineConfig)
     chosen = choose_views([len(cameras) for cameras in trajectories], config.enhance.max_views)
     virtual = [cameras[views] for cameras, views in zip(trajectories, chosen, strict=True)]
     lpips = perceptual(config)
-    references = ReferenceViews.gather(scene, training, training.train)
+    references = gather_references(scene, training, training.train)
     before = [value.clone() for value in _contents(scene)]
     pattern = virtual_steps(config.finetune)
     real_steps = int((~pattern).sum())
@@ -330,7 +331,7 @@ def realism(
     sink(cases)
     scene, posed = coarse_scene(loaded("sinus/hopkins", config), config.coarse)
     training = posed.training_part()
-    references = ReferenceViews.gather(scene, training, training.train)
+    references = gather_references(scene, training, training.train)
     test = np.asarray(posed.test)
     clips = held_out_clips(scene, references, posed, test, count=config.enhance.references)
     natives = prepared(methods, scene, training, config.enhance, config.coarse)

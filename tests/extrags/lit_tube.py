@@ -12,6 +12,7 @@ from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
+from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 
 WIDTH, HEIGHT = 64, 48
@@ -105,4 +106,4 @@ def build_tube() -> Tube:
         depth_mm=depth.astype(np.float32),
     )
     scene = Scene(gaussians, tube_light(frames - 2))
-    return Tube(scene, sequence, ReferenceViews.gather(scene, sequence, sequence.train))
+    return Tube(scene, sequence, gather_references(scene, sequence, sequence.train))

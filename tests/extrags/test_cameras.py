@@ -161,3 +161,25 @@ class TestRotations:
     def test_compose(self) -> None:
         pose = compose(np.eye(3), np.array([1.0, 2, 3]))
         np.testing.assert_array_equal(pose[:3, 3], [1, 2, 3])
+
+
+class TestInterpolated:
+    def test_cameras_and_the_way_between(self) -> None:
+        first = look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]))
+        second = first.copy()
+        second[:3, :3] = first[:3, :3] @ rotation_about(np.array([0.0, 1.0, 0.0]), np.pi / 2)
+        second[:3, 3] = [2.0, 0.0, 4.0]
+        K = np.tile(np.diag([10.0, 10.0, 1.0]), (2, 1, 1))
+        K[1, 0, 0] = 30.0
+        between = Cameras(K, np.stack([first, second]), 8, 6).interpolated(4)
+        assert len(between) == 5
+        np.testing.assert_allclose(between.world_from_camera[[0, 4]], [first, second], atol=1e-12)
+        np.testing.assert_allclose(between.centers[1], [0.5, 0.0, 1.0])
+        turned = rotation_angle_deg(between.world_from_camera[2, :3, :3], first[:3, :3])
+        assert turned == pytest.approx(45.0)
+        assert between.K[2, 0, 0] == pytest.approx(20.0)
+
+    def test_one_camera_goes_nowhere(self) -> None:
+        pose = look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]))
+        alone = Cameras(np.eye(3)[None], pose[None], 8, 6)
+        assert alone.interpolated(5) is alone

@@ -33,7 +33,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training import reconstruct
 from extrags.training.pose_refinement import with_refined_poses
-from extrags.view_synthesis.references import ReferenceViews
+from extrags.view_synthesis.gather import gather_references
 
 __all__ = [
     "METHODS",
@@ -89,7 +89,7 @@ def _deterministic(
 ) -> Enhancer:
     """The same network from the same pairs, trained as a plain regression from nothing."""
     pairs = make_pairs(scene, sequence, config, coarse)
-    transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
+    transfer = gather_references(scene, sequence, sequence.train).transfer
     return train_on_scene(pairs, transfer, _learning(config), deterministic=True)
 
 
@@ -228,7 +228,7 @@ def compare_methods(
     """
     methods = check_methods(methods)
     training = sequence.training_part()
-    references = ReferenceViews.gather(scene, training, training.train)
+    references = gather_references(scene, training, training.train)
     clips = held_out_clips(
         scene, references, sequence, np.asarray(sequence.test), count=config.enhance.references
     )

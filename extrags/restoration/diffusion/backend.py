@@ -22,7 +22,8 @@ from extrags.restoration.training_data.pairs import MIN_FRAMES, Pairs, make_pair
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.view_synthesis.gamut import Gamut
-from extrags.view_synthesis.references import LightTransfer, ReferenceViews
+from extrags.view_synthesis.gather import gather_references
+from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["EMBEDDED", "better_of_both"]
 
@@ -70,7 +71,7 @@ class EmbeddedBackend:
             ConfigError: when there would be neither weights nor training.
         """
         start = _pretrained(config)
-        transfer = ReferenceViews.gather(scene, sequence, sequence.train).transfer
+        transfer = gather_references(scene, sequence, sequence.train).transfer
         if start is not None and config.train_iterations == 0:
             pretrained = start.with_settings(config, _scene_gamut(sequence))
             if not config.judge or len(sequence.train) < MIN_FRAMES:

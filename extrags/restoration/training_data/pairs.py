@@ -27,6 +27,7 @@ from extrags.training.reconstruction import coarse_schedule, scene_extent
 from extrags.training.starting import median_depth, starting_gaussians, surface_normals
 from extrags.training.views import epochs, real_views
 from extrags.view_synthesis.conditioning import Layers, observe_views
+from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import ReferenceViews
 
 __all__ = ["Pairs", "fold_pairs", "leave_out_folds", "make_pairs", "pair_views", "synthetic_pairs"]
@@ -171,7 +172,7 @@ def fold_pairs(
     train = np.asarray(sequence.train, dtype=np.int64)
     kept, left = leave_out_folds(train, config.folds)[fold]
     partial = _partial_scene(scene, sequence, config, coarse, kept, fold)
-    references = ReferenceViews.gather(partial, sequence, kept)
+    references = gather_references(partial, sequence, kept)
     # In the partial scene the mean over the kept frames is one.
     gain = (_log_exposures(scene, sequence, left) - _log_exposures(scene, sequence, kept).mean()).exp()
     generator = np.random.default_rng([config.seed, 4, fold])
@@ -279,7 +280,7 @@ def synthetic_pairs(scene: Scene, sequence: EndoscopicSequence, config: EnhanceC
     train = np.asarray(sequence.train, dtype=np.int64)
     if len(train) < MIN_FRAMES:
         leave_out_folds(train, config.folds)
-    everything = ReferenceViews.gather(scene, sequence, train)
+    everything = gather_references(scene, sequence, train)
     generator = np.random.default_rng([config.seed, 1])
     centers = sequence.cameras[train].centers
     parts = []

@@ -21,7 +21,8 @@ from extrags.restoration.training_data.pairs import Pairs, pair_views
 from extrags.sequence import EndoscopicSequence
 from extrags.training.reconstruction import reconstruct
 from extrags.view_synthesis.conditioning import Layers, observe_views
-from extrags.view_synthesis.references import LightTransfer, ReferenceViews
+from extrags.view_synthesis.gather import gather_references
+from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["PretrainingScene", "make_pretraining_scene"]
 
@@ -154,7 +155,7 @@ def make_pretraining_scene(
         }
     )
     scene = reconstruct(sequence.training_part(), settings, stage="pretraining-scene").scene
-    references = ReferenceViews.gather(scene, sequence, sequence.train)
+    references = gather_references(scene, sequence, sequence.train)
     frames = np.asarray(sequence.test, dtype=np.int64)
     observation = observe_views(scene, references, sequence.cameras[frames], count=config.references)
     pairs = pair_views(sequence, observation.layers, frames, synthetic=False)

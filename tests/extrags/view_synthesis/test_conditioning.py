@@ -9,7 +9,7 @@ from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import render_clips
 from extrags.restoration.training_data.augmentation import cut_out, drop_references
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, condition, observe_views
-from extrags.view_synthesis.references import ReferenceViews
+from extrags.view_synthesis.gather import gather_references
 from tests.extrags.lit_tube import HEIGHT, WIDTH, Tube, cast_tube, tube_cameras
 
 
@@ -46,11 +46,11 @@ class TestObservation:
 
     def test_no_real_view_is_an_error(self, tube: Tube) -> None:
         with pytest.raises(CaptureError):
-            ReferenceViews.gather(tube.scene, tube.sequence, np.zeros(0, np.int64))
+            gather_references(tube.scene, tube.sequence, np.zeros(0, np.int64))
 
     def test_exposures_must_belong_to_the_frames(self, tube: Tube) -> None:
         with pytest.raises(ShapeError, match="exposures"):
-            ReferenceViews.gather(tube.scene, tube.sequence, np.array([0, 1]))
+            gather_references(tube.scene, tube.sequence, np.array([0, 1]))
 
 
 class TestCondition:
