@@ -431,7 +431,9 @@ class PipelineConfig(StageConfig):
         try:
             return PipelineConfig.model_validate(tree)
         except ValidationError as error:
+            first = error.errors()[0]
             # A place ends with the member of a union or of a tuple that was tried.
-            place = ".".join(str(part) for part in error.errors()[0]["loc"])
+            place = ".".join(str(part) for part in first["loc"])
             wrong = next(name for name in known if f"{place}.".startswith(f"{name}."))
-            raise known[wrong].refused(repr(overrides[wrong])) from error
+            # `with_seed` does not validate: what is wrong may have been there before.
+            raise known[wrong].refused(repr(overrides.get(wrong, first["input"]))) from error

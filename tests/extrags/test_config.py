@@ -77,6 +77,10 @@ class TestConfig:
         assert str(caught.value).startswith(f"setting {name} is ")
         assert "\n" not in str(caught.value)
 
+    def test_a_wrong_value_may_have_been_there_before(self) -> None:
+        with pytest.raises(ConfigError, match=r"poses\.seed is -1; expected a whole number of at least 0"):
+            PipelineConfig().with_seed(-1).with_overrides({"coarse.iterations": 7})
+
     def test_seed_reaches_every_stage_that_has_one(self) -> None:
         config = PipelineConfig().with_seed(7)
         assert config.coarse.seed == config.assess.seed == config.enhance.seed == 7

@@ -62,6 +62,18 @@ class TestStart:
         assert said.stdout.rstrip().endswith("[]")
         assert "phantom/0@sparse" in said.stdout
 
+    def test_the_help_of_a_verb_loads_no_torch_and_no_prefect(self) -> None:
+        code = (
+            "import sys\n"
+            "from flows.cli import VERBS, main\n"
+            "for verb in VERBS:\n"
+            "    try: main([verb, '--help'])\n"
+            "    except SystemExit: pass\n"
+            "print(sorted({'torch', 'prefect', 'zarr', 'numpy', 'open3d'} & set(sys.modules)))\n"
+        )
+        said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+        assert said.stdout.rstrip().endswith("[]")
+
     def test_no_verb_shows_help(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert main([]) == 2
         assert "verbs" in capsys.readouterr().out
