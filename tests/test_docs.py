@@ -118,9 +118,8 @@ def _runnable() -> list[tuple[str, str]]:
 @pytest.fixture
 def registered_for_one_test() -> Iterator[None]:
     """Take back what a block registers."""
-    from extrags.config.backends import BACKENDS
-
     from data_catalog import folders
+    from extrags.config.backends import BACKENDS
     from extrags.metrics.registry import added_metrics, unregister_metric
 
     backends, readers = dict(BACKENDS), list(folders._registered)

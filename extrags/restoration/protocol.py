@@ -122,6 +122,7 @@ class Backend(Protocol):
         """Digest of the pretrained model: weights and code, but not where they are stored.
 
         It is part of the key of a scene's restorer: another digest makes another restorer.
+        An enhancer that does not save all it restores with saves this digest, so that cached views follow it.
 
         Returns:
             None without a pretrained model.
