@@ -83,13 +83,14 @@ class ScenePlan(StageConfig, Storable):
         return config.with_overrides(overrides)
 
 
-def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig) -> ScenePlan:
+def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig | None = None) -> ScenePlan:
     """`measure` what the scene lacks, and `decide` what to do about it.
 
     Args:
         scene: the coarse reconstruction.
         sequence: its frames.
-        config: settings of all stages; `assess` and `explore`, and what the budgets are made from.
+        config: settings of all stages; `assess` and `explore`, and what the budgets are made from. None
+            takes the defaults.
 
     Returns:
         The plan, with every number it rests on.
@@ -97,6 +98,7 @@ def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig) -
     Raises:
         CaptureError: as `measure`.
     """
+    config = PipelineConfig() if config is None else config
     return decide(measure(scene, sequence, config.assess, config.explore.coverage), config)
 
 

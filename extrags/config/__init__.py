@@ -1,52 +1,9 @@
-"""Settings: frozen models, one per stage, documented field by field, and the profiles that combine them."""
+"""Settings: frozen models, one per stage, documented field by field, and the profiles that combine them.
 
-from extrags.config.base import StageConfig
-from extrags.config.profiles import PROFILES, ProfileName, profile_config
-from extrags.config.restorer import CaptionConfig, CheckpointConfig, EnhanceConfig, PretrainedConfig
-from extrags.config.stages import (
-    AssessConfig,
-    CoarseConfig,
-    CoverageConfig,
-    DensifyConfig,
-    EvaluateConfig,
-    ExploreConfig,
-    FinetuneConfig,
-    FreespaceConfig,
-    IngestConfig,
-    LightConfig,
-    LpipsNet,
-    OptimiserConfig,
-    PipelineConfig,
-    PoseRefinementConfig,
-    PosesConfig,
-    ReportConfig,
-    SurfaceConfig,
-)
+Every public name of the modules below is here: a new model is listed in its own `__all__` alone.
+"""
 
-__all__ = [
-    "PROFILES",
-    "AssessConfig",
-    "CaptionConfig",
-    "CheckpointConfig",
-    "CoarseConfig",
-    "CoverageConfig",
-    "DensifyConfig",
-    "EnhanceConfig",
-    "EvaluateConfig",
-    "ExploreConfig",
-    "FinetuneConfig",
-    "FreespaceConfig",
-    "IngestConfig",
-    "LightConfig",
-    "LpipsNet",
-    "OptimiserConfig",
-    "PipelineConfig",
-    "PoseRefinementConfig",
-    "PosesConfig",
-    "PretrainedConfig",
-    "ProfileName",
-    "ReportConfig",
-    "StageConfig",
-    "SurfaceConfig",
-    "profile_config",
-]
+from extrags.config.base import *  # noqa: F403
+from extrags.config.profiles import *  # noqa: F403
+from extrags.config.restorer import *  # noqa: F403
+from extrags.config.stages import *  # noqa: F403

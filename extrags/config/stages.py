@@ -28,6 +28,7 @@ __all__ = [
     "FreespaceConfig",
     "IngestConfig",
     "LightConfig",
+    "LpipsNet",
     "OptimiserConfig",
     "PipelineConfig",
     "PoseRefinementConfig",

@@ -92,7 +92,7 @@ class PoseEstimate:
         }
 
 
-def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig) -> PoseEstimate:
+def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = None) -> PoseEstimate:
     """Find the cameras of a sequence: by COLMAP, and where that fails, by colour and depth.
 
     *COLMAP*: SIFT inside the validity mask, known intrinsics held fixed, incremental mapping on the training
@@ -108,7 +108,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig) -> PoseEst
 
     Args:
         sequence: frames with intrinsics; poses it may have are not looked at.
-        config: settings.
+        config: settings; None takes the defaults.
 
     Returns:
         Poses of the frames that registered; the others are named in the log and in the report.
@@ -119,6 +119,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig) -> PoseEst
 
     Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
     """
+    config = PosesConfig() if config is None else config
     if len(sequence.train) < MIN_TRAINING_FRAMES:
         raise CaptureError(
             f"{sequence.name}: poses need at least {MIN_TRAINING_FRAMES} training frames, "

@@ -66,7 +66,7 @@ def test_trained_restorers_and_the_calibration(tmp_path: Path, capsys: pytest.Ca
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([SEQUENCE, "--methods", "none", "telea"], "unknown methods telea; expected none, classical"),
+        ([SEQUENCE, "--methods", "none", "telea"], "unknown methods telea; expected none, embedded-1"),
         ([SEQUENCE, "--seed", "-1"], "the seed is -1"),
         (["phantom/0@spars"], "no setting 'spars'"),
         ([SEQUENCE, "--set", "enhance.step=1"], "did you mean enhance.steps"),
