@@ -43,5 +43,7 @@ def evaluated(source: str, config: extrags.PipelineConfig) -> extrags.Evaluation
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     extrags.register_metric(CHROMA_ERROR)
     evaluated(sys.argv[1], extrags.PROFILES["quick"])

@@ -41,4 +41,6 @@ def explore_ply(ply: Path, source: str, folder: Path, config: extrags.PipelineCo
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 4:
+        sys.exit(__doc__)
     explore_ply(Path(sys.argv[1]), sys.argv[2], Path(sys.argv[3]), extrags.PROFILES["quick"])

@@ -41,4 +41,6 @@ def flythrough(
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     flythrough(*reconstructed(sys.argv[1], extrags.PROFILES["quick"]), Path(sys.argv[2]))

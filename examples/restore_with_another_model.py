@@ -18,8 +18,8 @@ import numpy as np
 import extrags
 from extrags.restoration.description import write_description
 from extrags.restoration.protocol import Clip, Restoration
+from extrags.thresholds import HOLE_ALPHA
 
-HOLE_ALPHA = 0.5
 RADIUS_PX = 3.0
 
 
@@ -88,5 +88,7 @@ def restored_with_telea(source: str, config: extrags.PipelineConfig) -> extrags.
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        sys.exit(__doc__)
     extrags.register_backend(TeleaBackend(), "inpainting by fast marching")
     restored_with_telea(sys.argv[1], extrags.PROFILES["quick"])

@@ -24,4 +24,6 @@ def whole_job(source: str, ply: Path, config: extrags.PipelineConfig) -> extrags
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     whole_job(sys.argv[1], Path(sys.argv[2]), extrags.PROFILES["quick"])

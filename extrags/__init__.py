@@ -29,11 +29,17 @@ __version__ = "0.1.0"
 
 def __getattr__(name: str) -> Any:
     # The import system asks for modules and for names of its own before it looks elsewhere: not for us.
-    if not name.startswith("_") and not _is_module(name):
-        api = import_module(f"{__name__}.api")
-        if name in api.__all__:
-            return getattr(api, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name.startswith("_") or _is_module(name):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    api = import_module(f"{__name__}.api")
+    if name not in api.__all__:
+        from extrags.errors import did_you_mean
+
+        raise AttributeError(
+            f"module {__name__!r} has no attribute {name!r}{did_you_mean(name, api.__all__)}"
+        )
+    value = globals()[name] = getattr(api, name)
+    return value
 
 
 def _is_module(name: str) -> bool:
@@ -43,4 +49,4 @@ def _is_module(name: str) -> bool:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *import_module(f"{__name__}.api").__all__})
+    return sorted(["__version__", *import_module(f"{__name__}.api").__all__])

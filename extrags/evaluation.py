@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
+from extrags.confidence import PerceptualDifference
 from extrags.events import Progress, emit
-from extrags.metrics.lpips import Lpips
 from extrags.metrics.protocol import EvaluationResult, RenderedViews, evaluate_views
 from extrags.metrics.surface import TrueSurface, evaluate_surface, scene_surface
 from extrags.scene import Scene
@@ -55,8 +55,7 @@ def evaluate_renders(
     *,
     mesh: Mesh | None = None,
     true_surface: TrueSurface | None = None,
-    lpips: Lpips | None = None,
-    lpips_reason: str = "no LPIPS was given",
+    measure: PerceptualDifference | None = None,
 ) -> EvaluationResult:
     """Metrics of rendered held-out views, and of the surface where the true one is known.
 
@@ -65,22 +64,24 @@ def evaluate_renders(
         sequence: with those frames.
         mesh: the scene's surface (`extrags.metrics.surface.scene_surface`); None where it has none.
         true_surface: what it is held against; None leaves the surface figures out.
-        lpips: the metric; None leaves it out.
-        lpips_reason: why there is no LPIPS.
+        measure: LPIPS, or why there is none; None takes it where its weights can be found.
 
     Raises:
         ShapeError: when renders and frames do not fit each other.
         NonFiniteError: for NaN or infinity in the renders; names the frame.
     """
+    measure = PerceptualDifference.available() if measure is None else measure
     surface = None if true_surface is None else evaluate_surface(mesh, true_surface, sequence)
     return evaluate_views(
         renders,
         sequence,
         sequence.test,
-        lpips,
-        lpips_reason=lpips_reason,
+        measure.lpips,
+        lpips_reason=measure.reason,
         surface=surface,
-        surface_reason="the sequence has no true depth",
+        surface_reason="the sequence has no true depth"
+        if sequence.depth_mm is None
+        else "no true surface given",
     )
 
 
@@ -89,8 +90,7 @@ def evaluate(
     sequence: EndoscopicSequence,
     *,
     true_surface: TrueSurface | None = None,
-    lpips: Lpips | None = None,
-    lpips_reason: str = "no LPIPS was given",
+    measure: PerceptualDifference | None = None,
 ) -> EvaluationResult:
     """`render` the held-out views of a scene, and `evaluate_renders`.
 
@@ -98,8 +98,7 @@ def evaluate(
         scene: the scene.
         sequence: posed frames, the held-out ones among them.
         true_surface: as in `evaluate_renders`.
-        lpips: the metric; None leaves it out.
-        lpips_reason: why there is no LPIPS.
+        measure: LPIPS, or why there is none; None takes it where its weights can be found.
 
     Raises:
         ShapeError: when there is no held-out frame.
@@ -110,6 +109,5 @@ def evaluate(
         sequence,
         mesh=mesh,
         true_surface=true_surface,
-        lpips=lpips,
-        lpips_reason=lpips_reason,
+        measure=measure,
     )

@@ -3,7 +3,8 @@
 `Pipeline` is the one place that knows the order of the stages and the rules by which one is skipped. It is
 subclassed twice: `InMemoryPipeline`, behind `run_pipeline`, makes each stage's product by calling the library
 and keeps it in memory; `flows.wiring.SequenceRun` makes the same products as cached tasks, by the same
-functions of the library.
+functions of the library. (Figures of the surface need the true one: tasks take it from the catalogue, which
+the library does not know; `run_pipeline` is given it.)
 
 This module loads nothing heavy by itself, so that flows and the command line can read the list of stages.
 """
@@ -13,10 +14,10 @@ from __future__ import annotations
 import logging
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 from extrags.config import PipelineConfig
 from extrags.errors import CaptureError, ConfigError
@@ -38,6 +39,8 @@ __all__ = ["STAGES", "InMemoryPipeline", "Pipeline", "Result", "StageName", "che
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T")
+
 StageName = Literal[
     "ingest",
     "poses",
@@ -55,6 +58,12 @@ StageName = Literal[
 STAGES: tuple[StageName, ...] = get_args(StageName)
 """All stages, in the order they run."""
 
+INDISPENSABLE: frozenset[StageName] = frozenset({"ingest", "coarse"})
+"""Stages that every other one rests on."""
+
+NEEDS: dict[StageName, StageName] = {"freespace": "surface", "explore": "freespace", "enhance": "explore"}
+"""What a stage cannot do without, besides the indispensable ones; skipped with it."""
+
 
 class Pipeline(ABC):
     """The stages of one sequence in their order, and the rules by which one is skipped.
@@ -66,15 +75,18 @@ class Pipeline(ABC):
         leave_out: stages to leave out whatever the plan says, with the reason.
 
     Raises:
-        ConfigError: for a stage that does not exist.
+        ConfigError: for a stage that does not exist, or that everything rests on.
     """
 
     def __init__(self, config: PipelineConfig, leave_out: Mapping[str, str] | None = None) -> None:
         self.config = config
         self.leave_out = dict(leave_out or {})
         self.plan: ScenePlan | None = None
+        self.skipped: set[StageName] = set()
         for stage in self.leave_out:
             check_stage(stage)
+            if stage in INDISPENSABLE:
+                raise ConfigError(f"the stage {stage} cannot be left out: everything rests on it")
 
     def run_stages(self, until: StageName = "report") -> None:
         """Take the sequence through all stages up to one.
@@ -83,24 +95,12 @@ class Pipeline(ABC):
             ConfigError: for a stage that does not exist.
         """
         check_stage(until)
-        make: dict[StageName, Callable[[], None]] = {
-            "ingest": self.ingest,
-            "poses": self.poses,
-            "coarse": self.coarse,
-            "assess": self.assess,
-            "surface": self.surface,
-            "freespace": self.freespace,
-            "explore": self.explore,
-            "enhance": self.enhance,
-            "finetune": self.finetune,
-            "evaluate": self.evaluate,
-            "report": self.report,
-        }
         for stage in STAGES[: STAGES.index(until) + 1]:
             reason = self.reason_to_skip(stage)
             if reason is None:
-                make[stage]()
+                getattr(self, stage)()
             else:
+                self.skipped.add(stage)
                 self.skip(stage, reason)
             if stage == "assess" and self.plan is not None:
                 self.config = self.plan.applied_to(self.config)
@@ -114,13 +114,15 @@ class Pipeline(ABC):
         # all methods are compared on the same terms.
         if planned is not None and not planned.run and not self.leave_out:
             return planned.reason
+        # Fine-tuning without `enhance` among the stages is a control on real views alone.
+        if stage == "finetune" and "enhance" not in self.leave_out and "enhance" in self.skipped:
+            return "there are no virtual views"
+        if stage in NEEDS and NEEDS[stage] in self.skipped:
+            return f"it needs the stage {NEEDS[stage]}, which was skipped"
         if stage == "poses" and self.has_poses() and not self.config.poses.replace_given:
             return "the source has poses"
         if stage == "enhance" and self.virtual_views() == 0:
             return "exploration found no view that adds anything"
-        # Fine-tuning without `enhance` among the stages is a control on real views alone.
-        if stage == "finetune" and not self.has_pseudo_views() and "enhance" not in self.leave_out:
-            return "there are no virtual views"
         if stage == "evaluate" and self.held_out_frames() == 0:
             return "the sequence has no held-out frames"
         return None
@@ -145,10 +147,6 @@ class Pipeline(ABC):
     @abstractmethod
     def virtual_views(self) -> int:
         """Number of virtual views the exploration found."""
-
-    @abstractmethod
-    def has_pseudo_views(self) -> bool:
-        """Whether virtual views were restored."""
 
     @abstractmethod
     def ingest(self) -> None:
@@ -218,8 +216,8 @@ class Result:
         exploration: the virtual trajectories.
         pseudo_views: restored virtual views.
         finetuning: the fine-tuned scene and its training history.
-        renders: held-out views by scene, `coarse` and `final`.
-        evaluations: their figures, by the same names; without fine-tuning `coarse` alone.
+        renders: held-out views of `coarse` and, where it was fine-tuned, of `final`.
+        evaluations: figures of `coarse` and `final`; without fine-tuning both are the coarse scene's.
         skipped: why stages were skipped, by name.
         seconds: wall-clock time by stage.
     """
@@ -299,10 +297,6 @@ class InMemoryPipeline(Pipeline):
         """Number of virtual views the exploration found."""
         return 0 if self.result.exploration is None else self.result.exploration.n_virtual
 
-    def has_pseudo_views(self) -> bool:
-        """Whether virtual views were restored."""
-        return self.result.pseudo_views is not None
-
     def ingest(self) -> None:
         """The sequence was read by the caller."""
 
@@ -349,11 +343,10 @@ class InMemoryPipeline(Pipeline):
         """`extrags.freespace.carve`."""
         from extrags.freespace import carve
 
-        if self.result.mesh is None:
-            raise ConfigError("the stage freespace needs the mesh of the stage surface, which was left out")
+        mesh = _made(self.result.mesh, "surface")
         with self._timed("freespace"):
             self.result.freespace = carve(
-                self.result.coarse, self.result.mesh, self._training.training_cameras, self.config.freespace
+                self.result.coarse, mesh, self._training.training_cameras, self.config.freespace
             )
 
     def explore(self) -> None:
@@ -369,13 +362,12 @@ class InMemoryPipeline(Pipeline):
         """`extrags.restoration.trajectories.restore`."""
         from extrags.restoration.trajectories import restore
 
-        if self.result.exploration is None:
-            raise ConfigError("the stage enhance needs the trajectories of the stage explore")
+        exploration = _made(self.result.exploration, "explore")
         with self._timed("enhance"):
             self.result.pseudo_views = restore(
                 self.result.coarse,
                 self._training,
-                self.result.exploration.trajectories,
+                exploration.trajectories,
                 self.config.enhance,
                 self.config.coarse,
                 measure=self._perceptual_difference(),
@@ -412,9 +404,10 @@ class InMemoryPipeline(Pipeline):
                     sequence,
                     mesh=None if self.true_surface is None else scene_surface(scene, sequence),
                     true_surface=self.true_surface,
-                    lpips=measure.lpips,
-                    lpips_reason=measure.reason,
+                    measure=measure,
                 )
+        # Where nothing was fine-tuned, the coarse scene is the final one.
+        self.result.evaluations.setdefault("final", self.result.evaluations["coarse"])
 
     def report(self) -> None:
         """The page of a run belongs to its artefacts; a `Result` has none."""
@@ -429,6 +422,17 @@ class InMemoryPipeline(Pipeline):
         begun = time.perf_counter()
         yield
         self.result.seconds[stage] = time.perf_counter() - begun
+
+
+def _made(product: T | None, stage: StageName) -> T:
+    """The product of an earlier stage, which `Pipeline.reason_to_skip` makes sure of.
+
+    Raises:
+        ConfigError: for stages called by hand in another order.
+    """
+    if product is None:
+        raise ConfigError(f"the stage {stage} has to run first")
+    return product
 
 
 def run_pipeline(

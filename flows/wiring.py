@@ -136,10 +136,6 @@ class SequenceRun(Pipeline):
         """Number of virtual views the exploration found."""
         return int(self._manifest("explore").counts["virtual_views"] or 0)
 
-    def has_pseudo_views(self) -> bool:
-        """Whether virtual views were restored."""
-        return "enhance" in self.refs
-
     # Each stage below is one method; `self.refs` holds what it made.
 
     def ingest(self) -> None:
@@ -247,7 +243,7 @@ class SequenceRun(Pipeline):
         with self._stage("finetune") as row:
             inputs = {
                 **self._scene_inputs(),
-                "pseudo": self.refs.get("enhance"),
+                "pseudo_views": self.refs.get("enhance"),
                 "config": self.config.finetune,
                 "coarse": self.config.coarse,
             }

@@ -68,14 +68,12 @@ def measure(
             f"process: {', '.join(added_metrics()) or 'none'}. Register them in every process of the run"
         )
     frames = slot.load(EndoscopicSequence, sequence)
-    difference = weights.perceptual_difference()
     result = evaluate_renders(
         slot.load(RenderedViews, renders),
         frames,
         mesh=slot.load(Mesh, renders) if (slot.open(renders) / Mesh.stored_as).exists() else None,
         true_surface=None if frames.depth_mm is None else true_surface(frames),
-        lpips=difference.lpips,
-        lpips_reason=difference.reason,
+        measure=weights.perceptual_difference(),
     )
     slot.save_json(METRICS_FILE, result.to_json(), indent=1)
     for figure in figures("counts"):

@@ -16,7 +16,7 @@ def finetune(
     slot: Slot,
     scene: Ref,
     sequence: Ref,
-    pseudo: Ref | None,
+    pseudo_views: Ref | None,
     config: FinetuneConfig,
     coarse: CoarseConfig,
 ) -> None:
@@ -29,7 +29,7 @@ def finetune(
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
-    views = None if pseudo is None else slot.load(PseudoViews, pseudo)
+    views = None if pseudo_views is None else slot.load(PseudoViews, pseudo_views)
     start, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
     with keeping_last_good(slot):
         result = training.finetune(start, frames, views, config, coarse)

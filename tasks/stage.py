@@ -2,8 +2,7 @@
 
     @stage("coarse", version=1)
     def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
-        result = reconstruct(Sequence.load(slot.open(sequence) / "sequence"), config)
-        result.scene.save(slot.path / "scene")
+        slot.save(reconstruct(slot.load(EndoscopicSequence, sequence), config).scene)
 
 is called as `coarse(store="...", label="...", sequence=ref, config=config)`, inside a flow or, through
 `coarse.fn(...)`, without any server.

@@ -15,6 +15,9 @@ from extrags.metrics.registry import unregister_metric
 from extrags.restoration import backends
 from tests.flows.tiny import SEQUENCE, tiny_config
 
+FAST = tiny_config(enhance__train_iterations=0, enhance__judge=False)
+"""Examples show the way through: the bundled restorer as it is, neither trained nor judged on the scene."""
+
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
@@ -31,7 +34,7 @@ def example(name: str) -> ModuleType:
 def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[extrags.Result, Path]:
     """The whole job, once for all tests."""
     ply = tmp_path_factory.mktemp("examples") / "scene.ply"
-    return example("whole_job").whole_job(SEQUENCE, ply, tiny_config()), ply
+    return example("whole_job").whole_job(SEQUENCE, ply, FAST), ply
 
 
 def test_every_example_is_tested() -> None:
@@ -51,7 +54,7 @@ class TestWholeJob:
 
     def test_progress_can_be_followed(self) -> None:
         seen: list[Event] = []
-        sequence = extrags.read(SEQUENCE, tiny_config().ingest)
+        sequence = extrags.read(SEQUENCE, FAST.ingest)
         with subscribed(seen.append):
             extrags.run_pipeline(sequence, tiny_config(), until="coarse")
         assert {event.stage for event in seen} == {"coarse"}
@@ -59,7 +62,7 @@ class TestWholeJob:
 
 def test_frames_to_flythrough(tmp_path: Path) -> None:
     module = example("frames_to_flythrough")
-    scene, cameras = module.reconstructed(SEQUENCE, tiny_config())
+    scene, cameras = module.reconstructed(SEQUENCE, FAST)
     frames = module.flythrough(scene, cameras[:3], tmp_path / "way.gif", views_between=2)
     assert len(frames) == 5
     with Image.open(tmp_path / "way.gif") as image:
@@ -70,7 +73,7 @@ def test_frames_to_flythrough(tmp_path: Path) -> None:
 def test_explore_a_ply(finished: tuple[extrags.Result, Path], tmp_path: Path) -> None:
     _, ply = finished
     module = example("explore_a_ply")
-    found = module.explore_ply(ply, SEQUENCE, tmp_path / "views", tiny_config())
+    found = module.explore_ply(ply, SEQUENCE, tmp_path / "views", FAST)
     assert len(found) > 0
     assert len(list((tmp_path / "views").glob("*.png"))) == len(found)
 
@@ -80,11 +83,10 @@ def test_restore_with_another_model(
 ) -> None:
     module = example("restore_with_another_model")
     # A registration lasts as long as the process: it is taken back after the test.
-    monkeypatch.setattr(backends, "BACKENDS", backends.BACKENDS)
     monkeypatch.setitem(backends.BACKENDS, "telea", None)
     monkeypatch.delitem(backends.BACKENDS, "telea")
     extrags.register_backend(module.TeleaBackend(), "inpainting by fast marching")
-    result = module.restored_with_telea(SEQUENCE, tiny_config())
+    result = module.restored_with_telea(SEQUENCE, FAST)
     views, (known, _) = result.pseudo_views, finished
     assert views is not None
     assert known.pseudo_views is not None
@@ -98,7 +100,7 @@ def test_custom_metric() -> None:
     module = example("custom_metric")
     extrags.register_metric(module.CHROMA_ERROR)
     try:
-        result = module.evaluated(SEQUENCE, tiny_config())
+        result = module.evaluated(SEQUENCE, FAST)
     finally:
         unregister_metric(module.CHROMA_ERROR.key)
     assert 0 < result.metrics["chroma_error"] < 0.2

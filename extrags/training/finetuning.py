@@ -1,4 +1,4 @@
-"""Joint fine-tuning on real views and confidence-weighted pseudo-observations."""
+"""Joint fine-tuning on real views and confidence-weighted pseudo_views-observations."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ HOLE_STRIDE_PX = 2
 def finetune(
     scene: Scene,
     sequence: EndoscopicSequence,
-    pseudo: PseudoViews | None,
+    pseudo_views: PseudoViews | None,
     config: FinetuneConfig | None = None,
     coarse: CoarseConfig | None = None,
 ) -> TrainingResult:
@@ -50,13 +50,13 @@ def finetune(
     :math:`w U_{img} (|I^P - \hat I| \odot U_{pixel} + L_{D-SSIM} + \lambda_d L_{depth})` with w the
     `pseudo_weight`; the depth term, with `pseudo_depth` alone, is that of the real views, on pixels whose
     surface the scene does not know. Which kind a step draws follows a fixed pattern whose share of virtual
-    views falls linearly. The position learning rate starts anew. Without pseudo-observations only real
+    views falls linearly. The position learning rate starts anew. Without pseudo_views-observations only real
     views are used: the control of a comparison.
 
     Args:
         scene: the coarse scene.
         sequence: posed frames; only training frames are used.
-        pseudo: restored virtual views with confidences, or None.
+        pseudo_views: restored virtual views with confidences, or None.
         config: budgets and shares; None takes the defaults.
         coarse: rates and weights, those the coarse scene was made with; None takes the defaults.
 
@@ -72,13 +72,13 @@ def finetune(
     depth = median_depth(sequence, frames)
     start = scene
     max_gaussians = round(config.growth * coarse.densify.max_gaussians)
-    if pseudo is not None and config.seed_holes:
+    if pseudo_views is not None and config.seed_holes:
         room = max_gaussians - len(scene.gaussians)
-        new_gaussians = hole_gaussians(scene, sequence, pseudo, room, thickness=coarse.thickness)
+        new_gaussians = hole_gaussians(scene, sequence, pseudo_views, room, thickness=coarse.thickness)
         if new_gaussians is not None:
             start = Scene(Gaussians.concatenated(scene.gaussians, new_gaussians), scene.light)
     real = real_views(sequence, frames)
-    virtual = [] if pseudo is None else virtual_views(pseudo, config)
+    virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)
     generator = np.random.default_rng(config.seed)
     next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
     pattern = virtual_steps(config, any_virtual=bool(virtual))
@@ -111,20 +111,20 @@ def virtual_steps(config: FinetuneConfig, *, any_virtual: bool = True) -> Bool[n
     return np.asarray(np.diff(np.floor(np.cumsum(share)), prepend=0) > 0)
 
 
-def virtual_views(pseudo: PseudoViews, config: FinetuneConfig) -> list[View]:
+def virtual_views(pseudo_views: PseudoViews, config: FinetuneConfig) -> list[View]:
     """Pseudo-observations as views, with both levels of confidence as weights."""
     views = []
-    confidence = np.maximum(pseudo.pixel_confidence, config.confidence_floor)
+    confidence = np.maximum(pseudo_views.pixel_confidence, config.confidence_floor)
     # Completed depth supervises only where the scene has no reliable surface.
-    depth = np.where(pseudo.uncertainty > UNKNOWN, pseudo.depth_mm, 0).astype(np.float32)
-    for index in range(len(pseudo.cameras)):
-        weight = config.pseudo_weight * float(pseudo.image_confidence[index])
+    depth = np.where(pseudo_views.uncertainty > UNKNOWN, pseudo_views.depth_mm, 0).astype(np.float32)
+    for index in range(len(pseudo_views.cameras)):
+        weight = config.pseudo_weight * float(pseudo_views.image_confidence[index])
         if weight <= 0:
             continue
-        target = pseudo.target[index] if config.keep_known else pseudo.restored[index]
+        target = pseudo_views.target[index] if config.keep_known else pseudo_views.restored[index]
         views.append(
             View(
-                camera=pseudo.cameras[index],
+                camera=pseudo_views.cameras[index],
                 rgb=torch.from_numpy(np.asarray(target, dtype=np.float32)),
                 weight=torch.from_numpy(confidence[index].astype(np.float32)),
                 depth_mm=torch.from_numpy(depth[index]) if config.pseudo_depth else None,
@@ -138,7 +138,7 @@ def virtual_views(pseudo: PseudoViews, config: FinetuneConfig) -> list[View]:
 def hole_gaussians(
     scene: Scene,
     sequence: EndoscopicSequence,
-    pseudo: PseudoViews,
+    pseudo_views: PseudoViews,
     room: int,
     *,
     thickness: float = 1.0,
@@ -152,24 +152,24 @@ def hole_gaussians(
     Args:
         scene: the coarse scene.
         sequence: posed frames; training frames carve.
-        pseudo: restored virtual views.
+        pseudo_views: restored virtual views.
         room: at most so many new Gaussians.
         thickness: along the surface's normal, as a share of the radius.
 
     Returns:
         The new Gaussians, or None where there is nothing to fill.
     """
-    holes = (pseudo.alpha < HOLE_ALPHA) & (pseudo.depth_mm > 0)
+    holes = (pseudo_views.alpha < HOLE_ALPHA) & (pseudo_views.depth_mm > 0)
     lattice = np.zeros_like(holes)
     lattice[:, ::HOLE_STRIDE_PX, ::HOLE_STRIDE_PX] = True
     chosen = np.flatnonzero(holes & lattice)
     if len(chosen) == 0 or room <= 0:
         return None
-    cameras = pseudo.cameras
+    cameras = pseudo_views.cameras
     view = chosen // (cameras.width * cameras.height)
     rays = pixel_rays(cameras).reshape(-1, 3)[chosen]
-    points = cameras.centers[view] + pseudo.depth_mm.reshape(-1)[chosen, None] * rays
-    rgb = np.asarray(pseudo.target, dtype=np.float64).reshape(-1, 3)[chosen]
+    points = cameras.centers[view] + pseudo_views.depth_mm.reshape(-1)[chosen, None] * rays
+    rgb = np.asarray(pseudo_views.target, dtype=np.float64).reshape(-1, 3)[chosen]
     if len(points) < MIN_POINTS:
         return None
     if scene.light is not None:

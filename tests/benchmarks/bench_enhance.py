@@ -1,8 +1,8 @@
-"""What restoration is worth: `python tests/benchmarks/bench_enhance.py table|enduse|realism`.
+"""What restoration is worth: `python tests/benchmarks/bench_enhance.py table|downstream|realism`.
 
 * `table`: restorers on held-out views with real degraded renders, over sequences and seeds; a markdown table
   of what each gains over no restoration and over the classical fill, mean and smallest..largest.
-* `enduse`: what pseudo-observations bring to the scene. Per sequence and seed one coarse scene, explored as
+* `downstream`: what pseudo-observations bring to the scene. Per sequence and seed one coarse scene, explored as
   the pipeline explores it, fine-tuned once per arm, always from that same coarse scene and always with the
   same number of steps on real views. An arm with pseudo-observations takes `finetune.iterations` steps, of
   which a fixed pattern gives R to real views; the arm `real` is fine-tuned for R steps, with its schedule
@@ -203,7 +203,7 @@ def _markdown_table(header: list[str], rows: list[list[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-# enduse
+# downstream
 
 
 @contextmanager
@@ -439,7 +439,7 @@ def contact_sheet(columns: dict[str, np.ndarray], file: Path) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("what", choices=("table", "enduse", "realism"))
+    parser.add_argument("what", choices=("table", "downstream", "realism"))
     parser.add_argument("--sequences", nargs="+", default=[f"phantom/{k}@distanced" for k in range(5)])
     parser.add_argument("--methods", nargs="+", default=["none", "classical", "embedded"])
     parser.add_argument("--arms", nargs="+", default=["real", "classical", "embedded"])
@@ -471,7 +471,7 @@ def main() -> int:
     if given.what == "table":
         cases = table(given.sequences, methods, configs, sink)
         said = markdown(cases, RESTORED, "method", ["none", "classical"], quality)
-    elif given.what == "enduse":
+    elif given.what == "downstream":
         cases = downstream(given.sequences, given.arms, configs, sink)
         said = markdown(
             cases,

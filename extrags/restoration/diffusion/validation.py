@@ -10,6 +10,7 @@ from torch import Tensor
 from extrags.metrics.image import psnr_per_image, ssim_map
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.training_data.pairs import Pairs
+from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import condition
 from extrags.view_synthesis.references import LightTransfer
 
@@ -61,7 +62,7 @@ def _score(image: Float[Tensor, "n 3 h w"], pairs: Pairs) -> dict[str, float]:
     render = image.permute(0, 2, 3, 1)
     target = pairs.target.permute(0, 2, 3, 1)
     mask = pairs.weight[:, 0] > 0
-    hole = mask & (pairs.layers.get("alpha")[:, 0] < 0.5)
+    hole = mask & (pairs.layers.get("alpha")[:, 0] < HOLE_ALPHA)
     known = [value for value in psnr_per_image(render, target, mask) if value is not None]
     score = {
         "psnr": float(np.mean(known)),

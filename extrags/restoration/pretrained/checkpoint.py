@@ -190,7 +190,7 @@ class CheckpointBackend:
     def prepare(
         self, scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
     ) -> CheckpointEnhancer:
-        """Check all preconditions, gather the scene's real views.
+        """Check everything that is needed, gather the scene's real views.
 
         Raises:
             ExtragsError: as `check`, or when there is no caption.
