@@ -26,7 +26,7 @@ __all__ = ["Decision", "ScenePlan", "assess", "decide", "measure", "probe_views"
 
 _log = logging.getLogger(__name__)
 
-GOLDEN_TURN = math.pi * (3 - math.sqrt(5))
+GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
 """Successive multiples of the golden angle never line up: the probes' sides spread evenly."""
 PROBE_CLEARANCE_SHARE = 0.2
 """A probe keeps this distance from solid Gaussians, in median depths."""
@@ -193,7 +193,7 @@ def probe_views(scene: Scene, cameras: Cameras, depth_unit_mm: float, config: As
     poses = []
     for index in range(config.probe_views):
         pose = cameras.world_from_camera[anchors[index % len(anchors)]].copy()
-        angle = phase + index * GOLDEN_TURN
+        angle = phase + index * GOLDEN_ANGLE_RAD
         side = np.array([np.cos(angle), np.sin(angle), 0.0])
         # The tissue may already be nearer to the training view itself; then the probe turns in place.
         allowed = min(PROBE_CLEARANCE_SHARE * depth_unit_mm, float(tissue.query(pose[:3, 3])[0]))

@@ -36,7 +36,7 @@ def render(
     frames = np.asarray(sequence.test if frames is None else frames)
     gains = None
     if scene.light is not None:
-        gains = scene.light.exposures_of(frames, sequence.train, sequence.recording)
+        gains = scene.light.interpolated_exposures(frames, sequence.train, sequence.recording)
     rgb, alpha, depth = [], [], []
     with torch.no_grad():
         for done, frame in enumerate(frames, start=1):

@@ -123,7 +123,7 @@ class Gaussians:
         quats[:, 0] = 1
         scales = torch.tensor(radius, dtype=torch.float32).log()[:, None].repeat(1, 3)
         if normals is not None:
-            quats = torch.tensor(_turned_to(normals), dtype=torch.float32)
+            quats = torch.tensor(_quaternions_from_normals(normals), dtype=torch.float32)
             scales[:, 2] += float(np.log(thickness))
         return cls(
             means=torch.tensor(points, dtype=torch.float32),
@@ -225,7 +225,7 @@ class Gaussians:
         )
 
 
-def _turned_to(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
+def _quaternions_from_normals(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
     """Quaternions (w, x, y, z) of the shortest turns that bring the z axis onto the normals."""
     facing = np.where(normals[:, 2:] < 0, -normals, normals)
     half = np.stack([1 + facing[:, 2], -facing[:, 1], facing[:, 0], np.zeros(len(facing))], axis=1)

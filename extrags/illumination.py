@@ -30,10 +30,10 @@ from extrags.zarr_io import open_group, read_array, write_array
 
 __all__ = ["NearFieldLight"]
 
-START_LOG_SOFTENING = -1.5
-START_SPREAD = 0.5
-START_COSINE = 0.5
-START_LOG_SHOULDER = 0.0
+INITIAL_LOG_SOFTENING = -1.5
+INITIAL_SPREAD = 0.5
+INITIAL_COSINE = 0.5
+INITIAL_LOG_SHOULDER = 0.0
 """Where learning starts: a lamp a little wide, walls a little Lambertian, a soft shoulder."""
 
 
@@ -77,16 +77,16 @@ class NearFieldLight:
         """
         config = LightConfig() if config is None else config
         return cls(
-            torch.tensor(START_LOG_SOFTENING),
+            torch.tensor(INITIAL_LOG_SOFTENING),
             torch.tensor(config.exponent if config.falloff else 0.0).log(),
             torch.zeros(n_frames),
             float(reference_distance),
-            spread=torch.tensor(START_SPREAD if config.spread else 0.0),
-            cosine=torch.tensor(START_COSINE if config.cosine else 0.0),
-            log_shoulder=torch.tensor(START_LOG_SHOULDER if config.response else -math.inf),
+            spread=torch.tensor(INITIAL_SPREAD if config.spread else 0.0),
+            cosine=torch.tensor(INITIAL_COSINE if config.cosine else 0.0),
+            log_shoulder=torch.tensor(INITIAL_LOG_SHOULDER if config.response else -math.inf),
         )
 
-    def of_cameras(self, exposure: Float[Tensor, "c"]) -> CameraLight:
+    def camera_light(self, exposure: Float[Tensor, "c"]) -> CameraLight:
         """The light as C cameras carry it, at given exposures."""
         return CameraLight(
             exposure[:, None].expand(-1, 3),
@@ -109,7 +109,7 @@ class NearFieldLight:
         """Gains of all training frames."""
         return (self.log_exposure - self.log_exposure.mean()).exp()
 
-    def exposures_of(
+    def interpolated_exposures(
         self,
         frames: Int[np.ndarray, "m"],
         train: Int[np.ndarray, "f"],
@@ -174,7 +174,7 @@ class NearFieldLight:
         """
         return light_gain(points, normals, self._row(points))
 
-    def signal(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    def invert_response(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """What reached the sensor, from image values in [0, 1]: the response undone."""
         return invert_response(rgb, self.log_shoulder.exp().to(rgb))
 
@@ -198,10 +198,10 @@ class NearFieldLight:
             normals: there; None takes every surface to face the lamp.
             min_gain: darker places are treated as if they received this much: noise is not albedo.
         """
-        return self.signal(rgb) / self.gain(points, normals).clamp_min(min_gain)[:, None]
+        return self.invert_response(rgb) / self.gain(points, normals).clamp_min(min_gain)[:, None]
 
     def _row(self, like: Tensor) -> Float[Tensor, "12"]:
-        return self.of_cameras(torch.ones(1)).packed()[0].to(like)
+        return self.camera_light(torch.ones(1)).packed()[0].to(like)
 
     def parameters(self) -> dict[str, Tensor]:
         """What is learned, by name."""

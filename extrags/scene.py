@@ -57,7 +57,7 @@ class Scene(Storable):
             self.gaussians.sh,
             viewmats=viewmats,
             sh_degree=degree if sh_degree is None else min(sh_degree, degree),
-            light=self._carried_light(len(cameras), exposure),
+            light=self._camera_light(len(cameras), exposure),
             **options,
         )
 
@@ -104,9 +104,9 @@ class Scene(Storable):
             **options,
         )
 
-    def _carried_light(self, count: int, exposure: Float[Tensor, "c"] | None) -> CameraLight | None:
+    def _camera_light(self, count: int, exposure: Float[Tensor, "c"] | None) -> CameraLight | None:
         if self.light is not None:
-            return self.light.of_cameras(torch.ones(count) if exposure is None else exposure)
+            return self.light.camera_light(torch.ones(count) if exposure is None else exposure)
         if exposure is None:
             return None
         zero, one = torch.zeros(()), torch.ones(())

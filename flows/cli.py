@@ -86,9 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if "--debug" in arguments:
             raise
         from extrags.errors import ConfigError, UnknownSequenceError
-        from flows.failures import told
+        from flows.failures import describe_error
 
-        for line in told(error):
+        for line in describe_error(error):
             print(f"extrags: {line}", file=sys.stderr)
         return USAGE if isinstance(error, ConfigError | UnknownSequenceError) else FAILED
 

@@ -20,17 +20,17 @@ from rich.progress import (
 from rich.table import Table
 
 from flows.outcome import DatasetOutcome, SequenceOutcome
-from flows.tables import figure, tabled
+from flows.tables import figure, table_figures
 from flows.terminal import console
 from tasks.progress import StageProgress, observed
 
-__all__ = ["print_outcomes", "print_plan", "watched"]
+__all__ = ["print_outcomes", "print_plan", "progress_bars"]
 
 _MARKS = {"ran": "[green]✓[/]", "cached": "[cyan]=[/]", "skipped": "[dim]-[/]", "failed": "[red]✗[/]"}
 
 
 @contextmanager
-def watched(*, terminal: bool) -> Iterator[None]:
+def progress_bars(*, terminal: bool) -> Iterator[None]:
     """Show the progress of the stages that run inside the block.
 
     Without a terminal nothing is drawn: stages then log their progress (`tasks.progress`).
@@ -94,7 +94,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("sequence", "status", "stages"):
         table.add_column(column)
-    for name in tabled()[:4]:
+    for name in table_figures()[:4]:
         table.add_column(name, justify="right")
     for outcome in run.sequences:
         states = [row.state for row in outcome.stages]
@@ -109,7 +109,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
             outcome.name,
             f"[{colour}]{outcome.status}[/]",
             counts,
-            *(_change(name, coarse.get(name), final.get(name)) for name in tabled()[:4]),
+            *(_change(name, coarse.get(name), final.get(name)) for name in table_figures()[:4]),
         )
     out.print(table)
     for outcome in run.sequences:

@@ -14,7 +14,7 @@ from pydantic import Field
 
 from extrags.config import ProfileName
 from extrags.pipeline import StageName
-from flows.methods import METHODS, MethodName, method_config, profile_label, refuse_pinned
+from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
 from flows.outcome import DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
 from flows.preflight import preflight
@@ -50,7 +50,7 @@ def reconstruct_dataset(
         One outcome per sequence, in the order given; failures among them. The summary is an artifact.
     """
     # Wrong settings, missing models and a store that cannot be written concern all sequences: say so once.
-    refuse_pinned(method, settings or {})
+    check_not_pinned(method, settings or {})
     config = method_config(method, profile, settings, seed)
     open_store(store)
     preflight(config, until, METHODS[method].leave_out)

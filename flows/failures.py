@@ -8,12 +8,12 @@ from collections.abc import Iterator
 
 from extrags.errors import ExtragsError
 
-__all__ = ["told"]
+__all__ = ["describe_error"]
 
 SEE_TRACEBACK = "run again with --debug for the traceback"
 
 
-def told(error: BaseException) -> list[str]:
+def describe_error(error: BaseException) -> list[str]:
     """An exception in one line; and, where there is something to do about it, that in a second one.
 
     An error of ours speaks for itself, also where something raised another one because of it. So does a

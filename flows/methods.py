@@ -20,9 +20,9 @@ __all__ = [
     "THREE_DGS_SHARED",
     "Method",
     "MethodName",
+    "check_not_pinned",
     "method_config",
     "profile_label",
-    "refuse_pinned",
     "three_dgs",
 ]
 
@@ -156,7 +156,7 @@ def method_config(
     return config.with_overrides(_known(method).pinned(config))
 
 
-def refuse_pinned(method: str, settings: Mapping[str, Any]) -> None:
+def check_not_pinned(method: str, settings: Mapping[str, Any]) -> None:
     """Refuse overrides of what a method pins: somebody who names both would wonder why nothing changes.
 
     A benchmark does not ask: its overrides are for all methods, and reach those that leave the setting open.

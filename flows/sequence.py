@@ -13,7 +13,7 @@ from pydantic import Field
 from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
-from flows.methods import METHODS, MethodName, method_config, profile_label, refuse_pinned
+from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
 from flows.outcome import SequenceFailedError, SequenceOutcome
 from flows.preflight import preflight
 from flows.runners import PrefectRunner
@@ -50,7 +50,7 @@ def reconstruct_sequence(
     Raises:
         SequenceFailedError: when a stage failed; what was finished stays in the store.
     """
-    refuse_pinned(method, settings or {})
+    check_not_pinned(method, settings or {})
     config = method_config(method, profile, settings, seed)
     open_store(store)
     preflight(config, until, METHODS[method].leave_out)

@@ -11,22 +11,22 @@ from flows.outcome import SequenceOutcome
 __all__ = [
     "benchmark_markdown",
     "dataset_markdown",
+    "difference_figures",
     "difference_text",
-    "differences",
     "figure",
     "markdown_table",
     "sequence_markdown",
     "spread_text",
-    "tabled",
+    "table_figures",
 ]
 
 
-def tabled() -> list[str]:
+def table_figures() -> list[str]:
     """Names of the figures in tables of runs; narrow tables show the first few."""
     return [shown.name for shown in figures("tables")]
 
 
-def differences() -> list[str]:
+def difference_figures() -> list[str]:
     """Names of the figures whose differences between methods are shown."""
     return [shown.name for shown in figures("differences")]
 
@@ -56,9 +56,9 @@ def sequence_markdown(outcome: SequenceOutcome) -> str:
         ],
     )
     metrics = markdown_table(
-        ["scene", *tabled(), "Gaussians"],
+        ["scene", *table_figures(), "Gaussians"],
         [
-            [which, *(figure(name, tree.get(name)) for name in tabled()), tree.get("n_gaussians", "")]
+            [which, *(figure(name, tree.get(name)) for name in table_figures()), tree.get("n_gaussians", "")]
             for which, tree in outcome.metrics.items()
             if tree is not None
         ],
@@ -80,12 +80,12 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
                 f"{outcome.seconds:.1f}",
                 *(
                     f"{figure(name, coarse.get(name))} → {figure(name, final.get(name))}"
-                    for name in tabled()[:3]
+                    for name in table_figures()[:3]
                 ),
                 "" if failed is None else f"{failed.stage}: {failed.reason}",
             ]
         )
-    return markdown_table(["sequence", "status", "seconds", *tabled()[:3], "problem"], rows)
+    return markdown_table(["sequence", "status", "seconds", *table_figures()[:3], "problem"], rows)
 
 
 def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
@@ -94,20 +94,20 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
 
     comparison = compare_runs(cases, baseline)
     paired = markdown_table(
-        ["dataset", "profile", "method", "sequences", *differences()],
+        ["dataset", "profile", "method", "sequences", *difference_figures()],
         [
             [
                 row["dataset"],
                 row["profile"],
                 row["method"],
                 row["n_sequences"],
-                *(difference_text(name, row["figures"].get(name)) for name in differences()),
+                *(difference_text(name, row["figures"].get(name)) for name in difference_figures()),
             ]
             for row in comparison["paired_datasets"]
         ],
     )
     spread = markdown_table(
-        ["sequence", "setting", "profile", "method", "seeds", *tabled()],
+        ["sequence", "setting", "profile", "method", "seeds", *table_figures()],
         [
             [
                 row["sequence"],
@@ -115,13 +115,13 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
                 row["profile"],
                 row["method"],
                 row["n_seeds"],
-                *(spread_text(name, row["figures"].get(name)) for name in tabled()),
+                *(spread_text(name, row["figures"].get(name)) for name in table_figures()),
             ]
             for row in comparison["sequences"]
         ],
     )
     runs = markdown_table(
-        ["sequence", "setting", "profile", "method", "seed", "seconds", "MiB", *tabled(), "problem"],
+        ["sequence", "setting", "profile", "method", "seed", "seconds", "MiB", *table_figures(), "problem"],
         [
             [
                 case["sequence"],
@@ -131,7 +131,7 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
                 case["seed"],
                 f"{case['seconds']:.1f}",
                 "" if case["peak_mib"] is None else f"{case['peak_mib']:.0f}",
-                *(figure(name, (case["metrics"] or {}).get(name)) for name in tabled()),
+                *(figure(name, (case["metrics"] or {}).get(name)) for name in table_figures()),
                 case["error"],
             ]
             for case in cases

@@ -122,7 +122,7 @@ class SequenceRun(Pipeline):
         """Write a row and tell who watches."""
         row = StageRow(stage, "skipped", reason=reason)
         self.outcome.stages.append(row)
-        self._tell(row, "skipped")
+        self._report_progress(row, "skipped")
 
     def has_poses(self) -> bool:
         """Whether the source has camera poses."""
@@ -144,13 +144,13 @@ class SequenceRun(Pipeline):
             source = resolve(self.outcome.name)
             fingerprint = source_fingerprint(source, self.config.ingest)
             inputs = {"source": source, "fingerprint": fingerprint, "config": self.config.ingest}
-            self.refs["ingest"] = self.refs["sequence"] = self._one(row, Call(ingest, inputs))
+            self.refs["ingest"] = self.refs["sequence"] = self._run_task(row, Call(ingest, inputs))
 
     def poses(self) -> None:
         """The artefact `sequence` again, with poses."""
         with self._stage("poses") as row:
             inputs = {"sequence": self.refs["sequence"], "config": self.config.poses}
-            self.refs["poses"] = self.refs["sequence"] = self._one(row, Call(poses, inputs))
+            self.refs["poses"] = self.refs["sequence"] = self._run_task(row, Call(poses, inputs))
             row.reason = str(self._manifest("poses").counts["summary"])
 
     def coarse(self) -> None:
@@ -158,16 +158,18 @@ class SequenceRun(Pipeline):
         with self._stage("coarse") as row:
             # Only the training frames go on from here. Cutting them out takes no time, and does not count
             # when it comes to whether the stage ran.
-            self.refs["training"] = self._aside(Call(training_frames, {"sequence": self.refs["sequence"]}))
+            self.refs["training"] = self._run_uncounted(
+                Call(training_frames, {"sequence": self.refs["sequence"]})
+            )
             inputs = {"sequence": self.refs["training"], "config": self.config.coarse}
-            self.refs["coarse"] = self._one(row, Call(coarse, inputs))
+            self.refs["coarse"] = self._run_task(row, Call(coarse, inputs))
             counts = self._manifest("coarse").counts
             if counts.get("refined_poses"):
                 # The scene belongs to the corrected poses: all that follows takes those.
                 inputs = {"sequence": self.refs["sequence"], "coarse": self.refs["coarse"]}
-                self.refs["sequence"] = self._aside(Call(refined_frames, inputs))
+                self.refs["sequence"] = self._run_uncounted(Call(refined_frames, inputs))
                 whole = {"sequence": self.refs["sequence"]}
-                self.refs["training"] = self._aside(Call(training_frames, whole))
+                self.refs["training"] = self._run_uncounted(Call(training_frames, whole))
                 row.reason = f"poses refined, by {counts['refined_mean_turn_deg']:.2f} degrees on average"
 
     def assess(self) -> None:
@@ -177,11 +179,11 @@ class SequenceRun(Pipeline):
         with self._stage("assess") as row:
             coverage = self.config.explore.coverage
             inputs = {**self._scene_inputs(), "config": self.config.assess, "coverage": coverage}
-            self.refs["assess"] = self._one(row, Call(assess, inputs))
+            self.refs["assess"] = self._run_task(row, Call(assess, inputs))
             # The decisions follow from the measurement and all budgets. They take no time, and do not
             # count when it comes to whether the stage ran.
             inputs = {"measured": self.refs["assess"], "config": self.config}
-            self.refs["plan"] = self._aside(Call(plan, inputs))
+            self.refs["plan"] = self._run_uncounted(Call(plan, inputs))
             self.plan = self.store.load(ScenePlan, self.refs["plan"])
             self.outcome.plan = self.plan.model_dump(mode="json")
 
@@ -189,29 +191,29 @@ class SequenceRun(Pipeline):
         """The mesh."""
         with self._stage("surface") as row:
             inputs = {**self._scene_inputs(), "config": self.config.surface}
-            self.refs["surface"] = self._one(row, Call(surface, inputs))
+            self.refs["surface"] = self._run_task(row, Call(surface, inputs))
 
     def freespace(self) -> None:
         """Where virtual cameras may go."""
         with self._stage("freespace") as row:
             mesh = self.refs["surface"]
             inputs = {**self._scene_inputs(), "surface": mesh, "config": self.config.freespace}
-            self.refs["freespace"] = self._one(row, Call(freespace, inputs))
+            self.refs["freespace"] = self._run_task(row, Call(freespace, inputs))
 
     def explore(self) -> None:
         """The virtual trajectories, wave by wave."""
         with self._stage("explore") as row:
             space = self.refs["freespace"]
             shared = {**self._scene_inputs(), "freespace": space, "config": self.config.explore}
-            self.refs["waves"] = self._one(row, Call(start, shared))
+            self.refs["waves"] = self._run_task(row, Call(start, shared))
             while anchors := self.store.load_json(NEXT, self.refs["waves"])["anchors"]:
                 state = self.refs["waves"]
                 calls = [Call(branch, {**shared, "state": state, "anchor": anchor}) for anchor in anchors]
-                branches = self._all(row, calls)
-                self.refs["waves"] = self._one(row, Call(merge, {"state": state, "branches": branches}))
+                branches = self._run_tasks(row, calls)
+                self.refs["waves"] = self._run_task(row, Call(merge, {"state": state, "branches": branches}))
                 accepted = self.store.load_json(NEXT, self.refs["waves"])["accepted"]
-                self._tell(row, "running", accepted, self.config.explore.trajectories)
-            self.refs["explore"] = self._one(row, Call(explore, {**shared, "state": self.refs["waves"]}))
+                self._report_progress(row, "running", accepted, self.config.explore.trajectories)
+            self.refs["explore"] = self._run_task(row, Call(explore, {**shared, "state": self.refs["waves"]}))
 
     def enhance(self) -> None:
         """The restorer, and the virtual views it restores in batches."""
@@ -223,7 +225,7 @@ class SequenceRun(Pipeline):
                 "coarse": self.config.coarse,
                 "model_digest": restorer_digest(settings),
             }
-            self.refs["restorer"] = self._one(row, Call(train, inputs))
+            self.refs["restorer"] = self._run_task(row, Call(train, inputs))
             weights = self._weights()
             shared = {
                 **self._scene_inputs(),
@@ -235,8 +237,8 @@ class SequenceRun(Pipeline):
             }
             trajectories = int(self._manifest("explore").counts["trajectories"] or 0)
             batches = range(settings.batches(trajectories))
-            parts = self._all(row, [Call(restore, {**shared, "batch": batch}) for batch in batches])
-            self.refs["enhance"] = self._one(row, Call(assemble, {"parts": parts}))
+            parts = self._run_tasks(row, [Call(restore, {**shared, "batch": batch}) for batch in batches])
+            self.refs["enhance"] = self._run_task(row, Call(assemble, {"parts": parts}))
 
     def finetune(self) -> None:
         """The final scene."""
@@ -247,7 +249,7 @@ class SequenceRun(Pipeline):
                 "config": self.config.finetune,
                 "coarse": self.config.coarse,
             }
-            self.refs["finetune"] = self._one(row, Call(finetune, inputs))
+            self.refs["finetune"] = self._run_task(row, Call(finetune, inputs))
 
     def evaluate(self) -> None:
         """Held-out views of both scenes, and their figures."""
@@ -256,7 +258,9 @@ class SequenceRun(Pipeline):
             scenes = [self.refs["coarse"]]
             if "finetune" in self.refs:
                 scenes.append(self.refs["finetune"])
-            renders = self._all(row, [Call(render, {"scene": ref, "sequence": sequence}) for ref in scenes])
+            renders = self._run_tasks(
+                row, [Call(render, {"scene": ref, "sequence": sequence}) for ref in scenes]
+            )
             weights = self._weights()
             settings = {
                 "net": weights.net,
@@ -264,7 +268,7 @@ class SequenceRun(Pipeline):
                 "weights": weights,
                 "added": added_metrics(),
             }
-            figures = self._all(
+            figures = self._run_tasks(
                 row, [Call(measure, {"renders": ref, "sequence": sequence, **settings}) for ref in renders]
             )
             self.refs["renders_coarse"], self.refs["metrics_coarse"] = renders[0], figures[0]
@@ -285,7 +289,7 @@ class SequenceRun(Pipeline):
                 "profile": self.profile,
                 "rows": [item.to_json() for item in self.outcome.stages if item.stage != "report"],
             }
-            self.refs["report"] = self._one(row, Call(report, inputs))
+            self.refs["report"] = self._run_task(row, Call(report, inputs))
             self.outcome.report = f"{self.refs['report'].uri}/{PAGE}"
 
     # Helpers.
@@ -296,15 +300,15 @@ class SequenceRun(Pipeline):
     def _weights(self) -> Weights:
         return lpips_weights(self.config.evaluate)
 
-    def _aside(self, call: Call) -> Ref:
+    def _run_uncounted(self, call: Call) -> Ref:
         """A task that does not count in its stage's row."""
         (result,) = self.runner.run([call], self.outcome.name)
         return result.ref
 
-    def _one(self, row: StageRow, call: Call) -> Ref:
-        return self._all(row, [call])[0]
+    def _run_task(self, row: StageRow, call: Call) -> Ref:
+        return self._run_tasks(row, [call])[0]
 
-    def _all(self, row: StageRow, calls: list[Call]) -> list[Ref]:
+    def _run_tasks(self, row: StageRow, calls: list[Call]) -> list[Ref]:
         results = self.runner.run(calls, self.outcome.name)
         for result in results:
             manifest = self.store.manifest(result.ref)
@@ -328,7 +332,7 @@ class SequenceRun(Pipeline):
             planned = self.planned(stage)
             row = StageRow(stage, "cached", reason="" if planned is None else planned.reason)
             self.outcome.stages.append(row)
-        self._tell(row, "running")
+        self._report_progress(row, "running")
         begun = time.monotonic()
         try:
             yield row
@@ -341,8 +345,8 @@ class SequenceRun(Pipeline):
             raise _StoppedError from error
         finally:
             row.seconds += time.monotonic() - begun
-            self._tell(row, row.state)
+            self._report_progress(row, row.state)
 
-    def _tell(self, row: StageRow, state: str, done: int = 0, total: int = 0) -> None:
+    def _report_progress(self, row: StageRow, state: str, done: int = 0, total: int = 0) -> None:
         reason = row.reason if state in ("skipped", "failed") else ""
         notify(StageProgress(self.outcome.name, row.stage, state, done, total, reason, row.seconds))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from extrags.config import CoarseConfig
 from extrags.store import Ref, Slot
-from tasks.divergence import keeping_last_good
+from tasks.divergence import keep_last_finite_scene
 from tasks.stage import stage
 
 __all__ = ["HISTORY", "coarse", "refined_frames"]
@@ -23,7 +23,7 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     from extrags.sequence import EndoscopicSequence
     from extrags.training import reconstruct
 
-    with keeping_last_good(slot):
+    with keep_last_finite_scene(slot):
         result = reconstruct(slot.load(EndoscopicSequence, sequence), config)
     slot.save(result.scene)
     slot.save_json(HISTORY, result.history)

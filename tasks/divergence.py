@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from extrags.errors import DivergedError
 from extrags.store import Slot
 
-__all__ = ["keeping_last_good"]
+__all__ = ["keep_last_finite_scene"]
 
 
 @contextmanager
-def keeping_last_good(slot: Slot) -> Iterator[None]:
+def keep_last_finite_scene(slot: Slot) -> Iterator[None]:
     """Leave the last finite scene among the debugging files of the failed stage."""
     try:
         yield

@@ -5,7 +5,7 @@ from __future__ import annotations
 from extrags.config import CoarseConfig, FinetuneConfig
 from extrags.store import Ref, Slot
 from tasks.coarse import HISTORY
-from tasks.divergence import keeping_last_good
+from tasks.divergence import keep_last_finite_scene
 from tasks.stage import stage
 
 __all__ = ["finetune"]
@@ -31,7 +31,7 @@ def finetune(
 
     views = None if pseudo_views is None else slot.load(PseudoViews, pseudo_views)
     start, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
-    with keeping_last_good(slot):
+    with keep_last_finite_scene(slot):
         result = training.finetune(start, frames, views, config, coarse)
     slot.save(result.scene)
     slot.save_json(HISTORY, result.history)

@@ -54,7 +54,7 @@ def lit_luminance(
         with torch.no_grad():
             cosine = torch.from_numpy(1 / np.linalg.norm(rays, axis=-1))
             falloff = light.falloff(torch.from_numpy(distance), cosine).numpy()
-            brightness = light.signal(torch.from_numpy(brightness).clamp(max=1.0)).numpy()
+            brightness = light.invert_response(torch.from_numpy(brightness).clamp(max=1.0)).numpy()
     else:
         falloff = np.ones_like(distance)
         usable = valid & (brightness > 1e-3) & (distance > 0)

@@ -106,7 +106,7 @@ def _color_difference(
         for image in (first, second)
     )
     difference = _hyab(first, second) ** _COLOR_EXPONENT
-    largest = _largest_color_difference()
+    largest = _max_color_difference()
     knee = _COLOR_KNEE * largest
     return torch.where(
         difference < knee,
@@ -189,7 +189,7 @@ def _hyab(first: Float[Tensor, "n 3 *s"], second: Float[Tensor, "n 3 *s"]) -> Fl
 
 
 @lru_cache(maxsize=1)
-def _largest_color_difference() -> float:
+def _max_color_difference() -> float:
     # The largest HyAB distance within sRGB is between green and blue (section 4.1.3).
     green, blue = torch.tensor([[[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]]], dtype=torch.float64)[..., None, None]
     distance = float(_hyab(_hunt_adjusted_lab(green), _hunt_adjusted_lab(blue)))

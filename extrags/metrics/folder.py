@@ -21,7 +21,7 @@ __all__ = ["read_renders"]
 
 COLOR_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
 DEPTH_SUFFIXES = frozenset({".npy", ".png", ".tif", ".tiff"})
-_NAMED_AT_MOST = 5
+_MAX_LISTED_NAMES = 5
 
 
 def read_renders(
@@ -179,5 +179,5 @@ def _check_size(file: Path, found: tuple[int, ...], expected: tuple[int, int]) -
 
 
 def _some(names: list[str]) -> str:
-    more = len(names) - _NAMED_AT_MOST
-    return ", ".join(names[:_NAMED_AT_MOST]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - _MAX_LISTED_NAMES
+    return ", ".join(names[:_MAX_LISTED_NAMES]) + (f" and {more} more" if more > 0 else "")

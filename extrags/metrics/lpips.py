@@ -69,7 +69,7 @@ _STEPS: dict[str, tuple[_Step, ...]] = {
 }
 _CHANNEL_SHIFT = (-0.030, -0.088, -0.188)
 _CHANNEL_SCALE = (0.458, 0.448, 0.450)
-_SMALLEST_SIDE_PX = 32
+_MIN_SIDE_PX = 32
 _NORM_EPS = 1e-10
 _IMAGES_AT_ONCE = 16
 
@@ -209,10 +209,9 @@ class Lpips:
             raise ShapeError(
                 f"LPIPS compares images [..., H, W, 3]; found {tuple(first.shape)} and {tuple(second.shape)}"
             )
-        if min(first.shape[-3:-1]) < _SMALLEST_SIDE_PX:
+        if min(first.shape[-3:-1]) < _MIN_SIDE_PX:
             raise ShapeError(
-                f"LPIPS needs images of at least {_SMALLEST_SIDE_PX} px, "
-                f"found {first.shape[-2]}x{first.shape[-3]}"
+                f"LPIPS needs images of at least {_MIN_SIDE_PX} px, found {first.shape[-2]}x{first.shape[-3]}"
             )
         firsts = first.reshape(-1, *first.shape[-3:])
         seconds = second.reshape(-1, *second.shape[-3:])

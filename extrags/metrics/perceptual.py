@@ -18,7 +18,7 @@ _CONTRAST_FLOOR = 0.03**2
 """SSIM's second constant: differences on patches flatter than this fade out."""
 _COLOR_SIGMA_PX = 2.0
 _COLOR_RADIUS_PX = 6
-_LARGEST_COLOR_DIFFERENCE = 0.5
+_MAX_COLOR_DIFFERENCE = 0.5
 """Mean channel difference that already counts as a wholly different colour."""
 
 
@@ -85,4 +85,4 @@ def _contrast_structure(one: Float[Tensor, "n 3 h w"], other: Float[Tensor, "n 3
 def _color_difference(one: Float[Tensor, "n 3 h w"], other: Float[Tensor, "n 3 h w"]) -> Tensor:
     window = gaussian_weights(_COLOR_SIGMA_PX, _COLOR_RADIUS_PX)
     difference = filter_separable(one - other, window, window).abs().mean(1)
-    return (difference / _LARGEST_COLOR_DIFFERENCE).clamp(0, 1).square()
+    return (difference / _MAX_COLOR_DIFFERENCE).clamp(0, 1).square()

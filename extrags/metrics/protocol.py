@@ -35,7 +35,7 @@ from extrags.zarr_io import open_group, read_array, write_frames
 
 __all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
 
-SMALLEST_PART = 0.003
+MIN_REGION_SHARE = 0.003
 """Share of the image below which a part of the pixels has no figure: a handful of pixels is noise."""
 SURFACE_ALPHA = 0.5
 """A pixel has a rendered depth from this alpha on."""
@@ -253,7 +253,7 @@ def _parts_of(
     # The array says nothing about frames that are not held out.
     known = np.isin(chosen, sequence.test) & mask.any((1, 2)) & (sequence.observed is not None)
     seen = np.zeros_like(mask) if sequence.observed is None else sequence.observed[chosen]
-    smallest = SMALLEST_PART * sequence.height * sequence.width
+    smallest = MIN_REGION_SHARE * sequence.height * sequence.width
     parts, shares = {}, {}
     for name, pixels in (("observed", mask & seen), ("unobserved", mask & ~seen)):
         counts = pixels.sum((1, 2))
@@ -332,7 +332,7 @@ def _reasons(
             elif not np.isin(frames, sequence.test).any():
                 reasons[name] = "told apart for held-out frames only"
             else:
-                reasons[name] = f"no view has {SMALLEST_PART:.1%} of its pixels {name}"
+                reasons[name] = f"no view has {MIN_REGION_SHARE:.1%} of its pixels {name}"
     return reasons
 
 

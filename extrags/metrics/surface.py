@@ -305,7 +305,7 @@ def _parts(
     points: Float[np.ndarray, "n 3"], truth: TrueSurface, sequence: EndoscopicSequence
 ) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "n"]]:
     """Which true points training cameras see, and which held-out cameras alone."""
-    far = _reach(sequence)
+    far = _max_fused_depth(sequence)
 
     def by(frames: np.ndarray) -> Bool[np.ndarray, "n"]:
         return seen_by(points, truth.mesh, sequence.cameras[frames], sequence.mask[frames], far)
@@ -314,7 +314,7 @@ def _parts(
     return observed, by(sequence.test) & ~observed
 
 
-def _reach(sequence: EndoscopicSequence) -> float:
+def _max_fused_depth(sequence: EndoscopicSequence) -> float:
     """Farther depth is not fused, so surface seen from farther only cannot be asked for."""
     frames = _all_frames(sequence)
     if sequence.depth_mm is None:

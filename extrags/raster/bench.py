@@ -26,7 +26,7 @@ from torch import Tensor
 
 from extrags.errors import ConfigError
 from extrags.raster import native
-from extrags.raster.peers import Contestant, check_peers, errors, exact_gradients, gradients, use_threads
+from extrags.raster.peers import TimedPeer, check_peers, errors, exact_gradients, gradients, use_threads
 from extrags.raster.roofline import part_times, roofline
 
 __all__ = ["STANDARD_SIZES", "BenchSize", "bench_raster", "bench_scene", "bench_train", "machine"]
@@ -215,27 +215,27 @@ def _bench_size(
     scene = bench_scene(size, seed=seed)
     exact = exact_gradients(scene) if with_error else None
     keys = [(peer, n) for peer in peers for n in (threads[:1] if peer == "reference" else threads)]
-    contestants = {key: Contestant(key[0], scene, training=training) for key in keys}
+    timed_peers = {key: TimedPeer(key[0], scene, training=training) for key in keys}
     peaks: dict[tuple[str, int], float | None] = {}
     gc.collect()
     for index in range(rounds + 2):
-        for (peer, count), contestant in contestants.items():
-            if contestant.finished:
+        for (peer, count), timed_peer in timed_peers.items():
+            if timed_peer.finished:
                 continue
             use_threads(peer, count)
             if index == 0:
-                peaks[peer, count] = _peak_mib(contestant.iteration)
+                peaks[peer, count] = _peak_mib(timed_peer.iteration)
             else:
-                contestant.iteration()
+                timed_peer.iteration()
     cases = []
-    for (peer, count), contestant in contestants.items():
+    for (peer, count), timed_peer in timed_peers.items():
         case: dict[str, Any] = {
             "width": size.width,
             "height": size.height,
             "n_gaussians": size.n_gaussians,
             "backend": peer,
             "threads": count,
-            **contestant.summary(),
+            **timed_peer.summary(),
             "peak_mib": peaks[peer, count],
         }
         use_threads(peer, count)

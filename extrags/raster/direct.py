@@ -50,9 +50,9 @@ class Target:
         if rgb.ndim != 3 or rgb.shape[2] != 3:
             raise ShapeError(f"rgb has shape {tuple(rgb.shape)}, expected (H, W, 3)")
         self.height, self.width = int(rgb.shape[0]), int(rgb.shape[1])
-        self.rgb = _plain(rgb)
-        self.weight = None if weight is None else _plain(weight)
-        self.depth = None if depth is None else _plain(depth)
+        self.rgb = _contiguous_array(rgb)
+        self.weight = None if weight is None else _contiguous_array(weight)
+        self.depth = None if depth is None else _contiguous_array(depth)
         for name, image in (("weight", self.weight), ("depth", self.depth)):
             if image is not None and image.shape != (self.height, self.width):
                 raise ShapeError(f"{name} has shape {image.shape}, expected {(self.height, self.width)}")
@@ -66,7 +66,7 @@ class Target:
         self.scale = 1 / total if total != 0 else 1.0
 
 
-def _plain(values: Tensor) -> np.ndarray:
+def _contiguous_array(values: Tensor) -> np.ndarray:
     return values.detach().to(torch.float32).contiguous().numpy()
 
 
@@ -91,7 +91,7 @@ class _Images:
         filled = native.compiled_kernels().Images(**outputs, means2d=means2d, radius=radius_px)
         return cls(tensors, arrays, filled)
 
-    def compared(
+    def loss_and_gradients(
         self,
         target: Target,
         *,
@@ -204,7 +204,7 @@ class DirectStep:
         kernels = native.compiled_kernels()
         torch.exp(self._values["scales"], out=self._linear["scales"])
         torch.sigmoid(self._values["opacities"], out=self._linear["opacities"])
-        self._refuse_nonfinite(kernels, light)
+        self._check_finite(kernels, light)
         images = self._images_of(target)
         camera = kernels.Camera(
             viewmat=target.viewmat,
@@ -215,7 +215,7 @@ class DirectStep:
             light=light,
         )
         frame = kernels.render(self._gaussians, camera, images.filled, degree=sh_degree)
-        loss, image_gradients = images.compared(
+        loss, image_gradients = images.loss_and_gradients(
             target,
             dssim_weight=dssim_weight,
             rgb_weight=loss_weight * target.scale,
@@ -231,7 +231,7 @@ class DirectStep:
                 light=self.light_gradient if self._lit else None,
             ),
         )
-        self._carry_activations()
+        self._backward_activations()
         torch.gt(self._radius_px[0], 0, out=self.visible)
         return loss
 
@@ -256,7 +256,7 @@ class DirectStep:
             self._images[size] = _Images.empty(*size, means2d, radius_px)
         return self._images[size]
 
-    def _carry_activations(self) -> None:
+    def _backward_activations(self) -> None:
         """From gradients of scales and opacities to those of their logarithms and logits."""
         g_scales, g_opacities = self.gradients["scales"], self.gradients["opacities"]
         torch.mul(g_scales, self._linear["scales"], out=g_scales)
@@ -264,7 +264,7 @@ class DirectStep:
             g_opacities, self._linear["opacities"], grad_input=g_opacities
         )
 
-    def _refuse_nonfinite(self, kernels: Any, light: np.ndarray | None) -> None:
+    def _check_finite(self, kernels: Any, light: np.ndarray | None) -> None:
         for name, tensor, array in self._checked:
             if array.size and kernels.first_nonfinite(array) >= 0:
                 raise nonfinite_error(name, tensor)

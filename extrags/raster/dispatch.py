@@ -19,8 +19,8 @@ from extrags.raster.rendering import (
     RasterInputs,
     RasterOptions,
     Rendering,
+    check_finite,
     checked_inputs,
-    refuse_nonfinite,
 )
 
 __all__ = ["Backend", "available_backends", "rasterize"]
@@ -116,7 +116,7 @@ def rasterize(
     chosen = _chosen(backend, means)
     if chosen == "native":
         return rasterize_native(inputs, options)
-    refuse_nonfinite(inputs)
+    check_finite(inputs)
     if chosen == "gsplat":
         from extrags.raster.gsplat import rasterize_gsplat
 

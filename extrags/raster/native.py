@@ -93,7 +93,7 @@ def compiled_kernels() -> ModuleType:
 
 def rasterize_native(inputs: RasterInputs, options: RasterOptions) -> Rendering:
     """Render float32 CPU tensors with the native kernels; arguments as checked by `rasterize`."""
-    _refuse_nonfinite(inputs)
+    _check_finite(inputs)
     call = _Call.prepared(inputs, options)
     rgb, alpha, depth = _Rasterize.apply(  # type: ignore[no-untyped-call]
         call,
@@ -120,7 +120,7 @@ def rasterize_native(inputs: RasterInputs, options: RasterOptions) -> Rendering:
     )
 
 
-def _refuse_nonfinite(inputs: RasterInputs) -> None:
+def _check_finite(inputs: RasterInputs) -> None:
     kernels = compiled_kernels()
     for name, value in vars(inputs).items():
         if value is None:

@@ -26,7 +26,7 @@ from extrags.raster.torch_tiles import (
 
 __all__ = [
     "PEERS",
-    "Contestant",
+    "TimedPeer",
     "check_peers",
     "errors",
     "exact_gradients",
@@ -73,7 +73,7 @@ def use_threads(backend: str, count: int) -> None:
         native.set_num_threads(count)
 
 
-class Contestant:
+class TimedPeer:
     """Repeated iterations of one peer on its own copy of a scene.
 
     Args:

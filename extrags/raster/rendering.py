@@ -164,7 +164,7 @@ def checked_inputs(
     return inputs, degree
 
 
-def refuse_nonfinite(inputs: RasterInputs) -> None:
+def check_finite(inputs: RasterInputs) -> None:
     """Raise for the first array that holds a NaN or an infinity.
 
     Raises:

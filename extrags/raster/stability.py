@@ -79,7 +79,7 @@ def bench_stability(axes: Sequence[str] | None = None, *, threads: int = 1) -> d
     before = native.num_threads(), torch.get_num_threads()
     use_threads("native", threads)
     try:
-        cases = [_judged(case) for axis in chosen if axis in AXES for case in AXES[axis]()]
+        cases = [_case_result(case) for axis in chosen if axis in AXES for case in AXES[axis]()]
         if REFUSED in chosen:
             cases += _refusals()
         return {"machine": machine(), "cases": cases}
@@ -88,8 +88,8 @@ def bench_stability(axes: Sequence[str] | None = None, *, threads: int = 1) -> d
         torch.set_num_threads(before[1])
 
 
-def _judged(case: _Case) -> dict[str, Any]:
-    found = _evaluated(case.scene, "native", torch.float32)
+def _case_result(case: _Case) -> dict[str, Any]:
+    found = _outputs_and_gradients(case.scene, "native", torch.float32)
     result: dict[str, Any] = {"axis": case.axis, "value": case.value, "error": None}
     bad = [name for name, value in found.items() if not bool(torch.isfinite(value).all())]
     alpha = found["alpha"]
@@ -99,8 +99,8 @@ def _judged(case: _Case) -> dict[str, Any]:
         return {**result, "ok": False, "note": "alpha outside [0, 1]"}
     if not case.compared:
         return {**result, "ok": True, "note": case.note or "finite"}
-    exact = _evaluated(case.scene, "reference", torch.float64)
-    plain = _evaluated(case.scene, "reference", torch.float32)
+    exact = _outputs_and_gradients(case.scene, "reference", torch.float64)
+    plain = _outputs_and_gradients(case.scene, "reference", torch.float32)
     image, gradient = _errors(found, exact)
     plain_image, plain_gradient = _errors(plain, exact)
     good_image = image <= max(IMAGE_TOLERANCE, FLOAT32_FACTOR * plain_image)
@@ -120,7 +120,7 @@ def _judged(case: _Case) -> dict[str, Any]:
     }
 
 
-def _evaluated(scene: Scene, backend: Any, dtype: torch.dtype) -> dict[str, Tensor]:
+def _outputs_and_gradients(scene: Scene, backend: Any, dtype: torch.dtype) -> dict[str, Tensor]:
     """All outputs, and the gradients of a fixed random weighting of colour, alpha and depth."""
     values = {name: value.to(dtype, copy=True) for name, value in scene.items()}
     leaves = {name: values[name].requires_grad_() for name in LEARNED}
@@ -339,7 +339,7 @@ def _refusals() -> Iterator[dict[str, Any]]:
             scene[name].view(-1)[-1] = value
             found = {"axis": REFUSED, "value": f"{value} in {name}", "error": None}
             try:
-                _evaluated(scene, "native", torch.float32)
+                _outputs_and_gradients(scene, "native", torch.float32)
             except NonFiniteError as error:
                 yield {**found, "ok": name in str(error), "note": str(error)}
             else:

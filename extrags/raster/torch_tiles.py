@@ -39,7 +39,7 @@ __all__ = ["TileImages", "l1_ssim_loss_torch", "rasterize_tiles", "tile_gradient
 TILE_PX = 8
 PIXELS = TILE_PX * TILE_PX
 
-LAYER = 64
+ENTRIES_PER_LAYER = 64
 """Entries of each tile's list that are composited at once."""
 
 ELEMENTS_PER_BATCH = 1 << 17
@@ -50,13 +50,13 @@ TILES_PER_PART = 128
 
 DSSIM_WEIGHT = 0.2
 
-RECORD = 10
+RECORD_SIZE = 10
 """Numbers per Gaussian and tile: centre 2, conic 3, log opacity, colour 3, depth."""
 
-NEVER = -1e4
+LOG_ZERO = -1e4
 """Log opacity of the entries that pad a list."""
 
-LOG_NOTHING = -20.0
+MIN_LOG_ALPHA = -20.0
 """Less than this logarithm of alpha is dropped in any case."""
 
 LOG_TRANSMITTANCE_MIN = math.log(TRANSMITTANCE_MIN)
@@ -209,7 +209,7 @@ def _lists(records: Tensor, extent: Tensor, width: int, height: int) -> _Lists:
     place = torch.arange(len(ids)) - torch.repeat_interleave(counts.cumsum(0) - counts, counts)
     wide = span[ids, 0]
     tile_x, tile_y = low[ids, 0] + place % wide.clamp_min(1), low[ids, 1] + place // wide.clamp_min(1)
-    reached = _reaches(records[ids], tile_x, tile_y)
+    reached = _ellipse_meets_tile(records[ids], tile_x, tile_y)
     ids, tile = ids[reached], (tile_y * columns + tile_x)[reached]
     ids = ids[torch.sort(tile.to(torch.int32), stable=True).indices]
     lengths = torch.bincount(tile, minlength=columns * rows)
@@ -217,7 +217,7 @@ def _lists(records: Tensor, extent: Tensor, width: int, height: int) -> _Lists:
     return _Lists(torch.cat([ids, padding]), lengths.cumsum(0) - lengths, lengths)
 
 
-def _reaches(records: Tensor, tile_x: Tensor, tile_y: Tensor) -> Tensor:
+def _ellipse_meets_tile(records: Tensor, tile_x: Tensor, tile_y: Tensor) -> Tensor:
     """Whether the ellipse of the 1/255 rule meets the rectangle of a tile's pixel centres."""
     left, top = tile_x * TILE_PX + 0.5, tile_y * TILE_PX + 0.5
     u, v, a, b, c, log_opacity = records[:, :6].unbind(-1)
@@ -239,13 +239,13 @@ def _blended(
     records: Float[Tensor, "n 10"], lists: _Lists, tiles: Int[Tensor, "t"], width: int
 ) -> Float[Tensor, "t 64 5"]:
     """Colour, depth sum and alpha of all pixels of some tiles."""
-    padding = records.new_zeros(1, RECORD)
-    padding[0, 5] = NEVER
+    padding = records.new_zeros(1, RECORD_SIZE)
+    padding[0, 5] = LOG_ZERO
     records = torch.cat([records, padding])
     result = records.new_zeros(len(tiles), PIXELS, 5) + 0 * records[:1, :1]
     passed = records.new_zeros(len(tiles), PIXELS)
-    for first in range(0, int(lists.lengths[tiles].max()), LAYER):
-        left = (lists.lengths[tiles] - first).clamp_max(LAYER)
+    for first in range(0, int(lists.lengths[tiles].max()), ENTRIES_PER_LAYER):
+        left = (lists.lengths[tiles] - first).clamp_max(ENTRIES_PER_LAYER)
         left = left * (passed.detach().amax(1) > LOG_TRANSMITTANCE_MIN)
         active = torch.sort(left, stable=True).indices[int((left <= 0).sum()) :]
         if len(active) == 0:
@@ -256,7 +256,7 @@ def _blended(
         gathered = records.index_select(0, torch.cat([rows.reshape(-1) for rows in entries]))
         parts = gathered.split([rows.numel() for rows in entries])
         found = [
-            _composite(part.reshape(*rows.shape, RECORD), tiles[chosen], passed[chosen], width)
+            _composite(part.reshape(*rows.shape, RECORD_SIZE), tiles[chosen], passed[chosen], width)
             for part, rows, (chosen, _) in zip(parts, entries, batches, strict=True)
         ]
         result = result.index_add(0, active, torch.cat([colours for colours, _ in found]))
@@ -303,12 +303,12 @@ def _composite(
         -1,
     )
     # Bounded below as well: the exponential of less is denormal, and slow.
-    log_alpha = (coefficients @ _monomials(entries)).clamp(LOG_NOTHING, math.log(ALPHA_MAX))
+    log_alpha = (coefficients @ _monomials(entries)).clamp(MIN_LOG_ALPHA, math.log(ALPHA_MAX))
     alpha = threshold(log_alpha.exp(), ALPHA_MIN, 0.0)
     log_pass = torch.log1p(-alpha)
     triangle = alpha.new_ones(alpha.shape[1], alpha.shape[1]).tril()
     behind = torch.baddbmm(passed[:, None].expand_as(alpha), triangle.expand(len(alpha), -1, -1), log_pass)
-    weights = torch.exp(threshold(behind, LOG_TRANSMITTANCE_MIN, NEVER) - log_pass) * alpha
+    weights = torch.exp(threshold(behind, LOG_TRANSMITTANCE_MIN, LOG_ZERO) - log_pass) * alpha
     features = torch.cat([entries[..., 6:], torch.ones_like(entries[..., :1])], -1)
     return weights.transpose(1, 2) @ features, behind[:, -1]
 

@@ -261,7 +261,7 @@ def condition(layers: Layers, transfer: LightTransfer) -> Conditioning:
     known = weight + (1 - weight) * alpha
     solid = _within_range(color / known.clamp_min(1e-3))
     base = _within_range(
-        transfer.apply_response(push_pull(transfer.signal(solid) / falloff, known) * falloff)
+        transfer.apply_response(push_pull(transfer.invert_response(solid) / falloff, known) * falloff)
     )
     channels = torch.cat(
         [

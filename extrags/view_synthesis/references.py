@@ -54,9 +54,9 @@ class LightTransfer:
             return self.light.falloff(distance, axis_cosine, facing_cosine)
         return (distance / self.scale_mm) ** -self.exponent
 
-    def signal(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    def invert_response(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Image values in [0, 1] with the camera's response undone."""
-        return rgb if self.light is None else self.light.signal(rgb)
+        return rgb if self.light is None else self.light.invert_response(rgb)
 
     def apply_response(self, signal: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """The image values of a signal."""

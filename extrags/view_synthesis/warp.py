@@ -150,7 +150,7 @@ def _warp_one(
     )
     ratio = ratio * (gain / references.exposure[chosen])[:, None]
     ratio = ratio.clamp(1 / BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
-    rgb = transfer.apply_response(transfer.signal(seen.rgb) * ratio[:, None])
+    rgb = transfer.apply_response(transfer.invert_response(seen.rgb) * ratio[:, None])
     # Too bright for the sensor: darkened as a whole, so that the hue stays.
     rgb = rgb / rgb.amax(dim=1, keepdim=True).clamp_min(1)
     trust = seen.weight * (seen.quality / GOOD_QUALITY).clamp(max=1)

@@ -128,7 +128,7 @@ def train(given: argparse.Namespace) -> int:
 def stability(given: argparse.Namespace) -> int:
     """`extrags bench stability`."""
     set_up_logging(debug=given.debug, terminal=True)
-    _let_waiting_threads_sleep()
+    _set_passive_openmp_wait()
     from extrags.raster.stability import bench_stability
 
     found = bench_stability(given.axis, threads=given.threads)
@@ -142,7 +142,7 @@ def stability(given: argparse.Namespace) -> int:
 def enhance(given: argparse.Namespace) -> int:
     """`extrags bench enhance`."""
     set_up_logging(debug=given.debug, terminal=True)
-    _let_waiting_threads_sleep()
+    _set_passive_openmp_wait()
     from flows.settings import pipeline_config
 
     config = pipeline_config(given.profile, given.settings, given.seed)
@@ -178,7 +178,7 @@ def enhance(given: argparse.Namespace) -> int:
 
 def _kernels(given: argparse.Namespace, *, training: bool) -> int:
     set_up_logging(debug=given.debug, terminal=True)
-    _let_waiting_threads_sleep()
+    _set_passive_openmp_wait()
     sizes = _sizes(given)
     threads = [_number("--threads", text) for text in items(given.threads or ["1", "2"])]
     usual = ["direct", "torch"] if training else ["torch"]
@@ -199,7 +199,7 @@ def _kernels(given: argparse.Namespace, *, training: bool) -> int:
     return 0
 
 
-def _let_waiting_threads_sleep() -> None:
+def _set_passive_openmp_wait() -> None:
     # Read when torch is loaded. Threads that spin while they wait starve the peers they are measured beside.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 

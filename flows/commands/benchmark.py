@@ -73,14 +73,14 @@ def benchmark(given: argparse.Namespace) -> int:
     prepare(Store(root).state, debug=given.debug)
     from flows.benchmark import benchmark as flow
     from flows.benchmark import check_methods
-    from flows.console import watched
+    from flows.console import progress_bars
     from flows.settings import task_runner
 
     # Prefect would say the same in a page of its own words.
     check_methods(methods, variants, given.baseline)
     for profile in profiles:
         profile_config(profile)
-    with without_heartbeat(), watched(terminal=terminal):
+    with without_heartbeat(), progress_bars(terminal=terminal):
         found = flow.with_options(task_runner=task_runner(given.runner))(
             sequences=given.sequences,
             profiles=profiles,
@@ -138,27 +138,27 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
     """What came out: differences to the baseline, spread over seeds, failures, and where the page is."""
     from rich.markup import escape
 
-    from flows.tables import difference_text, differences, spread_text, tabled
+    from flows.tables import difference_figures, difference_text, spread_text, table_figures
     from flows.terminal import console
 
     out = console(error=to_stderr)
     comparison = found["comparison"]
     if comparison["paired_datasets"]:
         table = _table(f"differences to {comparison['baseline']}, mean over sequences [95 % interval]")
-        for column in ("dataset", "profile", "method", "sequences", *differences()):
+        for column in ("dataset", "profile", "method", "sequences", *difference_figures()):
             table.add_column(column)
         for row in comparison["paired_datasets"]:
             about = (row["dataset"], row["profile"], row["method"], str(row["n_sequences"]))
             table.add_row(
-                *about, *(difference_text(name, row["figures"].get(name)) for name in differences())
+                *about, *(difference_text(name, row["figures"].get(name)) for name in difference_figures())
             )
         out.print(table)
     table = _table("mean ± standard deviation over seeds")
-    for column in ("sequence", "profile", "method", "seeds", *tabled()):
+    for column in ("sequence", "profile", "method", "seeds", *table_figures()):
         table.add_column(column)
     for row in comparison["sequences"]:
         name = f"{row['sequence']}@{row['setting']}" if row["setting"] else row["sequence"]
-        figures = (spread_text(metric, row["figures"].get(metric)) for metric in tabled())
+        figures = (spread_text(metric, row["figures"].get(metric)) for metric in table_figures())
         table.add_row(name, row["profile"], row["method"], str(row["n_seeds"]), *figures)
     out.print(table)
     for case in found["cases"]:

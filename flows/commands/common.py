@@ -70,9 +70,9 @@ def run_config(given: argparse.Namespace) -> PipelineConfig:
     Raises:
         ConfigError: for an unknown setting, a value out of range, or one that the method sets itself.
     """
-    from flows.methods import method_config, refuse_pinned
+    from flows.methods import check_not_pinned, method_config
 
-    refuse_pinned(given.method, given.settings)
+    check_not_pinned(given.method, given.settings)
     return method_config(given.method, given.profile, given.settings, given.seed)
 
 

@@ -102,17 +102,17 @@ def _finished(given: argparse.Namespace) -> dict[str, Any]:
 def _print(found: dict[str, Any]) -> None:
     from rich.table import Table
 
-    from flows.tables import figure, tabled
+    from flows.tables import figure, table_figures
     from flows.terminal import console
 
     out = console()
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("pixels", *tabled()):
+    for column in ("pixels", *table_figures()):
         table.add_column(column)
     metrics = found["metrics"]
     for group in GROUPS:
         tree = metrics[group] if group else metrics
-        table.add_row(group or "valid", *(figure(name, tree.get(name)) for name in tabled()))
+        table.add_row(group or "valid", *(figure(name, tree.get(name)) for name in table_figures()))
     out.print(table)
     surface = {name: value for name, value in metrics["surface"].items() if isinstance(value, float)}
     if surface:

@@ -77,7 +77,7 @@ def pretrain(given: argparse.Namespace) -> int:
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
     from extrags.restoration.diffusion.pretraining import pretrain as trained
-    from flows.console import watched
+    from flows.console import progress_bars
     from flows.terminal import console
 
     values = {
@@ -101,7 +101,7 @@ def pretrain(given: argparse.Namespace) -> int:
     checked(given, config)
     # As things are now: in some hours the working tree may be another.
     about: dict[str, Any] = {"command": _command(given), "machine": machine()}
-    with watched(terminal=terminal):
+    with progress_bars(terminal=terminal):
         files = make_scenes(Path(given.scenes_folder), config.scenes, given.workers)
         if given.threads is not None:
             torch.set_num_threads(given.threads)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from extrags.errors import ConfigError, ExtragsError, UnknownSequenceError
 from flows.commands.common import run_config, set_up_logging, store_root, write_json
 from flows.commands.options import Parser, add_json, add_method, add_runner
-from flows.failures import told
+from flows.failures import describe_error
 
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
@@ -68,7 +68,7 @@ def run(given: argparse.Namespace) -> int:
 
     print_outcomes(outcome, seconds)
     errors = [sequence.error for sequence in outcome.sequences if sequence.error is not None]
-    for hint in dict.fromkeys(hint for error in errors for hint in told(error)[1:]):
+    for hint in dict.fromkeys(hint for error in errors for hint in describe_error(error)[1:]):
         print(f"extrags: {hint}", file=sys.stderr)
     write_json(outcome.to_json(seconds), given.json)
     return 0 if all(sequence.status == "ok" for sequence in outcome.sequences) else 1
@@ -110,10 +110,10 @@ def execute(
     from flows.preflight import preflight
 
     preflight(config, until, METHODS[given.method].leave_out)
-    from flows.console import watched
+    from flows.console import progress_bars
     from flows.dataset import reconstruct_dataset
 
-    with without_heartbeat(), watched(terminal=terminal):
+    with without_heartbeat(), progress_bars(terminal=terminal):
         outcome: DatasetOutcome = reconstruct_dataset(
             sequences=sequences,
             profile=given.profile,

@@ -67,7 +67,7 @@ def rendered(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     exposure = None
     if scene.light is not None:
-        exposure = scene.light.exposures_of(frames, sequence.train, sequence.recording)
+        exposure = scene.light.interpolated_exposures(frames, sequence.train, sequence.recording)
     with torch.no_grad():
         shown = scene.render(sequence.cameras[frames], exposure=exposure)
     return shown.rgb.clamp(0, 1).double(), shown.depth
@@ -239,7 +239,7 @@ def cost(rounds: int = 40) -> list[dict[str, Any]]:
                 started = time.process_time()
                 if label == "with":
                     learned = {k: v.requires_grad_() for k, v in light.detached().parameters().items()}
-                    carried = NearFieldLight(**learned, reference_distance=2.0).of_cameras(torch.ones(1))
+                    carried = NearFieldLight(**learned, reference_distance=2.0).camera_light(torch.ones(1))
                 shown = rasterize(
                     leaves["means"],
                     leaves["quats"],

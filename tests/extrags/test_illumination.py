@@ -70,8 +70,8 @@ class TestNearFieldLight:
         """Interpolated inside a recording that was trained on, the mean elsewhere."""
         train = np.array([0, 2, 6])
         recording = np.array([0, 0, 0, 0, 0, 0, 0, 1, 1])
-        gains = light().exposures_of(np.array([1, 4, 7, 8]), train, recording)
+        gains = light().interpolated_exposures(np.array([1, 4, 7, 8]), train, recording)
         own = light().exposures().log()
         expected = torch.stack([(own[0] + own[1]) / 2, (own[1] + own[2]) / 2, own[0] * 0, own[0] * 0])
         torch.testing.assert_close(gains.log(), expected)
-        torch.testing.assert_close(light().exposures_of(train, train), light().exposures())
+        torch.testing.assert_close(light().interpolated_exposures(train, train), light().exposures())

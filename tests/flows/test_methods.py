@@ -13,9 +13,9 @@ from flows.methods import (
     METHODS,
     THREE_DGS_SHARED,
     MethodName,
+    check_not_pinned,
     method_config,
     profile_label,
-    refuse_pinned,
     three_dgs,
 )
 
@@ -66,10 +66,10 @@ def test_overrides_and_seeds_reach_what_is_open_only() -> None:
 
 
 def test_an_override_of_a_pinned_setting_is_refused_where_both_are_named() -> None:
-    refuse_pinned("3dgs", {"coarse.iterations": 5})
-    refuse_pinned("coarse", {"coarse.light.enabled": False})
+    check_not_pinned("3dgs", {"coarse.iterations": 5})
+    check_not_pinned("coarse", {"coarse.light.enabled": False})
     with pytest.raises(ConfigError, match=r"3dgs sets coarse\.sh_degree itself"):
-        refuse_pinned("3dgs", {"coarse.sh_degree": 1})
+        check_not_pinned("3dgs", {"coarse.sh_degree": 1})
     with pytest.raises(ConfigError, match="no method 'nerf'; known: extrags"):
         method_config("nerf", "quick")
 

@@ -9,7 +9,7 @@ from extrags.errors import DivergedError
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.store import Store
-from tasks.divergence import keeping_last_good
+from tasks.divergence import keep_last_finite_scene
 
 
 def test_the_last_good_scene_is_kept_and_nothing_is_cached(tmp_path: Path) -> None:
@@ -24,7 +24,7 @@ def test_the_last_good_scene_is_kept_and_nothing_is_cached(tmp_path: Path) -> No
     with (
         pytest.raises(DivergedError, match="iteration 7"),
         store.slot(stage="coarse", version=1, key="coarse-v1-test", label="", config={}, inputs={}) as slot,
-        keeping_last_good(slot),
+        keep_last_finite_scene(slot),
     ):
         raise DivergedError("coarse: not finite any more at iteration 7", scene)
     assert store.find("coarse-v1-test") is None

@@ -26,7 +26,7 @@ from extrags.metrics.exposure import align_exposure
 from extrags.metrics.image import mean_of_known, psnr
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.photometric import photometric_values
-from extrags.metrics.protocol import COLOR_LEVELS, SMALLEST_PART
+from extrags.metrics.protocol import COLOR_LEVELS, MIN_REGION_SHARE
 from extrags.metrics.registry import figures, metric_named
 from extrags.restoration.clips import as_images, as_planes, keep_known, render_clips
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
@@ -130,7 +130,7 @@ def held_out_clips(
     recording = np.zeros(len(sequence), int) if sequence.recording is None else sequence.recording
     gains = torch.ones(len(frames))
     if scene.light is not None:
-        gains = scene.light.exposures_of(frames, sequence.train, sequence.recording)
+        gains = scene.light.interpolated_exposures(frames, sequence.train, sequence.recording)
     clips: list[Clip] = []
     borders = np.flatnonzero(np.diff(recording[frames])) + 1
     for run in np.split(np.arange(len(frames)), borders):
@@ -356,7 +356,7 @@ class RestorerBenchmark:
         inside = self.regions["valid"][..., None].to(images.dtype)
         render = (images * COLOR_LEVELS).round() / COLOR_LEVELS * inside
         target = self._truth * inside
-        smallest = SMALLEST_PART * render.shape[1] * render.shape[2]
+        smallest = MIN_REGION_SHARE * render.shape[1] * render.shape[2]
         regions = {
             name: region & (region.sum((1, 2)) >= smallest)[:, None, None]
             for name, region in self.regions.items()

@@ -56,7 +56,7 @@ class RealViews:
                     f"the scene's light has {len(light.log_exposure)} exposures for {len(frames)} frames"
                 )
             gains = light.exposures().detach()[:, None, None, None]
-            signal = light.signal(torch.from_numpy(rgb.astype(np.float32) / 255))
+            signal = light.invert_response(torch.from_numpy(rgb.astype(np.float32) / 255))
             balanced = light.apply_response(signal / gains).detach().clamp(0, 1).numpy()
             rgb = np.rint(balanced * 255).astype(np.uint8)
         return cls(rgb, sequence.cameras.world_from_camera[frames])

@@ -325,7 +325,7 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
         torch.from_numpy(values.astype(np.float32)) for values in (distance, depth / distance, facing)
     )
     falloff = views.transfer.falloff(*seen).numpy()
-    signal = views.transfer.signal(torch.from_numpy(packed[chosen, :3])).numpy()
+    signal = views.transfer.invert_response(torch.from_numpy(packed[chosen, :3])).numpy()
     albedo = signal / np.maximum(falloff, MIN_GAIN)[:, None]
     albedo = albedo / views.exposure.numpy()[view, None]
     # Without a light the fall-off cannot be divided out: the colour stays as it was seen.

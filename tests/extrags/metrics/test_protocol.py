@@ -251,7 +251,7 @@ def test_the_protocol_in_words_is_of_this_version() -> None:
     words = (Path(protocol.__file__).parent / "PROTOCOL.md").read_text()
     assert words.startswith(f"# Evaluation protocol, version {PROTOCOL_VERSION}\n")
     assert f"\n{PROTOCOL_VERSION}. " in words.split("## Versions")[1]
-    assert f"smaller than {protocol.SMALLEST_PART:.1%}".replace("%", " %") in words
+    assert f"smaller than {protocol.MIN_REGION_SHARE:.1%}".replace("%", " %") in words
     assert f"alpha >= {protocol.SURFACE_ALPHA}" in words
     for item in fields(SurfaceErrors):
         assert f"`{item.name}`" in words

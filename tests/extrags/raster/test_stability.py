@@ -52,7 +52,7 @@ class TestFailures:
         monkeypatch.setattr(stability, "AXES", {"flat": only})
 
     def erring(self, monkeypatch: pytest.MonkeyPatch, name: str, change: float) -> None:
-        true = stability._evaluated
+        true = stability._outputs_and_gradients
 
         def wrong(scene: stability.Scene, backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
             found = true(scene, backend, dtype)
@@ -60,7 +60,7 @@ class TestFailures:
                 found[name] = found[name] * change
             return found
 
-        monkeypatch.setattr(stability, "_evaluated", wrong)
+        monkeypatch.setattr(stability, "_outputs_and_gradients", wrong)
 
     @pytest.mark.parametrize(
         ("name", "change", "note"),

@@ -70,7 +70,7 @@ def test_float32_is_near_it() -> None:
 def test_the_cut_into_layers_and_batches_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = on_black(2000, 20, 17, torch.float64)
     whole = rasterize_tiles(arguments(scene), 20, 17)
-    monkeypatch.setattr(torch_tiles, "LAYER", 5)
+    monkeypatch.setattr(torch_tiles, "ENTRIES_PER_LAYER", 5)
     monkeypatch.setattr(torch_tiles, "ELEMENTS_PER_BATCH", 700)
     pieces = rasterize_tiles(arguments(scene), 20, 17)
     torch.testing.assert_close(pieces.rgb, whole.rgb, rtol=1e-12, atol=1e-14)

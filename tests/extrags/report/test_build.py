@@ -199,12 +199,12 @@ def test_nan_in_a_shown_image_is_refused(inputs: ReportInputs) -> None:
 def test_protocol_words_agree_with_the_metrics(page: Page) -> None:
     from extrags.metrics.flip import PIXELS_PER_DEGREE
     from extrags.metrics.image import SSIM_SIGMA_PX, SSIM_WINDOW_PX
-    from extrags.metrics.protocol import PROTOCOL_VERSION, SMALLEST_PART, SURFACE_ALPHA
+    from extrags.metrics.protocol import MIN_REGION_SHARE, PROTOCOL_VERSION, SURFACE_ALPHA
 
     assert f"{PIXELS_PER_DEGREE:.0f} pixels per degree" in page.text
     window = rf"{SSIM_WINDOW_PX} . {SSIM_WINDOW_PX} Gaussian window, . = {SSIM_SIGMA_PX} px"
     assert re.search(window, page.text)
-    assert f"smaller than {100 * SMALLEST_PART:.1f} % of the image" in page.text.replace(
+    assert f"smaller than {100 * MIN_REGION_SHARE:.1f} % of the image" in page.text.replace(
         "\N{NO-BREAK SPACE}", " "
     )
     assert SURFACE_ALPHA == 0.5

@@ -107,7 +107,7 @@ class TestFigures:
         cameras = tube.sequence.cameras[tube.sequence.test]
         light = tube.scene.light
         assert light is not None
-        gain = light.exposures_of(tube.sequence.test, tube.sequence.train)
+        gain = light.interpolated_exposures(tube.sequence.test, tube.sequence.train)
         with torch.no_grad():
             rendered = tube.scene.render(cameras, exposure=gain).rgb.clamp(0, 1)
         rendered = (255 * rendered).round() / 255

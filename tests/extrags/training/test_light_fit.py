@@ -26,7 +26,7 @@ def _gradient() -> np.ndarray:
 @pytest.mark.parametrize("frame", [None, 0, 3])
 def test_row_is_what_the_light_packs(frame: int | None) -> None:
     light = _light()
-    expected = light.of_cameras(light.exposure(frame)[None]).packed()[0].numpy()
+    expected = light.camera_light(light.exposure(frame)[None]).packed()[0].numpy()
     np.testing.assert_allclose(LightFit(light, EVERYTHING).row(frame), expected, rtol=1e-6)
 
 
@@ -35,7 +35,7 @@ def test_gradients_are_those_of_autograd() -> None:
     values = {k: v.requires_grad_() for k, v in light.parameters().items()}
     fit = LightFit(light, EVERYTHING)
     fit.row(3)
-    row = light.of_cameras(light.exposure(3)[None]).packed()[0]
+    row = light.camera_light(light.exposure(3)[None]).packed()[0]
     prior = EVERYTHING.exposure_prior * light.log_exposure.square().mean()
     (row @ torch.from_numpy(gradient) + prior).backward()
     assert fit.prior() == pytest.approx(float(prior.detach()), rel=1e-6)
