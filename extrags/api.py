@@ -1,6 +1,6 @@
-"""What `import extrags` offers, in one list; loaded as a whole when the first of it is used.
+"""The public names of `import extrags`; this module is imported when the first of them is used.
 
-Reading belongs to the catalogue, a layer above the library: no other module of the library imports it.
+Reading belongs to `data_catalog`, a layer above the library: no other module of the library imports it.
 """
 
 from __future__ import annotations

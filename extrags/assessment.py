@@ -1,4 +1,4 @@
-"""What a reconstruction still lacks, and which stages that calls for."""
+"""Assessment of a coarse scene: measures holes and poorly seen surface, and decides which stages run."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ __all__ = ["Decision", "ScenePlan", "assess", "decide", "measure", "probe_views"
 _log = logging.getLogger(__name__)
 
 GOLDEN_ANGLE_RAD = math.pi * (3 - math.sqrt(5))
-"""Successive multiples of the golden angle never line up: the probes' sides spread evenly."""
+"""The golden angle in radians: its successive multiples spread directions evenly over the circle."""
 PROBE_CLEARANCE_SHARE = 0.2
-"""A probe keeps this distance from solid Gaussians, in median depths."""
+"""Smallest distance of a probe camera from solid Gaussians, in median rendered depths."""
 SOLID_OPACITY = 0.5
 PROBES_PER_BATCH = 8
 
 
 class Decision(StageConfig):
-    """One line of the plan."""
+    """The plan's decision on one stage."""
 
     stage: str = Field(description="name of the stage")
     run: bool = Field(description="whether it runs")
@@ -54,10 +54,10 @@ class ScenePlan(StageConfig, Storable):
     decisions: tuple[Decision, ...] = Field(description="one per stage, in the order they run")
 
     def decision(self, stage: str) -> Decision:
-        """The line of a stage.
+        """The decision on a stage.
 
         Raises:
-            ConfigError: when the plan says nothing about it.
+            ConfigError: when the plan holds no decision on it.
         """
         for line in self.decisions:
             if line.stage == stage:
@@ -76,7 +76,7 @@ class ScenePlan(StageConfig, Storable):
         return cls.model_validate_json(path.read_bytes())
 
     def applied_to(self, config: PipelineConfig) -> PipelineConfig:
-        """The settings with the plan's budgets in place."""
+        """A copy of the settings with the plan's budgets as overrides."""
         overrides: dict[str, Any] = {
             f"{line.stage}.{name}": value for line in self.decisions for name, value in line.budget.items()
         }
@@ -84,16 +84,16 @@ class ScenePlan(StageConfig, Storable):
 
 
 def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig | None = None) -> ScenePlan:
-    """`measure` what the scene lacks, and `decide` what to do about it.
+    """Measure the scene (`measure`) and decide which stages run (`decide`).
 
     Args:
         scene: the coarse reconstruction.
         sequence: its frames.
-        config: settings of all stages; `assess` and `explore`, and what the budgets are made from. None
+        config: settings of all stages: `assess` and `explore`, and the stages whose budgets are scaled. None
             takes the defaults.
 
     Returns:
-        The plan, with every number it rests on.
+        The plan, with all measurements.
 
     Raises:
         CaptureError: as `measure`.
@@ -105,20 +105,20 @@ def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig | 
 def measure(
     scene: Scene, sequence: EndoscopicSequence, settings: AssessConfig, coverage: CoverageConfig
 ) -> dict[str, float]:
-    """Measure what the scene lacks in a fan of nearby views.
+    """Measure holes and poorly seen surface in probe views near the training views.
 
-    A pixel of the fan lacks something when it is a hole (alpha too low) or is mostly made of Gaussians
-    that the training views saw from too few directions. Budgets play no part: `decide` turns the numbers
-    into a plan.
+    A pixel of a probe view is lacking when it is a hole (alpha below `hole_alpha`) or when more than half of
+    its alpha comes from Gaussians that the training views saw from fewer than `min_directions` direction
+    bins. Budgets are not used here: `decide` turns the numbers into a plan.
 
     Args:
         scene: the coarse reconstruction.
         sequence: its frames.
-        settings: the fan, and what counts as lacking.
-        coverage: what counts as seen, as the exploration counts it.
+        settings: the probe views, and the thresholds for lacking pixels.
+        coverage: when a Gaussian counts as seen; the same rule as in the exploration.
 
     Returns:
-        Measurements by name; shares are of all pixels of the fan, or of all Gaussians.
+        Measurements by name; shares are of all pixels of the probe views, or of all Gaussians.
 
     Raises:
         CaptureError: when there are no Gaussians, or no training view sees any.
@@ -168,16 +168,16 @@ def measure(
 
 
 def probe_views(scene: Scene, cameras: Cameras, depth_unit_mm: float, config: AssessConfig) -> Cameras:
-    """A fan of views beside the training views: shifted sideways and turned.
+    """Probe cameras next to the training views, shifted sideways and turned.
 
-    Anchors are spread over the recording; round each optical axis the side of the shift advances by the
-    golden angle, and the turn is alternately towards and away from that side. A shift that would
-    bring the probe to the tissue is halved until it does not.
+    Probes start at training views spread over the recording. The direction of the shift advances by the
+    golden angle about the optical axis, and the turn is alternately towards and away from it. A shift that
+    would bring the probe too close to solid Gaussians is halved until it does not.
 
     Args:
-        scene: its solid Gaussians are what a probe must not touch.
+        scene: its solid Gaussians (opacity above `SOLID_OPACITY`) are the obstacles.
         cameras: the training views.
-        depth_unit_mm: median rendered depth.
+        depth_unit_mm: median rendered depth, in world units.
         config: number, shift and turn of the probes.
 
     Returns:
@@ -233,7 +233,7 @@ def _training_view_measurements(scene: Scene, cameras: Cameras, config: AssessCo
 def _lacking_pixels(
     scene: Scene, probes: Cameras, poorly_seen: np.ndarray, config: AssessConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels of the probes are holes, and which others show mostly poorly seen Gaussians."""
+    """Masks [P, H, W] of the probes' holes, and of other pixels made mostly of poorly seen Gaussians."""
     flag = torch.from_numpy(poorly_seen.astype(np.float32))[:, None]
     holes, poor = [], []
     with torch.no_grad():
@@ -246,17 +246,17 @@ def _lacking_pixels(
 
 
 def decide(measurements: Mapping[str, float], config: PipelineConfig) -> ScenePlan:
-    """What the measured share of lacking pixels means for each later stage.
+    """Decide which of the later stages run, and scale their budgets.
 
-    That share decides whether anything is explored, and scales the number of trajectories: the whole
-    budget from `assess.full_budget_share` on.
+    The share of lacking pixels is compared with `assess.min_hole_share`. Above it the number of trajectories
+    grows in proportion, up to the whole budget at `assess.full_budget_share`.
 
     Args:
         measurements: from `measure`.
         config: thresholds in `assess`, and the full budgets of the stages.
 
     Returns:
-        The plan, one line per stage: surface, freespace, explore, enhance, finetune.
+        The plan, one decision per stage: surface, freespace, explore, enhance, finetune.
     """
     decisions = _decisions(measurements["lacking_share"], config)
     return ScenePlan(measurements=dict(measurements), decisions=decisions)

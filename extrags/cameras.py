@@ -28,8 +28,8 @@ __all__ = [
     "unproject_pixels",
 ]
 
-# Quaternions printed with six digits give rotations that are off by about 1e-6; a frame that is
-# off by more than this is not a rotation that lost digits, but something else.
+# Quaternions printed with six digits give rotations that are off by about 1e-6; a larger deviation than
+# this is not rounding, but a matrix that is no rotation.
 ROTATION_TOLERANCE = 1e-2
 
 
@@ -85,12 +85,12 @@ class Cameras:
         return self.world_from_camera[:, :3, 2]
 
     def interpolated(self, steps: int) -> Cameras:
-        """The way along the cameras with views between them, as for a fly-through.
+        """A camera path through these cameras, e.g. for a fly-through.
 
-        Centres move on straight lines, orientations by the shortest rotation; intrinsics change linearly.
+        Centres and intrinsics are interpolated linearly, orientations along the shortest rotation (slerp).
 
         Args:
-            steps: from each camera to the next; 1 gives the cameras themselves.
+            steps: number of steps from each camera to the next; 1 returns the cameras themselves.
 
         Returns:
             `(C - 1) * steps + 1` cameras.
@@ -113,14 +113,14 @@ class Cameras:
         return Cameras(K, poses, self.width, self.height)
 
     def resized(self, width: int, height: int) -> Cameras:
-        """The same views at another resolution (pixel edges stay where they are)."""
+        """The same views at another resolution, in pixels; intrinsics are scaled, image borders stay."""
         K = self.K.copy()
         K[:, 0] *= width / self.width
         K[:, 1] *= height / self.height
         return Cameras(K, self.world_from_camera, width, height)
 
     def at_most_width(self, width: int) -> Cameras:
-        """The same views no wider than so many pixels, the height in proportion."""
+        """The same views, downscaled to this width in pixels if they are wider; the aspect ratio is kept."""
         if self.width <= width:
             return self
         return self.resized(width, max(1, round(self.height * width / self.width)))
@@ -128,26 +128,31 @@ class Cameras:
     def project(
         self, points: Float[np.ndarray, "*p 3"]
     ) -> tuple[Float[np.ndarray, "c *p 2"], Float[np.ndarray, "c *p"]]:
-        """Where every camera sees world points, whatever stands in between.
+        """Project world points into every camera; occlusion is not considered.
 
         Args:
             points: in world coordinates.
 
         Returns:
-            Pixels (u, v), NaN for points that are not in front of the camera, and z-depths. Both float64.
+            Pixels (u, v), NaN for points that are not in front of the camera, and z-depths in world units.
+            Both float64.
         """
         local = np.stack([transform_points(viewmat, points) for viewmat in self.viewmats])
         pixels = np.stack([project_points(part, K) for part, K in zip(local, self.K, strict=True)])
         return pixels, local[..., 2]
 
     def contains(self, pixels: Float[np.ndarray, "*p 2"]) -> Bool[np.ndarray, "*p"]:
-        """Which positions lie in the image; NaN lies nowhere."""
+        """Whether pixel positions (u, v) lie inside the image; false for NaN."""
         u, v = pixels[..., 0], pixels[..., 1]
         return np.asarray((u >= 0) & (u < self.width) & (v >= 0) & (v < self.height))
 
     @staticmethod
     def concatenated(parts: Sequence[Cameras]) -> Cameras:
-        """Join batches of equal image size."""
+        """Concatenate batches along the camera axis.
+
+        Raises:
+            ShapeError: when the image sizes differ.
+        """
         sizes = {(part.width, part.height) for part in parts}
         if len(sizes) != 1:
             raise ShapeError(f"cameras of different image sizes cannot be joined: {sorted(sizes)}")
@@ -162,12 +167,12 @@ class Cameras:
 def as_rotation(
     matrix: Float[np.ndarray, "3 3"], *, frame: object = None, file: object = None
 ) -> Float[np.ndarray, "3 3"]:
-    """The rotation nearest to a matrix that is one up to rounding.
+    """The rotation nearest to a matrix (polar decomposition), if the matrix is a rotation up to rounding.
 
     Args:
-        matrix: what a file calls a rotation.
-        frame: named in the error.
-        file: named in the error.
+        matrix: rotation matrix as read from a file.
+        frame: name of the frame, for the error message.
+        file: name of the file, for the error message.
 
     Raises:
         PoseError: for non-finite entries, a mirrored matrix (det < 0), or one further than
@@ -199,7 +204,7 @@ def as_rotation(
 
 
 def invert_poses(poses: Float[np.ndarray, "*b 4 4"]) -> Float[np.ndarray, "*b 4 4"]:
-    """Inverse of rigid motions, exact for orthonormal rotations."""
+    """Inverses of rigid motions, from the transposed rotation; exact for orthonormal rotations."""
     inverse = np.zeros_like(poses)
     rotation = np.swapaxes(poses[..., :3, :3], -1, -2)
     inverse[..., :3, :3] = rotation
@@ -246,7 +251,7 @@ def look_at(
     forward = forward / length
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-6:
-        # Looking straight along `up`: any direction across will do, but always the same one.
+        # Viewing direction parallel to `up`: any perpendicular axis is valid; take a fixed one.
         right = np.cross(forward, np.eye(3)[int(np.argmin(np.abs(forward)))])
     right = right / np.linalg.norm(right)
     down = np.cross(forward, right)
@@ -256,9 +261,9 @@ def look_at(
 def transform_points(
     motion: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "*p 3"]
 ) -> Float[np.ndarray, "*p 3"]:
-    """Points after a rigid motion.
+    """Apply a rigid motion [4, 4] to points.
 
-    Without BLAS, whose last bits depend on the number of threads and of points.
+    Computed without BLAS, whose rounding depends on the number of threads and of points.
     """
     x, y, z = np.moveaxis(points, -1, 0)
     return np.stack([a * x + b * y + c * z + shift for a, b, c, shift in motion[:3]], axis=-1)

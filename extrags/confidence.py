@@ -1,6 +1,6 @@
-"""How much a restored view counts in the fine-tuning: per image and per pixel.
+"""Confidence of restored views, the weight they have in fine-tuning: per image and per pixel.
 
-Both are computed once, from the coarse scene, and stored.
+Both are computed once, from the coarse scene, and stored with the pseudo-views.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from extrags.metrics.perceptual import perceptual_map
 __all__ = ["PerceptualDifference", "gaussian_iou", "image_confidence", "pixel_confidence"]
 
 LPIPS_SCALE = 0.25
-"""LPIPS at which the confidence reaches 1 - 1/e. Strong local changes have 0.3 to 1."""
+"""LPIPS at which the confidence reaches 1 - 1/e. Strong local changes have an LPIPS of 0.3 to 1."""
 VIEWS_AT_ONCE = 8
 
 
 def gaussian_iou(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"]) -> Float[Tensor, "v"]:
-    r"""Share of the Gaussians seen by a reference view that the virtual view sees too.
+    r"""Share of the Gaussians seen by a reference view that the virtual view also sees.
 
     .. math:: GIOU = |vis(V) \cap vis(ref)| / |vis(ref)|
 
-    Visibility is that of blending weights, so that Gaussians hidden behind a fold do not count.
+    Visibility is taken from blending weights, so occluded Gaussians do not count.
 
     Args:
         virtual: Gaussians seen by each virtual view.
-        reference: Gaussians seen by its reference view.
+        reference: Gaussians seen by the reference view of each.
 
     Returns:
-        In [0, 1]; 0 where the reference sees nothing.
+        Values in [0, 1]; 0 where the reference sees no Gaussian.
 
     Raises:
         ShapeError: when the shapes differ.
@@ -50,7 +50,7 @@ def gaussian_iou(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"]) -
 
 
 def image_confidence(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"]) -> Float[Tensor, "v"]:
-    """U_img = 1 - GIOU: the less a virtual view repeats its reference, the more it counts.
+    """U_img = 1 - GIOU: the less a virtual view overlaps its reference view, the higher its weight.
 
     Args:
         virtual: Gaussians seen by each virtual view.
@@ -66,11 +66,11 @@ def image_confidence(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"
 
 @dataclass(frozen=True)
 class PerceptualDifference:
-    """The measure behind U_pixel: LPIPS where its weights are there, else the weight-free map.
+    """Perceptual difference that U_pixel is computed from: LPIPS, or `perceptual_map` without its weights.
 
     Args:
-        lpips: the metric, or None for the weight-free map.
-        reason: why there is no LPIPS; empty with it.
+        lpips: the metric, or None for `extrags.metrics.perceptual.perceptual_map`, which needs no weights.
+        reason: why LPIPS is not used; empty when it is.
     """
 
     lpips: Lpips | None
@@ -78,13 +78,13 @@ class PerceptualDifference:
 
     @classmethod
     def available(cls, config: EvaluateConfig | None = None) -> PerceptualDifference:
-        """LPIPS when its weights can be found.
+        """LPIPS if its weights can be found, else `perceptual_map`.
 
         Args:
-            config: the network, and the file of its weights where one is named; None takes the defaults.
+            config: the backbone, and optionally the file of its weights; None takes the defaults.
 
         Raises:
-            WeightsError: when a file was named and cannot be used.
+            WeightsError: when the settings name a file that cannot be used.
         """
         config = EvaluateConfig() if config is None else config
         try:
@@ -96,7 +96,7 @@ class PerceptualDifference:
 
     @property
     def name(self) -> str:
-        """For the provenance: `lpips_alex` or `perceptual_map`."""
+        """Name of the measure in the provenance: `lpips_alex` or `perceptual_map`."""
         return "perceptual_map" if self.lpips is None else self.lpips.name
 
 
@@ -105,23 +105,23 @@ def pixel_confidence(
     restored: Float[np.ndarray, "v h w 3"],
     measure: PerceptualDifference,
 ) -> Float[np.ndarray, "v h w"]:
-    r"""U_pixel: how much restoration changed each pixel, perceptually.
+    r"""U_pixel: perceptual difference between rendered and restored image, per pixel.
 
-    LPIPS has no upper bound, a weight must: :math:`1 - e^{-d / 0.25}`. The weight-free map is in [0, 1]
+    LPIPS d is unbounded and is mapped to [0, 1] by :math:`1 - e^{-d / 0.25}`; `perceptual_map` is in [0, 1]
     already.
 
     Args:
-        rendered: coarse renderings in [0, 1].
-        restored: their pseudo-observations in [0, 1].
-        measure: LPIPS or the weight-free map.
+        rendered: renderings of the coarse scene in [0, 1].
+        restored: the restored images in [0, 1].
+        measure: LPIPS or `perceptual_map`.
 
     Returns:
-        In [0, 1].
+        Values in [0, 1].
 
     Raises:
         ShapeError: when the images differ in shape, or are too small for the measure.
 
-    Source: [ExtraGS, eq. 23], see docs/references.md; the bound is our own.
+    Source: [ExtraGS, eq. 23], see docs/references.md; the mapping to [0, 1] is our own.
     """
     if rendered.shape != restored.shape:
         raise ShapeError(f"images {rendered.shape} and {restored.shape} do not fit")

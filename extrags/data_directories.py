@@ -1,8 +1,8 @@
-"""Where data sets and weights are looked for: what the user names, and the user's own directories.
+"""Search paths for data sets and weights: environment variables, then the user's XDG directories.
 
-Nothing is looked for beside the checkout or the working directory.
+Neither the source checkout nor the working directory is searched.
 
-Source: XDG Base Directory Specification 0.8, which also has relative paths in its variables ignored.
+Source: XDG Base Directory Specification 0.8; as it requires, relative paths in its variables are ignored.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ def user_directories() -> list[Path]:
 
 
 def data_roots() -> list[Path]:
-    """Folders that may hold data sets, the first to be looked at first: `$EXTRAGS_DATA`, then the user's."""
+    """Folders searched for data sets, in this order: `$EXTRAGS_DATA`, then the user's directories."""
     chosen = os.environ.get(DATA_VARIABLE)
     named = [Path(chosen).expanduser()] if chosen else []
     return list(dict.fromkeys([*named, *user_directories()]))
 
 
 def weights_roots(kind: str) -> list[Path]:
-    """Folders that may hold weights of a kind, e.g. `lpips`: that subfolder of the user's directories."""
+    """Folders searched for weights of a kind, e.g. `lpips`: that subfolder of the user's directories."""
     return [directory / kind for directory in user_directories()]
 
 

@@ -1,7 +1,8 @@
-"""Every error the library raises on purpose.
+"""All exceptions that the library raises.
 
-One root class; each error is also the builtin kind a caller would expect, so that `except ValueError`
-keeps working. A message names the file, the frame and the field, what was found and what was expected.
+They share one root class, and each also derives from the fitting builtin exception, so that
+`except ValueError` keeps working. A message names the file, the frame and the field, what was found and
+what was expected.
 """
 
 from __future__ import annotations
@@ -27,11 +28,12 @@ __all__ = [
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """`; did you mean A or B?` for a message about a name that is not known; empty where none is near.
+    """`; did you mean A or B?`, to be appended to a message about an unknown name; empty without a match.
 
     Args:
-        name: as it was given.
-        known: names there are. The last part of a dotted one is near: `iterations` to `coarse.iterations`.
+        name: the unknown name.
+        known: valid names. The last part of a dotted name matches, too: `iterations` finds
+            `coarse.iterations`.
     """
     from difflib import get_close_matches
 
@@ -50,15 +52,15 @@ class ShapeError(ExtragsError, ValueError):
 
 
 class NonFiniteError(ExtragsError, ValueError):
-    """A NaN or an infinity where only finite numbers make sense; names the array."""
+    """An array or setting holds NaN or infinity; names the array."""
 
 
 class ConfigError(ExtragsError, ValueError):
-    """A setting that cannot be used, alone or together with others."""
+    """A setting is unknown, out of range, or incompatible with other settings."""
 
 
 class SourceError(ExtragsError, ValueError):
-    """A file of the input is there but wrong.
+    """An input file exists, but its content is invalid.
 
     Args:
         problem: what is wrong and what was expected, as a sentence.
@@ -87,7 +89,7 @@ class SourceError(ExtragsError, ValueError):
         super().__init__(f"{', '.join(where)}: {problem}" if where else problem)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Survive pickling between worker processes with all fields."""
+        """Pickle with all fields, for errors that cross process boundaries."""
         return (
             _rebuild_source_error,
             (type(self), self.problem, self.file, self.frame, self.field),
@@ -108,11 +110,11 @@ class SourceNotFoundError(SourceError, FileNotFoundError):
 
 
 class PoseError(SourceError):
-    """A camera pose that is not a rigid motion, or not where it should be."""
+    """A camera pose is not a rigid motion, or is missing or misplaced."""
 
 
 class CaptureError(ExtragsError, RuntimeError):
-    """The recording itself does not allow the step: too few frames, no parallax, nothing visible."""
+    """The recording is not sufficient for a step: too few frames, no parallax, no visible surface."""
 
 
 class UnknownSequenceError(ExtragsError, KeyError):
@@ -127,7 +129,7 @@ class StoreError(ExtragsError, OSError):
 
 
 class WeightsError(ExtragsError, FileNotFoundError):
-    """Weights of a network are missing or do not fit; says how to get them."""
+    """Weights of a network are missing or belong to another network; says how to get them."""
 
 
 class MissingDependencyError(ExtragsError, ImportError):
@@ -139,7 +141,7 @@ class DivergedError(ExtragsError, ArithmeticError):
 
     Args:
         message: which stage, iteration and parameter group.
-        last_good: the last state that was finite, for debugging; whatever the optimisation works on.
+        last_good: the last finite state of what was optimised, for debugging.
     """
 
     def __init__(self, message: str, last_good: object = None) -> None:

@@ -1,4 +1,4 @@
-"""Held-out views of a scene, rendered once, and what the evaluation protocol says of them."""
+"""Rendering of a scene's held-out views, and their evaluation by the protocol in `extrags.metrics`."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ __all__ = ["evaluate", "evaluate_renders", "render"]
 def render(
     scene: Scene, sequence: EndoscopicSequence, frames: Int[np.ndarray, "v"] | None = None
 ) -> RenderedViews:
-    """Render frames of a sequence as the evaluation protocol wants them.
+    """Render frames of a sequence by the rules of the evaluation protocol.
 
-    Training frames are shown at their own exposure; held-out frames of a recording that was trained on at
-    the exposure interpolated between their neighbours; frames of another recording at the mean.
+    Training frames are rendered at their own exposure; held-out frames of a recording with training frames
+    at the exposure interpolated between these; frames of other recordings at the mean exposure.
 
     Args:
         scene: the scene.
         sequence: posed frames in the scene's world.
-        frames: which of them; None takes the held-out ones.
+        frames: indices of the frames; None takes the held-out ones.
 
     Returns:
-        Colour, alpha and depth of each view.
+        Colour, alpha and expected z-depth of each view, at the size of the sequence.
     """
     frames = np.asarray(sequence.test if frames is None else frames)
     gains = None
@@ -57,17 +57,18 @@ def evaluate_renders(
     true_surface: TrueSurface | None = None,
     measure: PerceptualDifference | None = None,
 ) -> EvaluationResult:
-    """Metrics of rendered held-out views, and of the surface where the true one is known.
+    """Metrics of rendered held-out views, and of the surface where ground truth is known.
 
     Args:
         renders: of the held-out frames, in their order.
-        sequence: with those frames.
+        sequence: the sequence of these frames.
         mesh: the scene's surface (`extrags.metrics.surface.scene_surface`); None where it has none.
-        true_surface: what it is held against; None leaves the surface figures out.
-        measure: LPIPS, or why there is none; None takes it where its weights can be found.
+        true_surface: ground truth of the surface; None omits the surface metrics.
+        measure: LPIPS with its weights, or the reason why there is none; None uses LPIPS if its weights can be
+            found.
 
     Raises:
-        ShapeError: when renders and frames do not fit each other.
+        ShapeError: when renders and frames differ in number or size.
         NonFiniteError: for NaN or infinity in the renders; names the frame.
     """
     measure = PerceptualDifference.available() if measure is None else measure
@@ -92,13 +93,14 @@ def evaluate(
     true_surface: TrueSurface | None = None,
     measure: PerceptualDifference | None = None,
 ) -> EvaluationResult:
-    """`render` the held-out views of a scene, and `evaluate_renders`.
+    """Render the held-out views of a scene and compute their metrics (`render`, `evaluate_renders`).
 
     Args:
         scene: the scene.
-        sequence: posed frames, the held-out ones among them.
-        true_surface: as in `evaluate_renders`.
-        measure: LPIPS, or why there is none; None takes it where its weights can be found.
+        sequence: posed frames, including the held-out ones.
+        true_surface: ground truth of the surface; None omits the surface metrics.
+        measure: LPIPS with its weights, or the reason why there is none; None uses LPIPS if its weights can be
+            found.
 
     Raises:
         ShapeError: when there is no held-out frame.

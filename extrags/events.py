@@ -1,6 +1,6 @@
-"""Typed events that long loops emit.
+"""Typed progress events of long loops.
 
-The library never prints. Loops call an `Emit`; progress bars, logs and Prefect artifacts subscribe.
+The library never prints. Loops call `emit`; progress bars, logs and Prefect artifacts subscribe.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ class Progress:
     total: int
     """Steps in all."""
     values: dict[str, float] = field(default_factory=dict)
-    """What is worth watching: loss, number of Gaussians, ..."""
+    """Further values to display, by name: loss, number of Gaussians, ..."""
 
 
 @dataclass(frozen=True, slots=True)
 class MetricRecorded:
-    """A number measured once."""
+    """A single measured value of a stage."""
 
     stage: str
     name: str
@@ -43,7 +43,7 @@ _subscriber: ContextVar[Emit | None] = ContextVar("extrags_event_subscriber", de
 
 
 def emit(event: Event) -> None:
-    """Hand an event to the current subscriber; without one it is dropped."""
+    """Send an event to the current subscriber; without one it is dropped."""
     subscriber = _subscriber.get()
     if subscriber is not None:
         subscriber(event)

@@ -1,4 +1,4 @@
-"""Where a virtual camera may go: bounding volume, occupancy grid and clearance."""
+"""Free space for virtual cameras: bounding volume, occupancy grid and clearance."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ __all__ = ["FREE", "OCCUPIED", "UNKNOWN", "FreeSpace", "carve", "voxel_visibilit
 _log = logging.getLogger(__name__)
 
 FREE = 0
-"""A training view looks through the voxel onto a surface behind it."""
+"""The voxel is empty: training views see a surface behind it."""
 OCCUPIED = 1
-"""There is, or begins, tissue."""
+"""The voxel holds the tissue surface or lies directly behind it."""
 UNKNOWN = 2
-"""No training view can tell; also everything outside the bounding volume."""
+"""Not observed by any training view; also everything outside the bounding volume."""
 
 LENS_VOXELS = 1.5
-"""Radius of the ball round each training camera that is free because the endoscope was there."""
+"""Radius, in voxels, of the ball around each training camera that is free: the endoscope was there."""
 
 
 @dataclass(frozen=True)
 class FreeSpace(Storable):
-    """Occupancy on S x S x S cubic voxels, and the distance to what is occupied.
+    """Occupancy grid of S x S x S cubic voxels, and the distance to the nearest occupied voxel.
 
     Voxel (i, j, k) has its centre at `origin_mm + ((i, j, k) + 0.5) * voxel_mm @ axes`.
 
@@ -81,7 +81,7 @@ class FreeSpace(Storable):
         return float((self.occupancy == FREE).mean())
 
     def to_grid(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
-        """Continuous voxel coordinates: voxel i covers [i, i + 1)."""
+        """World positions in continuous voxel coordinates: voxel i covers [i, i + 1)."""
         return _to_grid(points, self.origin_mm, self.axes, self.voxel_mm)
 
     def voxel_centers(self) -> Float[np.ndarray, "v 3"]:
@@ -113,10 +113,10 @@ class FreeSpace(Storable):
     def segment_is_free(
         self, a: Float[np.ndarray, "*b 3"], b: Float[np.ndarray, "*b 3"]
     ) -> Bool[np.ndarray, "*b"]:
-        """True where every voxel that the straight segment from `a` to `b` passes is free.
+        """True where all voxels that the straight segment from `a` to `b` traverses are free.
 
-        Exact: the segment is cut wherever it crosses a plane between voxels, and each piece is looked
-        up (Amanatides and Woo 1987, with all segments at once instead of stepping along one).
+        Exact voxel traversal: the segment is split at every plane between voxels, and each piece is looked
+        up (after Amanatides and Woo 1987, vectorised over all segments).
         """
         start, end = np.broadcast_arrays(self.to_grid(a), self.to_grid(b))
         shape = start.shape[:-1]
@@ -129,7 +129,7 @@ class FreeSpace(Storable):
         position = low[:, :, None] + np.arange(planes)
         with np.errstate(divide="ignore", invalid="ignore"):
             t = (position - start[:, :, None]) / delta[:, :, None]
-        # Planes that are not crossed collapse onto the end of the segment.
+        # Planes that are not crossed are clamped to the end of the segment.
         t = np.where(np.isfinite(t), np.clip(t, 0.0, 1.0), 1.0).reshape(len(start), -1)
         ends = np.zeros((len(start), 1)), np.ones((len(start), 1))
         t = np.sort(np.concatenate([ends[0], t, ends[1]], axis=1), axis=1)
@@ -139,7 +139,7 @@ class FreeSpace(Storable):
         return np.asarray(free.all(axis=1).reshape(shape))
 
     def save(self, path: Path) -> None:
-        """Write a zarr v3 group; the grid's frame goes into the attributes."""
+        """Write a zarr v3 group; origin, axes and voxel size are its attributes."""
         group = open_group(path, mode="w")
         write_array(group, "occupancy", self.occupancy)
         write_array(group, "clearance", self.clearance)
@@ -174,13 +174,13 @@ class FreeSpace(Storable):
 
 
 def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | None = None) -> FreeSpace:
-    """Occupancy and clearance from what the training views see through.
+    """Occupancy and clearance by space carving with rendered transmittance.
 
     The visibility of a voxel is the mean of its `top_views` largest transmittances over the training
-    views that can tell: those that have it in the image, on a ray that ends on a surface. Above
-    `occupied_below` the voxel is free. Below, it is occupied when it lies at the mesh and unknown
-    when it lies deeper (hidden behind a fold is not the same as solid). Voxels that the mesh passes
-    are occupied, those at a training camera free.
+    views that observe it: those with the voxel in the image, on a ray that ends on a surface. From
+    `occupied_below` on the voxel is free. Below, it is occupied within `wall_voxels` of the mesh and unknown
+    farther away (an occluded voxel need not be solid). Voxels that the mesh intersects are occupied, those
+    at a training camera free.
 
     Args:
         scene: the reconstructed scene.
@@ -213,8 +213,8 @@ def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | 
     occupancy[visibility >= config.occupied_below] = FREE
     hidden = np.isnan(visibility) | (visibility < config.occupied_below)
     occupancy[hidden & (from_surface <= config.wall_voxels)] = OCCUPIED
-    # The cube is only as large as it must be along the longest axis; along the others the bounding
-    # volume ends earlier.
+    # The grid is a cube with the longest side of the bounding volume; along the other axes the volume ends
+    # before the cube does.
     index = np.arange(size) + 0.5
     inside = [np.abs(index - size / 2) <= extent / 2 for extent in extent_voxels]
     outside = ~(inside[0][:, None, None] & inside[1][None, :, None] & inside[2][None, None, :])
@@ -223,7 +223,7 @@ def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | 
     lens = _to_grid(cameras.centers, origin_mm, axes, voxel_mm)
     occupancy[_ball_mask(lens, size, LENS_VOXELS)] = FREE
     occupancy[surface] = OCCUPIED
-    # Without padding a camera may lie on the volume's very face.
+    # Without padding a camera may lie exactly on a face of the volume.
     at_lens = np.clip(np.floor(lens).astype(np.int64), 0, size - 1)
     occupancy[at_lens[:, 0], at_lens[:, 1], at_lens[:, 2]] = FREE
 
@@ -231,7 +231,7 @@ def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | 
         raise CaptureError("no voxel of the scene is free; the views see no surface at a distance")
     occupied = occupancy == OCCUPIED
     if occupied.any():
-        # From centre to centre; the occupied voxel itself begins half a voxel earlier.
+        # The transform measures between voxel centres; the face of the occupied voxel is half a voxel nearer.
         distance = np.maximum(np.asarray(distance_transform_edt(~occupied)) - 0.5, 0.0) * voxel_mm
     else:
         distance = np.full(occupancy.shape, size * voxel_mm)
@@ -243,7 +243,7 @@ def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | 
 def voxel_visibility(
     scene: Scene, cameras: Cameras, points: Float[np.ndarray, "q 3"], config: FreespaceConfig
 ) -> Float[np.ndarray, "q"]:
-    """Mean of the largest transmittances with which the views see each point.
+    """Mean of the `top_views` largest transmittances between each point and the views.
 
     Args:
         scene: the reconstructed scene.
@@ -252,11 +252,11 @@ def voxel_visibility(
         config: `top_views`, `min_alpha`, `render_width`.
 
     Returns:
-        A value in [0, 1]; NaN where no view can tell. Fewer views than `top_views` are averaged over
-        as many as there are, so that a single recording's ends do not count as occupied.
+        A value in [0, 1]; NaN where no view observes the point. With fewer than `top_views` such views the
+        mean is over those there are, so that the ends of a recording do not count as occupied.
     """
     cameras = cameras.at_most_width(config.render_width)
-    # Running top-k: -1 marks "not seen by so many views".
+    # Running top-k over the views; -1 marks ranks that no view fills.
     best = np.full((config.top_views, len(points)), -1.0, dtype=np.float32)
     with torch.no_grad():
         for index in range(len(cameras)):
@@ -283,12 +283,12 @@ def voxel_visibility(
 def _bounding_volume(
     mesh: Mesh, cameras: Cameras, config: FreespaceConfig
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float, Float[np.ndarray, "3"]]:
-    """Origin, axes, voxel edge and extent in voxels of the padded box round mesh and cameras."""
+    """Origin, axes, voxel size and extent in voxels of the padded bounding box of mesh and cameras."""
     points = np.concatenate([mesh.vertices.astype(np.float64), cameras.centers])
     centered = points - points.mean(axis=0)
     _, axes = np.linalg.eigh(np.einsum("ni,nj->ij", centered, centered))
     axes = axes.T[::-1]
-    # Eigenvectors have no sign of their own: the largest component points along its world axis.
+    # The sign of an eigenvector is arbitrary: make its largest component positive.
     largest = np.abs(axes).argmax(axis=1)
     axes = axes * np.sign(axes[np.arange(3), largest])[:, None]
     axes[2] = np.cross(axes[0], axes[1])
@@ -315,7 +315,7 @@ def _to_grid(
 def _rotated(
     points: Float[np.ndarray, "*b 3"], matrix: Float[np.ndarray, "3 3"]
 ) -> Float[np.ndarray, "*b 3"]:
-    """`points @ matrix.T`, without BLAS, whose last bits depend on the number of threads."""
+    """`points @ matrix.T` without BLAS, whose rounding depends on the number of threads."""
     x, y, z = points[..., :1], points[..., 1:2], points[..., 2:]
     return np.asarray(x * matrix[:, 0] + y * matrix[:, 1] + z * matrix[:, 2])
 
@@ -334,7 +334,7 @@ def _voxels_of_mesh(
     voxel_mm: float,
     size: int,
 ) -> Bool[np.ndarray, "s s s"]:
-    """Voxels that a triangle passes, from samples at most half a voxel apart."""
+    """Voxels that a triangle intersects, from samples at most half a voxel apart."""
     corners = _to_grid(mesh.vertices.astype(np.float64), origin_mm, axes, voxel_mm)[mesh.triangles]
     marked = np.zeros((size, size, size), dtype=bool)
     if len(corners) == 0:

@@ -1,4 +1,4 @@
-"""3D Gaussians: the packed parameters, PLY in and out, and their form in zarr."""
+"""3D Gaussians: their parameters, reading and writing of 3DGS PLY files, and storage in zarr."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Gaussians:
 
     @property
     def n_gaussians(self) -> int:
-        """How many Gaussians there are."""
+        """Number of Gaussians, N."""
         return len(self)
 
     @property
@@ -78,7 +78,7 @@ class Gaussians:
         return torch.cat([self.sh0, self.shN], dim=1)
 
     def parameters(self) -> dict[str, Tensor]:
-        """The arrays by name."""
+        """The parameter tensors by name."""
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
     def detached(self) -> Gaussians:
@@ -86,12 +86,12 @@ class Gaussians:
         return Gaussians(**{k: v.detach().clone() for k, v in self.parameters().items()})
 
     def subset(self, index: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> Gaussians:
-        """Chosen Gaussians."""
+        """The Gaussians of an index or a mask."""
         return Gaussians(**{k: v[index] for k, v in self.parameters().items()})
 
     @staticmethod
     def concatenated(first: Gaussians, second: Gaussians) -> Gaussians:
-        """Both sets, `first` in front."""
+        """Both sets, `first` before `second`."""
         other = second.parameters()
         return Gaussians(**{k: torch.cat([v, other[k]]) for k, v in first.parameters().items()})
 
@@ -107,15 +107,15 @@ class Gaussians:
         normals: Float[np.ndarray, "n 3"] | None = None,
         thickness: float = 1.0,
     ) -> Gaussians:
-        """Gaussians at points: round ones, or discs on the surface.
+        """Initialise Gaussians at points: isotropic, or flat discs on the surface where normals are given.
 
         Args:
             points: centres in world units.
-            rgb: colours in [0, 1].
+            rgb: colours in [0, 1]; they set the SH coefficients of degree 0.
             radius: standard deviation of each, in world units.
             opacity: the same for all, in (0, 1).
-            sh_degree: higher coefficients are zero.
-            normals: unit normals of the surface; their sign does not matter. None makes round ones.
+            sh_degree: degree of the SH coefficients; those above degree 0 are zero.
+            normals: unit normals of the surface, of either sign; None makes isotropic Gaussians.
             thickness: standard deviation along the normal, as a share of the radius.
         """
         n = len(points)
@@ -147,10 +147,10 @@ class Gaussians:
         return cls(**{f.name: torch.from_numpy(read_array(group, f.name)) for f in fields(cls)})
 
     def write_ply(self, path: Path) -> None:
-        """Write the standard 3DGS PLY (opens in SuperSplat and brush).
+        """Write the PLY format of 3DGS (opens in SuperSplat and brush).
 
-        Colours go out as they are stored: with a near-field light they are albedo, so bake the
-        light first when a plain viewer shall show what the endoscope saw.
+        Colours are written as stored. In a scene with near-field light they are albedo, so a viewer does not
+        show the brightness of the recording unless the light was baked into the colours before.
         """
         from plyfile import PlyData, PlyElement
 
@@ -163,7 +163,7 @@ class Gaussians:
             columns[name] = np.zeros(n, np.float32)
         for axis in range(3):
             columns[f"f_dc_{axis}"] = self.sh0.detach().numpy()[:, 0, axis]
-        # 3DGS stores the higher coefficients colour by colour.
+        # 3DGS stores the higher coefficients channel by channel.
         rest = self.shN.detach().numpy().transpose(0, 2, 1).reshape(n, -1)
         for k in range(rest.shape[1]):
             columns[f"f_rest_{k}"] = rest[:, k]
@@ -226,7 +226,7 @@ class Gaussians:
 
 
 def _quaternions_from_normals(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
-    """Quaternions (w, x, y, z) of the shortest turns that bring the z axis onto the normals."""
+    """Quaternions (w, x, y, z) of the shortest rotations from the z axis to the normals."""
     facing = np.where(normals[:, 2:] < 0, -normals, normals)
     half = np.stack([1 + facing[:, 2], -facing[:, 1], facing[:, 0], np.zeros(len(facing))], axis=1)
     return np.asarray(half / np.linalg.norm(half, axis=1, keepdims=True))

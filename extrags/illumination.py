@@ -1,8 +1,9 @@
-"""The light that rides on the camera, and the camera's response, as a scene learns them (design section 6).
+"""Near-field light at the camera, and the camera's response, as learned parameters of a scene.
 
-The formula, its gauge and its kernels are those of `extrags.raster.light`; here live the learned numbers:
-a handful for the whole scene and one exposure per training frame. The mean of the log-exposures is held at
-zero, and everything that could trade brightness against albedo is one at the reference distance, on the axis.
+The model and its kernels are those of `extrags.raster.light`; this module holds the parameters: a few for the
+whole scene and one exposure per training frame. Brightness and albedo are ambiguous up to a factor. Two
+conventions fix it: the mean of the log-exposures is zero, and the gain of the light is one at the reference
+distance on the optical axis.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ INITIAL_LOG_SOFTENING = -1.5
 INITIAL_SPREAD = 0.5
 INITIAL_COSINE = 0.5
 INITIAL_LOG_SHOULDER = 0.0
-"""Where learning starts: a lamp a little wide, walls a little Lambertian, a soft shoulder."""
+"""Initial values of the parameters: moderate angular spread, partly Lambertian surfaces, a soft shoulder."""
 
 
 @dataclass(frozen=True)
@@ -42,14 +43,14 @@ class NearFieldLight:
     """Global light parameters and the exposure of each training frame.
 
     Args:
-        log_softening: log of c, scalar.
-        log_exponent: log of e, scalar.
-        log_exposure: log of g_f for each training frame, [F_train]; mean zero.
-        reference_distance: in world units.
-        spread: k, scalar.
-        cosine: q, scalar.
-        offset: of the lamp from the lens, in the camera frame, in reference distances, [3].
-        log_shoulder: log of s, scalar; minus infinity is a straight response.
+        log_softening: logarithm of the softening c of the fall-off, scalar.
+        log_exponent: logarithm of the fall-off exponent e, scalar.
+        log_exposure: logarithm of the gain g_f of each training frame, [F_train]; mean zero.
+        reference_distance: distance at which the gain of the light is one, in world units.
+        spread: exponent k of the light's angular spread, scalar.
+        cosine: exponent q of the cosine law at the surface, scalar.
+        offset: position of the light in the camera frame, in reference distances, [3].
+        log_shoulder: logarithm of the response's shoulder s, scalar; minus infinity is a linear response.
     """
 
     log_softening: Float[Tensor, ""]
@@ -68,12 +69,12 @@ class NearFieldLight:
         reference_distance: float,
         config: LightConfig | None = None,
     ) -> NearFieldLight:
-        """The starting light: a softened power of the distance, equal exposures.
+        """Initial parameters: a softened power law of the distance, equal exposures.
 
         Args:
             n_frames: number of training frames.
-            reference_distance: the gauge, in world units.
-            config: which parts the model has; the others start, and stay, without effect.
+            reference_distance: distance at which the gain of the light is one, in world units.
+            config: which terms the model has; the parameters of the others keep values without effect.
         """
         config = LightConfig() if config is None else config
         return cls(
@@ -87,7 +88,7 @@ class NearFieldLight:
         )
 
     def camera_light(self, exposure: Float[Tensor, "c"]) -> CameraLight:
-        """The light as C cameras carry it, at given exposures."""
+        """The light of C cameras with given exposure gains, as `rasterize` takes it."""
         return CameraLight(
             exposure[:, None].expand(-1, 3),
             self.log_softening.exp(),
@@ -100,13 +101,13 @@ class NearFieldLight:
         )
 
     def exposure(self, frame: int | None) -> Float[Tensor, ""]:
-        """Gain of a training frame; None gives the mean exposure (held-out and virtual views)."""
+        """Exposure gain of a training frame; None gives the mean exposure, which is 1."""
         if frame is None:
             return torch.ones(())
         return (self.log_exposure[frame] - self.log_exposure.mean()).exp()
 
     def exposures(self) -> Float[Tensor, "f"]:
-        """Gains of all training frames."""
+        """Exposure gains of all training frames, [F_train]."""
         return (self.log_exposure - self.log_exposure.mean()).exp()
 
     def interpolated_exposures(
@@ -115,16 +116,16 @@ class NearFieldLight:
         train: Int[np.ndarray, "f"],
         recording: Int[np.ndarray, "n"] | None = None,
     ) -> Float[Tensor, "m"]:
-        """Gains for frames that were not trained on, by a rule that looks at none of their pixels.
+        """Exposure gains of arbitrary frames, interpolated between training frames; no pixel is used.
 
-        A camera's automatic exposure moves slowly: between training frames of the same recording the
-        log-exposure is interpolated over the frame number, beyond the first and the last it stays theirs.
-        A recording without training frames gets the mean exposure.
+        Automatic exposure changes slowly. Between training frames of the same recording the log-exposure is
+        interpolated linearly over the frame index; before the first and after the last it is constant.
+        Frames of a recording without training frames get the mean exposure.
 
         Args:
-            frames: their numbers in the sequence.
-            train: numbers of the training frames, in the order of `log_exposure`.
-            recording: of every frame of the sequence; None is one recording.
+            frames: indices of the frames in the sequence.
+            train: indices of the training frames, in the order of `log_exposure`.
+            recording: recording of every frame of the sequence; None for a single recording.
         """
         owner = (
             np.zeros(int(max(frames.max(initial=0), train.max())) + 1, int)
@@ -145,13 +146,13 @@ class NearFieldLight:
         axis_cosine: Float[Tensor, "*b"] | None = None,
         facing_cosine: Float[Tensor, "*b"] | None = None,
     ) -> Float[Tensor, "*b"]:
-        """The factor on the albedo of surfaces under a lamp at the lens.
+        """Gain of a light at the optical centre (`offset` is ignored), at unit exposure.
 
         Args:
-            distance: from the lens, in world units.
+            distance: from the optical centre, in world units.
             axis_cosine: cosine between the ray and the optical axis; None is on the axis.
-            facing_cosine: cosine between the ray and the surface's normal, of either sign; None takes all
-                surfaces to face the lens.
+            facing_cosine: cosine between the ray and the surface normal, of either sign; None assumes
+                fronto-parallel surfaces.
         """
         softening = self.log_softening.exp()
         relative = (distance / self.reference_distance) ** 2
@@ -166,20 +167,20 @@ class NearFieldLight:
     def gain(
         self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None = None
     ) -> Float[Tensor, "*b"]:
-        """The factor on the albedo of points in the camera frame, at unit exposure.
+        """Gain of the light at points, by which albedo is multiplied at unit exposure.
 
         Args:
             points: in the camera frame, in world units.
-            normals: there; None takes every surface to face the lamp.
+            normals: unit surface normals in the camera frame; None assumes surfaces that face the light.
         """
         return light_gain(points, normals, self._row(points))
 
     def invert_response(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """What reached the sensor, from image values in [0, 1]: the response undone."""
+        """Sensor signal of image values in [0, 1]: the inverse of the camera response."""
         return invert_response(rgb, self.log_shoulder.exp().to(rgb))
 
     def apply_response(self, signal: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-        """Image values of what reaches the sensor."""
+        """Image values of a sensor signal: the camera response."""
         return apply_response(signal, self.log_shoulder.exp().to(signal))
 
     def albedo(
@@ -190,13 +191,13 @@ class NearFieldLight:
         *,
         min_gain: float = 1e-3,
     ) -> Float[Tensor, "n 3"]:
-        """Colours with light and response divided out.
+        """Albedo from image values: the response is inverted and the gain of the light divided out.
 
         Args:
             rgb: image values in [0, 1], at unit exposure.
-            points: where they were seen, in the camera frame, in world units.
-            normals: there; None takes every surface to face the lamp.
-            min_gain: darker places are treated as if they received this much: noise is not albedo.
+            points: the surface points they show, in the camera frame, in world units.
+            normals: unit surface normals in the camera frame; None assumes surfaces that face the light.
+            min_gain: lower bound of the gain, so that noise in dark regions is not amplified.
         """
         return self.invert_response(rgb) / self.gain(points, normals).clamp_min(min_gain)[:, None]
 
@@ -204,7 +205,7 @@ class NearFieldLight:
         return self.camera_light(torch.ones(1)).packed()[0].to(like)
 
     def parameters(self) -> dict[str, Tensor]:
-        """What is learned, by name."""
+        """The learned tensors by name."""
         return {
             "log_softening": self.log_softening,
             "log_exponent": self.log_exponent,

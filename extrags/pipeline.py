@@ -1,10 +1,10 @@
-"""The stages of a sequence: their order, which of them run, and the whole job as plain calls.
+"""The stages of a sequence: their order, which of them run, and the whole pipeline as plain calls.
 
-`Pipeline` is the one place that knows the order of the stages and the rules by which one is skipped. It is
-subclassed twice: `InMemoryPipeline`, behind `run_pipeline`, makes each stage's product by calling the library
-and keeps it in memory; `flows.wiring.SequenceRun` makes the same products as cached tasks, by the same
-functions of the library. (Figures of the surface need the true one: tasks take it from the catalogue, which
-the library does not know; `run_pipeline` is given it.)
+`Pipeline` alone defines the order of the stages and the rules by which one is skipped. It has two subclasses:
+`InMemoryPipeline`, behind `run_pipeline`, calls the library and keeps the results in memory;
+`flows.wiring.SequenceRun` computes the same results as cached tasks, with the same functions of the library.
+(Surface metrics need the true surface: tasks get it from the catalogue, which the library does not import;
+`run_pipeline` takes it as an argument.)
 
 This module loads nothing heavy by itself, so that flows and the command line can read the list of stages.
 """
@@ -68,14 +68,14 @@ NEEDS: dict[StageName, StageName] = {"freespace": "surface", "explore": "freespa
 class Pipeline(ABC):
     """The stages of one sequence in their order, and the rules by which one is skipped.
 
-    A subclass makes each stage's product in a method of the stage's name, and answers what the rules ask.
+    A subclass implements each stage in a method of the stage's name, and the properties the rules depend on.
 
     Args:
-        config: settings of all stages; the plan's budgets are put into them after `assess`.
-        leave_out: stages to leave out whatever the plan says, with the reason.
+        config: settings of all stages; the plan's budgets are applied to them after `assess`.
+        leave_out: stages to skip regardless of the plan, with the reason.
 
     Raises:
-        ConfigError: for a stage that does not exist, or that everything rests on.
+        ConfigError: for a stage that does not exist, or that cannot be left out.
     """
 
     def __init__(self, config: PipelineConfig, leave_out: Mapping[str, str] | None = None) -> None:
@@ -89,7 +89,7 @@ class Pipeline(ABC):
                 raise ConfigError(f"the stage {stage} cannot be left out: everything rests on it")
 
     def run_stages(self, until: StageName = "report") -> None:
-        """Take the sequence through all stages up to one.
+        """Run all stages up to and including one.
 
         Raises:
             ConfigError: for a stage that does not exist.
@@ -106,12 +106,12 @@ class Pipeline(ABC):
                 self.config = self.plan.applied_to(self.config)
 
     def reason_to_skip(self, stage: StageName) -> str | None:
-        """Why a stage is not run, or None; asked when its turn has come."""
+        """Why a stage is skipped, or None if it runs; called after the stages before it have run."""
         if stage in self.leave_out:
             return self.leave_out[stage]
         planned = self.planned(stage)
-        # Who leaves stages out compares methods: the others then run whatever the plan would save, so that
-        # all methods are compared on the same terms.
+        # Stages are left out to compare methods. The remaining stages then run regardless of the plan, so
+        # that all methods are compared under the same conditions.
         if planned is not None and not planned.run and not self.leave_out:
             return planned.reason
         # Fine-tuning without `enhance` among the stages is a control on real views alone.
@@ -128,13 +128,13 @@ class Pipeline(ABC):
         return None
 
     def planned(self, stage: str) -> Decision | None:
-        """The plan's line on a stage; None for stages that are not planned."""
+        """The plan's decision on a stage; None for stages that are not planned."""
         lines = () if self.plan is None else self.plan.decisions
         return next((line for line in lines if line.stage == stage), None)
 
     @abstractmethod
     def skip(self, stage: StageName, reason: str) -> None:
-        """Take note of a stage that is skipped."""
+        """Record that a stage is skipped."""
 
     @abstractmethod
     def has_poses(self) -> bool:
@@ -190,14 +190,14 @@ class Pipeline(ABC):
 
     @abstractmethod
     def report(self) -> None:
-        """Write the page of the run."""
+        """Write the HTML report of the run."""
 
 
 def check_stage(stage: str) -> None:
-    """Refuse a name that is no stage.
+    """Check the name of a stage.
 
     Raises:
-        ConfigError: names the stages there are.
+        ConfigError: for an unknown stage; lists the valid names.
     """
     if stage not in STAGES:
         raise ConfigError(f"no stage {stage!r}; known: {', '.join(STAGES)}")
@@ -205,19 +205,19 @@ def check_stage(stage: str) -> None:
 
 @dataclass
 class Result:
-    """What `run_pipeline` made of a sequence; None for what was skipped.
+    """Results of `run_pipeline` for a sequence; None for the results of skipped stages.
 
     Args:
         sequence: all frames, with the poses the scene belongs to.
         reconstruction: the coarse scene and its training history.
-        plan: what the scene lacked, and which stages that called for.
-        mesh: the surface.
-        freespace: where virtual cameras may go.
+        plan: measurements of the coarse scene, and the decisions on later stages.
+        mesh: the surface mesh.
+        freespace: occupancy and clearance for virtual cameras.
         exploration: the virtual trajectories.
         pseudo_views: restored virtual views.
         finetuning: the fine-tuned scene and its training history.
-        renders: held-out views of `coarse` and, where it was fine-tuned, of `final`.
-        evaluations: figures of `coarse` and `final`; without fine-tuning both are the coarse scene's.
+        renders: held-out views of `coarse` and, if it was fine-tuned, of `final`.
+        evaluations: metrics of `coarse` and `final`; without fine-tuning both are the coarse scene's.
         skipped: why stages were skipped, by name.
         seconds: wall-clock time by stage.
     """
@@ -240,7 +240,7 @@ class Result:
         """The coarse scene.
 
         Raises:
-            CaptureError: when the run ended before it was reconstructed.
+            CaptureError: when the run ended before the stage `coarse`.
         """
         if self.reconstruction is None:
             raise CaptureError(f"{self.sequence.name}: the run ended before the scene was reconstructed")
@@ -248,7 +248,7 @@ class Result:
 
     @property
     def scene(self) -> Scene:
-        """The final scene: fine-tuned, or the coarse one where nothing was fine-tuned.
+        """The final scene: the fine-tuned one, or the coarse one if fine-tuning was skipped.
 
         Raises:
             CaptureError: as `coarse`.
@@ -257,13 +257,13 @@ class Result:
 
 
 class InMemoryPipeline(Pipeline):
-    """The stages as plain calls of the library; their products are kept in `result`.
+    """The stages as plain calls of the library; their results are kept in `result`.
 
     Args:
-        sequence: the frames, as `data_catalog.read` gives them.
+        sequence: the frames, from `data_catalog.read`.
         config: settings of all stages.
         leave_out: see `Pipeline`.
-        true_surface: what the evaluation holds the surface against; None leaves its figures out.
+        true_surface: ground truth of the surface for the evaluation; None omits the surface metrics.
     """
 
     def __init__(
@@ -278,10 +278,10 @@ class InMemoryPipeline(Pipeline):
         self.result = Result(sequence)
         self.true_surface = true_surface
         self._training = sequence
-        """What the reconstruction may see: from `coarse` on, the training frames alone."""
+        """The frames that the reconstruction uses: from `coarse` on, the training frames alone."""
 
     def skip(self, stage: StageName, reason: str) -> None:
-        """Write the reason down."""
+        """Record and log the reason."""
         log.info("%s: %s skipped: %s", self.result.sequence.name, stage, reason)
         self.result.skipped[stage] = reason
 
@@ -301,7 +301,7 @@ class InMemoryPipeline(Pipeline):
         """The sequence was read by the caller."""
 
     def poses(self) -> None:
-        """`extrags.poses.estimate_poses`; frames that do not register are left out."""
+        """`extrags.poses.estimate_poses`; frames that cannot be registered are dropped."""
         from extrags.poses import estimate_poses, with_estimated_poses
 
         with self._timed("poses"):
@@ -318,7 +318,7 @@ class InMemoryPipeline(Pipeline):
             self._training = self.result.sequence.training_part()
             found = reconstruct(self._training, self.config.coarse)
             if found.refined is not None:
-                # The scene belongs to the corrected poses: all that follows takes those.
+                # The scene was optimised with the corrected poses: later stages need them.
                 refined = with_refined_poses(self.result.sequence, found.refined.world_from_camera)
                 self.result.sequence, self._training = refined, refined.training_part()
             self.result.reconstruction = found
@@ -410,7 +410,7 @@ class InMemoryPipeline(Pipeline):
         self.result.evaluations.setdefault("final", self.result.evaluations["coarse"])
 
     def report(self) -> None:
-        """The page of a run belongs to its artefacts; a `Result` has none."""
+        """Nothing: the HTML report is built from artefacts, which a run in memory does not have."""
 
     def _perceptual_difference(self) -> PerceptualDifference:
         from extrags.confidence import PerceptualDifference
@@ -445,24 +445,24 @@ def run_pipeline(
 ) -> Result:
     """Reconstruct, explore, restore, fine-tune and evaluate a sequence, in memory.
 
-    Nothing is cached; `extrags run` and the flows make the same products as cached artefacts. Progress goes
-    to `extrags.events.subscribed`.
+    Nothing is cached; `extrags run` and the flows compute the same results as cached artefacts. Progress
+    events go to the subscriber of `extrags.events.subscribed`.
 
     Args:
-        sequence: the frames, as `extrags.read` gives them.
+        sequence: the frames, from `extrags.read`.
         config: settings of all stages, e.g. `extrags.PROFILES["quick"]`; None takes the defaults.
         until: last stage to run.
-        leave_out: stages to leave out whatever the plan says, with the reason.
-        true_surface: what the surface is held against (`data_catalog.true_surface`); None leaves it out.
+        leave_out: stages to skip regardless of the plan, with the reason.
+        true_surface: ground truth of the surface (`data_catalog.true_surface`); None omits its metrics.
 
     Returns:
-        Everything that was made.
+        The results of all stages that ran.
 
     Raises:
-        CaptureError: when the frames do not suffice.
-        DivergedError: when an optimisation does not stay finite.
-        WeightsError: when a model that the settings name is not there.
-        ConfigError: when settings do not fit each other.
+        CaptureError: when the frames are not sufficient for a reconstruction.
+        DivergedError: when an optimisation produces NaN or infinity.
+        WeightsError: when a model that the settings name does not exist.
+        ConfigError: when settings are incompatible with each other.
     """
     pipeline = InMemoryPipeline(
         sequence, PipelineConfig() if config is None else config, leave_out, true_surface=true_surface

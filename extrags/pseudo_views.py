@@ -1,4 +1,4 @@
-"""Pseudo-observations: restored virtual views with what is known about them, and their form in zarr."""
+"""Pseudo-observations: restored virtual views with their confidences, and their storage in zarr."""
 
 from __future__ import annotations
 
@@ -31,20 +31,19 @@ class PseudoViews(Storable):
     Args:
         cameras: the virtual views, [V].
         rendered: what the coarse scene shows, in [0, 1], [V, H, W, 3].
-        restored: what the enhancer made of it, in [0, 1], [V, H, W, 3].
-        target: `u * restored + (1 - u) * rendered` with the feathered uncertainty u: known texture is
-            kept, [V, H, W, 3].
+        restored: output of the restorer, in [0, 1], [V, H, W, 3].
+        target: `u * restored + (1 - u) * rendered` with the feathered uncertainty u, which keeps rendered
+            texture where the scene is certain, [V, H, W, 3].
         alpha: opacity of the rendering, [V, H, W].
-        depth_mm: rendered z-depth, completed smoothly where `alpha` is low (there it is a guess), in
-            world units, [V, H, W].
-        uncertainty: 1 where the scene knows nothing about the pixel, [V, H, W].
+        depth_mm: rendered z-depth, smoothly extrapolated where `alpha` is low, in world units, [V, H, W].
+        uncertainty: in [0, 1]; 1 where the scene has no information on the pixel, [V, H, W].
         pixel_confidence: U_pixel, weight of the colour term of each pixel in [0, 1], [V, H, W].
         image_confidence: U_img, weight of each view in [0, 1], [V].
-        reference: position among the training frames of the one that sees most of the same surface, [V].
+        reference: position, among the training frames, of the frame with the largest overlap, [V].
         clip: index of the clip each view belongs to, [V].
-        provenance: backend, steps, seed, perceptual measure, ...; ready for JSON.
-        expected_error: absolute error of a restored pixel, mean of its channels, as the enhancer expects it;
-            None where it has no idea of it, [V, H, W].
+        provenance: backend, steps, seed, perceptual measure, ...; JSON types.
+        expected_error: absolute error of a restored pixel, mean over its channels, as predicted by the
+            restorer; None for restorers that predict none, [V, H, W].
 
     Raises:
         ShapeError: when the arrays do not fit each other.
@@ -90,10 +89,10 @@ class PseudoViews(Storable):
 
     @staticmethod
     def concatenated(parts: Sequence[PseudoViews]) -> PseudoViews:
-        """Join batches of clips, in the order given; the provenance is the first one's.
+        """Concatenate batches of clips in the order given; the provenance is taken from the first.
 
         Raises:
-            ShapeError: without any part, or when image sizes differ.
+            ShapeError: when `parts` is empty, or image sizes differ.
         """
         if not parts:
             raise ShapeError("no pseudo-observations to join")
@@ -106,12 +105,12 @@ class PseudoViews(Storable):
         return PseudoViews(cameras, **arrays, provenance=dict(parts[0].provenance))
 
     def save(self, path: Path) -> None:
-        """Write a zarr v3 group: colours and shares in 8 bits, depth in float32, one view per chunk."""
+        """Write a zarr v3 group: values in [0, 1] with 8 bits, depth in float32, one view per chunk."""
         group = open_group(path, mode="w")
         for name in (*_IMAGES, *_SHARES):
             write_frames(group, name, _as_bytes(getattr(self, name)))
         if self.expected_error is not None:
-            # Errors are a few of the 255 steps of a byte.
+            # 8 bits would be too coarse: expected errors are only a few steps of 1/255.
             write_frames(group, "expected_error", self.expected_error.astype(np.float16))
         write_frames(group, "depth_mm", self.depth_mm.astype(np.float32))
         write_array(group, "image_confidence", self.image_confidence.astype(np.float32))
@@ -130,7 +129,7 @@ class PseudoViews(Storable):
 
     @classmethod
     def load(cls, path: Path) -> PseudoViews:
-        """Read what `save` wrote; colours and shares come back in steps of 1/255."""
+        """Read what `save` wrote; values in [0, 1] come back quantised to steps of 1/255."""
         group = zarr.open_group(str(path), mode="r")
         attributes: Any = dict(group.attrs)
         arrays: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""A reconstructed scene: Gaussians and the light that is part of the model, rendered together."""
+"""A reconstructed scene: Gaussians, and optionally a near-field light model, rendered together."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class Scene(Storable):
             cameras: the views.
             exposure: gain per camera; None is the mean exposure of the training frames.
             sh_degree: use spherical harmonics up to this degree only.
-            viewmats: camera from world instead of the cameras' own; gradients reach them.
-            options: handed to `extrags.raster.rasterize` (visibility, query_points, ...).
+            viewmats: world-to-camera matrices that replace those of the cameras; differentiable.
+            options: further arguments of `extrags.raster.rasterize` (visibility, query_points, ...).
 
         Returns:
             Renderings of all cameras in one batch.
@@ -64,14 +64,14 @@ class Scene(Storable):
     def render_attributes(
         self, cameras: Cameras, attributes: Float[Tensor, "n k"]
     ) -> tuple[Float[Tensor, "c h w k"], Float[Tensor, "c h w"]]:
-        """Blend one value or more of each Gaussian as colours are blended, without light.
+        """Alpha-blend arbitrary attributes of the Gaussians instead of colours, without light.
 
         Args:
             cameras: the views.
-            attributes: of each Gaussian.
+            attributes: k values per Gaussian.
 
         Returns:
-            The sum of the attributes with the blending weights, and the sum of the weights, the opacity.
+            The attributes summed with the blending weights, and alpha, the sum of the weights.
         """
         parts = []
         alpha = torch.zeros(len(cameras), cameras.height, cameras.width)

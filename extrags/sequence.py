@@ -1,4 +1,4 @@
-"""A posed endoscopic sequence and its form in zarr."""
+"""A posed endoscopic sequence and its storage in zarr."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from extrags.zarr_io import open_group, read_array, write_array, write_frames
 __all__ = ["EndoscopicSequence", "PoseSource", "Split", "saturated_mask"]
 
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
-"""given: by the source; estimated: by COLMAP; aligned: by colour and depth; refined: corrected by the
-reconstruction."""
+"""Origin of the poses. given: by the source; estimated: by COLMAP; aligned: by RGB-D alignment; refined:
+corrected during the reconstruction."""
 
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """Which frames train and which are held out; always from a manifest, never from file names.
+    """Training and held-out frames; always defined by a manifest, never by file names.
 
     Args:
         name: e.g. `sparse`, `distanced`, `every8`.
         train: indices of frames the reconstruction may see.
         test: indices of held-out frames.
-        version: raised by hand when the rule behind the name changes.
+        version: version of the rule behind the name; raised by hand when the rule changes.
     """
 
     name: str
@@ -42,29 +42,29 @@ class Split:
 
 @dataclass(frozen=True)
 class EndoscopicSequence(Storable):
-    """Frames of one scene: colour, and depth, poses and ground truth where they exist.
+    """Frames of one scene: colour images, with depth, poses and ground truth where they exist.
 
-    Frames of all recordings of the scene stand one after the other in one world frame.
+    Frames of all recordings of the scene are concatenated and share one world coordinate system.
 
     Args:
         name: `DATASET/SEQUENCE[@SETTING]`.
         rgb: colour images, uint8, [F, H, W, 3].
         K: pinhole intrinsics in pixels, [F, 3, 3].
-        mask: true where a pixel shows tissue (field of view, no overlay), [F, H, W].
+        mask: validity mask, true where a pixel shows tissue (in the field of view, no overlay), [F, H, W].
         split: training and held-out frames.
         world_from_camera: poses, or None until the poses stage has found them.
         depth_mm: z-depth, 0 where unknown, [F, H, W]; millimetres when `metric`.
         recording: index of the recording each frame belongs to, [F].
         frame_names: one name per frame, for messages.
         metric: true when lengths are millimetres; false for an arbitrary scale.
-        observed: for frames of the test split, true where the surface seen by a pixel was seen by
-            at least one training frame; false elsewhere. None where the source cannot tell.
-        points: sparse points known from the source, [P, 3], or None.
+        observed: for held-out frames, true where the surface at a pixel is visible in at least one training
+            frame; false elsewhere. None where the source has no such ground truth.
+        points: sparse point cloud of the source, [P, 3], or None.
         points_rgb: their colours, uint8, [P, 3], or None.
         truth: further ground truth of simulated sources, as JSON (light, exposure, ...).
-        specular: true on specular highlights, [F, H, W]; they carry no weight in training, but count in the
-            evaluation of held-out frames like any other pixel. None where they were not looked for.
-        pose_source: where the poses come from; the reconstruction may refine those that were estimated.
+        specular: true on specular highlights, [F, H, W]; they have no weight in training, but count in the
+            evaluation of held-out frames like any other pixel. None where they were not detected.
+        pose_source: origin of the poses; the reconstruction may refine estimated ones.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -149,10 +149,10 @@ class EndoscopicSequence(Storable):
         return self.cameras[self.train]
 
     def supervised_mask(self, frames: int | Int[np.ndarray, "n"]) -> Bool[np.ndarray, "*n h w"]:
-        """Pixels that may supervise: tissue, less specular highlights where they were looked for.
+        """Mask of pixels used for supervision: the validity mask without detected specular highlights.
 
         Args:
-            frames: one frame, or several.
+            frames: index of one frame, or indices of several.
 
         Returns:
             [H, W] for one frame, [N, H, W] for several; a copy.
@@ -161,20 +161,20 @@ class EndoscopicSequence(Storable):
         return np.array(mask) if self.specular is None else np.asarray(mask & ~self.specular[frames])
 
     def frame_name(self, index: int) -> str:
-        """Name of a frame for messages."""
+        """Name of a frame, for messages."""
         return self.frame_names[index] if self.frame_names else f"{index:04d}"
 
     def with_poses(
         self, world_from_camera: Float[np.ndarray, "f 4 4"], source: PoseSource = "given"
     ) -> EndoscopicSequence:
-        """The same sequence with poses."""
+        """A copy of the sequence with other poses, `world_from_camera` [F, 4, 4]."""
         return replace(self, world_from_camera=world_from_camera, pose_source=source)
 
     def training_part(self) -> EndoscopicSequence:
-        """The training frames alone, with nothing that tells of the others.
+        """The training frames alone, without any information on the held-out frames.
 
-        This is all that reconstruction, exploration and restoration are given: what is held out cannot
-        leak into them, and settings that train on the same frames share what is made from them.
+        Reconstruction, exploration and restoration get this sequence only: held-out frames cannot leak into
+        them, and settings with the same training frames share their cached results.
         """
         train = self.train
 
@@ -223,7 +223,7 @@ class EndoscopicSequence(Storable):
                 "truth": self.truth,
             }
         )
-        # Only where it says something: what was written before the field existed keeps its digest.
+        # Written only where it differs from the default, so that older artefacts keep their digest.
         if self.pose_source != "given":
             group.attrs["pose_source"] = self.pose_source
 
@@ -267,5 +267,5 @@ class EndoscopicSequence(Storable):
 
 
 def saturated_mask(rgb: UInt8[np.ndarray, "*f h w 3"]) -> Bool[np.ndarray, "*f h w"]:
-    """True where any channel is saturated: the true value is not known, whatever shines there."""
+    """True where any channel is at or above `SATURATED`: the true radiance is unknown there."""
     return np.asarray(rgb.max(axis=-1) >= SATURATED)

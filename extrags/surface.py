@@ -1,4 +1,4 @@
-"""Triangle mesh of the scene by TSDF fusion of rendered depth."""
+"""Triangle mesh of a scene by TSDF fusion of rendered depth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ __all__ = ["Mesh", "fuse_depth", "fuse_surface", "rendered_depth"]
 _log = logging.getLogger(__name__)
 
 VIEWS_PER_BATCH = 8
-"""Views rendered in one call; bounds the memory, has no influence on the result."""
+"""Views rendered in one call; limits the memory, does not affect the result."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class Mesh(Storable):
         triangles: vertex indices, counter-clockwise seen from free space, [T, 3], int32.
 
     Raises:
-        ShapeError: when a triangle names a vertex that is not there.
+        ShapeError: when a triangle refers to a vertex that does not exist.
     """
 
     stored_as: ClassVar[str] = "mesh"
@@ -78,10 +78,10 @@ class Mesh(Storable):
 
 
 def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig | None = None) -> Mesh:
-    """Mesh of what the views see, from the scene's own median depth.
+    """Mesh of the surface visible in the views, by TSDF fusion of the scene's median depth.
 
-    Voxel size and truncation follow the depth quantiles of all views: an endoscope looks along a
-    tube, so there is no object in the middle whose distance could set the scale.
+    Voxel size and truncation distance are set from depth quantiles over all views: in a tubular organ there
+    is no central object whose distance could define the scale.
 
     Args:
         scene: the reconstructed scene.
@@ -104,8 +104,8 @@ def rendered_depth(
 ) -> tuple[Cameras, Float[np.ndarray, "c h w"]]:
     """Median z-depth of all views, 0 where alpha is too low.
 
-    The median, not the expected depth, is fused: at a fold's edge the expected depth lies in mid-air
-    between the fold and what is behind it.
+    The median is fused, not the expected depth, because at occlusion edges the expected depth lies between
+    the foreground and the background surface.
 
     Args:
         scene: the reconstructed scene.
@@ -165,13 +165,12 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         block_count=20_000,
         device=o3c.Device("CPU:0"),
     )
-    # Open3D's voxel grid, unlike its older integration, has pixel centres at +0.5 as we have. It refuses
-    # arrays whose byte order is spelled out, as those read by zarr have it; astype always leaves the
-    # machine's own.
+    # Open3D's VoxelBlockGrid, unlike its legacy integration, has pixel centres at +0.5, as this project has.
+    # It rejects arrays with an explicit byte order, which zarr returns; astype yields the native one.
     K = cameras.K.astype(np.float64)
     viewmats = cameras.viewmats.astype(np.float64)
     for index in range(len(cameras)):
-        # A view with nothing nearer than the limit touches no block, which Open3D takes for an error.
+        # A view without depth below the limit activates no block, which Open3D reports as an error.
         if not ((depth_mm[index] > 0) & (depth_mm[index] < far_mm)).any():
             continue
         image = o3d.t.geometry.Image(o3c.Tensor(depth_mm[index].astype(np.float32, order="C")))
@@ -192,8 +191,8 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
 def _canonical(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"]
 ) -> tuple[Float[np.ndarray, "unique 3"], Int[np.ndarray, "distinct 3"]]:
-    """Sorted vertices and triangles: Open3D's order varies from run to run, the positions do not."""
-    # Adding zero turns -0.0 into 0.0, which would sort apart from it.
+    """Sort vertices and triangles: their order from Open3D varies between runs, the positions do not."""
+    # Adding zero turns -0.0 into 0.0, so that both sort as equal.
     unique, index = np.unique(vertices + np.float32(0), axis=0, return_inverse=True)
     triangles = index.reshape(-1)[triangles]
     distinct = (
@@ -210,7 +209,7 @@ def _canonical(
 def _without_small_clusters(
     vertices: Float[np.ndarray, "v 3"], triangles: Int[np.ndarray, "t 3"], min_triangles: int
 ) -> Mesh:
-    """Drop connected pieces of fewer triangles, and vertices that nothing uses."""
+    """Remove connected components with fewer triangles, and unused vertices."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

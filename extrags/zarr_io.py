@@ -1,4 +1,4 @@
-"""How arrays stand in zarr v3: one frame per chunk, blosc-zstd, shards for long stacks."""
+"""Layout of arrays in zarr v3: one frame per chunk, Blosc with Zstandard, shards for long stacks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def open_group(path: Path, *, mode: Literal["r", "w", "a"]) -> zarr.Group:
 
 
 def write_array(group: zarr.Group, name: str, array: np.ndarray) -> None:
-    """Write one array as a single chunk; `name` may hold slashes."""
+    """Write one array as a single chunk; `name` may be a path with slashes."""
     array = np.asarray(array, order="C")  # ascontiguousarray would make a scalar one-dimensional
     target = group.create_array(
         name,
@@ -55,12 +55,12 @@ def write_frames(group: zarr.Group, name: str, stack: np.ndarray) -> None:
 
 
 def read_array(group: zarr.Group, name: str) -> Any:
-    """Read one array whole, in the machine's own byte order (Open3D takes no other)."""
+    """Read a whole array, in native byte order (Open3D accepts no other)."""
     stored = np.asarray(group[name][...])  # type: ignore[index]
     return stored.astype(stored.dtype.newbyteorder("="), copy=False)
 
 
 def _codec(dtype: np.dtype[Any]) -> BloscCodec:
-    # Bit-shuffling pays for floats (exponents compress together); bytes gain nothing from it.
+    # Bit shuffling helps floats (their exponents compress together), but not single bytes.
     shuffle: Literal["bitshuffle", "noshuffle"] = "bitshuffle" if dtype.itemsize > 1 else "noshuffle"
     return BloscCodec(cname="zstd", clevel=5, shuffle=shuffle, typesize=dtype.itemsize)

@@ -1,4 +1,4 @@
-"""Settings: frozen models, one per stage, documented field by field, and the profiles that combine them.
+"""Settings: one frozen pydantic model per stage, with a description of each field, and named profiles.
 
 Every public name of the modules below is here: a new model is listed in its own `__all__` alone.
 """

@@ -1,7 +1,7 @@
-"""The restorer backends: the one dict where each is entered, by the name `enhance.backend` takes.
+"""The registry of restorer backends, by the names that `enhance.backend` takes.
 
-Settings are checked and documented against these names, so nothing is imported here: an entry says where
-its backend is implemented, and `extrags.restoration.backends.backend_of` imports it when it is used.
+Settings are validated and documented with these names, so no backend is imported here: an entry gives the
+import path of its backend, and `extrags.restoration.backends.backend_of` imports it on first use.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ class BackendEntry:
 
     Args:
         summary: what it is, in a few words, for help texts.
-        implementation: where its `extrags.restoration.protocol.Backend` is, as "module:attribute"; or that
-            object itself, for backends registered by a program.
+        implementation: import path of its `extrags.restoration.protocol.Backend` as "module:attribute", or
+            the object itself for backends registered by a program.
     """
 
     summary: str
@@ -65,5 +65,5 @@ def backend_summaries() -> str:
 
 
 def backend_schema(schema: dict[str, Any]) -> None:
-    """Complete a JSON schema of the setting with the backends registered by now."""
+    """Add the backends registered so far to a JSON schema of the setting."""
     schema.update(enum=list(BACKENDS), description=backend_summaries())

@@ -1,4 +1,4 @@
-"""What all settings have in common."""
+"""Base class and annotations of all settings."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ __all__ = ["KeyOf", "StageConfig"]
 
 
 class KeyOf:
-    """Annotation of a text setting whose values are the keys of a table, which programs may extend.
+    """Annotation of a text setting whose values are the keys of a mapping that programs may extend.
 
     Args:
-        table: the values allowed, as they are when a setting is read.
+        table: the mapping; its keys are looked up when a setting is validated.
     """
 
     def __init__(self, table: Mapping[str, Any]) -> None:
         self.table = table
 
     def check(self, value: str) -> str:
-        """The value itself.
+        """Validate a value and return it.
 
         Raises:
-            ConfigError: when it is no key; gives the nearest one.
+            ConfigError: when it is not a key; suggests the most similar one.
         """
         if value not in self.table:
             known = ", ".join(self.table)
@@ -39,6 +39,6 @@ class KeyOf:
 
 
 class StageConfig(BaseModel):
-    """Base of all settings: immutable, unknown names refused."""
+    """Base class of all settings: immutable; unknown names are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -1,4 +1,4 @@
-"""The named combinations of settings: `quick`, `balanced` and `paper`."""
+"""Profiles, the named combinations of settings: `quick`, `balanced` and `paper`."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ __all__ = ["PROFILES", "ProfileName", "profile_config"]
 ProfileName = Literal["quick", "balanced", "paper"]
 
 PROFILES: dict[str, PipelineConfig] = {
-    # A look at the scene in about three minutes on two cores.
+    # A preview in about three minutes on two cores.
     "quick": PipelineConfig(
         coarse=CoarseConfig(
             iterations=1500,
             max_points=8000,
             sh_every=400,
             densify=DensifyConfig(max_gaussians=14_000),
-            # A short run has no time for the published rates.
+            # The published learning rates are too small for a short run.
             optimiser=OptimiserConfig(means=3.2e-4, sh0=5e-3),
         ),
         explore=ExploreConfig(trajectories=12, length=10, rotation_deg=20.0, orbit_deg=20.0),

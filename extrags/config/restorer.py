@@ -13,10 +13,10 @@ __all__ = ["CaptionConfig", "CheckpointConfig", "EnhanceConfig", "PretrainedConf
 
 
 class CaptionConfig(StageConfig):
-    """What pretrained pipelines are told in words about a scene.
+    """Text prompts of pretrained pipelines.
 
-    The endpoint's address and key are no settings: they come from EXTRAGS_CAPTION_URL and
-    EXTRAGS_CAPTION_KEY, so that no key can end up in an artefact.
+    The endpoint's URL and API key are not settings: they come from EXTRAGS_CAPTION_URL and
+    EXTRAGS_CAPTION_KEY, so that no API key can end up in an artefact.
     """
 
     source: Literal["constant", "file", "endpoint"] = Field(
@@ -29,15 +29,15 @@ class CaptionConfig(StageConfig):
     )
     negative_text: str = Field(
         "blurry, noisy, floating blobs, distorted, text, watermark",
-        description="what guidance leads away from",
+        description="the negative prompt",
     )
     file: str | None = Field(None, description="YAML or JSON file {name of the sequence: text}")
     model: str | None = Field(None, description="model the endpoint is asked for")
-    frames: int = Field(6, ge=1, le=32, description="training frames the endpoint is shown")
+    frames: int = Field(6, ge=1, le=32, description="training frames sent to the endpoint")
     frame_width: int = Field(320, ge=32, le=1024, description="width they are reduced to, in pixels")
     max_tokens: int = Field(70, ge=8, le=500, description="length of the answer; CLIP reads 77 tokens")
     timeout_s: float = Field(60.0, gt=0, description="of one request")
-    retries: int = Field(4, ge=0, le=10, description="further tries after a passing fault")
+    retries: int = Field(4, ge=0, le=10, description="retries after a transient error")
     retry_wait_s: float = Field(1.0, ge=0, description="before the second try; doubled after each")
     prompt_price: float = Field(0.0, ge=0, description="of a million tokens sent; the cost is shown in it")
     completion_price: float = Field(0.0, ge=0, description="of a million tokens received")
@@ -65,8 +65,10 @@ class PretrainedConfig(StageConfig):
     )
     guidance_scale: float | None = Field(None, ge=0, description="weight of the text; 1 and less: none")
     reference_images: int = Field(2, ge=0, description="real views handed over where a pipeline takes them")
-    mask_threshold: float = Field(0.5, gt=0, le=1, description="pixels known by less than this are made anew")
-    mask_dilation_px: int = Field(3, ge=0, description="and so far around them")
+    mask_threshold: float = Field(
+        0.5, gt=0, le=1, description="pixels with a smaller known share are inpainted"
+    )
+    mask_dilation_px: int = Field(3, ge=0, description="dilation of the inpainted region")
 
 
 class CheckpointConfig(StageConfig):
@@ -90,7 +92,7 @@ class CheckpointConfig(StageConfig):
     guidance_scale: float | None = Field(
         None, ge=0, description="weight of the text; None: 1 for enhancer, 7.5 for dynamicrafter"
     )
-    fps: int = Field(5, ge=1, description="frame rate the model is told")
+    fps: int = Field(5, ge=1, description="frame rate that conditions the model")
     frames: int = Field(16, ge=2, description="frames of one window, a real view first")
     overlap: int = Field(4, ge=0, description="frames two windows share, cross-faded")
     width: int = Field(512, ge=16, description="image width; images are stretched to it, as the paper does")

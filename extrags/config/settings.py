@@ -1,8 +1,7 @@
-"""Every setting by its dotted name: what it is, which values it takes, and how text becomes one.
+"""All settings by dotted name, with description, valid values and parsing from text.
 
-The flags and the help of the command line are made from this, and so are the errors of
-`PipelineConfig.with_overrides`: a field of a model, with its limits and its description, is all there is
-to write for a new setting.
+The flags and the help of the command line and the errors of `PipelineConfig.with_overrides` are derived from
+this: a new setting only takes a field of a model, with its limits and its description.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class Setting:
         return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} or {words[-1]}"
 
     def parse(self, text: str) -> Any:
-        """The value that a text stands for: `none`, `true`, `1e-3`, or numbers with commas between.
+        """Parse a value from text: `none`, `true`, `1e-3`, or comma-separated numbers.
 
         Raises:
             ConfigError: names the setting, what was found and what was expected.
@@ -66,19 +65,19 @@ class Setting:
             raise self.refused(text) from None
 
     def text(self, value: Any) -> str:
-        """What `parse` reads this value from."""
+        """Format a value as text; the inverse of `parse`."""
         if isinstance(value, tuple):
             return ",".join(str(part) for part in value)
         return str(value).lower() if value is None or isinstance(value, bool) else str(value)
 
     def refused(self, found: str) -> ConfigError:
-        """The error for a value that it does not take."""
+        """The error for an invalid value."""
         meant = did_you_mean(found.strip("'"), self.choices)
         return ConfigError(f"setting {self.name} is {found or 'empty'}; expected {self.expected}{meant}")
 
     @property
     def choices(self) -> list[str]:
-        """The names it takes, where they are a closed list or the keys of a table."""
+        """Valid values, if they are enumerated (a `Literal`, or the keys of a mapping)."""
         tables = [item.table for item in self.limits if isinstance(item, KeyOf)]
         literals = [get_args(kind) for kind in self._kinds if get_origin(kind) is Literal]
         return [str(name) for names in (*literals, *tables) for name in names]
@@ -129,7 +128,7 @@ def groups_of(model: type[BaseModel]) -> dict[str, str]:
 
 
 def unknown_setting(name: str, known: Iterable[str]) -> ConfigError:
-    """The error for a name that no setting has, with those that were perhaps meant."""
+    """The error for an unknown setting, with similar names."""
     known = list(known)
     inside = [other.removeprefix(f"{name}.") for other in known if other.startswith(f"{name}.")]
     if inside:

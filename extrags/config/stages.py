@@ -39,7 +39,7 @@ __all__ = [
 
 
 class IngestConfig(StageConfig):
-    """How a source becomes an `EndoscopicSequence`."""
+    """Reading of a source into an `EndoscopicSequence`."""
 
     width: int | None = Field(
         None, ge=16, le=4096, description="image width in pixels; None keeps the source's own"
@@ -87,7 +87,7 @@ class PosesConfig(StageConfig):
         "never: COLMAP alone; rgbd: alignment by colour and depth from the start",
     )
     replace_given: bool = Field(
-        False, description="estimate poses although the source has them; theirs become the yardstick"
+        False, description="estimate poses even if the source has them; the source's serve as reference"
     )
     rgbd_width: int = Field(192, ge=32, description="alignment by colour and depth works at most so wide")
     rgbd_neighbours: int = Field(6, ge=1, description="frames each frame is aligned with")
@@ -95,7 +95,7 @@ class PosesConfig(StageConfig):
 
 
 class LightConfig(StageConfig):
-    """Near-field light that rides on the camera (design section 6)."""
+    """Near-field light fixed to the camera, and the camera response."""
 
     enabled: bool = Field(True, description="False: colours do not depend on the distance")
     falloff: bool = Field(True, description="learn exponent and softening of the fall-off with distance")
@@ -146,7 +146,7 @@ class DensifyConfig(StageConfig):
         0.01, gt=0, description="larger than this share of the extent: split, else clone"
     )
     strategy: Literal["default", "mcmc"] = Field(
-        "default", description="default: clone, split, prune; mcmc: relocate dead Gaussians and shake"
+        "default", description="default: clone, split, prune; mcmc: relocate dead Gaussians, add noise"
     )
     absgrad: bool = Field(
         False,
@@ -225,7 +225,7 @@ class CoarseConfig(StageConfig):
 
 
 class AssessConfig(StageConfig):
-    """What the scene still lacks, and the plan that follows."""
+    """Assessment of the coarse scene, and the plan of the later stages."""
 
     probe_views: int = Field(24, ge=1, description="views in the fan round the training views")
     probe_offset: float = Field(0.35, gt=0, description="sideways offset of a probe, in median depths")
@@ -241,7 +241,7 @@ class AssessConfig(StageConfig):
         2, ge=1, description="a Gaussian seen from fewer direction bins counts as poorly seen"
     )
     full_budget_share: float = Field(
-        0.25, gt=0, le=1, description="at this share of lacking pixels the whole budget is spent"
+        0.25, gt=0, le=1, description="share of lacking pixels from which the whole budget is used"
     )
     force: bool = Field(False, description="run every stage whatever the measurements say")
     seed: int = Field(0, ge=0, description="seed of all random sampling")
@@ -279,7 +279,7 @@ class FreespaceConfig(StageConfig):
 
 
 class CoverageConfig(StageConfig):
-    """How it is counted which Gaussian was seen from which direction."""
+    """Coverage: which Gaussians were seen from which directions."""
 
     directions: int = Field(32, ge=4, le=32, description="D: equal-area direction bins")
     visible_weight: float = Field(
@@ -330,14 +330,14 @@ class ExploreConfig(StageConfig):
 
     @property
     def coverage(self) -> CoverageConfig:
-        """The settings that say what counts as seen; `assess` measures by them too."""
+        """The settings of coverage measurement, which `assess` uses as well."""
         return CoverageConfig(
             directions=self.directions, visible_weight=self.visible_weight, render_width=self.render_width
         )
 
 
 class FinetuneConfig(StageConfig):
-    """Real and restored views together."""
+    """Fine-tuning on real and restored views."""
 
     iterations: int = Field(2000, ge=1, description="optimisation steps, one view each")
     densify_share: float = Field(0.6, ge=0, le=1, description="densification ends at this share")
@@ -355,7 +355,7 @@ class FinetuneConfig(StageConfig):
         True, description="restored depth supervises where the scene knows nothing of a pixel"
     )
     growth: float = Field(
-        2.0, ge=1, description="room for new Gaussians: times the coarse stage's largest number"
+        2.0, ge=1, description="limit on the number of Gaussians, times coarse.densify.max_gaussians"
     )
     seed_holes: bool = Field(
         True, description="place new Gaussians where the restored view has surface and none is"

@@ -1,4 +1,4 @@
-"""Figures of merit: image, perceptual, depth, surface and pose errors, and their protocol.
+"""Metrics of images, depth, surfaces and poses, and the evaluation protocol.
 
 `registry` says which metrics there are; `image`, `flip`, `lpips` and `perceptual` compare images, `depth`,
 `surface` and `pose` the geometry; `protocol` evaluates held-out views, `folder` reads renders made elsewhere,

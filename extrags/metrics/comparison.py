@@ -1,4 +1,4 @@
-"""Runs compared: spread over seeds, and paired differences between methods.
+"""Comparison of runs: statistics over seeds, and paired differences between methods.
 
 A run is a mapping with `method`, `profile`, `sequence`, `setting`, `seed` and `metrics` (the tree of
 `EvaluationResult`). Methods are compared in pairs only: two runs that share everything but the method. Over
@@ -25,16 +25,16 @@ Run = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """A sample of a figure, or of differences.
+    """Statistics of a sample of metric values, or of their differences.
 
     Args:
-        n: its size.
-        mean: of the sample.
-        deviation: standard deviation with n - 1; None for a single value.
-        low: lower end of the 95 % interval of the mean (Student's t); None for a single value.
-        high: its upper end.
-        smallest: of the sample.
-        largest: of the sample.
+        n: sample size.
+        mean: sample mean.
+        deviation: sample standard deviation (n - 1 in the denominator); None for a single value.
+        low: lower end of the 95 % confidence interval of the mean (Student's t); None for a single value.
+        high: upper end of the interval; None for a single value.
+        smallest: minimum of the sample.
+        largest: maximum of the sample.
     """
 
     n: int
@@ -47,7 +47,7 @@ class Spread:
 
 
 def spread(values: Sequence[float]) -> Spread:
-    """Mean, deviation and 95 % interval of a sample.
+    """Mean, standard deviation and 95 % confidence interval of a sample.
 
     Raises:
         ConfigError: for an empty sample.
@@ -67,7 +67,7 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def figure_of(metrics: Mapping[str, Any] | None, name: str) -> float | None:
-    """A figure by its dotted path; None when any part of the way is missing."""
+    """Value of a metric by its dotted path, e.g. `observed.psnr`; None when the path does not exist."""
     node: Any = metrics
     for part in name.split("."):
         if not isinstance(node, Mapping):
@@ -83,7 +83,7 @@ def dataset_of(run: Run) -> str:
 
 
 def paired(runs: Sequence[Run], method: str, baseline: str, name: str) -> list[tuple[Run, float]]:
-    """Differences method - baseline of runs that share all but the method.
+    """Differences method - baseline between runs that are equal in everything but the method.
 
     Args:
         runs: of both, and of others.
@@ -120,7 +120,7 @@ def compare_runs(runs: Sequence[Run], baseline: str) -> dict[str, Any]:
         and, per figure, in how many of the `n` pairs the method is better.
 
     Raises:
-        ConfigError: when no run is of the baseline, or a run is there twice.
+        ConfigError: when there is no run of the baseline, or a run occurs twice.
     """
     methods = list(dict.fromkeys(str(run["method"]) for run in runs))
     if runs and baseline not in methods:
@@ -207,7 +207,7 @@ def _paired(
 
 
 def _sample(values: Sequence[tuple[Run, float]], about: Callable[[Run], dict[str, Any]]) -> list[float]:
-    """The values of a sequence's seeds; of a dataset, the mean of each sequence."""
+    """The sample of a group: for a sequence the values of its seeds, for a dataset its sequences' means."""
     if about is _by_sequence:
         return [value for _, value in values]
     by_sequence: dict[Any, list[float]] = {}

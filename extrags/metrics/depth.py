@@ -21,7 +21,7 @@ class DepthErrors:
         rmse: root of the mean squared error, in the unit of the depths.
         delta125: share of pixels with max(rendered / true, true / rendered) < 1.25.
         coverage: share of the pixels with true depth for which there is a rendered one.
-        n_pixels: pixels the errors are taken over.
+        n_pixels: number of pixels with both depths.
     """
 
     absrel: float
@@ -38,8 +38,8 @@ def depth_errors(
 ) -> DepthErrors | None:
     """AbsRel, RMSE and delta < 1.25 of z-depth.
 
-    A pixel counts when it is in the mask and both depths are finite and above zero: 0 and NaN mean
-    unknown on either side. What the render leaves empty lowers `coverage`, not the errors.
+    A pixel is evaluated when it is in the mask and both depths are finite and above zero: 0 and NaN mean
+    unknown on either side. Pixels without rendered depth lower `coverage`, not the errors.
 
     Args:
         rendered: rendered z-depth, 0 or NaN where there is no surface.

@@ -1,10 +1,10 @@
 """Exposure alignment: one gain per image before a metric is taken.
 
-A recording made with another exposure must not be punished for it, and a plain metric must not be
-flattered: figures come in both kinds, and aligned ones stand in a place of their own.
+Differences in exposure between recordings are no reconstruction errors, while alignment can hide errors. So
+metrics are reported both without and with alignment; aligned ones are in a separate group.
 
 The rule: inside the mask, the gain g minimises `sum (g * render - target)^2` over pixels and channels,
-so `g = sum(render * target) / sum(render^2)`, held within [1/8, 8]; the aligned render is
+so `g = sum(render * target) / sum(render^2)`, clamped to [1/8, 8]; the aligned render is
 `clip(g * render, 0, 1)`. Empty (black) pixels of a render take no part in g. A change of exposure
 scales linear light; behind a power-law camera response it is a gain of the encoded values too, which is
 why the gain is fitted on the values as stored.
@@ -21,7 +21,7 @@ from extrags.errors import ShapeError
 __all__ = ["MAX_EXPOSURE_GAIN", "align_exposure", "exposure_gain"]
 
 MAX_EXPOSURE_GAIN = 8.0
-"""Three stops either way; beyond, render and target have nothing in common but a number."""
+"""Upper limit of the gain, and the inverse of its lower limit: three stops."""
 
 
 def exposure_gain(
@@ -31,7 +31,7 @@ def exposure_gain(
     *,
     per_channel: bool = False,
 ) -> Float[Tensor, "*b c"]:
-    """The least-squares gain of each image; see the module's rule.
+    """The least-squares gain of each image, as defined in the module docstring.
 
     Args:
         render: images in [0, 1].

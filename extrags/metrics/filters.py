@@ -1,7 +1,7 @@
 """Separable image filters as two small matrix products.
 
 At the sizes metrics are taken (a few hundred pixels) multiplying by a banded [W, W] matrix is several
-times faster on a CPU than a convolution of eleven taps, and the border rule lives in the matrix.
+times faster on a CPU than a convolution of eleven taps; the matrix also implements the border rule.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def gaussian_weights(sigma_px: float, radius_px: int) -> tuple[float, ...]:
     return tuple(get_gaussian_kernel1d(2 * radius_px + 1, sigma_px, dtype=torch.float64)[0].tolist())
 
 
-# A cached tensor outlives an inference-mode block it was made in, and must serve autograd afterwards.
+# A cached tensor may be created in inference mode and used with autograd later.
 @lru_cache(maxsize=128)
 @torch.inference_mode(False)
 def _filter_matrix(size: int, weights: tuple[float, ...], border: BorderRule) -> Float[Tensor, "s s"]:

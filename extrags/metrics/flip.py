@@ -1,4 +1,4 @@
-"""LDR-FLIP: how different two images look when one flips between them; needs no weights.
+"""LDR-FLIP: perceived difference between two images that are shown alternately; needs no weights.
 
 Source: Andersson, Nilsson, Akenine-Möller, Oskarsson, Åström, Fairchild: FLIP: A Difference Evaluator
 for Alternating Images, Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020. The section numbers below
@@ -69,7 +69,7 @@ def flip_map(
     Args:
         render: sRGB-encoded images in [0, 1]; values outside are clamped.
         target: sRGB-encoded images in [0, 1].
-        pixels_per_degree: how large a pixel is for the viewer.
+        pixels_per_degree: resolution for the viewer, in pixels per degree of visual angle.
 
     Raises:
         ShapeError: when the images differ in shape.

@@ -1,8 +1,8 @@
-"""Renders made elsewhere: a folder of images as `RenderedViews`.
+"""Renders of other programs: reads a folder of images as `RenderedViews`.
 
-Images stand for the held-out frames of a sequence. They are matched by name (`b_0010.png` for the frame
-`b_0010`) where every file name is a frame's; otherwise by number: as many files as held-out frames, in the
-order of the numbers in their names, in the order of the recording.
+The images show the held-out frames of a sequence. They are matched by name (`b_0010.png` for the frame
+`b_0010`) if every file name is that of a frame; otherwise by number: as many files as held-out frames, sorted
+by the numbers in their names, for the frames in the order of the recording.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ def read_renders(
 
     Args:
         folder: images of the sequence's size, 8 bits a channel.
-        sequence: says which frames, in which order, and how large.
+        sequence: defines the held-out frames, their order and the image size.
         depth_folder: z-depth maps of the same frames, 0 where there is no surface: `.npy` or floating-point
             TIFF in the unit of the sequence, or 16-bit PNG or TIFF in steps of `depth_step_mm`.
         depth_step_mm: unit of integer depth images; not needed for floating-point ones.
 
     Returns:
-        The renders in the order of `sequence.test`. Alpha is 1; without depth maps depth is 0, which the
-        protocol reads as unknown.
+        The renders in the order of `sequence.test`. Alpha is 1; without depth maps depth is 0, which means
+        unknown.
 
     Raises:
-        SourceNotFoundError: for a folder that is not there or holds no images, and for held-out frames
-            without one; names them.
-        SourceError: for a file that cannot be read or stands for no held-out frame.
+        SourceNotFoundError: for a folder that does not exist or holds no images, and for held-out frames
+            without an image; names them.
+        SourceError: for a file that cannot be read or matches no held-out frame.
         ShapeError: for an image of another size; names the file and both sizes.
         NonFiniteError: for depth that holds NaN or infinity.
         ConfigError: for integer depth without its step.

@@ -1,7 +1,7 @@
 """PSNR and SSIM of colour images, whole or inside a mask.
 
 Images are float tensors [..., H, W, 3] with values in [0, 1]. A mean over a batch is the mean of the
-values per image. An image without a single pixel in its mask has no value, and says so with `None`.
+values per image. The value of an image whose mask is empty is None.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 MAX_PSNR_DB = 100.0
-"""Equal images get this value instead of infinity, which JSON cannot hold."""
+"""PSNR of equal images in dB, instead of infinity, which JSON cannot represent."""
 SSIM_WINDOW_PX = 11
 SSIM_SIGMA_PX = 1.5
 _SSIM_C1 = 0.01**2
@@ -151,7 +151,7 @@ def means_per_image(
     if mask is None:
         return [float(mean) for mean in flat.mean(1)]
     inside = mask.reshape(flat.shape)
-    # `where` and not a product: whatever stands outside the mask, a NaN even, must not leak in.
+    # `where` instead of a product, so that values outside the mask have no effect even if they are NaN.
     sums = torch.where(inside, flat, torch.zeros_like(flat)).sum(1)
     counts = inside.sum(1)
     return [float(total / count) if count > 0 else None for total, count in zip(sums, counts, strict=True)]
@@ -160,14 +160,14 @@ def means_per_image(
 def means_in_regions(
     map_of: Callable[[Tensor, Tensor], Float[Tensor, "n h w"]],
 ) -> Callable[[Tensor, Tensor, dict[str, Tensor]], dict[str, list[float | None]]]:
-    """The metric whose value is the mean of a map over the pixels.
+    """Make a metric for `Metric.measure` from a function that returns a value per pixel.
 
     Args:
-        map_of: from render and target, [n, h, w, 3] in [0, 1], the metric of each pixel.
+        map_of: from render and target, [n, h, w, 3] in [0, 1], to a map [n, h, w].
 
     Returns:
-        A function of render, target and regions by name, [n, h, w]: one value per image and region, None
-        where the region is empty. The map is made once for all regions.
+        A function of render, target and regions by name, [n, h, w], that returns the mean of the map per
+        image and region, None where the region is empty. The map is computed once for all regions.
     """
 
     def measure(render: Tensor, target: Tensor, regions: dict[str, Tensor]) -> dict[str, list[float | None]]:
@@ -178,7 +178,7 @@ def means_in_regions(
 
 
 def mean_of_known(values: list[float | None]) -> float | None:
-    """Mean of the values that are there, or None when none is."""
+    """Mean of the values that are not None; None if there are none."""
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else None
 

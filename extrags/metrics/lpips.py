@@ -3,8 +3,8 @@
 Source: Zhang, Isola, Efros, Shechtman, Wang: The Unreasonable Effectiveness of Deep Features as a
 Perceptual Metric, CVPR 2018, equation 1.
 
-Figures of different backbones cannot be compared; name the network beside every figure. Much of the
-literature on 3D Gaussians reports LPIPS-VGG.
+Values of different backbones are not comparable; state the network with every value. Much of the literature
+on 3D Gaussians reports LPIPS-VGG.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ _IMAGES_AT_ONCE = 16
 
 @dataclass(frozen=True)
 class Lpips:
-    """The metric with its weights in memory.
+    """LPIPS with loaded weights.
 
     Args:
         net: backbone.
@@ -118,7 +118,7 @@ class Lpips:
 
     @property
     def name(self) -> str:
-        """How to name the figure, e.g. `lpips_alex`."""
+        """Key of the metric, e.g. `lpips_alex`."""
         return f"lpips_{self.net}"
 
     def distance(
@@ -143,10 +143,10 @@ class Lpips:
     def distance_map(
         self, first: Float[Tensor, "*b h w 3"], second: Float[Tensor, "*b h w 3"]
     ) -> Float[Tensor, "*b h w"]:
-        """LPIPS of each pixel: each layer's map brought to image size (bilinear), then summed.
+        """LPIPS of each pixel: the maps of all layers, resized bilinearly to the image size and summed.
 
-        Its mean is near `distance` and not equal to it, because a layer's border cells cover less
-        of the image than its inner ones.
+        Its mean is close to `distance`, but not equal: border cells of a layer cover less of the image than
+        inner ones.
 
         Args:
             first: images in [0, 1].
@@ -173,9 +173,8 @@ class Lpips:
     ) -> dict[str, list[float | None]]:
         """LPIPS inside regions, from one pass of the network.
 
-        Each layer's map is averaged with the share of the region in each of its cells as weight. With
-        a region that holds every pixel this is `distance`, exactly. Features see beyond the region's
-        edge, as SSIM's window does.
+        Each layer's map is averaged with the share of the region in each of its cells as weight. For a region
+        of all pixels this equals `distance`. Receptive fields extend beyond the region, like SSIM's window.
 
         Args:
             first: images in [0, 1].
@@ -273,8 +272,8 @@ def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> Path:
 
     Looks, in this order, at the explicit path, at the environment variable `EXTRAGS_LPIPS_WEIGHTS`
     (each a file, or a folder that holds `lpips_<net>_v0.1.npz`), and at `extrags/lpips` in the user's
-    data and cache directories (`extrags.data_directories`). A path that was named and does not exist is an
-    error; the search does not go on behind it.
+    data and cache directories (`extrags.data_directories`). A named path that does not exist is an error;
+    later places are then not searched.
 
     Args:
         explicit: path the user named, or None.

@@ -1,4 +1,4 @@
-"""A perceptual difference per pixel that needs no weights, for machines without those of LPIPS."""
+"""A perceptual difference per pixel without learned weights, used where LPIPS has none."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ __all__ = ["perceptual_map"]
 
 _SCALES = 3
 _CONTRAST_FLOOR = 0.03**2
-"""SSIM's second constant: differences on patches flatter than this fade out."""
+"""SSIM's constant C2, which attenuates differences on patches of lower contrast."""
 _COLOR_SIGMA_PX = 2.0
 _COLOR_RADIUS_PX = 6
 _MAX_COLOR_DIFFERENCE = 0.5
-"""Mean channel difference that already counts as a wholly different colour."""
+"""Mean absolute channel difference at which the colour difference saturates at 1."""
 
 
 def perceptual_map(
@@ -34,12 +34,12 @@ def perceptual_map(
       coarse maps are enlarged bilinearly. A scale is left out when its images are smaller than the
       window.
     * c: square of the mean absolute channel difference of the images blurred with sigma 2 px, divided
-      by 0.5 and clipped to 1. The square lets a change of exposure pass lightly, as LPIPS does, and
-      still sees a hole without texture.
+      by 0.5 and clipped to 1. The square gives changes of exposure little weight, as LPIPS does, while
+      holes without texture still have a large difference.
 
-    This is the project's own stand-in, not a published metric: figures taken with it are not LPIPS.
-    On real and path-traced endoscopy under noise, blur, holes and dimming its mean ranks images as
-    LPIPS-Alex does with a rank correlation of 0.75; blur weighs less with it than with LPIPS.
+    This is a substitute of this project, not a published metric, and its values are not LPIPS values. On real
+    and path-traced endoscopy with noise, blur, holes and dimming its mean has a rank correlation of 0.75 with
+    LPIPS-Alex; it is less sensitive to blur.
 
     Args:
         first: images in [0, 1].

@@ -30,7 +30,7 @@ Alignment = Literal["sim3", "se3", "none"]
 
 @dataclass(frozen=True)
 class Similarity:
-    """`target = scale * rotation @ source + translation`.
+    """A similarity transform: `target = scale * rotation @ source + translation`.
 
     Args:
         scale: above zero.
@@ -43,11 +43,11 @@ class Similarity:
     translation: Float[np.ndarray, "3"]
 
     def apply(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
-        """Move points."""
+        """Transform points."""
         return np.asarray(self.scale * (points @ self.rotation.T) + self.translation)
 
     def apply_to_poses(self, world_from_camera: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 4 4"]:
-        """Move cameras; they stay rigid motions, only their centres are scaled."""
+        """Transform camera poses; they remain rigid motions, only their centres are scaled."""
         moved = world_from_camera.astype(np.float64, copy=True)
         moved[:, :3, :3] = self.rotation @ world_from_camera[:, :3, :3]
         moved[:, :3, 3] = self.apply(world_from_camera[:, :3, 3])
@@ -68,7 +68,7 @@ class TrajectoryErrors:
 
 @dataclass(frozen=True, slots=True)
 class RelativePoseErrors:
-    """Drift over a fixed number of frames."""
+    """Errors of the relative motion over a fixed number of frames (drift)."""
 
     translation_rmse: float
     rotation_rmse_deg: float
@@ -78,10 +78,10 @@ class RelativePoseErrors:
 def umeyama(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"], *, with_scale: bool = True
 ) -> Similarity:
-    """The similarity (or rigid motion) that brings points nearest to points, in least squares.
+    """Least-squares similarity (or rigid motion) between two point sets.
 
-    On a straight line of points the turn about the line is not determined; any of the best motions is
-    returned, and distances between aligned points are still the smallest.
+    For collinear points the rotation about their line is undetermined; one of the optimal motions is
+    returned.
 
     Args:
         source: points to move.

@@ -1,10 +1,10 @@
-"""The evaluation protocol: which pixels count, how, and what the numbers are called.
+"""The evaluation protocol: which pixels are evaluated, by which metrics, and the names of the results.
 
-`PROTOCOL.md` beside this file is the protocol in words, one section per rule; this module is the protocol in
-code. The two change together, with `PROTOCOL_VERSION`.
+`PROTOCOL.md` in this folder specifies the protocol, one section per rule; this module implements it. Both
+change together, with `PROTOCOL_VERSION`.
 
-Figures of a sequence are means over the views that have one. What cannot be had is None, and `reasons`
-says why.
+Metrics of a sequence are means over the views that have a value. Metrics without a value are None, and
+`reasons` says why.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from extrags.zarr_io import open_group, read_array, write_frames
 __all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
 
 MIN_REGION_SHARE = 0.003
-"""Share of the image below which a part of the pixels has no figure: a handful of pixels is noise."""
+"""Regions with a smaller share of the image are not evaluated: metrics of a few pixels are noise."""
 SURFACE_ALPHA = 0.5
-"""A pixel has a rendered depth from this alpha on."""
+"""Smallest alpha of a pixel with a valid rendered depth."""
 COLOR_LEVELS = 255
-"""Renders are measured as 8-bit images, so that PNGs of them have the same figures."""
+"""Renders are quantised to 8 bits, so that metrics of PNG files of them are the same."""
 _PIXELS_AT_ONCE = 400_000
 
 _NO_ERRORS: dict[str, Any] = {item.name: None for item in fields(SurfaceErrors)}
@@ -55,7 +55,7 @@ _NO_SURFACE: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class RenderedViews(Storable):
-    """Held-out views as rendered once; every metric starts from these.
+    """Rendered held-out views, the input of all metrics.
 
     Args:
         rgb: colours, [V, H, W, 3], float32.
@@ -96,7 +96,7 @@ class RenderedViews(Storable):
         """Read what `save` wrote.
 
         Raises:
-            SourceNotFoundError: when there is nothing at the path.
+            SourceNotFoundError: when the path does not exist.
         """
         if not Path(path).exists():
             raise SourceNotFoundError("no renders here", file=path)
@@ -107,15 +107,15 @@ class RenderedViews(Storable):
 
 @dataclass(frozen=True)
 class EvaluationResult:
-    """Metrics of a sequence and of each view, ready for JSON.
+    """Metrics of a sequence and of each of its views, in JSON types.
 
     Args:
         sequence: name of the sequence.
         metrics: `{psnr, ssim, lpips_alex, flip, depth_absrel, ..., n_gaussians, aligned: {...},
-            observed: {...}, unobserved: {...}, whole: {...}, surface: {...}}`; None for what cannot be had.
-        per_view: the same per view, with `frame` and `name`; without `surface`, which a view has none of.
-        reasons: why a figure is None, by its key.
-        true_surface: what the surface was held against: `mesh` or `depth`; None without surface figures.
+            observed: {...}, unobserved: {...}, whole: {...}, surface: {...}}`; None for missing values.
+        per_view: the same per view, with `frame` and `name`, without `surface`.
+        reasons: why a metric is None, by its key.
+        true_surface: kind of the true surface, `mesh` or `depth`; None without surface metrics.
         protocol: version of the protocol.
     """
 
@@ -127,7 +127,7 @@ class EvaluationResult:
     protocol: int = PROTOCOL_VERSION
 
     def to_json(self) -> dict[str, Any]:
-        """A tree of JSON values; holds neither NaN nor infinity."""
+        """The result as JSON types, without NaN or infinity."""
         return {
             "protocol": self.protocol,
             "sequence": self.sequence,
@@ -149,12 +149,12 @@ def evaluate_views(
     surface: SurfaceResult | None = None,
     surface_reason: str = "no surface was given",
 ) -> EvaluationResult:
-    """Compare rendered views with the frames they stand for, by the protocol of this module.
+    """Compare rendered views with the frames they show, by the protocol of this module.
 
     Args:
         renders: one render per frame of `frames`, at the sequence's size; colours are clipped to [0, 1] and
             rounded to 8 bits.
-        sequence: holds the frames, masks and what is known of depth and of observed surface.
+        sequence: the frames and masks, and true depth and observed masks where it has them.
         frames: indices into the sequence.
         lpips: the metric with its weights, or None.
         lpips_reason: said in `reasons` when `lpips` is None.
@@ -247,7 +247,7 @@ def _parts_of(
 ) -> tuple[dict[str, Tensor], dict[str, list[float | None]]]:
     """Observed and unobserved pixels, and their shares of the mask.
 
-    The pixels are empty where it is unknown or there are too few to tell; the share is the true one.
+    A mask is empty where it is unknown or has fewer pixels than `MIN_REGION_SHARE`; the share is that before.
     """
     mask = sequence.mask[chosen]
     # The array says nothing about frames that are not held out.

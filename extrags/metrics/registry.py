@@ -1,4 +1,4 @@
-"""The registry of metrics: what is measured, how it is written, and where it is shown.
+"""The registry of metrics: how they are computed, formatted, and where they are shown.
 
 Everything that lists metrics is derived from here: the columns of the protocol, the figures that runs are
 compared by, the tables of the command line, the tiles, tables and charts of the pages, and the tables of the
@@ -92,8 +92,8 @@ class Metric:
 
     Args:
         key: its name in the tree of metrics and in tables: lower case, digits and underscores.
-        label: for people.
-        higher_is_better: the direction.
+        label: name shown in tables and pages.
+        higher_is_better: whether larger values are better.
         unit: empty for a plain number.
         digits: decimals on pages.
         table_digits: decimals in tables on the command line.
@@ -101,16 +101,16 @@ class Metric:
             `extrags.metrics.surface`.
         measure: computes a photometric metric. LPIPS has none: its network brings it.
         lpips_net: the backbone, for LPIPS.
-        network: the backbone's name for people.
+        network: display name of the backbone.
         optional: the key is left out of the results where it was not measured; otherwise it is null.
         groups: groups of pixels it is measured in; None is all of its kind.
-        shown: by place, the groups whose figure is shown there.
+        shown: by place, the groups of pixels for which the metric is shown there.
         description: a sentence on the metric for the pages.
         version: of a metric registered by a program: raised whenever its values could change, as it is part
             of the key under which results are cached.
 
     Raises:
-        ConfigError: for a key that is no name, or groups that the kind does not have.
+        ConfigError: for an invalid key, or groups that do not exist for the kind.
     """
 
     key: str
@@ -150,7 +150,7 @@ class Figure:
     Args:
         key: of the metric.
         name: dotted path in the tree of metrics.
-        label: for people, the group included.
+        label: name shown in tables and pages, group included.
         unit: as the metric's.
         higher_is_better: as the metric's.
         digits: as the metric's.
@@ -272,7 +272,7 @@ def register_metric(metric: Metric) -> None:
         metric: with its `measure`, see `extrags.metrics.image.means_in_regions`.
 
     Raises:
-        ConfigError: for a key that is taken, or a metric that says not how it is measured.
+        ConfigError: for a key that is already registered, or a metric without `measure`.
     """
     if metric.key in _metrics or metric.key in _NODES:
         raise ConfigError(f"metric {metric.key}: the key is taken")
@@ -282,7 +282,7 @@ def register_metric(metric: Metric) -> None:
 
 
 def unregister_metric(key: str) -> None:
-    """Take back what `register_metric` added.
+    """Remove a metric that was added by `register_metric`.
 
     Raises:
         ConfigError: for a metric that was not registered by a program.

@@ -51,27 +51,27 @@ PROTOCOL_FUSION = SurfaceConfig(
     min_cluster_triangles=50,
     max_width=320,
 )
-"""Every value is written down: other defaults of the surface stage must not change a figure."""
+"""All values are explicit, so that changed defaults of the surface stage do not change the metrics."""
 N_SAMPLES = 30_000
 """Samples of each surface."""
 THRESHOLD_MM = 1.0
-"""Closer than this is right: about the voxel of the fusion at 60 mm, a twentieth of a usual distance."""
+"""Distance below which a sample counts as correct: about one voxel of the fusion at a distance of 60 mm."""
 THRESHOLD_SHARE = 0.05
 """The same where lengths are not millimetres, as a share of the median true depth of training frames."""
 _HIDDEN_SHARE = 0.005
-"""A point is hidden when something stands before it by more than this share of the way."""
+"""Tolerance of the occlusion test, as a share of the distance between camera and point."""
 _SEED = 20_260
 
 
 @dataclass(frozen=True, slots=True)
 class SurfaceErrors:
-    """How a reconstructed surface fits a true one; None where there is nothing to take a mean of.
+    """Errors of a reconstructed surface against the true one; None where there are no samples.
 
     Args:
         accuracy_mm: mean distance of reconstructed samples from the true surface.
-        accuracy_median_mm: the median of it, blind to floaters.
+        accuracy_median_mm: median of that distance, robust to floaters.
         completeness_mm: mean distance of true samples from the reconstructed surface.
-        completeness_median_mm: the median of it, blind to holes.
+        completeness_median_mm: median of that distance, robust to holes.
         precision: share of reconstructed samples closer than the threshold.
         recall: share of true samples closer than the threshold.
         fscore: harmonic mean of precision and recall.
@@ -88,7 +88,7 @@ class SurfaceErrors:
 
 @dataclass(frozen=True, slots=True)
 class TrueSurface:
-    """What the reconstruction is held against.
+    """Ground truth of the surface.
 
     Args:
         mesh: in the world of the sequence.
@@ -101,7 +101,7 @@ class TrueSurface:
 
 @dataclass(frozen=True, slots=True)
 class SurfaceResult:
-    """Surface figures of a scene.
+    """Surface metrics of a scene.
 
     Args:
         observed: errors on surface that training cameras saw.
@@ -109,8 +109,8 @@ class SurfaceResult:
         coverage: share of all that surface, observed or not, closer than the threshold to the
             reconstruction.
         observed_share: how much of it is observed.
-        threshold_mm: what counts as close.
-        kind: of the true surface.
+        threshold_mm: the distance threshold.
+        kind: kind of the true surface, `mesh` or `depth`.
     """
 
     observed: SurfaceErrors
@@ -132,11 +132,11 @@ class SurfaceResult:
 
 
 def scene_surface(scene: Scene, sequence: EndoscopicSequence) -> Mesh | None:
-    """The surface of a scene as the protocol sees it, or None when the cameras see none.
+    """The surface of a scene, extracted by the rules of the protocol; None when no camera sees a surface.
 
     Args:
         scene: the reconstruction.
-        sequence: says where the training and held-out cameras are.
+        sequence: provides the training and held-out cameras.
     """
     cameras = sequence.cameras[_all_frames(sequence)]
     try:
@@ -160,12 +160,12 @@ def surface_from_depth(sequence: EndoscopicSequence) -> TrueSurface | None:
 
 
 def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: EndoscopicSequence) -> SurfaceResult:
-    """Surface figures of a reconstruction, observed and unobserved parts apart.
+    """Surface metrics of a reconstruction, separately for observed and unobserved surface.
 
     Args:
-        mesh: of `scene_surface`, or made elsewhere in the same world; None is an empty reconstruction.
+        mesh: from `scene_surface`, or any mesh in the same world; None for an empty reconstruction.
         truth: the true surface.
-        sequence: its cameras and masks tell what is observed.
+        sequence: its cameras and masks define which surface is observed.
 
     Raises:
         ShapeError: while the poses are unknown.
@@ -196,14 +196,14 @@ def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: Endoscopic
 def surface_errors(
     reconstructed: Mesh, true: Mesh, threshold_mm: float, *, n_samples: int = N_SAMPLES, seed: int = _SEED
 ) -> SurfaceErrors:
-    """Errors of a whole surface against another, without any notion of what was observed.
+    """Errors of a whole surface against another, regardless of which parts were observed.
 
     Args:
-        reconstructed: the mesh in question.
-        true: the mesh it should be.
-        threshold_mm: closer than this is right.
-        n_samples: samples of each.
-        seed: of the samples.
+        reconstructed: the mesh to evaluate.
+        true: the ground-truth mesh.
+        threshold_mm: distance below which a sample counts as correct.
+        n_samples: samples per mesh.
+        seed: seed of the sampling.
 
     Raises:
         ConfigError: for a threshold or a number of samples that is not positive.
@@ -220,12 +220,12 @@ def surface_errors(
 
 
 def sample_surface(mesh: Mesh, n_samples: int, *, seed: int) -> Float[np.ndarray, "n 3"]:
-    """Points spread evenly by area: one in each of `n_samples` equal parts of the total area.
+    """Stratified uniform samples of a mesh: one in each of `n_samples` equal parts of its area.
 
     Args:
         mesh: with at least one triangle of some area.
         n_samples: number of points.
-        seed: places each point in its part.
+        seed: seed of the sampling.
 
     Raises:
         ConfigError: for a mesh without area, or no samples.
@@ -263,11 +263,11 @@ def seen_by(
     mask: Bool[np.ndarray, "c h w"],
     far_mm: float,
 ) -> Bool[np.ndarray, "n"]:
-    """Which points on a mesh at least one camera sees.
+    """Which points on a mesh are visible in at least one camera.
 
     Args:
         points: on the mesh.
-        mesh: what may stand in between.
+        mesh: the possible occluder.
         cameras: the views.
         mask: pixels that show tissue.
         far_mm: z-depth beyond which nothing counts as seen.
@@ -315,7 +315,7 @@ def _parts(
 
 
 def _max_fused_depth(sequence: EndoscopicSequence) -> float:
-    """Farther depth is not fused, so surface seen from farther only cannot be asked for."""
+    """Largest depth that is fused; surface that is only seen from farther away is not evaluated."""
     frames = _all_frames(sequence)
     if sequence.depth_mm is None:
         return float("inf")

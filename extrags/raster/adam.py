@@ -1,4 +1,4 @@
-"""Adam that steps only the rows a view has touched, and follows densification."""
+"""Selective Adam: updates only the Gaussians visible in a view, and supports densification."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Joined", "SelectiveAdam"]
 
 @dataclass(frozen=True)
 class Joined:
-    """Parameters side by side in one array, and their moments, all [N, K, ...] and contiguous."""
+    """Several parameters concatenated in one array, and their moments, all [N, K, ...] and contiguous."""
 
     values: Tensor
     first_moments: Tensor
@@ -27,19 +27,19 @@ class Joined:
 class SelectiveAdam:
     """Adam over named parameters that share their rows (one row per Gaussian).
 
-    A step updates the rows flagged visible and leaves the others, their moments and their count of steps
-    alone: untouched Gaussians cost nothing. The bias correction of a row counts that row's own steps, so
-    a row first seen late, or added by densification, starts as at step one. With all rows visible this is
-    `torch.optim.Adam`. The result depends on nothing but the inputs, whatever the number of threads.
+    A step updates only the rows flagged visible; other rows keep their values, moments and step counts, and
+    cost no time. The bias correction of a row counts that row's own steps, so a row that is first visible
+    late, or was added by densification, starts at step one. With all rows visible the result equals
+    `torch.optim.Adam`. Results are deterministic and independent of the number of threads.
 
-    Parameters that are joined lie side by side in one array: the kernels that want them together need no
-    copy. They stay parameters of their own, with their own names, rates, moments and leaves.
+    Joined parameters are stored in one array, so that kernels that take them together need no copy. They
+    remain separate parameters with their own names, learning rates, moments and leaf tensors.
 
     Args:
         parameters: leaf tensors [N, ...] by name, contiguous; stepped in place.
-        learning_rates: one per parameter, by name; a rate of 0 leaves the parameter as it is.
-        betas: decay of the first and second moment.
-        eps: added to the root of the second moment.
+        learning_rates: one per parameter, by name; a rate of 0 freezes the parameter.
+        betas: decay rates of the first and second moment.
+        eps: added to the square root of the second moment.
         joined: names of float32 CPU parameters [N, K_i, ...] to be joined along K, by the name of the whole;
             `parameters` holds new leaves for them.
 
@@ -91,7 +91,7 @@ class SelectiveAdam:
 
     @torch.no_grad()
     def _join(self) -> None:
-        """Lay parameters and moments that belong together into one array each."""
+        """Concatenate joined parameters, and their moments, into one array each."""
         for whole, parts in self._parts.items():
             arrays = []
             for held in (self.parameters, self.first_moments, self.second_moments):
@@ -116,12 +116,12 @@ class SelectiveAdam:
     def step(
         self, visible: Bool[Tensor, "n"] | None = None, gradients: Mapping[str, Tensor] | None = None
     ) -> None:
-        """Update the parameters from their `.grad`; a parameter without one is left alone.
+        """Update the parameters from their `.grad`; a parameter without a gradient is unchanged.
 
         Args:
             visible: rows to update; None updates all.
-            gradients: use these instead of `.grad`, by name; those of joined parameters come as one array
-                under the name of the whole. A parameter without one is left alone.
+            gradients: gradients to use instead of `.grad`, by name; joined parameters have one array, under
+                the name of the joined array. A parameter without a gradient is unchanged.
 
         Raises:
             ShapeError: when `visible` does not have one flag per row.
@@ -177,7 +177,7 @@ class SelectiveAdam:
         value[rows] -= rate * (m / (1 - beta1**count)) / denominator
 
     def zero_grad(self) -> None:
-        """Forget the gradients."""
+        """Set all gradients to None."""
         for value in self.parameters.values():
             value.grad = None
 

@@ -1,8 +1,8 @@
 """Run time and error of the rasteriser and of a whole training iteration: `extrags bench raster|train`.
 
-All peers render the same scene in turns, one call each per round, so that a busy machine slows all of them
-alike; reported are medians over the rounds and their spread. One-thread cases can be judged by `cpu_ms`, the
-processor time of the process, which a neighbour on the core does not change.
+All peers (the backends compared) render the same scene, one call each per round, so that other load on the
+machine affects all of them equally; reported are medians over the rounds and quantiles. For cases with one
+thread `cpu_ms`, the processor time of the process, is independent of such load.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ def bench_scene(size: BenchSize, *, seed: int = 0) -> dict[str, Tensor]:
 
 
 def machine() -> dict[str, Any]:
-    """What the measurements were taken on: processor, threads, versions, commit."""
+    """The environment of the measurements: processor, threads, versions, commit."""
     processor = platform.processor()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -256,7 +256,7 @@ def _bench_size(
 
 
 def _peak_mib(function: Callable[[], None]) -> float | None:
-    """Memory a call takes at its height beyond what the process held before."""
+    """Peak resident memory of a call beyond that of the process before it, in MiB."""
     _return_free_memory()
     reset, status = Path("/proc/self/clear_refs"), Path("/proc/self/status")
     if not os.access(reset, os.W_OK):
@@ -276,7 +276,7 @@ def _peak_mib(function: Callable[[], None]) -> float | None:
 
 
 def _return_free_memory() -> None:
-    """Else memory that an earlier peer left in the heap would be used again and not be counted."""
+    """Return freed heap memory to the system: memory reused from an earlier peer would not be counted."""
     try:
         ctypes.CDLL("libc.so.6").malloc_trim(0)
     except (OSError, AttributeError):  # another C library: the figure of later peers is a lower bound

@@ -1,8 +1,8 @@
-"""Loss and gradients of one view straight from the native kernels, without autograd.
+"""Loss and gradients of one view computed directly by the native kernels, without autograd.
 
-`rasterize`, `l1_ssim_loss`, `inverse_depth_loss` and a backward pass through them do the same for any
-backend. Here nothing is recorded: the arrays that the kernels write stay while the number of Gaussians does,
-and the chain rule through exponential and sigmoid is written out.
+The result equals `rasterize`, `l1_ssim_loss`, `inverse_depth_loss` and a backward pass through them. There is
+no autograd graph: buffers are reused as long as the number of Gaussians stays the same, and the chain rule
+through the activations (exponential, sigmoid) is explicit.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ __all__ = ["DirectStep", "Target"]
 
 
 class Target:
-    """What the image of one camera is held against, as the kernels read it.
+    """Ground truth of one camera, in the layout that the kernels read.
 
     Args:
         viewmat: camera from world, [4, 4].
         K: intrinsics in pixels, [3, 3].
-        rgb: the colours, [H, W, 3].
-        weight: of the colours, per pixel, [H, W]; None weighs all alike.
+        rgb: ground-truth colours, [H, W, 3].
+        weight: weight of the colour loss per pixel, [H, W]; None weights all pixels equally.
         depth: z-depth in world units, 0 where there is none, [H, W].
 
     Raises:
@@ -72,7 +72,7 @@ def _contiguous_array(values: Tensor) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Images:
-    """Rendered images of one size and their gradients; tensors and the same memory as the kernels take it."""
+    """Buffers for rendered images and their gradients, as tensors and as arrays that share memory."""
 
     tensors: dict[str, Tensor]
     arrays: dict[str, np.ndarray]
@@ -100,7 +100,7 @@ class _Images:
         depth_weight: float,
         depth_scale: float,
     ) -> tuple[float, Any]:
-        """The loss, and the kernels' struct of its gradients."""
+        """The loss, and the kernels' struct of its gradients with respect to the images."""
         kernels, image = native.compiled_kernels(), self.arrays
         loss: float = kernels.l1_ssim(
             image["rgb"], target.rgb, target.weight, image["v_rgb"], dssim_weight, rgb_weight
@@ -117,14 +117,14 @@ class _Images:
 
 
 class DirectStep:
-    """Renders, compares and carries back one view after the other, into the same arrays.
+    """Forward pass, loss and backward pass of one view at a time, in reused buffers.
 
     `gradients` holds the last view's gradients with respect to the parameters before activation, by name.
     It and the renderings are overwritten by the next `run` and replaced by the next `bind`.
 
     Args:
         absgrad: fill `means2d.absgrad`.
-        lit: the cameras carry a light.
+        lit: the scene has a near-field light.
     """
 
     def __init__(self, *, absgrad: bool = False, lit: bool = False) -> None:
@@ -143,7 +143,7 @@ class DirectStep:
         self._means2d = self._radius_px = torch.empty(0)
 
     def bind(self, parameters: Mapping[str, Tensor]) -> None:
-        """Take the parameters to work on; they may change in place from one `run` to the next.
+        """Set the parameters to differentiate; they may be updated in place between calls of `run`.
 
         Args:
             parameters: float32 on the CPU and contiguous: `means` [N, 3], `quats` [N, 4], `scales` (their
@@ -188,7 +188,7 @@ class DirectStep:
         """Loss of one view; fills `gradients`, `visible`, `light_gradient` and the rendering.
 
         Args:
-            target: what to compare with, and its camera.
+            target: ground truth of the view, and its camera.
             sh_degree: use the harmonics up to this degree.
             light: a row of `CameraLight.packed`; given exactly if the step was made `lit`.
             dssim_weight: as in `l1_ssim_loss`.
@@ -236,7 +236,7 @@ class DirectStep:
         return loss
 
     def rendering(self, target: Target) -> Rendering:
-        """The images of the last `run`, whose target this must be, in the arrays the next one overwrites."""
+        """The images of the last `run`, which must have had this target; the next `run` overwrites them."""
         size = target.width, target.height
         if size not in self._renderings:
             images = self._images_of(target).tensors
@@ -257,7 +257,7 @@ class DirectStep:
         return self._images[size]
 
     def _backward_activations(self) -> None:
-        """From gradients of scales and opacities to those of their logarithms and logits."""
+        """Chain rule through the activations: from scales and opacities to their logarithms and logits."""
         g_scales, g_opacities = self.gradients["scales"], self.gradients["opacities"]
         torch.mul(g_scales, self._linear["scales"], out=g_scales)
         torch.ops.aten.sigmoid_backward.grad_input(

@@ -1,4 +1,4 @@
-"""`rasterize`: one function in front of all backends."""
+"""`rasterize`: the public function that dispatches to a backend."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Backend = Literal["auto", "native", "gsplat", "reference"]
 
 
 def available_backends() -> tuple[str, ...]:
-    """Backends that work here, the preferred one first.
+    """Backends available on this machine, in order of preference.
 
     Returns:
         Any of `gsplat` (CUDA device and the package gsplat), `native` (compiled kernels), `reference`.
@@ -94,10 +94,10 @@ def rasterize(
         visibility: fill `Rendering.visibility_max` and `visibility_sum`.
         query_points: world points at which `Rendering.transmittance` is wanted.
         absgrad: fill `means2d.absgrad` on backward.
-        light: the light the cameras carry; `sh` or `colors` are albedo then. Differentiable.
+        light: near-field light of the cameras; `sh` or `colors` are then albedo. Differentiable.
 
     Returns:
-        The images and what was asked for; see `Rendering` for shapes and meaning.
+        The images and the optional outputs requested; see `Rendering` for shapes and meaning.
 
     Raises:
         ShapeError: when shapes, dtypes or devices do not fit together.

@@ -18,9 +18,9 @@ __all__ = ["rasterize_gsplat"]
 def rasterize_gsplat(inputs: RasterInputs, options: RasterOptions) -> Rendering:
     """Render float32 CUDA tensors with gsplat; arguments as checked by `rasterize`.
 
-    gsplat has no median depth, no visibility and no transmittance at points. Asked for, they are computed
-    from the same Gaussians by the native kernels on the CPU (or by the reference where those are not
-    built); none of them is differentiable in any backend.
+    gsplat has no median depth, no visibility and no transmittance at points. If requested, they are computed
+    from the same Gaussians by the native kernels on the CPU (or by the reference if those are not built);
+    they are not differentiable in any backend.
     """
     import gsplat
 
@@ -57,7 +57,7 @@ def rasterize_gsplat(inputs: RasterInputs, options: RasterOptions) -> Rendering:
 
 
 def _colors(inputs: RasterInputs, sh_degree: int) -> Tensor | None:
-    """Lit colours, which gsplat knows nothing of, are computed per camera, by the reference's formula."""
+    """Colours per camera; under a light they come from the reference, since gsplat has no light model."""
     if inputs.light is None:
         return inputs.sh if inputs.sh is not None else inputs.colors
     everything = torch.arange(len(inputs.means), device=inputs.means.device)
@@ -71,7 +71,7 @@ def _radius(radii: Tensor) -> Tensor:
 
 
 def _centres(projected: Tensor, absgrad: bool) -> Tensor:
-    """A tensor outside the graph that takes gsplat's gradients of the centres on backward."""
+    """A tensor outside the graph whose `.grad` is filled with gsplat's gradients on backward."""
     means2d = projected.detach().clone()
     if projected.requires_grad:
 

@@ -1,7 +1,7 @@
-r"""The near-field light a camera carries, as the rasteriser applies it to every Gaussian.
+r"""Near-field light fixed to the camera, as the rasteriser applies it to every Gaussian.
 
-A Gaussian of albedo a (its spherical harmonics), at :math:`\mathbf d` from the lamp (in the camera frame, in
-reference distances), with normal n (its shortest axis), sends to the lens
+A Gaussian of albedo a (from its spherical harmonics), at :math:`\mathbf d` from the light (in the camera
+frame, in reference distances), with normal n (its shortest axis), has signal x and image value I:
 
 .. math::
     x = g \, a \left(\frac{1 + c}{|\mathbf d|^2 + c}\right)^{e}
@@ -10,9 +10,10 @@ reference distances), with normal n (its shortest axis), sends to the lens
     \qquad \cos\alpha = \frac{\mathbf n \cdot \mathbf d}{|\mathbf d|},
     \qquad I = \frac{(1 + s) \, x}{1 + s \, x}
 
-with exposure g (one per colour), softening c, exponent e, spread k of the lamp, share q of the cosine law at
-the surface, and shoulder s of the camera's response. At the reference distance, on the axis, facing the lamp,
-x is g a, and I is x where x is one: the gauge. With k = q = s = 0 this is the plain softened fall-off.
+with exposure g (one per colour channel), softening c and exponent e of the fall-off with distance, exponent k
+of the light's angular spread, exponent q of the cosine law at the surface, and shoulder s of the camera
+response. Normalisation: at the reference distance, on the axis and facing the light, x = g a; and I = 1 for
+x = 1. With k = q = s = 0 this is the softened fall-off with distance alone.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ from extrags.raster.rotations import rotation_matrices
 __all__ = ["CameraLight", "apply_response", "invert_response", "light_gain", "lit_colors", "shortest_axes"]
 
 SQUARE_MIN = 1e-6
-"""Nothing is nearer to the lamp than this (squared, in reference distances)."""
+"""Lower bound of the squared distance to the light, in reference distances."""
 
 SPREAD_MIN = 0.1
-"""Beyond this cosine to the lamp's axis the spread stays what it is."""
+"""Lower bound of the cosine to the light's axis; at larger angles the angular spread is constant."""
 
 COSINE_SOFTENING = 0.04
-"""epsilon: a wall seen edge-on does not turn black, and the gradient of its normal stays bounded."""
+"""epsilon: surfaces at grazing incidence do not become black, and the gradient of the normal is bounded."""
 
 LOG2_GAIN_MAX = 40.0
-"""Gains are held within 2^-40 and 2^40."""
+"""Gains are clamped to [2^-40, 2^40]."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class CameraLight:
         exponent: e, scalar.
         spread: k, scalar.
         cosine: q, scalar.
-        offset: where the lamp stands in the camera frame, in reference distances, [3].
+        offset: position of the light in the camera frame, in reference distances, [3].
         shoulder: s, not negative, scalar.
         reference_distance: in world units; not learned.
     """
@@ -82,12 +83,12 @@ def lit_colors(
     normals: Float[Tensor, "n 3"],
     light: Float[Tensor, "12"],
 ) -> Float[Tensor, "n 3"]:
-    """What Gaussians send to one camera.
+    """Image colours of Gaussians in one camera under its light.
 
     Args:
-        albedo: colours before the light, not negative.
+        albedo: colours without light, not negative.
         points: centres in the camera frame, in world units.
-        normals: unit normals in the camera frame; their sign does not matter.
+        normals: unit normals in the camera frame, of either sign.
         light: a row of `CameraLight.packed`.
     """
     signal = albedo * light[:3] * light_gain(points, normals, light)[:, None]
@@ -97,7 +98,10 @@ def lit_colors(
 def light_gain(
     points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None, light: Float[Tensor, "12"]
 ) -> Float[Tensor, "*b"]:
-    """The factor on the albedo at unit exposure; without normals all surfaces face the lamp."""
+    """Gain of the light at points in the camera frame, at unit exposure.
+
+    Without normals all surfaces are assumed to face the light.
+    """
     softening, exponent, spread, cosine = light[3:7]
     offset = points / light[11] - light[7:10]
     square = offset.square().sum(-1).clamp(SQUARE_MIN, 1e30)
@@ -112,12 +116,12 @@ def light_gain(
 
 
 def apply_response(signal: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
-    """The camera's response I(x)."""
+    """Camera response I(x) of a signal x."""
     return (1 + shoulder) * signal / (1 + shoulder * signal)
 
 
 def invert_response(image: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:
-    """The signal x whose response is I, for I in [0, 1]."""
+    """Inverse of `apply_response`: the signal x of image values I in [0, 1]."""
     return image / (1 + shoulder * (1 - image))
 
 

@@ -5,9 +5,9 @@ For an image x, a target y and per-pixel weights m in [0, 1],
 .. math:: L = (1 - \lambda) \frac{\sum_p m_p \sum_c |x - y|}{3 \sum_p m_p}
         + \lambda \frac{\sum_p m_p \sum_c (1 - \mathrm{SSIM}_{pc}) / 2}{3 \sum_p m_p}.
 
-The SSIM map is that of Wang et al. 2004: 11 x 11 Gaussian window of sigma 1.5, zeros outside the image,
-C1 = 0.01^2, C2 = 0.03^2 for a range of one, and is taken on the images as they are: the weights choose
-where the map counts, they do not change it. Where all weights are zero the loss is zero.
+The SSIM map is that of Wang et al. 2004: 11 x 11 Gaussian window of sigma 1.5 px, zero padding,
+C1 = 0.01^2, C2 = 0.03^2 for a data range of one. It is computed on the unweighted images; the weights apply
+to the map only. If all weights are zero the loss is zero.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ def l1_ssim_loss(
 
     Args:
         image: rendered colour in [0, 1].
-        target: what it should be.
+        target: ground-truth colour in [0, 1].
         dssim_weight: lambda, in [0, 1].
-        mask: weights per pixel, in [0, 1] or larger; None weighs all alike.
+        mask: weights per pixel, not negative; None weights all pixels equally.
 
     Returns:
         The loss.
@@ -68,7 +68,7 @@ def l1_ssim_loss_reference(
     dssim_weight: float = 0.2,
     mask: Float[Tensor, "*c h w"] | None = None,
 ) -> Float[Tensor, ""]:
-    """The same in plain torch, any floating dtype: the specification of `l1_ssim_loss`."""
+    """Reference implementation of `l1_ssim_loss` in plain torch, for any floating-point dtype."""
     _check(image, target, mask)
     target = target.detach()
     height, width = image.shape[-3:-1]
@@ -92,17 +92,17 @@ def inverse_depth_loss(
 ) -> Float[Tensor, ""]:
     """Mean absolute difference of inverse depths, in units of the inverse of a typical depth.
 
-    Only where both surfaces are there: a hole has no depth that could be wrong. The native kernel of the
-    same name computes it together with its gradient; see `extrags.raster.direct`.
+    The mean is over pixels with both a rendered surface and a target depth. The native kernel of the same
+    name computes it together with its gradient; see `extrags.raster.direct`.
 
     Args:
-        depth: rendered z-depth; the only one to get a gradient.
-        alpha: rendered opacity; pixels at `HOLE_ALPHA` or below do not count.
-        target: true z-depth, 0 where it is not known.
-        scale: the typical depth.
+        depth: rendered z-depth in world units; only this argument gets a gradient.
+        alpha: rendered opacity; pixels at `HOLE_ALPHA` or below are ignored.
+        target: z-depth of the ground truth in world units, 0 where unknown.
+        scale: the typical depth, in world units.
 
     Returns:
-        The loss; zero where nothing can be compared.
+        The loss; zero if no pixel can be compared.
     """
     valid = (target > 0) & (alpha.detach() > HOLE_ALPHA) & (depth.detach() > 1e-3 * scale)
     if not bool(valid.any()):

@@ -1,7 +1,7 @@
-"""The native CPU backend: autograd round the compiled kernels.
+"""The native CPU backend: autograd functions around the compiled kernels.
 
-The kernels project, bin, sort and composite in one call per camera, and carry the gradients back in
-another. What a forward pass leaves in memory travels in a `Frame` to its backward pass.
+One kernel call per camera projects, bins, sorts and composites; another computes the gradients. A `Frame`
+holds the intermediate results of a forward pass for its backward pass.
 """
 
 from __future__ import annotations
@@ -38,9 +38,10 @@ __all__ = [
 
 
 def native_isa() -> str | None:
-    """The instruction set the kernels use, `avx512`, `avx2` or `portable`; None when they are not built.
+    """Instruction set the kernels use, `avx512`, `avx2` or `portable`; None when they are not built.
 
-    The best one of the processor is chosen at import; the environment variable EXTRAGS_ISA overrides it.
+    The fastest one the processor supports is chosen at import; the environment variable EXTRAGS_ISA
+    overrides it.
     """
     return None if _kernels is None else str(_kernels.isa())
 
@@ -63,7 +64,7 @@ def set_native_isa(name: str) -> None:
 
 
 def set_num_threads(n: int) -> None:
-    """Let the kernels use up to n threads; the results do not depend on it.
+    """Set the maximum number of threads of the kernels; results do not depend on it.
 
     The default is the number of cores this process may use, at most 8.
 
@@ -76,7 +77,7 @@ def set_num_threads(n: int) -> None:
 
 
 def num_threads() -> int:
-    """How many threads the kernels may use."""
+    """Maximum number of threads of the kernels."""
     return int(compiled_kernels().num_threads())
 
 
@@ -162,7 +163,7 @@ class _Call:
         )
 
     def take_gradients(self, gradients: Tensor, absolute: Tensor | None) -> None:
-        """Hand the gradients of the projected centres to the tensor the user holds."""
+        """Accumulate the gradients of the 2D means into `means2d`, the tensor returned to the caller."""
         means2d = self.means2d
         means2d.grad = gradients if means2d.grad is None else means2d.grad + gradients
         if absolute is not None:
@@ -352,7 +353,7 @@ def adam_step(
         betas: decay of the moments.
         eps: added to the root of the second moment.
     """
-    # The kernels take numpy's arrays in a tenth of the time they need for torch's.
+    # Binding numpy arrays takes the kernels a tenth of the time of binding torch tensors.
     compiled_kernels().adam(
         [
             (

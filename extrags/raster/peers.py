@@ -1,4 +1,4 @@
-"""What the benchmarks measure: the backends and the torch baseline, each doing the same iteration."""
+"""The implementations compared by the benchmarks: all backends and a torch baseline."""
 
 from __future__ import annotations
 
@@ -44,13 +44,13 @@ PEERS: dict[str, str] = {
 }
 
 MAX_ROUNDS = {"torch": 6, "reference": 3}
-"""The slow ones run no oftener than this, one round of warming up included."""
+"""Upper limit on the rounds of slow implementations, one warm-up round included."""
 
 NOT_LEARNED = ("viewmats", "Ks", "target")
 
 
 def check_peers(peers: list[str]) -> None:
-    """Refuse what cannot run here.
+    """Check that all peers are known and available on this machine.
 
     Raises:
         ConfigError: for an unknown peer, or one that is not available.
@@ -65,16 +65,16 @@ def check_peers(peers: list[str]) -> None:
 
 
 def use_threads(backend: str, count: int) -> None:
-    """Let a backend use so many threads."""
-    # Beside the native kernels torch has only small arrays to handle: its threads, which wait for each other
-    # at barriers, would cost more than they bring.
+    """Set the number of threads of a backend."""
+    # With the native kernels torch handles small arrays only, for which the synchronisation of several
+    # threads costs more than it gains.
     torch.set_num_threads(1 if backend in ("native", "direct") else count)
     if native.native_isa() is not None:
         native.set_num_threads(count)
 
 
 class TimedPeer:
-    """Repeated iterations of one peer on its own copy of a scene.
+    """Timed iterations of one peer on its own copy of a scene.
 
     Args:
         backend: one of `PEERS`.
@@ -90,7 +90,7 @@ class TimedPeer:
         if backend == "direct":
             values["scales"], values["opacities"] = values["scales"].log(), values["opacities"].logit()
         self.parameters = {k: v.requires_grad_() for k, v in values.items() if k not in NOT_LEARNED}
-        # Rates so small that the scene stays what it is, round after round
+        # Learning rates so small that the scene is practically constant over all rounds
         rate = 1e-9
         self.adam: SelectiveAdam | torch.optim.Adam
         if backend in ("native", "direct", "gsplat"):
@@ -106,7 +106,7 @@ class TimedPeer:
         self._cpu: list[dict[str, float]] = []
 
     def iteration(self) -> None:
-        """Render, compare, carry back, step; the times are kept."""
+        """One iteration (forward, loss, backward, optimiser step); its times are recorded."""
         if self.backend == "direct":
             self._direct_iteration()
             return
@@ -165,7 +165,7 @@ class TimedPeer:
         return len(self._wall) >= MAX_ROUNDS.get(self.backend, len(self._wall) + 1)
 
     def summary(self) -> dict[str, Any]:
-        """Medians in milliseconds without the warming up, and the spread of the iteration."""
+        """Medians in milliseconds without warm-up, and quantiles of the iteration time."""
         warm_up = 1 if self.backend in MAX_ROUNDS else 2
 
         def medians(record: list[dict[str, float]]) -> dict[str, float]:
@@ -182,7 +182,7 @@ class TimedPeer:
 
 
 def rasterize_scene(scene: Mapping[str, Tensor], backend: str, width: int, height: int) -> Rendering:
-    """`rasterize` with its arguments out of a scene."""
+    """Call `rasterize` with the arrays of a scene."""
     return rasterize(
         scene["means"],
         scene["quats"],
@@ -212,10 +212,10 @@ def _cotangents(scene: Mapping[str, Tensor]) -> TileImages:
 
 
 def exact_gradients(scene: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Image, and gradients of a fixed random weighting of colour, alpha and depth, in float64.
+    """Image, and gradients of a fixed random linear function of colour, alpha and depth, in float64.
 
-    Through `tile_gradients`, which needs memory for a few tiles only; the tests hold it against the
-    specification to rounding.
+    Computed by `tile_gradients`, whose memory is bounded; the tests compare it with the reference
+    implementation.
     """
     exact = {name: value.double() for name, value in scene.items()}
     height, width = scene["target"].shape[1:3]
@@ -224,7 +224,7 @@ def exact_gradients(scene: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def gradients(backend: str, scene: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """What `exact_gradients` gives, by a peer and in its own precision."""
+    """The same results as `exact_gradients`, computed by a peer in its own precision."""
     height, width = scene["target"].shape[1:3]
     values = _placed(backend, scene)
     leaves = {k: v.requires_grad_() for k, v in values.items() if k not in NOT_LEARNED}
@@ -246,7 +246,7 @@ def gradients(backend: str, scene: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def errors(found: Mapping[str, Tensor], exact: Mapping[str, Tensor]) -> dict[str, Any]:
-    """Relative L2 of the image and of each gradient."""
+    """Relative L2 error of the image and of each gradient."""
     relative = {
         name: float((found[name].double().cpu() - value).norm() / value.norm().clamp_min(1e-30))
         for name, value in exact.items()

@@ -1,7 +1,8 @@
-"""The specification of the rasteriser, in plain torch.
+"""Reference implementation and specification of the rasteriser, in plain torch.
 
-Any floating dtype, on any device, differentiable by autograd. Written to be read and checked, in float64
-where it judges the others: every pixel evaluates every Gaussian whose box touches its tile.
+Supports any floating-point dtype and device, and is differentiable by autograd. It favours readability over
+speed: every pixel evaluates every Gaussian whose bounding box overlaps its tile. Tests compare the other
+backends with it in float64.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ __all__ = ["camera_colors", "rasterize_reference"]
 
 TILE_PX = 16
 ELEMENTS_PER_CHUNK = 1 << 22
-"""Pixel-Gaussian pairs evaluated at once; bounds the memory."""
+"""Pixel-Gaussian pairs evaluated at once; limits the memory."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class _Projected:
         depths: z in the camera frame, [M].
         opacities: [M].
         colors: [M, 3].
-        extent_px: half width and half height of the box the 1/255 rule leaves, [M, 2].
+        extent_px: half width and half height of the box outside which alpha is below 1/255, [M, 2].
     """
 
     ids: Tensor
@@ -200,7 +201,7 @@ def _project(inputs: RasterInputs, options: RasterOptions, camera: int) -> _Proj
 
 
 def camera_colors(inputs: RasterInputs, sh_degree: int, camera: int, ids: Tensor) -> Tensor:
-    """What chosen Gaussians send to one camera: colours or harmonics, under its light if there is one."""
+    """Colours [M, 3] of the Gaussians `ids` in one camera, from `colors` or `sh`, and its light if any."""
     albedo = _albedo(inputs, sh_degree, camera, ids)
     if inputs.light is None:
         return albedo
@@ -217,7 +218,7 @@ def _albedo(inputs: RasterInputs, sh_degree: int, camera: int, ids: Tensor) -> T
     if inputs.sh is None:
         raise ShapeError("exactly one of sh and colors must be given")
     rotation, translation = inputs.viewmats[camera, :3, :3], inputs.viewmats[camera, :3, 3]
-    # A rigid motion's inverse; off SO(3) the pose gradient is that of this expression.
+    # Inverse of a rigid motion; the gradient of the pose is that of this expression, also off SO(3).
     offset = inputs.means[ids] + rotation.T @ translation
     directions = offset / (offset.square().sum(-1, keepdim=True) + 1e-20).sqrt()
     basis = sh_basis(directions, sh_degree)
@@ -233,7 +234,7 @@ def _pixel_centres(x0: int, y0: int, size: tuple[int, int], like: Tensor) -> Ten
 def _touching(seen: _Projected, x0: int, y0: int, size: tuple[int, int]) -> Tensor:
     """Indices (nearest first) of the Gaussians whose box reaches a tile."""
     u, v = seen.means2d.detach().unbind(-1)
-    # A hair more than the box, so that rounding never drops a pixel the 1/255 rule keeps.
+    # Slightly larger than the box, so that rounding never drops a pixel with alpha of at least 1/255.
     ex, ey = (seen.extent_px * (1 + 1e-4) + 1e-3).unbind(-1)
     hit = (u + ex >= x0) & (u - ex <= x0 + size[1]) & (v + ey >= y0) & (v - ey <= y0 + size[0])
     return torch.nonzero(hit)[:, 0]
@@ -264,7 +265,7 @@ def _blend(
     """Blending weights [P, M], final transmittance [P], transmittance behind each Gaussian [P, M]."""
     alpha = _alphas(seen, index, pixels, absolute if options.absgrad else None)
     behind = torch.cumprod(1 - alpha, 1)
-    # The transmittance never grows, so this mask is the front part of each pixel's list.
+    # Transmittance is non-increasing, so this mask is a prefix of each pixel's list.
     alpha = torch.where(behind > TRANSMITTANCE_MIN, alpha, torch.zeros_like(alpha))
     behind = torch.cumprod(1 - alpha, 1)
     ones = torch.ones_like(behind[:, :1]) if behind.shape[1] else alpha.new_ones(len(pixels), 1)
@@ -327,7 +328,7 @@ def _fill_gradients_on_backward(
         return
 
     def fill(gradient: Tensor | None) -> None:
-        # No gradient at all reaches the hook of a part nothing depends on.
+        # The hook gets None where the output does not depend on the tensor.
         if gradient is None:
             return
         if means2d.grad is None:

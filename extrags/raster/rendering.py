@@ -1,4 +1,4 @@
-"""What a rasteriser is given and what it gives back, the same for all backends."""
+"""Inputs and outputs of a rasteriser, common to all backends."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from extrags.errors import NonFiniteError, ShapeError
 __all__ = ["RasterInputs", "RasterOptions", "Rendering", "checked_inputs"]
 
 DILATION_PX2 = 0.3
-"""Added to the diagonal of each projected covariance: gsplat's `eps2d`, a low-pass of about a pixel."""
+"""Added to the diagonal of each projected covariance, in px^2: gsplat's `eps2d`, a low-pass filter."""
 
 ALPHA_MAX = 0.999
-"""No Gaussian blocks more than this."""
+"""Upper limit of a Gaussian's alpha."""
 
 ALPHA_MIN = 1.0 / 255.0
-"""Fainter contributions are dropped."""
+"""Contributions with a smaller alpha are dropped."""
 
 TRANSMITTANCE_MIN = 1e-4
-"""A pixel is finished before its transmittance would fall to this."""
+"""Compositing of a pixel stops before its transmittance would fall to this value."""
 
 FIELD_OF_VIEW_MARGIN = 0.3
-"""The Jacobian of the projection is taken inside the image widened by this share of half its size."""
+"""Centres are clamped to the image, enlarged by this share of half its size, to evaluate the Jacobian."""
 
 ALPHA_EPS = 1e-10
-"""Keeps the expected depth finite where nothing was hit."""
+"""Lower bound of the denominator of the expected depth."""
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """Images of C cameras and what was asked for beside them.
+    """Images of C cameras and optional outputs.
 
     Args:
         rgb: colour, background included, [C, H, W, 3].
@@ -68,7 +68,7 @@ class Rendering:
 
     @property
     def visible(self) -> Bool[Tensor, "c n"]:
-        """Which Gaussians can reach a pixel of the image at all (occlusion not considered)."""
+        """Gaussians whose footprint overlaps the image; occlusion is not considered."""
         return self.radius_px > 0
 
 
@@ -91,7 +91,7 @@ class RasterInputs:
 
 @dataclass(frozen=True)
 class RasterOptions:
-    """Everything about a rasterisation that is not an array."""
+    """Arguments of a rasterisation that are not arrays."""
 
     width: int
     height: int
@@ -105,17 +105,17 @@ class RasterOptions:
 def checked_inputs(
     inputs: RasterInputs, width: int, height: int, near: float, sh_degree: int | None
 ) -> tuple[RasterInputs, int]:
-    """Refuse what cannot be rendered, by name.
+    """Check shapes, dtypes and devices of the arguments.
 
     Args:
-        inputs: as the user gave them; a background of one colour may be [3].
+        inputs: arguments of the caller; a background of one colour may be [3].
         width: of the images, in pixels.
         height: of the images, in pixels.
         near: distance of the near plane.
         sh_degree: highest degree to use; None is all there is.
 
     Returns:
-        The inputs with the background spread over the cameras, and the degree to use.
+        The inputs with the background expanded to all cameras, and the SH degree to use.
 
     Raises:
         ShapeError: when shapes, dtypes or devices do not fit together, or a size is out of range.
@@ -165,7 +165,7 @@ def checked_inputs(
 
 
 def check_finite(inputs: RasterInputs) -> None:
-    """Raise for the first array that holds a NaN or an infinity.
+    """Check that all arrays are finite.
 
     Raises:
         NonFiniteError: names the array and the first bad entry.

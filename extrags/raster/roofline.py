@@ -1,6 +1,7 @@
-"""The floor under a training iteration, and where its time goes.
+"""Roofline model of a training iteration, and a breakdown of its time.
 
-The floor is set by what the kernels must compute and move at the peaks measured on the machine itself.
+The lower bound on the time follows from the arithmetic and the memory traffic of the kernels, at the peak
+rates measured on the machine itself.
 """
 
 from __future__ import annotations
@@ -21,18 +22,18 @@ from extrags.raster.peers import rasterize_scene
 __all__ = ["part_times", "roofline"]
 
 FLOPS_PER_LANE = {"forward": 38, "backward": 61}
-"""Counted per pixel and Gaussian, the gradient's share of the reduction included."""
+"""Floating-point operations per pixel and Gaussian, reduction of the gradients included."""
 
 PARAMETERS_PER_GAUSSIAN = 59
 """Floats: mean 3, quaternion 4, scales 3, opacity 1, harmonics of degree 3 48."""
 
 
 def part_times(scene: Mapping[str, Tensor], rounds: int = 8) -> tuple[dict[str, float], int]:
-    """Where the time of a training iteration on the native kernels goes.
+    """Breakdown of the time of a training iteration on the native kernels.
 
     Args:
-        scene: as `bench_scene` makes it.
-        rounds: how often; the result is the median.
+        scene: from `bench_scene`.
+        rounds: number of repetitions; the result is their median.
 
     Returns:
         Milliseconds by part (`rest` is what autograd and Python add), and the number of entries (a Gaussian
@@ -51,7 +52,7 @@ def part_times(scene: Mapping[str, Tensor], rounds: int = 8) -> tuple[dict[str, 
         rendered = time.perf_counter()
         loss = l1_ssim_loss(rendering.rgb, target)
         compared = time.perf_counter()
-        # The frame keeps the kernels' own clocks; it lives in the graph until the backward pass is over.
+        # The frame holds the kernels' timers; the graph keeps it alive until the backward pass is over.
         frame = rendering.rgb.grad_fn.call.frames[0]  # type: ignore[union-attr]
         loss.backward()
         carried = time.perf_counter()
@@ -74,7 +75,7 @@ def part_times(scene: Mapping[str, Tensor], rounds: int = 8) -> tuple[dict[str, 
 
 
 def roofline(n_gaussians: int, entries: int, threads: int, iteration_ms: float) -> dict[str, float]:
-    """The least time an iteration could take at the measured arithmetic peak and memory bandwidth.
+    """Lower bounds on the time of an iteration at the measured arithmetic peak and memory bandwidth.
 
     Arithmetic: composited entries times sixteen lanes, forward and backward (projection, loss and Adam
     left out). Memory: parameters read twice, gradients written and read, Adam's moments and parameters
@@ -84,10 +85,10 @@ def roofline(n_gaussians: int, entries: int, threads: int, iteration_ms: float) 
         n_gaussians: in the scene.
         entries: composited, as `part_times` counts them.
         threads: of the kernels.
-        iteration_ms: what an iteration took.
+        iteration_ms: measured time of an iteration.
 
     Returns:
-        The two peaks, the two floors in milliseconds, and `share`: the larger floor over the time taken.
+        The two peaks, the two bounds in milliseconds, and `share`: the larger bound over the time taken.
     """
     flops = 16 * entries * sum(FLOPS_PER_LANE.values())
     traffic = 4 * PARAMETERS_PER_GAUSSIAN * n_gaussians * (2 + 2 + 6)

@@ -10,7 +10,7 @@ __all__ = ["rotation_matrices"]
 
 
 def rotation_matrices(quats: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3 3"]:
-    """Of unnormalised (w, x, y, z); the null quaternion stands for the identity."""
+    """Rotation matrices of quaternions (w, x, y, z) of any length; a null quaternion gives the identity."""
     norm = quats.square().sum(-1, keepdim=True).clamp_min(1e-24).sqrt()
     w, x, y, z = (quats / norm).unbind(-1)
     return torch.stack(

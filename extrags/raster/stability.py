@@ -1,8 +1,8 @@
-"""Scenes at the edges of what the rasteriser can be given: `extrags bench stability`.
+"""Numerical stability of the rasteriser on extreme inputs: `extrags bench stability`.
 
-A case passes when nothing that leaves the native kernels is NaN or infinite, alpha stays in [0, 1], and
-image and gradients agree with the float64 specification as well as float32 allows: within a fixed tolerance,
-or no worse than a few times the error that the specification itself makes in float32.
+A case passes when all outputs of the native kernels are finite, alpha is in [0, 1], and image and gradients
+agree with the float64 reference as well as float32 allows: within a fixed tolerance, or within a few times
+the error of the reference itself in float32.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from extrags.raster.rendering import Rendering
 __all__ = ["AXES", "REFUSED", "bench_stability"]
 
 IMAGE_TOLERANCE, GRADIENT_TOLERANCE = 1e-4, 1e-3
-"""Relative L2 that passes in any case."""
+"""Relative L2 errors that always pass."""
 
 FLOAT32_FACTOR = 4.0
-"""How many times the error of the specification in float32 passes as well."""
+"""Multiple of the reference's own float32 error that passes as well."""
 
 NEAR = 0.01
 LEARNED = ("means", "quats", "scales", "opacities", "sh")
@@ -41,11 +41,11 @@ class _Case:
     """One scene.
 
     Args:
-        axis: what is driven to its limit.
-        value: how far.
-        scene: as `bench_scene` makes it.
-        compared: whether float64 says what must come out; else only finiteness counts.
-        note: what there is to know about it.
+        axis: the quantity that takes extreme values.
+        value: its value, for the table.
+        scene: arrays in the layout of `bench_scene`.
+        compared: whether results are compared with float64; if not, they only have to be finite.
+        note: remark for the table.
     """
 
     axis: str
@@ -121,7 +121,7 @@ def _case_result(case: _Case) -> dict[str, Any]:
 
 
 def _outputs_and_gradients(scene: Scene, backend: Any, dtype: torch.dtype) -> dict[str, Tensor]:
-    """All outputs, and the gradients of a fixed random weighting of colour, alpha and depth."""
+    """All outputs, and the gradients of a fixed random linear function of colour, alpha and depth."""
     values = {name: value.to(dtype, copy=True) for name, value in scene.items()}
     leaves = {name: values[name].requires_grad_() for name in LEARNED}
     height, width = scene["target"].shape[1:3]
@@ -160,14 +160,14 @@ def _outputs_and_gradients(scene: Scene, backend: Any, dtype: torch.dtype) -> di
 
 
 def _errors(found: dict[str, Tensor], exact: dict[str, Tensor]) -> tuple[float, float]:
-    """Relative L2 of the image, and the worst of the gradients."""
+    """Relative L2 error of the image, and the largest one of the gradients."""
 
     def relative(name: str) -> float:
         difference = (found[name].double() - exact[name].double()).norm()
         return float(difference / exact[name].double().norm().clamp_min(1e-30))
 
     names = [f"gradient of {name}" for name in LEARNED]
-    # Where all that is right is (nearly) zero, a relative error says nothing.
+    # A relative error is meaningless where the exact value is (nearly) zero.
     sizes = {name: float(exact[name].norm()) for name in names if name in exact and name in found}
     largest = max(sizes.values(), default=0.0)
     counted = [name for name, size in sizes.items() if size > 1e-12 * largest]
@@ -210,8 +210,8 @@ def _quaternions() -> Iterator[_Case]:
     unit = torch.nn.functional.normalize(base["quats"], dim=1)
     for length in (0.0, 1e-38, 1e-20, 1e-3, 1e3, 1e18, 1e37):
         note = "stands for the identity" if length == 0 else ""
-        # Below the reference's own guard against division by zero its answer is arbitrary, and in float32
-        # the squared length of the longest overflows: finite is all that can be asked there.
+        # Below the reference's guard against division by zero its result is arbitrary, and in float32 the
+        # squared length of the longest overflows: results only have to be finite there.
         compared = length in (0.0, 1e-3, 1e3)
         yield _Case("quaternion length", f"{length:g}", _with(base, quats=unit * length), compared, note)
 
@@ -268,7 +268,7 @@ def _far_means() -> Iterator[_Case]:
         yield _Case("means", f"scene times {factor:g}", grown)
         yield _Case("means", f"positions times {factor:g}", _with(base, means=base["means"] * factor))
     for offset in (1e2, 1e4):
-        # Scene and camera together far from the origin, the camera turned: the pose cancels.
+        # Scene and rotated camera far from the origin: large terms of the pose cancel.
         turn = torch.tensor([[0.0, -0.3, 0.2], [0.3, 0.0, -0.1], [-0.2, 0.1, 0.0]])
         viewmat = torch.eye(4)
         viewmat[:3, :3] = torch.linalg.matrix_exp(turn)
@@ -324,14 +324,14 @@ AXES: dict[str, Callable[[], Iterator[_Case]]] = {
     "harmonics": _colours,
     "number of Gaussians": _counts,
 }
-"""What can be driven to its limits."""
+"""Cases by the quantity that takes extreme values."""
 
 REFUSED = "not finite"
-"""A further axis: what is refused rather than rendered."""
+"""A further axis: non-finite inputs, which must be rejected."""
 
 
 def _refusals() -> Iterator[dict[str, Any]]:
-    """NaN and infinity in every input: refused, and named."""
+    """NaN and infinity in every input: must raise an error that names the array."""
     for name in (*LEARNED, "viewmats", "Ks"):
         for value in (math.nan, math.inf):
             scene = _base(20, 16, 12)

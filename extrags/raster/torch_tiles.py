@@ -1,11 +1,11 @@
-"""A rasteriser in plain torch, written to be fast: what the native kernels are measured against.
+"""A fast tile-based rasteriser in plain torch: the baseline that the native kernels are compared with.
 
-Nothing renders with it; it is the peer `torch` of the benchmarks. Tiles of 8 x 8 pixels list the Gaussians
-whose ellipse reaches them, nearest first. The lists are composited a layer of entries at a time, all tiles
-together, so that the work is a few large tensor operations and autograd does the rest; a tile whose pixels
-are all opaque drops out. Two things make it faster than the obvious way: the exponent of all pixels of a
-tile is a product with the six monomials of the pixel's place, a matrix product, and the transmittance is
-the exponential of a running sum of logarithms, a product with a triangle.
+It is used by the benchmarks only, as the peer `torch`. Each tile of 8 x 8 pixels has a list of the Gaussians
+whose ellipse overlaps it, nearest first. The lists of all tiles are composited together, one layer of entries
+at a time, so that the work consists of a few large tensor operations, differentiated by autograd; tiles whose
+pixels are all opaque are dropped. Two formulations make it fast: the exponents of all pixels of a tile are a
+matrix product with the six monomials of the pixel position, and the transmittance is the exponential of a
+cumulative sum of logarithms, a product with a triangular matrix.
 
 In float64 it is an independent second implementation of the specification, in bounded memory:
 `tile_gradients` composites and differentiates some tiles at a time.
@@ -40,10 +40,10 @@ TILE_PX = 8
 PIXELS = TILE_PX * TILE_PX
 
 ENTRIES_PER_LAYER = 64
-"""Entries of each tile's list that are composited at once."""
+"""Entries of each tile's list composited at once."""
 
 ELEMENTS_PER_BATCH = 1 << 17
-"""Pixel-Gaussian pairs composited at once: what stays in the second-level cache beside its gradients."""
+"""Pixel-Gaussian pairs composited at once: as many as fit into the L2 cache with their gradients."""
 
 TILES_PER_PART = 128
 """Tiles that `tile_gradients` differentiates at once."""
@@ -54,10 +54,10 @@ RECORD_SIZE = 10
 """Numbers per Gaussian and tile: centre 2, conic 3, log opacity, colour 3, depth."""
 
 LOG_ZERO = -1e4
-"""Log opacity of the entries that pad a list."""
+"""Stands for the logarithm of zero: opacity of padding entries, transmittance of finished pixels."""
 
 MIN_LOG_ALPHA = -20.0
-"""Less than this logarithm of alpha is dropped in any case."""
+"""Lower bound of log alpha; well below the threshold at which contributions are dropped."""
 
 LOG_TRANSMITTANCE_MIN = math.log(TRANSMITTANCE_MIN)
 
@@ -79,7 +79,7 @@ class TileImages:
 
 @dataclass(frozen=True)
 class _Lists:
-    """Which Gaussians each tile holds, nearest first.
+    """The Gaussians of each tile, nearest first.
 
     Args:
         ids: rows of the records, tile after tile, [E]; the last entry stands for padding.
@@ -189,7 +189,7 @@ def _records(
     with torch.no_grad():
         reach = 2 * torch.log(opacities / ALPHA_MIN).clamp_min(0)
         extent = torch.sqrt(reach[:, None] * torch.stack([xx, yy], -1))
-        # A hair more, so that rounding never drops a pixel that the 1/255 rule keeps.
+        # Slightly larger, so that rounding never drops a pixel with alpha of at least 1/255.
         extent = (extent * (1 + 1e-4) + 1e-3) * (ahead & (determinant > 0))[:, None]
     return records, extent
 
@@ -218,12 +218,12 @@ def _lists(records: Tensor, extent: Tensor, width: int, height: int) -> _Lists:
 
 
 def _ellipse_meets_tile(records: Tensor, tile_x: Tensor, tile_y: Tensor) -> Tensor:
-    """Whether the ellipse of the 1/255 rule meets the rectangle of a tile's pixel centres."""
+    """Whether the ellipse with alpha of at least 1/255 overlaps the rectangle of a tile's pixel centres."""
     left, top = tile_x * TILE_PX + 0.5, tile_y * TILE_PX + 0.5
     u, v, a, b, c, log_opacity = records[:, :6].unbind(-1)
     right, bottom = left + (TILE_PX - 1), top + (TILE_PX - 1)
     near_x, near_y = u.clamp(left, right), v.clamp(top, bottom)
-    # A convex quadratic is least on the sides that face its centre (or at the centre itself).
+    # A convex quadratic has its minimum over a rectangle on the sides facing its centre, or at the centre.
     on_x = (v - b / c * (near_x - u)).clamp(top, bottom)
     on_y = (u - b / a * (near_y - v)).clamp(left, right)
 
@@ -286,7 +286,7 @@ def _entries(lists: _Lists, tiles: Tensor, first: int, longest: int) -> Int[Tens
 def _composite(
     entries: Float[Tensor, "b k 10"], tiles: Int[Tensor, "b"], passed: Float[Tensor, "b 64"], width: int
 ) -> tuple[Float[Tensor, "b 64 5"], Float[Tensor, "b 64"]]:
-    """What a layer adds to colour, depth sum and alpha, and the log transmittance behind it."""
+    """Contribution of a layer to colour, depth sum and alpha, and the log transmittance behind it."""
     columns = -(-width // TILE_PX)
     centre = torch.stack([tiles % columns, tiles // columns], -1).to(entries.dtype) * TILE_PX + TILE_PX / 2
     dx, dy = (entries[..., :2] - centre[:, None]).unbind(-1)
@@ -302,7 +302,7 @@ def _composite(
         ],
         -1,
     )
-    # Bounded below as well: the exponential of less is denormal, and slow.
+    # Also bounded below: smaller exponentials are denormal, and slow.
     log_alpha = (coefficients @ _monomials(entries)).clamp(MIN_LOG_ALPHA, math.log(ALPHA_MAX))
     alpha = threshold(log_alpha.exp(), ALPHA_MIN, 0.0)
     log_pass = torch.log1p(-alpha)
@@ -314,7 +314,7 @@ def _composite(
 
 
 def _monomials(like: Tensor) -> Float[Tensor, "6 64"]:
-    """1, x, y, x^2, xy, y^2 of the pixel centres about the middle of a tile."""
+    """1, x, y, x^2, xy, y^2 of the pixel centres relative to the centre of a tile."""
     line = torch.arange(TILE_PX, dtype=like.dtype) + 0.5 - TILE_PX / 2
     y, x = (axis.reshape(-1) for axis in torch.meshgrid(line, line, indexing="ij"))
     return torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
@@ -334,7 +334,7 @@ def _images(blended: Tensor, width: int, height: int) -> TileImages:
 
 
 def _tiled(images: TileImages, width: int, height: int) -> Float[Tensor, "t 64 5"]:
-    """The inverse of `_images` for images that may end inside a tile; zeros beyond."""
+    """Inverse of `_images`, for images that may end inside a tile; padded with zeros."""
     columns, rows = -(-width // TILE_PX), -(-height // TILE_PX)
     stacked = torch.cat([images.rgb, images.alpha[..., None], images.depth[..., None]], -1)
     whole = stacked.new_zeros(rows * TILE_PX, columns * TILE_PX, 5)
@@ -343,7 +343,7 @@ def _tiled(images: TileImages, width: int, height: int) -> Float[Tensor, "t 64 5
 
 
 def l1_ssim_loss_torch(image: Float[Tensor, "h w 3"], target: Float[Tensor, "h w 3"]) -> Float[Tensor, ""]:
-    """0.8 L1 + 0.1 (1 - SSIM) as `l1_ssim_loss`, in as few passes over the images as torch allows."""
+    """0.8 L1 + 0.1 (1 - SSIM), equal to `l1_ssim_loss`, with as few passes over the images as possible."""
     x, y = image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
     mean_x, mean_y, square_x, square_y, product = window_means(x, y)
     both, each = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y

@@ -1,4 +1,4 @@
-"""Refs, keys and content-addressed artefacts."""
+"""The artefact store: references, cache keys and content-addressed artefacts."""
 
 from __future__ import annotations
 

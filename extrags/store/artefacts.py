@@ -1,4 +1,4 @@
-"""The store: artefacts by key, written whole or not at all."""
+"""The artefact store: artefacts by key, written atomically."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ S = TypeVar("S", bound=Storable)
 
 
 class Slot:
-    """A scratch directory that becomes an artefact when its block ends well.
+    """A scratch directory that becomes an artefact when its `with` block ends without an exception.
 
     Args:
         path: where the stage writes.
-        counts: numbers for the manifest; the stage adds to it.
+        counts: numbers for the manifest, filled by the stage.
     """
 
     def __init__(self, path: Path, store: Store) -> None:
@@ -56,16 +56,20 @@ class Slot:
         return self.store.load_json(file, ref)
 
     def save(self, value: Storable) -> None:
-        """Write an object to where `load` looks for it."""
+        """Write an object to its place in the artefact (`Storable.stored_as`)."""
         value.save(self.path / value.stored_as)
 
     def save_json(self, file: str, value: Any, *, indent: int | None = None) -> None:
-        """Write plain JSON beside the arrays; NaN and infinity are no JSON and raise ValueError."""
+        """Write a JSON file.
+
+        Raises:
+            ValueError: for NaN and infinity, which JSON cannot represent.
+        """
         (self.path / file).write_text(json.dumps(value, indent=indent, allow_nan=False), encoding="utf-8")
 
     @property
     def debug(self) -> Path:
-        """Directory for what helps to understand a failure; kept only if the stage fails."""
+        """Directory for debugging files; kept only if the stage fails."""
         self._debug.mkdir(exist_ok=True)
         return self._debug
 
@@ -84,9 +88,9 @@ class Slot:
 class Store:
     """Content-addressed artefacts below a directory or an fsspec URL.
 
-    An artefact exists from the moment its manifest can be read; that is the only record there is, so
-    none can dangle. Safe against SIGKILL at any point and for several processes at once. (After a power
-    cut, `verify` tells whether the disk kept every byte.)
+    An artefact exists if and only if its manifest can be read; there is no other record that could become
+    stale. Safe for concurrent processes and against SIGKILL at any point. (After a power failure, `verify`
+    checks whether all bytes reached the disk.)
 
     Args:
         root: a directory, or a URL such as `s3://bucket/prefix` or `memory://name`.
@@ -114,11 +118,11 @@ class Store:
 
     @property
     def locks(self) -> Path:
-        """Where the locks of keys stand."""
+        """Directory of the lock files, one per key."""
         return self.state / "locks"
 
     def check_writable(self) -> None:
-        """Try the store.
+        """Check that the store can be written.
 
         Raises:
             StoreError: when it cannot be written, with the reason.
@@ -191,15 +195,15 @@ class Store:
         config: Mapping[str, Any] | None = None,
         inputs: Mapping[str, Ref] | None = None,
     ) -> Iterator[Slot]:
-        """Write an artefact: all of it, or nothing when the block raises.
+        """Write an artefact atomically: it is committed when the block ends, and discarded when it raises.
 
         Args:
             stage: name of the stage.
-            version: its hand-bumped version.
+            version: version of the stage, raised by hand.
             key: the cache key; also the artefact's name.
-            label: for people, e.g. the name of the sequence.
-            config: settings, JSON types.
-            inputs: the artefacts it is made from.
+            label: display name, e.g. of the sequence.
+            config: settings, as JSON types.
+            inputs: the input artefacts by name.
 
         Yields:
             The slot; after the block `slot.ref` is the artefact.
@@ -253,7 +257,7 @@ class Store:
             slot._debug.rename(kept)
             log.info("what the failed stage left for debugging: %s", kept)
         except OSError as problem:
-            # The stage's own error matters more than its debris.
+            # A failure to keep debugging files must not hide the error of the stage.
             log.warning("could not keep the debugging files of %s: %s", key, problem)
 
     def ls(self, pattern: str = "*") -> list[Manifest]:
@@ -267,18 +271,18 @@ class Store:
         return [manifest.key for manifest in self.ls(pattern) if self.backend.discard(manifest.key)]
 
     def sweep(self, *, older_than_hours: float = 24.0) -> list[str]:
-        """Remove what killed processes left; never touches what a living process writes.
+        """Remove leftovers of killed processes; scratch directories of running processes are kept.
 
         Args:
-            older_than_hours: on object stores, unfinished uploads count as dead after so long.
+            older_than_hours: on object stores, age after which unfinished uploads are removed.
 
         Returns:
-            Names of what was removed.
+            Names of the removed files and directories.
         """
         return self.backend.sweep(older_than_hours)
 
     def gc(self, current: Mapping[str, int] | None = None, *, older_than_hours: float = 24.0) -> list[str]:
-        """`sweep`, and remove debugging files of failures and artefacts that can never be hit again.
+        """Garbage collection: `sweep`, debugging files of failures, and artefacts of outdated versions.
 
         Args:
             current: version of each stage; artefacts of other versions are removed. None keeps all.

@@ -1,4 +1,4 @@
-"""Keys by content: one JSON form per value, and its digest."""
+"""Cache keys: the canonical JSON form of a value, and its digest."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ DIGEST_BYTES = 16
 
 
 class Ref(BaseModel):
-    """Where an immutable artefact is, and what is in it.
+    """Reference to an immutable artefact: its location and the digest of its content.
 
-    Only the digest enters cache keys: a moved or copied artefact is still the same input.
+    Only the digest is part of cache keys: a moved or copied artefact is the same input.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -31,21 +31,21 @@ class Ref(BaseModel):
 
 
 def canonical(value: Any) -> Any:
-    """The one JSON form of a value, independent of process, platform and order of insertion.
+    """Canonical JSON form of a value, independent of process, platform and insertion order.
 
-    Floats go by their exact bits (`float.hex`), pydantic models by their fields, refs by their digest
-    alone. Tuples and lists are the same; `1`, `1.0` and `True` are not.
+    Floats are represented exactly (`float.hex`), pydantic models by their fields, refs by their digest alone.
+    Tuples and lists are equivalent; `1`, `1.0` and `True` are distinct.
 
     Args:
         value: None, bool, int, float, str, `Ref`, a pydantic model, or lists, tuples and string-keyed
             dicts of these.
 
     Returns:
-        The same as plain JSON types.
+        The value as plain JSON types.
 
     Raises:
-        ConfigError: for anything else. Sets have no order, paths and arrays no content that could be
-            read off cheaply, functions no identity: each would make keys that lie.
+        ConfigError: for other types (sets, paths, arrays, functions, ...), which have no canonical form that
+            determines a result, and for NaN and infinity.
     """
     return _canonical(value, "value")
 
@@ -58,7 +58,7 @@ def _canonical(value: Any, where: str) -> Any:
     if type(value) is float:
         if not math.isfinite(value):
             raise ConfigError(f"{where}: {value} cannot be part of a cache key; expected a finite number")
-        # + 0.0 folds -0.0 into 0.0: they compare equal, so they must have one key.
+        # + 0.0 turns -0.0 into 0.0: they compare equal, so their keys must be equal.
         return {"$float": (value + 0.0).hex()}
     if isinstance(value, Ref):
         return {"$ref": value.digest}

@@ -1,4 +1,4 @@
-"""Artefacts in a local directory: scratch, then one rename."""
+"""Storage in a local directory: artefacts are written to a scratch directory and renamed."""
 
 from __future__ import annotations
 
@@ -23,11 +23,10 @@ log = logging.getLogger(__name__)
 
 
 class DirectoryBackend:
-    """`artefacts/<key>/` below a root; what is being written stands in `scratch/`.
+    """Artefacts in `artefacts/<key>/` below a root directory; unfinished ones are in `scratch/`.
 
-    A scratch directory is moved into place with one `rename`, so a reader sees all of it or nothing.
-    Its writer holds a `flock` on it: the kernel drops the lock when the process dies, however it dies,
-    and `sweep` removes exactly the scratch directories that nobody holds.
+    A scratch directory is committed with one atomic `rename`. Its writer holds a `flock` on it, which the
+    kernel releases when the process ends for any reason; `sweep` removes the unlocked scratch directories.
     """
 
     def __init__(self, root: Path) -> None:
@@ -61,14 +60,14 @@ class DirectoryBackend:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except ValidationError as error:
-            # Not ours, or damaged: the stage runs again and replaces it.
+            # Foreign or damaged file: the stage runs again and replaces it.
             log.warning("%s is not a manifest (%d faults); ignored", path, error.error_count())
             return None
         except OSError as error:
             raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
 
     def uri(self, key: str) -> str:
-        """Where the artefact of a key stands."""
+        """Path of the artefact of a key."""
         return str(self.artefacts / key)
 
     def names(self) -> list[str]:
@@ -85,7 +84,7 @@ class DirectoryBackend:
     def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
         """Move a finished scratch directory into place.
 
-        Where another process was first with the same content, its artefact stays.
+        If another process has committed the same content before, its artefact is kept.
         """
         (scratch / MANIFEST).write_text(manifest.model_dump_json(indent=1))
         target = self.artefacts / manifest.key
@@ -106,7 +105,7 @@ class DirectoryBackend:
         raise StoreError(f"artefact {manifest.key} is being replaced by others again and again")
 
     def discard(self, key: str) -> bool:
-        """Remove one artefact: out of sight at once, then from the disk."""
+        """Remove an artefact: it is first renamed, so that it disappears atomically, then deleted."""
         aside = self.scratch / f"{key}.{secrets.token_hex(4)}.removed"
         self.scratch.mkdir(parents=True, exist_ok=True)
         try:
@@ -117,7 +116,7 @@ class DirectoryBackend:
         return True
 
     def sweep(self, older_than_hours: float) -> list[str]:
-        """Remove what killed processes left behind, and artefact folders without a manifest."""
+        """Remove scratch directories of killed processes, and artefact directories without a manifest."""
         removed = sweep_directories(self.scratch)
         for key in self.names():
             if not (self.artefacts / key / MANIFEST).exists() and self.discard(key):
@@ -127,10 +126,10 @@ class DirectoryBackend:
 
 @contextmanager
 def private_directory(parent: Path, name: str) -> Iterator[Path]:
-    """A fresh directory that belongs to this process as long as it lives; removed at the end.
+    """Create a directory locked by this process; it is removed at the end of the block.
 
     Raises:
-        StoreError: when it cannot be made.
+        StoreError: when it cannot be created.
     """
     try:
         path, lock = _claim(parent, name)
@@ -151,18 +150,18 @@ def _claim(parent: Path, name: str) -> tuple[Path, int]:
         try:
             lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
         except FileNotFoundError:
-            continue  # A sweeper saw it before we could lock it.
+            continue  # Another process's sweep removed it before it was locked.
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.fstat(lock), os.stat(path)):
                 return path, lock
         except (BlockingIOError, FileNotFoundError):
-            pass  # The same, a moment later.
+            pass  # Removed by a sweep after it was opened.
         os.close(lock)
 
 
 def sweep_directories(parent: Path) -> list[str]:
-    """Remove the directories below `parent` whose owner is gone; returns their names."""
+    """Remove the directories below `parent` that no process has locked; returns their names."""
     removed = []
     try:
         entries = sorted(entry.name for entry in os.scandir(parent) if entry.is_dir(follow_symlinks=False))

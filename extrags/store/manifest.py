@@ -1,4 +1,4 @@
-"""What stands in an artefact's `manifest.json`, and the digest over its files."""
+"""The `manifest.json` of an artefact, and the digest over its files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ READ_BYTES = 1 << 20
 
 
 class Manifest(BaseModel):
-    """Where an artefact comes from. Written last: its presence is what makes the artefact exist."""
+    """Provenance of an artefact. Written last: an artefact exists once its manifest does."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -30,19 +30,19 @@ class Manifest(BaseModel):
     digest: str
     """Digest over the files (relative names and bytes) without this manifest."""
     label: str = ""
-    """For people: the sequence it was made for. Not part of the key."""
+    """Display name: the sequence it was made for. Not part of the key."""
     config: dict[str, Any] = Field(default_factory=dict)
     """The stage's settings and other plain inputs."""
     inputs: dict[str, str] = Field(default_factory=dict)
-    """Digests of the artefacts it was made from."""
+    """Digests of the input artefacts, by name."""
     input_keys: dict[str, str] = Field(default_factory=dict)
-    """Their keys, to walk the lineage."""
+    """Keys of the input artefacts, by name, to trace the lineage."""
     software: dict[str, str] = Field(default_factory=dict)
     started: str = ""
     """UTC, ISO 8601."""
     seconds: float = 0.0
     counts: dict[str, float | int | str | None] = Field(default_factory=dict)
-    """What is worth knowing without opening the artefact: numbers of frames, Gaussians, ..."""
+    """Summary of the content: numbers of frames, Gaussians, ..."""
     files: int = 0
     bytes: int = 0
     data: str = ""
@@ -72,7 +72,7 @@ def content_digest(directory: Path) -> tuple[str, int, int]:
 
 @cache
 def software_versions() -> dict[str, str]:
-    """Versions of what the numbers depend on."""
+    """Versions of the software that results depend on."""
     versions = {"python": platform.python_version()}
     for package in ("extrags", "numpy", "torch", "zarr", "open3d-cpu", "pycolmap", "prefect"):
         try:

@@ -1,4 +1,4 @@
-"""What one stage hands to the next: objects that know their place in an artefact and their form on disk."""
+"""Base class of the objects that stages exchange through artefacts."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ __all__ = ["Storable"]
 
 
 class Storable(ABC):
-    """Can be written into an artefact (`Slot.save`) and read from one (`Store.load`)."""
+    """An object that can be written to an artefact (`Slot.save`) and read from one (`Store.load`)."""
 
     stored_as: ClassVar[str]
-    """Name of its folder or file inside the artefact; `.` for what fills the whole of it."""
+    """Name of its file or directory in the artefact; `.` if it is the whole artefact."""
 
     @abstractmethod
     def save(self, path: Path) -> None:

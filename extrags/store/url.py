@@ -1,4 +1,4 @@
-"""Artefacts behind an fsspec URL (S3-compatible and others), where there is no rename.
+"""Storage behind an fsspec URL (S3-compatible object stores and others), which has no atomic rename.
 
 The files of each attempt go below a prefix of their own, `<key>/<attempt>/`; `<key>/manifest.json`,
 written last with a single put, names the attempt. Before that nothing is visible, and two writers of
@@ -56,7 +56,11 @@ class UrlBackend:
         self.local = self.state / "artefacts"
 
     def check_writable(self) -> None:
-        """Try one write, here and there."""
+        """Try one write to the local cache and one to the remote store.
+
+        Raises:
+            StoreError: when either fails, with the reason.
+        """
         name = f"{self.prefix}/probe-{secrets.token_hex(4)}"
         try:
             self.fs.pipe_file(name, b"x")
@@ -81,7 +85,7 @@ class UrlBackend:
             raise StoreError(f"{self.url}/{key}/{MANIFEST} cannot be read: {error}") from error
 
     def uri(self, key: str) -> str:
-        """Where the artefact of a key stands."""
+        """URL of the artefact of a key."""
         return f"{self.url}/{key}"
 
     def names(self) -> list[str]:
@@ -89,7 +93,7 @@ class UrlBackend:
         return sorted(name for name, kind in self._children(self.prefix) if kind == "directory")
 
     def path(self, ref: Ref, manifest: Manifest) -> Path:
-        """The artefact's files on the local disk; fetched at the first call, checked against the digest."""
+        """Local directory with the artefact's files; downloaded at the first call, verified by the digest."""
         target = self.local / f"{manifest.key}.{manifest.digest}"
         if target.is_dir():
             return target
@@ -136,7 +140,7 @@ class UrlBackend:
         return manifest
 
     def discard(self, key: str) -> bool:
-        """Remove one artefact; the manifest goes first, so that it is out of sight at once."""
+        """Remove an artefact; its manifest is deleted first, so that it disappears atomically."""
         found = self.fs.exists(f"{self.prefix}/{key}")
         if found:
             if self.fs.exists(f"{self.prefix}/{key}/{MANIFEST}"):
@@ -146,9 +150,9 @@ class UrlBackend:
         return bool(found)
 
     def sweep(self, older_than_hours: float) -> list[str]:
-        """Remove local leftovers, and attempts without a manifest that are older than so many hours.
+        """Remove local leftovers, and remote attempts without a manifest older than `older_than_hours`.
 
-        Whether a remote writer still lives cannot be known, only how old its files are.
+        Only the age of remote files is known, not whether their writer is still running.
         """
         removed = sweep_directories(self.scratch)
         limit = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=older_than_hours)
