@@ -4,7 +4,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STORE ?= .extrags/demo
-# OpenMP threads that spin while they wait starve each other on small machines.
+# Actively waiting OpenMP threads slow each other down on machines with few cores.
 export OMP_WAIT_POLICY := passive
 
 .PHONY: help setup system demo test test-slow lint same-results bench clean
@@ -48,7 +48,7 @@ lint: setup ## Format, lint, types, import layers, spelling
 	$(BIN)/lint-imports
 	$(BIN)/codespell
 
-same-results: setup ## Record the code behind each stage: its version was raised, or results are the same
+same-results: setup ## Update the stage inventory after a change of version, or of code with equal results
 	$(BIN)/python -m tests.stage_inventory
 
 bench: setup ## Benchmarks of the kernels (JSON on standard output)

@@ -64,8 +64,7 @@ def evaluate_renders(
         sequence: the sequence of these frames.
         mesh: the scene's surface (`extrags.metrics.surface.scene_surface`); None where it has none.
         true_surface: ground truth of the surface; None omits the surface metrics.
-        measure: LPIPS with its weights, or the reason why there is none; None uses LPIPS if its weights can be
-            found.
+        measure: LPIPS with its weights, or the reason why there is none; None searches for the weights.
 
     Raises:
         ShapeError: when renders and frames differ in number or size.
@@ -99,8 +98,7 @@ def evaluate(
         scene: the scene.
         sequence: posed frames, including the held-out ones.
         true_surface: ground truth of the surface; None omits the surface metrics.
-        measure: LPIPS with its weights, or the reason why there is none; None uses LPIPS if its weights can be
-            found.
+        measure: LPIPS with its weights, or the reason why there is none; None searches for the weights.
 
     Raises:
         ShapeError: when there is no held-out frame.

@@ -26,7 +26,7 @@ from tasks.evaluate import METRICS_FILE
 __all__ = ["Case", "benchmark", "case_of", "check_methods", "run_method"]
 
 NOT_COUNTED = frozenset({"evaluate", "report"})
-"""Stages that measure a method are no part of its run time."""
+"""Stages that are not part of a method's run time."""
 PREFERRED_BASELINE = "3dgs"
 
 
@@ -69,8 +69,8 @@ def benchmark(
 ) -> dict[str, Any]:
     """Measure every combination, and compare the methods pair by pair.
 
-    What is in the store already is not run again: its time is what it took when it was made. Delete it
-    (`extrags cache rm`) to measure anew. A run that fails does not stop the others.
+    Artefacts in the store are reused, with the time that was measured when they were computed; delete them
+    (`extrags cache rm`) to measure again. A run that fails does not stop the others.
 
     Returns:
         `{machine, cases: [{method, profile, sequence, setting, seed, seconds, peak_mib, metrics, ...}],
@@ -88,7 +88,7 @@ def benchmark(
     wanted = [*methods, *(variants or {})]
     for method in wanted:
         for profile in profiles:
-            # Wrong settings and missing models concern all runs: say so before the first hour.
+            # Invalid settings and missing models affect all runs: report them before the first run.
             config = _config_of(method, profile, settings, variants or {}, 0)
             preflight(config, "evaluate", METHODS[_variant(method, variants or {})[0]].leave_out)
     found = [
@@ -121,10 +121,10 @@ def benchmark(
 def check_methods(
     methods: Sequence[str], variants: dict[str, dict[str, Any]], baseline: str | None = None
 ) -> str:
-    """The baseline, after a look at the names.
+    """Check the names of methods, variants and baseline; returns the baseline.
 
     Raises:
-        ConfigError: for unknown methods, names that are there twice, or a baseline that is not run.
+        ConfigError: for unknown methods, duplicate names, or a baseline that is not among the methods.
     """
     for method in methods:
         if method not in METHODS:
@@ -147,7 +147,7 @@ def check_methods(
 
 
 def summary_of(method: str, variants: dict[str, dict[str, Any]]) -> str:
-    """What a method or variant is, in words."""
+    """A description of a method or variant."""
     if method not in variants:
         return METHODS[method].summary
     base, settings = _variant(method, variants)
@@ -166,7 +166,7 @@ def run_method(
     *,
     variants: dict[str, dict[str, Any]] | None = None,
 ) -> Case:
-    """One case: run it, or take it from the store. A failing stage is in the outcome and is not raised.
+    """Run one case, or take it from the store. The error of a failed stage is in the outcome, not raised.
 
     Raises:
         ConfigError: for an unknown method or setting.

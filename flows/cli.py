@@ -1,4 +1,4 @@
-"""The `extrags` command: a list of verbs, and what is said when one fails.
+"""The `extrags` command: its verbs, and the reporting of errors.
 
 A verb is a module of `flows.commands` with `add_arguments`, which gives the parser its options and, as
 `command`, the function that does the work. Only the module of the verb that is used is imported, so that
@@ -49,7 +49,7 @@ Exit codes: 0 all well, 1 a sequence failed, 2 wrong usage."""
 
 
 def parser(verb: str | None = None) -> Parser:
-    """The command line; of the verbs only the one that is named has its options."""
+    """The argument parser; only the verb that is named gets its options."""
     root = Parser(
         prog="extrags",
         description="Reconstruct an endoscopic sequence as 3D Gaussians, explore what it did not see, "
@@ -69,8 +69,8 @@ def parser(verb: str | None = None) -> Parser:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code.
 
-    An error that is expected is one sentence on standard error, and a hint where there is one; any other is
-    its name and message. `--debug` shows the traceback of both.
+    Expected errors (`ExtragsError`) are printed to standard error as their message, with a hint if there is
+    one, other errors with their type and message. `--debug` shows tracebacks.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     try:

@@ -1,4 +1,4 @@
-"""Progress bars in a terminal, log lines elsewhere; and the tables a run ends with."""
+"""Progress bars in a terminal, log lines elsewhere; and the summary tables of a run."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ _MARKS = {"ran": "[green]✓[/]", "cached": "[cyan]=[/]", "skipped": "[dim]-[/]"
 
 @contextmanager
 def progress_bars(*, terminal: bool) -> Iterator[None]:
-    """Show the progress of the stages that run inside the block.
+    """Show progress bars of the stages that run inside the block.
 
-    Without a terminal nothing is drawn: stages then log their progress (`tasks.progress`).
+    Without a terminal there are no bars: stages then log their progress (`tasks.progress`).
     """
     if not terminal:
         yield
@@ -57,7 +57,7 @@ def _bars() -> Progress:
 
 
 class _Display:
-    """Stage progress to bars; called from any thread."""
+    """Observer that shows stage progress as bars; may be called from any thread."""
 
     def __init__(self, bars: Progress) -> None:
         self.bars = bars
@@ -89,7 +89,7 @@ class _Display:
 
 
 def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
-    """What came out, one row per sequence."""
+    """Print a table of results, one row per sequence."""
     out = console(error=True)
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("sequence", "status", "stages"):

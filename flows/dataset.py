@@ -49,7 +49,7 @@ def reconstruct_dataset(
     Returns:
         One outcome per sequence, in the order given; failures among them. The summary is an artifact.
     """
-    # Wrong settings, missing models and a store that cannot be written concern all sequences: say so once.
+    # Invalid settings, missing models and a read-only store affect all sequences: report them once.
     check_not_pinned(method, settings or {})
     config = method_config(method, profile, settings, seed)
     open_store(store)
@@ -74,7 +74,7 @@ def reconstruct_dataset(
         outcomes = [reconstruct(sequence) for sequence in sequences]
     else:
         with ThreadPoolExecutor(max_workers=at_once) as pool:
-            # Flow and observer travel in context variables, which threads do not inherit.
+            # Flow and observer are in context variables, which threads do not inherit.
             futures = [pool.submit(copy_context().run, reconstruct, sequence) for sequence in sequences]
             outcomes = [future.result() for future in futures]
     page = None

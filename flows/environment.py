@@ -13,10 +13,10 @@ __all__ = ["prepare", "without_heartbeat"]
 
 
 def prepare(state: Path, *, debug: bool = False) -> None:
-    """Point Prefect at a home of its own and keep it quiet; what the user has set stays.
+    """Set up a separate Prefect home with quiet logging; variables set by the user are kept.
 
-    OpenMP threads are told to sleep while they wait: spinning, which is their default, makes training up to
-    five times slower as soon as anything else wants the cores.
+    OpenMP threads are set to wait passively: active waiting, their default, makes training up to five times
+    slower when other processes use the cores.
 
     Args:
         state: local directory of the store; Prefect's database goes to `prefect/` in it. Left alone when
@@ -28,15 +28,15 @@ def prepare(state: Path, *, debug: bool = False) -> None:
     """
     chosen = {
         "OMP_WAIT_POLICY": "passive",
-        # Without an API URL Prefect starts a server of its own for the time of the run. Its default of
-        # 20 s to get up is too short on a busy machine.
+        # Without an API URL Prefect starts a temporary server for the run. Its default start-up timeout of
+        # 20 s is too short on a busy machine.
         "PREFECT_SERVER_EPHEMERAL_ENABLED": "true",
         "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "90",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         "DO_NOT_TRACK": "1",
         "PREFECT_CLI_PROMPT": "false",
         "PREFECT_LOGGING_TO_API_ENABLED": "false",
-        # Failures are told in our own words; Prefect would add a traceback for each.
+        # Failures are reported by `flows.failures`; Prefect would add a traceback for each.
         "PREFECT_LOGGING_LEVEL": "INFO" if debug else "CRITICAL",
         "PREFECT_SERVER_LOGGING_LEVEL": "WARNING" if debug else "CRITICAL",
     }

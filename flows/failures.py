@@ -1,4 +1,4 @@
-"""What the command line says of an exception."""
+"""Error messages of the command line for exceptions."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ SEE_TRACEBACK = "run again with --debug for the traceback"
 
 
 def describe_error(error: BaseException) -> list[str]:
-    """An exception in one line; and, where there is something to do about it, that in a second one.
+    """Describe an exception in one line, and a hint in a second line if there is one.
 
-    An error of ours speaks for itself, also where something raised another one because of it. So does a
-    server that cannot be reached: nothing is wrong with the program then. Anything else is told by its name.
+    An `ExtragsError` in the chain of causes is shown as its message, a connection error as an unreachable
+    server; any other exception by its type and message, with a hint to the traceback.
     """
     for cause in _causes(error):
         if isinstance(cause, ExtragsError):
@@ -43,7 +43,7 @@ def _line(text: str) -> str:
 
 
 def _is_connection_error(error: BaseException) -> bool:
-    # Not imported for this: where they were never loaded, the error is none of theirs.
+    # Look up the modules instead of importing them: if one is not loaded, the error cannot come from it.
     kinds = [("httpx", "TransportError"), ("distributed.comm.core", "CommClosedError")]
     loaded = [getattr(sys.modules[module], name) for module, name in kinds if module in sys.modules]
     return isinstance(error, (ConnectionError, *loaded))

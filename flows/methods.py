@@ -1,8 +1,7 @@
 """The methods that are compared: each is the pipeline with some settings pinned and some stages left out.
 
-Everything a method does not pin is shared: data, split, starting points, number of iterations, largest
-number of Gaussians, rasteriser, evaluator. A pinned setting is what the method *is*: overrides do not
-reach it.
+Everything a method does not pin is shared: data, split, initial points, number of iterations, limit on the
+number of Gaussians, rasteriser, evaluation. A pinned setting defines the method: overrides do not change it.
 """
 
 from __future__ import annotations
@@ -55,8 +54,8 @@ THREE_DGS_SHARED = frozenset(
     }
 )
 """Settings of the coarse stage that the baseline takes from the profile, like every other method. A test
-holds that each setting is either here or pinned: a new one must be decided on, lest the baseline profit or
-suffer from it unnoticed."""
+checks that each setting is either listed here or pinned, so that a new setting cannot change the baseline
+unnoticed."""
 
 
 def three_dgs(config: PipelineConfig) -> dict[str, Any]:
@@ -157,9 +156,9 @@ def method_config(
 
 
 def check_not_pinned(method: str, settings: Mapping[str, Any]) -> None:
-    """Refuse overrides of what a method pins: somebody who names both would wonder why nothing changes.
+    """Check that overrides name no setting that the method pins, since they would have no effect.
 
-    A benchmark does not ask: its overrides are for all methods, and reach those that leave the setting open.
+    Not used by benchmarks: their overrides are for all methods, and apply to those that do not pin them.
 
     Raises:
         ConfigError: names the setting.
@@ -171,7 +170,7 @@ def check_not_pinned(method: str, settings: Mapping[str, Any]) -> None:
 
 
 def profile_label(profile: str, method: str) -> str:
-    """What a page calls the settings: the profile, and the method where it is not the whole pipeline."""
+    """Label of the settings on pages: the profile, and the method unless it is the whole pipeline."""
     return profile if method == "extrags" else f"{profile}, method {method}"
 
 

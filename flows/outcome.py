@@ -1,4 +1,4 @@
-"""What a run reports: the JSON of `extrags run` (design section 7)."""
+"""Results of a run, as the JSON of `extrags run` reports them."""
 
 from __future__ import annotations
 
@@ -31,26 +31,26 @@ Part = Literal[
     "metrics_final",
     "report",
 ]
-"""What a run makes of a sequence. `sequence` is the frames with the latest poses, `training` their training
-part, `waves` the state of the exploration, `restorer` what restores this scene."""
+"""Artefacts of a run. `sequence` has all frames with the latest poses, `training` the training frames alone,
+`waves` the state of the exploration, `restorer` the restorer prepared for this scene."""
 
 StageState = Literal["ran", "cached", "skipped", "failed"]
 
 
 @dataclass
 class StageRow:
-    """How one stage of one sequence went."""
+    """Outcome of one stage of one sequence."""
 
     stage: str
     state: StageState
     seconds: float = 0.0
-    """Time it took now; next to nothing when cached."""
+    """Wall-clock time in this run; near zero when cached."""
     reason: str = ""
-    """Why it was skipped or failed; what the plan said."""
+    """Why it was skipped or failed, or the reason from the plan."""
     made_seconds: float = 0.0
-    """Time it took when its artefacts were made."""
+    """Time it took to compute its artefacts, in this or an earlier run."""
     peak_mib: float | None = None
-    """Peak resident memory of the process when they were made."""
+    """Peak resident memory of the process while they were computed."""
     tasks: int = 0
     """Task runs it consists of."""
 
@@ -69,7 +69,7 @@ class StageRow:
 
 @dataclass
 class SequenceOutcome:
-    """How one sequence went."""
+    """Outcome of one sequence."""
 
     name: str
     status: Literal["ok", "failed"] = "ok"
@@ -83,7 +83,7 @@ class SequenceOutcome:
     """What was made."""
     plan: dict[str, Any] | None = None
     error: Exception | None = None
-    """The exception of a failed stage, for those in the same process."""
+    """The exception of a failed stage; only available in the process that ran it."""
 
     @property
     def artefacts(self) -> dict[str, str]:
@@ -126,7 +126,7 @@ class SequenceOutcome:
 
 @dataclass
 class DatasetOutcome:
-    """How the sequences of a run went."""
+    """Outcomes of the sequences of a run."""
 
     sequences: list[SequenceOutcome]
     report: str | None = None

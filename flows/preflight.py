@@ -1,4 +1,4 @@
-"""What a run would otherwise only find out after the reconstruction is looked for before it begins."""
+"""Checks before a run, of problems that would otherwise only be found after the reconstruction."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["preflight"]
 
 
 def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = ()) -> None:
-    """Look for models, weights and packages that the settings name.
+    """Check that the models, weights and packages that the settings need are available.
 
     Args:
         config: settings of all stages.

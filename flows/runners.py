@@ -1,8 +1,8 @@
-"""Three ways to get an artefact: a Prefect task run, a plain call, or only from the store.
+"""Three ways to obtain artefacts: Prefect task runs, plain calls, or lookup in the store.
 
-The wiring of a sequence is written once against `Runner`. `PrefectRunner` is the real one;
-`DirectRunner` calls the same stages in this thread without any server; `StoreRunner` runs nothing and
-tells whether everything is there already.
+The wiring of a sequence uses the protocol `Runner`. `PrefectRunner` is used in flows; `DirectRunner` calls
+the same stages in the current thread without a server; `StoreRunner` runs nothing and finds out whether all
+artefacts exist.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Call:
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a call."""
+    """The artefact of a call and how it was obtained."""
 
     ref: Ref
     state: Literal["ran", "cached"]
@@ -54,7 +54,7 @@ class WorkerLostError(ExtragsError, RuntimeError):
 
 
 class Runner(Protocol):
-    """Makes artefacts, several at once where it can."""
+    """Obtains artefacts, concurrently if possible."""
 
     def run(self, calls: Sequence[Call], label: str) -> list[Result]:
         """Make the artefacts of all calls, in their order.

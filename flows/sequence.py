@@ -74,7 +74,7 @@ def reconstruct_sequence(
 
 
 def open_store(root: str) -> Store:
-    """The store of a run: writable, and without what killed runs left.
+    """Open the store of a run, check that it can be written, and remove leftovers of killed runs.
 
     Raises:
         StoreError: when it cannot be written. Prefect itself would run everything and keep nothing.

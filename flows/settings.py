@@ -1,4 +1,4 @@
-"""Parameters that all flows and commands share, and what they mean."""
+"""Parameters that flows and commands share: store, profile and settings, task runner."""
 
 from __future__ import annotations
 

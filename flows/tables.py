@@ -32,7 +32,7 @@ def difference_figures() -> list[str]:
 
 
 def figure(name: str, value: float | None) -> str:
-    """A metric with the digits it deserves; a dash where it cannot be had."""
+    """Format a metric with its number of digits; a dash for None."""
     return "–" if value is None else f"{value:.{_digits(name)}f}"  # noqa: RUF001
 
 

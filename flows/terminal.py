@@ -1,4 +1,4 @@
-"""Where tables go."""
+"""The console that tables are printed to."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from rich.console import Console
 __all__ = ["console"]
 
 FILE_WIDTH = 200
-"""Columns of a table that goes to a file or a pipe: nobody folds lines there."""
+"""Width, in columns, of tables that are written to a file or a pipe."""
 
 
 def console(*, error: bool = False) -> Console:
-    """A console on standard output (or standard error) that does not squeeze tables in files."""
+    """A console on standard output (or standard error), with a fixed width for files and pipes."""
     stream = sys.stderr if error else sys.stdout
     return Console(stderr=error, width=None if stream.isatty() else FILE_WIDTH, highlight=False)

@@ -1,4 +1,4 @@
-"""One sequence through all stages as cached tasks: which artefact is made of which."""
+"""The pipeline of one sequence as cached tasks: the inputs and artefacts of every stage."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ def run_sequence(
     until: StageName = "report",
     leave_out: Mapping[str, str] | None = None,
 ) -> SequenceOutcome:
-    """Take one sequence through all stages.
+    """Run all stages of one sequence.
 
-    A failing stage ends the sequence; what is finished stays in the store, so that the next run goes on
-    there. The failure is in the outcome and is not raised.
+    A failing stage ends the sequence; finished artefacts stay in the store, and the next run resumes there.
+    The error is in the outcome, not raised.
 
     Args:
         name: `DATASET/SEQUENCE[@SETTING]` or a path.
@@ -119,7 +119,7 @@ class SequenceRun(Pipeline):
         return self.outcome
 
     def skip(self, stage: StageName, reason: str) -> None:
-        """Write a row and tell who watches."""
+        """Add a row to the outcome and report the progress."""
         row = StageRow(stage, "skipped", reason=reason)
         self.outcome.stages.append(row)
         self._report_progress(row, "skipped")
@@ -156,8 +156,8 @@ class SequenceRun(Pipeline):
     def coarse(self) -> None:
         """The coarse scene from the training frames; where it refined poses, the frames with these."""
         with self._stage("coarse") as row:
-            # Only the training frames go on from here. Cutting them out takes no time, and does not count
-            # when it comes to whether the stage ran.
+            # Later stages get the training frames alone. Extracting them takes no time, and does not affect
+            # whether the stage counts as cached.
             self.refs["training"] = self._run_uncounted(
                 Call(training_frames, {"sequence": self.refs["sequence"]})
             )
@@ -165,7 +165,7 @@ class SequenceRun(Pipeline):
             self.refs["coarse"] = self._run_task(row, Call(coarse, inputs))
             counts = self._manifest("coarse").counts
             if counts.get("refined_poses"):
-                # The scene belongs to the corrected poses: all that follows takes those.
+                # The scene was optimised with the corrected poses: later stages need them.
                 inputs = {"sequence": self.refs["sequence"], "coarse": self.refs["coarse"]}
                 self.refs["sequence"] = self._run_uncounted(Call(refined_frames, inputs))
                 whole = {"sequence": self.refs["sequence"]}
@@ -180,8 +180,8 @@ class SequenceRun(Pipeline):
             coverage = self.config.explore.coverage
             inputs = {**self._scene_inputs(), "config": self.config.assess, "coverage": coverage}
             self.refs["assess"] = self._run_task(row, Call(assess, inputs))
-            # The decisions follow from the measurement and all budgets. They take no time, and do not
-            # count when it comes to whether the stage ran.
+            # The decisions depend on the measurements and all budgets. They take no time, and do not affect
+            # whether the stage counts as cached.
             inputs = {"measured": self.refs["assess"], "config": self.config}
             self.refs["plan"] = self._run_uncounted(Call(plan, inputs))
             self.plan = self.store.load(ScenePlan, self.refs["plan"])
@@ -301,7 +301,7 @@ class SequenceRun(Pipeline):
         return lpips_weights(self.config.evaluate)
 
     def _run_uncounted(self, call: Call) -> Ref:
-        """A task that does not count in its stage's row."""
+        """Run a task that is not counted in the row of its stage."""
         (result,) = self.runner.run([call], self.outcome.name)
         return result.ref
 

@@ -1,4 +1,4 @@
-"""assess: what the scene lacks, and the plan that follows."""
+"""assess: measurements of the coarse scene, and the plan derived from them."""
 
 from __future__ import annotations
 
@@ -15,8 +15,7 @@ MEASUREMENTS = "measurements.json"
 def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig, coverage: CoverageConfig) -> None:
     """Measure the scene; writes `measurements.json`.
 
-    Budgets play no part, so that another budget of exploration does not measure again; `plan` turns the
-    numbers into decisions.
+    The measurements do not depend on budgets, so changed budgets do not repeat them; `plan` decides.
     """
     from extrags.assessment import measure
     from extrags.scene import Scene
@@ -29,7 +28,7 @@ def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig, coverage
 
 @stage("plan", version=2)
 def plan(slot: Slot, measured: Ref, config: PipelineConfig) -> None:
-    """Decide on the measured numbers with the run's own budgets; writes `plan.json`."""
+    """Derive the plan from the measurements and the budgets of the run; writes `plan.json`."""
     from extrags.assessment import decide
 
     slot.save(decide(slot.load_json(MEASUREMENTS, measured), config))

@@ -17,7 +17,7 @@ PER_VIEW_FILE = "per_view.json"
 """Every figure of every held-out view of every run."""
 
 
-# `rows` adds what the runs cost. The page shows it, but other times are no reason to build another page.
+# `rows` holds times and memory of the runs. The page shows them, but they are not part of its cache key.
 @stage("benchmark-report", version=1, ignore=("rows",))
 def benchmark_report(
     slot: Slot,
@@ -36,14 +36,14 @@ def benchmark_report(
     """Build the page; writes `report.html`, `comparison.json` and `per_view.json`.
 
     Args:
-        slot: where it goes.
+        slot: the artefact to write.
         name: title of the page.
         baseline: method the others are compared with.
-        methods: what each method is, in words.
+        methods: a description of each method.
         runs: `{method, profile, sequence, setting, seed}` of each.
-        metrics: where the metrics of a run are, by its index as text; failed runs have none.
-        failures: what went wrong, by the same index.
-        pictures: `{baseline, contender, label}`: two runs, by index as text, to be shown side by side.
+        metrics: artefact with the metrics of each run, by its index as text; failed runs have none.
+        failures: error messages of failed runs, by the same index.
+        pictures: `{baseline, contender, label}`: two runs, by index as text, shown side by side.
         sequences: the sequence of each run that is shown, by index.
         renders: its renders.
         views: rows of pictures per pair at most.

@@ -17,8 +17,8 @@ HISTORY = "history.json"
 def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     """Optimise the coarse scene; writes `scene/` and `history.json`.
 
-    Where poses were refined (`refined_poses` in the counts), also `refined_poses/`: those of the training
-    frames, which the scene belongs to.
+    If poses were refined (`refined_poses` in the counts), also writes `refined_poses/`: the poses of the
+    training frames that the scene was optimised with.
     """
     from extrags.sequence import EndoscopicSequence
     from extrags.training import reconstruct
@@ -37,7 +37,7 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
 
 @stage("refined-frames", version=2)
 def refined_frames(slot: Slot, sequence: Ref, coarse: Ref) -> None:
-    """The whole sequence with the poses the coarse scene belongs to; writes `sequence/`."""
+    """The whole sequence with the refined poses of the coarse stage; writes `sequence/`."""
     from extrags.sequence import EndoscopicSequence
     from extrags.training.pose_refinement import RefinedPoses, with_refined_poses
 

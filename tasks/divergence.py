@@ -1,4 +1,4 @@
-"""What is kept of an optimisation that diverged."""
+"""Debugging files of an optimisation that diverged."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["keep_last_finite_scene"]
 
 @contextmanager
 def keep_last_finite_scene(slot: Slot) -> Iterator[None]:
-    """Leave the last finite scene among the debugging files of the failed stage."""
+    """On divergence, save the last finite scene with the debugging files of the failed stage."""
     try:
         yield
     except DivergedError as error:

@@ -1,4 +1,4 @@
-"""enhance: the restorer is trained, clips are restored in batches, pseudo-observations are joined."""
+"""enhance: trains the restorer, restores clips in batches, and concatenates the pseudo-observations."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def restore(
     weights_digest: str | None,
     weights: Weights,
 ) -> None:
-    """Render, restore and weigh one batch of trajectories; writes `pseudo/`."""
+    """Render and restore one batch of trajectories and compute its confidences; writes `pseudo/`."""
     from extrags.exploration import Exploration
     from extrags.restoration.backends import load_enhancer
     from extrags.restoration.trajectories import restore_batch
@@ -72,7 +72,7 @@ def restore(
 
 @stage("enhance", version=2)
 def assemble(slot: Slot, parts: list[Ref]) -> None:
-    """Join the batches; writes `pseudo/`."""
+    """Concatenate the batches; writes `pseudo/`."""
     from extrags.pseudo_views import PseudoViews
 
     views = PseudoViews.concatenated([slot.load(PseudoViews, part) for part in parts])

@@ -1,4 +1,4 @@
-"""evaluate: held-out views and the surface rendered once, metrics as a stage of their own."""
+"""evaluate: rendering of held-out views and extraction of the surface, and metrics as a separate stage."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ METRICS_FILE = "metrics.json"
 
 @stage("evaluate-render", version=3)
 def render(slot: Slot, scene: Ref, sequence: Ref) -> None:
-    """Render the held-out views at the exposure the protocol gives them, and fuse the scene's surface.
+    """Render the held-out views at the exposure defined by the protocol, and extract the scene's surface.
 
-    Writes `renders/`; and `mesh/` where there is a true surface to hold it against.
+    Writes `renders/`, and `mesh/` if the sequence has a true surface.
     """
     from extrags import evaluation
     from extrags.metrics.surface import scene_surface
@@ -28,7 +28,7 @@ def render(slot: Slot, scene: Ref, sequence: Ref) -> None:
     views = evaluation.render(shown, frames)
     slot.save(views)
     slot.counts.update(views=len(views), n_gaussians=views.n_gaussians)
-    # Without true depth there is no true surface either: nothing to fuse for.
+    # Without true depth there is no true surface either, so the mesh is not needed.
     if frames.depth_mm is None:
         return
     mesh = scene_surface(shown, frames)
@@ -37,7 +37,7 @@ def render(slot: Slot, scene: Ref, sequence: Ref) -> None:
     slot.counts["triangles"] = 0 if mesh is None else len(mesh.triangles)
 
 
-# Metrics are a stage of their own: raising the protocol's version measures again without a new render.
+# Metrics are a separate stage, so that a new version of the protocol does not repeat the rendering.
 @stage("evaluate", version=PROTOCOL_VERSION, ignore=("weights",))
 def measure(
     slot: Slot,

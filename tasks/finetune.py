@@ -1,4 +1,4 @@
-"""finetune: real and restored views together."""
+"""finetune: optimises the coarse scene on real and restored views."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def finetune(
 ) -> None:
     """Fine-tune the coarse scene; writes `scene/` and `history.json`.
 
-    Without pseudo-views only the real views count: the control of a comparison.
+    Without pseudo-views it trains on the real views alone: the control of a comparison of methods.
     """
     from extrags import training
     from extrags.pseudo_views import PseudoViews

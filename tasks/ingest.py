@@ -1,4 +1,4 @@
-"""ingest: any source to an `EndoscopicSequence`, and the part of it the reconstruction may see."""
+"""ingest: reads a source into an `EndoscopicSequence`, and extracts its training frames."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tasks.stage import stage
 __all__ = ["ingest", "training_frames"]
 
 
-# The fingerprint holds the content of the files; where they lie does not matter.
+# The fingerprint covers the content of the files; their location is not part of the key.
 @stage("ingest", version=2, ignore=("source",))
 def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: IngestConfig) -> None:
     """Read a source into `sequence/`."""
@@ -38,7 +38,7 @@ def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: Inge
 
 @stage("training-frames", version=1)
 def training_frames(slot: Slot, sequence: Ref) -> None:
-    """Take the held-out frames away; writes `sequence/`."""
+    """Extract the training frames (`EndoscopicSequence.training_part`); writes `sequence/`."""
     from extrags.sequence import EndoscopicSequence
 
     part = slot.load(EndoscopicSequence, sequence).training_part()

@@ -1,9 +1,9 @@
 """A Prefect lock manager on `flock(2)`.
 
-Prefect's own file lock stays behind for ever when its holder is killed. The kernel drops a `flock`
-with the last file descriptor of its process, however the process ends. Needs a local file system or
-NFSv4; on object stores the locks of one machine stand in its cache directory, and machines that race
-for one key both compute it (harmless: artefacts are written whole, the first one stays).
+Prefect's own file locks become stale when their holder is killed. The kernel releases a `flock` with the last
+file descriptor of its process, for whatever reason the process ends. Requires a local file system or NFSv4.
+With object stores, locks are local to a machine (in its cache directory); machines that race for one key
+both compute it, which is harmless: artefacts are written atomically, and the first one is kept.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class FlockManager(LockManager):
         self._held: dict[str, tuple[str, int]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        # Locks belong to the process that took them; a copy in a worker starts with none.
+        # Locks belong to the process that acquired them; a copy in a worker starts without any.
         return {"directory": self.directory}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -53,7 +53,7 @@ class FlockManager(LockManager):
         acquire_timeout: float | None = None,
         hold_timeout: float | None = None,
     ) -> bool:
-        """Take the lock of a key; waits for as long as `acquire_timeout`, or without limit.
+        """Acquire the lock of a key; waits for `acquire_timeout` seconds, or without limit.
 
         `hold_timeout` is not needed: a lock never outlives its process.
         """
@@ -77,7 +77,7 @@ class FlockManager(LockManager):
         return await asyncio.to_thread(self.acquire_lock, key, holder, acquire_timeout, hold_timeout)
 
     def release_lock(self, key: str, holder: str) -> None:
-        """Give the lock back and remove its file.
+        """Release the lock and remove its file.
 
         Raises:
             ValueError: when `holder` does not hold it (the protocol's contract).
@@ -87,8 +87,8 @@ class FlockManager(LockManager):
             if owner != holder:
                 raise ValueError(f"no lock held by {holder} for {key}")
             del self._held[key]
-        # Unlinked while still locked: whoever waits on this inode sees that the path has gone or
-        # belongs to another inode, and starts afresh.
+        # Unlinked while still locked: a process that waits on this inode then finds that the path is gone
+        # or refers to another inode, and retries.
         self._path(key).unlink(missing_ok=True)
         os.close(descriptor)
 
@@ -133,7 +133,7 @@ class FlockManager(LockManager):
 
 
 def _lock_file(path: Path, timeout: float | None) -> int | None:
-    """Open and lock a file that is still the one at its path afterwards; None when the time is up."""
+    """Open and lock the file at a path, retrying if it is replaced meanwhile; None on timeout."""
     path.parent.mkdir(parents=True, exist_ok=True)
     end = None if timeout is None else time.monotonic() + timeout
     while True:

@@ -17,16 +17,16 @@ MIB = 1 << 20
 
 @dataclass
 class PeakMemory:
-    """Largest resident size seen so far; None where the system does not tell."""
+    """Peak resident set size in MiB so far; None where the system does not report it."""
 
     mib: float | None = None
 
 
 @contextmanager
 def peak_memory() -> Iterator[PeakMemory]:
-    """Sample the resident size ten times a second while the block runs.
+    """Sample the resident set size ten times per second while the block runs.
 
-    The size is the whole process's: stages that run at the same time on other threads count, too.
+    The size is that of the whole process, including stages that run concurrently on other threads.
     """
     peak = PeakMemory(_resident_mib())
     if peak.mib is None:

@@ -1,4 +1,4 @@
-"""poses: camera poses, for sources without them."""
+"""poses: estimates camera poses, for sources without them."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ __all__ = ["poses"]
 
 @stage("poses", version=2)
 def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
-    """Find poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
+    """Estimate poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
 
-    Where the source has poses as well, they are not looked at until the estimate stands; its errors against
-    them are in `poses.json` under `against_given`.
+    Poses of the source are not used for the estimate. If there are any, the errors of the estimate relative
+    to them are in `poses.json` under `against_given`.
     """
     from extrags.poses import estimate_poses, with_estimated_poses
     from extrags.sequence import EndoscopicSequence

@@ -1,4 +1,4 @@
-"""Progress of stages, for whoever watches: the command line's bars, or the log."""
+"""Progress of stages, for the progress bars of the command line or for the log."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LOG_EVERY_SECONDS = 15.0
 
 @dataclass(frozen=True, slots=True)
 class StageProgress:
-    """What happened in one stage of one sequence."""
+    """Progress of one stage of one sequence."""
 
     label: str
     """Name of the sequence."""
@@ -53,7 +53,7 @@ def observed(observer: Observer) -> Iterator[None]:
 
 
 def notify(progress: StageProgress) -> None:
-    """Tell the observer; without one it goes to the log."""
+    """Send progress to the observer; without one it is logged."""
     observer = _observer.get()
     if observer is not None:
         observer(progress)
@@ -70,13 +70,13 @@ def notify(progress: StageProgress) -> None:
 
 @contextmanager
 def reporting(label: str, stage: str) -> Iterator[None]:
-    """Turn the library's events inside the block into progress of one stage."""
+    """Convert events of the library inside the block into progress of one stage."""
     quiet_until = 0.0
 
     def receive(event: Event) -> None:
         nonlocal quiet_until
         if _observer.get() is None:
-            # Loops may emit thousands of events; a log wants a line now and then.
+            # Loops may emit thousands of events; the log gets only some of them.
             now = time.monotonic()
             if now < quiet_until:
                 return

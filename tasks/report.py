@@ -1,4 +1,4 @@
-"""report: one self-contained page from the artefacts of a run."""
+"""report: one self-contained HTML page from the artefacts of a run."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 """What a page shows of a run, by the names of `flows.outcome.Part`; all but `sequence` may be missing."""
 
 
-# `rows` says how long the stages took in this run. The page shows it, but other times are no reason to
-# build another page.
+# `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
+# key.
 @stage("report", version=3, ignore=("rows",))
 def report(
     slot: Slot,
@@ -50,7 +50,7 @@ def report(
     """Build the page; writes `report.html`.
 
     Args:
-        slot: where it goes.
+        slot: the artefact to write.
         parts: the artefacts to show, of `REPORT_PARTS`.
         skipped: why stages were skipped, by name.
         config: settings of the run, the plan's budgets included.
@@ -135,14 +135,13 @@ def dataset_report(
     """Build the page that compares sequences; writes `report.html`.
 
     Args:
-        slot: where it goes.
+        slot: the artefact to write.
         name: title of the page.
         profile: name of the profile of the settings.
         sequences: their names, in the order they are shown.
-        metrics: `NAME coarse` and `NAME final`: where the metrics of each sequence are.
-        failures: what went wrong, by sequence.
-        rows: `SequenceOutcome.to_json()` of each: times, states and links, which are no reason to build
-            another page.
+        metrics: artefacts with the metrics of each sequence, by `NAME coarse` and `NAME final`.
+        failures: error messages by sequence.
+        rows: `SequenceOutcome.to_json()` of each: times, states and links, not part of the cache key.
     """
     from extrags.report.dataset import DatasetRow, build_dataset_report
 
@@ -171,5 +170,5 @@ def dataset_report(
 
 
 def _neighbour(page: str | None) -> str:
-    """Address of another artefact's page, seen from this one: artefacts stand side by side."""
+    """Relative URL of another artefact's page: artefacts are sibling directories."""
     return "" if page is None else "/".join(["..", *page.rsplit("/", 2)[1:]])

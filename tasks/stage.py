@@ -7,9 +7,9 @@
 is called as `coarse(store="...", label="...", sequence=ref, config=config)`, inside a flow or, through
 `coarse.fn(...)`, without any server.
 
-The artefact's manifest is the only cache record there is. `ArtefactRecords` shows it to Prefect as a
-result record, so a record can neither dangle nor be missing: Prefect says `Cached` exactly when the
-artefact is there, also after a kill between writing the artefact and Prefect's own commit.
+The artefact's manifest is the only cache record. `ArtefactRecords` presents it to Prefect as a result record,
+so records and artefacts cannot become inconsistent: a task run is `Cached` if and only if its artefact
+exists, even after a kill between writing the artefact and Prefect's own commit.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ __all__ = ["ArtefactRecords", "StageKey", "at", "stage", "stage_key", "stage_ver
 P = ParamSpec("P")
 
 NOT_IN_KEY = frozenset({"store", "label"})
-"""Where the artefact goes and what people call it: neither changes what is in it."""
+"""Parameters of every stage that do not affect the content of its artefact: store and display name."""
 
 _versions: dict[str, int] = {}
 
 
 @dataclass
 class StageKey(CachePolicy):
-    """Key = stage name + hand-bumped version + canonical inputs. No source text, no run id, no paths."""
+    """Cache policy: key = stage name + version (raised by hand) + canonical inputs; no source, no run id."""
 
     name: str = ""
     version: int = 0
@@ -61,7 +61,7 @@ class StageKey(CachePolicy):
         flow_parameters: dict[str, Any] | None,
         **_: Any,
     ) -> str:
-        """The key.
+        """Compute the cache key of a task run.
 
         Raises:
             ConfigError: for inputs without a canonical form.
@@ -72,7 +72,7 @@ class StageKey(CachePolicy):
 
 
 class ArtefactRecords(WritableFileSystem):
-    """The store, seen by Prefect as a place for result records.
+    """The artefact store as a Prefect file system for result records.
 
     Args:
         root: the store's root.
@@ -86,7 +86,7 @@ class ArtefactRecords(WritableFileSystem):
         """Keys are names, not paths: nothing to resolve."""
 
     def read_path(self, path: str, _sync: bool = True) -> bytes:  # type: ignore[override]
-        """The record of a key, made from its artefact.
+        """The result record of a key, derived from its artefact.
 
         Raises:
             FileNotFoundError: without an artefact; Prefect then runs the task.
@@ -102,7 +102,7 @@ class ArtefactRecords(WritableFileSystem):
         return self.read_path(path)
 
     def write_path(self, path: str, content: bytes, _sync: bool = True) -> None:  # type: ignore[override]
-        """Nothing to do: the stage has committed its artefact, and failures leave no record."""
+        """Do nothing: the stage has committed its artefact, and failures have no record."""
 
     async def awrite_path(self, path: str, content: bytes) -> None:
         """As `write_path`."""
@@ -111,18 +111,18 @@ class ArtefactRecords(WritableFileSystem):
 def stage(
     name: str, *, version: int, ignore: tuple[str, ...] = ()
 ) -> Callable[[Callable[Concatenate[Slot, P], None]], Task[..., Ref]]:
-    """Make a function that fills a slot into a cached task.
+    """Decorator factory: turn a function that writes a slot into a cached Prefect task.
 
     Args:
         name: name of the stage; part of the key.
         version: raised by hand whenever the same inputs give another artefact.
-        ignore: arguments that are not part of the key, because others already say what matters (a path
-            beside the digest of what lies there).
+        ignore: arguments that are not part of the key, because others determine the result (e.g. a path
+            whose content is given by a digest).
 
     Returns:
-        A decorator. Its task takes the function's own arguments by name, and besides `store` (root of
-        the store) and `label` (name of the sequence, for people); it returns a `Ref`. Arguments must be
-        refs, settings or plain values, since their canonical form is the key.
+        A decorator. Its task takes the function's arguments by name, and in addition `store` (root of the
+        store) and `label` (display name of the sequence); it returns a `Ref`. Arguments must be refs,
+        settings or plain values, since their canonical form is the key.
 
     Raises:
         ConfigError: when two stages share a name.
@@ -178,12 +178,12 @@ def stage(
 
 
 def at(task: Task[..., Ref], store: str, *, refresh: bool = False) -> Task[..., Ref]:
-    """The task with its cache in a store; two processes never run one key at the same time there.
+    """Configure a task to cache in a store, with locks so that only one process computes a key at a time.
 
     Args:
         task: made by `stage`.
         store: root of the store.
-        refresh: run it although its artefact is there.
+        refresh: run it even if its artefact exists.
     """
     policy = task.cache_policy
     if not isinstance(policy, StageKey):
@@ -195,7 +195,7 @@ def at(task: Task[..., Ref], store: str, *, refresh: bool = False) -> Task[..., 
     )
     if refresh:
         bound = bound.with_options(refresh_cache=True)
-    # As an option Prefect takes only blocks saved on a server; this one is nothing but a path.
+    # `with_options` accepts only blocks saved on a server; this one is not saved, it only wraps a path.
     bound.result_storage = ArtefactRecords(root=store)
     return bound
 

@@ -1,4 +1,4 @@
-"""Weights as part of cache keys: by their content, or as absent."""
+"""Weights as part of cache keys: the digest of their content, or that they are absent."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["Weights", "lpips_weights", "restorer_digest"]
 
 
 class Weights(BaseModel):
-    """Weights that were found, or why there are none."""
+    """Weights that were found, or the reason why there are none."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -27,7 +27,7 @@ class Weights(BaseModel):
     reason: str = ""
 
     def perceptual_difference(self) -> PerceptualDifference:
-        """LPIPS with these weights, else the weight-free map and why."""
+        """LPIPS with these weights, else `perceptual_map` with the reason."""
         from extrags.confidence import PerceptualDifference
         from extrags.metrics.lpips import Lpips
 
@@ -36,7 +36,7 @@ class Weights(BaseModel):
 
 
 def lpips_weights(config: EvaluateConfig) -> Weights:
-    """Look for LPIPS weights in the usual places.
+    """Search LPIPS weights (`extrags.metrics.lpips.find_weights`).
 
     Raises:
         WeightsError: when the settings name a file that is not there.
