@@ -35,9 +35,8 @@ def __getattr__(name: str) -> Any:
     if name not in api.__all__:
         from extrags.errors import did_you_mean
 
-        raise AttributeError(
-            f"module {__name__!r} has no attribute {name!r}{did_you_mean(name, api.__all__)}"
-        )
+        hint = did_you_mean(name, api.__all__)
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
     value = globals()[name] = getattr(api, name)
     return value
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -104,6 +104,18 @@ class PseudoViews(Storable):
         cameras = Cameras.concatenated([part.cameras for part in parts])
         return PseudoViews(cameras, **arrays, provenance=dict(parts[0].provenance))
 
+    def quantised(self) -> PseudoViews:
+        """The same values as `load` returns after `save`: a run in memory then equals a cached one."""
+        values = {name: _from_bytes(_as_bytes(getattr(self, name))) for name in (*_IMAGES, *_SHARES)}
+        error = self.expected_error
+        return replace(
+            self,
+            **values,
+            depth_mm=self.depth_mm.astype(np.float32),
+            image_confidence=self.image_confidence.astype(np.float32),
+            expected_error=None if error is None else error.astype(np.float16).astype(np.float32),
+        )
+
     def save(self, path: Path) -> None:
         """Write a zarr v3 group: values in [0, 1] with 8 bits, depth in float32, one view per chunk."""
         group = open_group(path, mode="w")
@@ -132,10 +144,7 @@ class PseudoViews(Storable):
         """Read what `save` wrote; values in [0, 1] come back quantised to steps of 1/255."""
         group = zarr.open_group(str(path), mode="r")
         attributes: Any = dict(group.attrs)
-        arrays: dict[str, Any] = {
-            name: read_array(group, name).astype(np.float32) / np.float32(255)
-            for name in (*_IMAGES, *_SHARES)
-        }
+        arrays: dict[str, Any] = {name: _from_bytes(read_array(group, name)) for name in (*_IMAGES, *_SHARES)}
         if "expected_error" in group:
             arrays["expected_error"] = read_array(group, "expected_error").astype(np.float32)
         for name in ("depth_mm", "image_confidence", "reference", "clip"):
@@ -147,6 +156,10 @@ class PseudoViews(Storable):
             int(attributes["height"]),
         )
         return cls(cameras, **arrays, provenance=dict(attributes["provenance"]))
+
+
+def _from_bytes(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values.astype(np.float32) / np.float32(255))
 
 
 def _as_bytes(values: np.ndarray) -> np.ndarray:

@@ -67,7 +67,9 @@ def test_the_front_door_opens_late_and_wrong_names_are_refused() -> None:
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120
     )
-    assert result.stdout.strip() == "module 'extrags' has no attribute 'reconstrct'"
+    assert (
+        result.stdout.strip() == "module 'extrags' has no attribute 'reconstrct'; did you mean reconstruct?"
+    )
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ from extrags.metrics.registry import unregister_metric
 from extrags.restoration import backends
 from tests.flows.tiny import SEQUENCE, tiny_config
 
-FAST = tiny_config(enhance__train_iterations=0, enhance__judge=False)
-"""Examples show the way through: the bundled restorer as it is, neither trained nor judged on the scene."""
+FAST = tiny_config(enhance__pretrained_weights="bundled", enhance__train_iterations=0, enhance__judge=False)
+"""The bundled restorer as it is, neither trained nor judged on the scene."""
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 

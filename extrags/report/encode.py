@@ -45,11 +45,6 @@ class DataImage:
     width: int = 0
     height: int = 0
 
-    @property
-    def size_bytes(self) -> int:
-        """What it adds to the page."""
-        return len(self.uri)
-
 
 def data_uri(content: bytes, media_type: str) -> str:
     """Content as a base64 `data:` URI."""

@@ -48,7 +48,7 @@ def restore(
         restore_batch(scene, sequence, trajectories, enhancer, config, batch, measure)
         for batch in range(config.batches(len(trajectories)))
     ]
-    return PseudoViews.concatenated(parts)
+    return PseudoViews.concatenated(parts).quantised()
 
 
 def restore_batch(

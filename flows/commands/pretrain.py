@@ -125,7 +125,7 @@ def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
 
     if config.validation_scenes >= config.scenes:
         raise ConfigError(
-            f"{config.validation_scenes} of {config.scenes} scenes are for validation; none is left to train on"
+            f"{config.validation_scenes} of {config.scenes} scenes are for validation; none is left to train"
         )
     for name in ("workers", "threads"):
         value = getattr(given, name)

@@ -2,8 +2,8 @@
 
 * `table`: restorers on held-out views with real degraded renders, over sequences and seeds; a markdown table
   of what each gains over no restoration and over the classical fill, mean and smallest..largest.
-* `downstream`: what pseudo-observations bring to the scene. Per sequence and seed one coarse scene, explored as
-  the pipeline explores it, fine-tuned once per arm, always from that same coarse scene and always with the
+* `downstream`: what pseudo-observations bring to the scene. Per sequence and seed one coarse scene, explored
+  as the pipeline explores it, fine-tuned once per arm, always from that same coarse scene and always with the
   same number of steps on real views. An arm with pseudo-observations takes `finetune.iterations` steps, of
   which a fixed pattern gives R to real views; the arm `real` is fine-tuned for R steps, with its schedule
   compressed to them: rates start and end where the other arms' do, densification ends at the same share, and

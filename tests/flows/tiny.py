@@ -36,6 +36,8 @@ TINY: dict[str, Any] = {
     "enhance.batch": 2,
     "enhance.crop": 32,
     "enhance.channels": [8, 8, 16],
+    # A network of these widths, not the bundled one: trained from nothing in seconds.
+    "enhance.pretrained_weights": "none",
     "enhance.max_views": 4,
     "enhance.clips_per_batch": 1,
     "finetune.iterations": 20,

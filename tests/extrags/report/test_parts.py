@@ -39,7 +39,7 @@ def test_images_survive_encoding() -> None:
 def test_fitted_images_keep_to_their_bound(largest_bytes: int) -> None:
     image = np.random.default_rng(0).integers(0, 256, (300, 600, 3), dtype=np.uint8)
     fitted = fitted_image(image, largest_bytes)
-    assert len(fitted.uri) <= largest_bytes * 4 / 3 + 64
+    assert len(fitted.uri) <= largest_bytes
     assert fitted.width / fitted.height == pytest.approx(2, rel=0.05)
 
 
