@@ -106,7 +106,9 @@ class PseudoViews(Storable):
 
     def quantised(self) -> PseudoViews:
         """The same values as `load` returns after `save`: a run in memory then equals a cached one."""
-        values = {name: _from_bytes(_as_bytes(getattr(self, name))) for name in (*_IMAGES, *_SHARES)}
+        values: dict[str, Any] = {
+            name: _from_bytes(_as_bytes(getattr(self, name))) for name in (*_IMAGES, *_SHARES)
+        }
         error = self.expected_error
         return replace(
             self,

@@ -1,4 +1,4 @@
-"""`benchmark`: methods compared over sequences, profiles and seeds (JSON of design section 7, and more)."""
+"""`benchmark`: methods compared over sequences, profiles and seeds (its JSON: docs/command_line.md)."""
 
 from __future__ import annotations
 

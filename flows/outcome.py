@@ -110,7 +110,7 @@ class SequenceOutcome:
         return next((row for row in self.stages if row.stage == stage), None)
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON object; keys as in design section 7, and more beside them."""
+        """A JSON object; keys as in docs/command_line.md."""
         return {
             "name": self.name,
             "status": self.status,
@@ -133,7 +133,7 @@ class DatasetOutcome:
     """Where the page that compares them stands."""
 
     def to_json(self, seconds: float) -> dict[str, Any]:
-        """A JSON object; keys as in design section 7, and `report` beside them."""
+        """A JSON object; keys as in docs/command_line.md."""
         return {
             "seconds": round(seconds, 3),
             "sequences": [outcome.to_json() for outcome in self.sequences],

@@ -22,10 +22,13 @@ class BackendEntry:
         summary: what it is, in a few words, for help texts.
         implementation: import path of its `extrags.restoration.protocol.Backend` as "module:attribute", or
             the object itself for backends registered by a program.
+        version: of a backend registered by a program, part of the cache key; 0 for those of the project,
+            whose code is covered by the stage's version.
     """
 
     summary: str
     implementation: Any
+    version: int = 0
 
 
 BACKENDS: dict[str, BackendEntry] = {

@@ -41,7 +41,7 @@ def backend_of(name: str) -> Backend:
     return backend
 
 
-def register_backend(backend: Backend | Any, summary: str) -> None:
+def register_backend(backend: Backend | Any, summary: str, *, version: int = 1) -> None:
     """Make a backend of another program known; `enhance.backend` takes its name from now on.
 
     The registration holds for this process. Where stages run in other processes, each of them has to
@@ -50,17 +50,20 @@ def register_backend(backend: Backend | Any, summary: str) -> None:
     Args:
         backend: of the protocol `Backend`; its `name` must be free.
         summary: what it is, in a few words, for help texts.
+        version: raise it whenever its results change: it is part of the key under which they are cached.
 
     Raises:
-        ConfigError: when a part of the protocol is missing, or the name is taken.
+        ConfigError: for a version below 1, when a part of the protocol is missing, or the name is taken.
     """
     if not isinstance(backend, Backend):
         parts = ("name", "check", "digest", "needs_text", "prepare", "load")
         missing = [part for part in parts if not hasattr(backend, part)]
         raise ConfigError(f"{type(backend).__name__} is no restorer backend: it lacks {', '.join(missing)}")
+    if version < 1:
+        raise ConfigError(f"version {version} of the restorer backend {backend.name}: expected 1 or more")
     if backend.name in BACKENDS:
         raise ConfigError(f"there is a restorer backend {backend.name} already; choose another name")
-    BACKENDS[backend.name] = BackendEntry(summary, backend)
+    BACKENDS[backend.name] = BackendEntry(summary, backend, version)
 
 
 def check_restorer(config: EnhanceConfig) -> None:
@@ -101,9 +104,12 @@ def restorer_digest(config: EnhanceConfig) -> str | None:
     backend = backend_of(config.backend)
     model = backend.digest(config)
     texts = check_source(config.caption) if backend.needs_text(config) else None
-    if texts is None:
+    version = BACKENDS[config.backend].version
+    if texts is None and version == 0:
         return model
-    parts = f"{model} {files_fingerprint({'texts': texts})}"
+    parts = str(model) if texts is None else f"{model} {files_fingerprint({'texts': texts})}"
+    if version > 0:
+        parts += f" {backend.name} version {version}"
     return hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()
 
 

@@ -238,7 +238,6 @@ class TestRegistration:
     ) -> None:
         config = PipelineConfig().with_overrides({"enhance.backend": "darkened"}).enhance
         check_restorer(config)
-        assert restorer_digest(config) is None
         train_enhancer(tube.scene, tube.sequence, config, COARSE).save(tmp_path)
         restored = load_enhancer(tmp_path).restore(clip).rgb
         np.testing.assert_array_equal(restored, 0.5 * ClassicalEnhancer().restore(clip).rgb)
@@ -253,6 +252,16 @@ class TestRegistration:
         schema = EnhanceConfig.model_json_schema()["properties"]["backend"]
         assert schema["enum"] == list(BACKENDS)
         assert schema["description"].endswith("darkened: half as bright")
+
+    def test_its_version_is_part_of_the_digest(self, registered: Backend) -> None:
+        config = EnhanceConfig(backend=registered.name)
+        first = restorer_digest(config)
+        assert first is not None
+        del BACKENDS[registered.name]
+        register_backend(registered, "half as bright", version=2)
+        assert restorer_digest(config) not in (first, None)
+        with pytest.raises(ConfigError, match="version 0 of the restorer backend"):
+            register_backend(Darkened(), "again", version=0)
 
     @pytest.mark.usefixtures("registered")
     def test_a_name_is_given_once(self) -> None:
