@@ -100,7 +100,7 @@ def test_what_would_fail_after_hours_is_said_at_once(
 ) -> None:
     out = ["--out", str(tmp_path / "w"), "--scenes-folder", str(scenes)]
     assert main(["pretrain", *out, "--scenes", "3", "--validation-scenes", "3"]) == 2
-    assert "none is left to learn" in capsys.readouterr().err
+    assert "none is left to train" in capsys.readouterr().err
     assert main(["pretrain", *out, "--workers", "0"]) == 2
     assert "--workers 0" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
