@@ -71,10 +71,13 @@ class PerceptualDifference:
     Args:
         lpips: the metric, or None for `extrags.metrics.perceptual.perceptual_map`, which needs no weights.
         reason: why LPIPS is not used; empty when it is.
+        raw: U_pixel is as in the paper: LPIPS itself, without an upper bound, of the rendering and the whole
+            restored image instead of the blend of both that `keep_known` makes.
     """
 
     lpips: Lpips | None
     reason: str = ""
+    raw: bool = False
 
     @classmethod
     def available(cls, config: EvaluateConfig | None = None) -> PerceptualDifference:
@@ -96,8 +99,10 @@ class PerceptualDifference:
 
     @property
     def name(self) -> str:
-        """Name of the measure in the provenance: `lpips_alex` or `perceptual_map`."""
-        return "perceptual_map" if self.lpips is None else self.lpips.name
+        """Name of the measure in the provenance: `lpips_alex`, `raw_lpips_alex` or `perceptual_map`."""
+        if self.lpips is None:
+            return "perceptual_map"
+        return f"raw_{self.lpips.name}" if self.raw else self.lpips.name
 
 
 def pixel_confidence(
@@ -107,8 +112,8 @@ def pixel_confidence(
 ) -> Float[np.ndarray, "v h w"]:
     r"""U_pixel: perceptual difference between rendered and restored image, per pixel.
 
-    LPIPS d is unbounded and is mapped to [0, 1] by :math:`1 - e^{-d / 0.25}`; `perceptual_map` is in [0, 1]
-    already.
+    LPIPS d has no upper bound and is mapped to [0, 1] by :math:`1 - e^{-d / 0.25}`, unless the measure is
+    `raw`: then it is d itself, as in the paper. `perceptual_map` is in [0, 1] already.
 
     Args:
         rendered: renderings of the coarse scene in [0, 1].
@@ -116,7 +121,7 @@ def pixel_confidence(
         measure: LPIPS or `perceptual_map`.
 
     Returns:
-        Values in [0, 1].
+        Values in [0, 1]; raw LPIPS may exceed one.
 
     Raises:
         ShapeError: when the images differ in shape, or are too small for the measure.
@@ -131,9 +136,11 @@ def pixel_confidence(
         second = torch.from_numpy(np.ascontiguousarray(restored[start : start + VIEWS_AT_ONCE]))
         with torch.no_grad():
             if measure.lpips is None:
-                maps.append(perceptual_map(first, second))
-            else:
-                maps.append(1 - torch.exp(-measure.lpips.distance_map(first, second) / LPIPS_SCALE))
+                maps.append(perceptual_map(first, second).clamp(0, 1))
+                continue
+            distance = measure.lpips.distance_map(first, second)
+            bounded = (1 - torch.exp(-distance / LPIPS_SCALE)).clamp(0, 1)
+            maps.append(distance if measure.raw else bounded)
     if not maps:
         return np.zeros(rendered.shape[:3], np.float32)
-    return np.asarray(torch.cat(maps).clamp(0, 1).numpy(), dtype=np.float32)
+    return np.asarray(torch.cat(maps).numpy(), dtype=np.float32)

@@ -19,7 +19,8 @@ from extrags.zarr_io import open_group, read_array, write_array, write_frames
 __all__ = ["PseudoViews"]
 
 _IMAGES = ("rendered", "restored", "target")
-_SHARES = ("alpha", "uncertainty", "pixel_confidence")
+_SHARES = ("alpha", "uncertainty")
+_STEPPED = (*_IMAGES, *_SHARES, "pixel_confidence")
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class PseudoViews(Storable):
         alpha: opacity of the rendering, [V, H, W].
         depth_mm: rendered z-depth, smoothly extrapolated where `alpha` is low, in world units, [V, H, W].
         uncertainty: in [0, 1]; 1 where the scene has no information on the pixel, [V, H, W].
-        pixel_confidence: U_pixel, weight of the colour term of each pixel in [0, 1], [V, H, W].
+        pixel_confidence: U_pixel, weight of the colour term of each pixel, not negative, in [0, 1] unless it
+            is raw LPIPS, [V, H, W].
         image_confidence: U_img, weight of each view in [0, 1], [V].
         reference: position, among the training frames, of the frame with the largest overlap, [V].
         clip: index of the clip each view belongs to, [V].
@@ -69,7 +71,7 @@ class PseudoViews(Storable):
         views = len(self.cameras)
         size = (views, self.cameras.height, self.cameras.width)
         expected: dict[str, tuple[int, ...]] = dict.fromkeys(_IMAGES, (*size, 3))
-        expected.update(dict.fromkeys((*_SHARES, "depth_mm"), size))
+        expected.update(dict.fromkeys((*_SHARES, "pixel_confidence", "depth_mm"), size))
         expected.update(dict.fromkeys(("image_confidence", "reference", "clip"), (views,)))
         if self.expected_error is not None:
             expected["expected_error"] = size
@@ -96,7 +98,7 @@ class PseudoViews(Storable):
         """
         if not parts:
             raise ShapeError("no pseudo-observations to join")
-        names = (*_IMAGES, *_SHARES, "depth_mm", "image_confidence", "reference", "clip")
+        names = (*_STEPPED, "depth_mm", "image_confidence", "reference", "clip")
         arrays = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         errors = [part.expected_error for part in parts if part.expected_error is not None]
         if len(errors) == len(parts):
@@ -106,9 +108,7 @@ class PseudoViews(Storable):
 
     def quantised(self) -> PseudoViews:
         """The same values as `load` returns after `save`: a run in memory then equals a cached one."""
-        values: dict[str, Any] = {
-            name: _from_bytes(_as_bytes(getattr(self, name))) for name in (*_IMAGES, *_SHARES)
-        }
+        values: dict[str, Any] = {name: _from_steps(self._as_steps(name)) for name in _STEPPED}
         error = self.expected_error
         return replace(
             self,
@@ -119,10 +119,13 @@ class PseudoViews(Storable):
         )
 
     def save(self, path: Path) -> None:
-        """Write a zarr v3 group: values in [0, 1] with 8 bits, depth in float32, one view per chunk."""
+        """Write a zarr v3 group: values in [0, 1] with 8 bits, depth in float32, one view per chunk.
+
+        Where a pixel-level confidence exceeds one, all of them have 16 bits, in the same steps of 1/255.
+        """
         group = open_group(path, mode="w")
-        for name in (*_IMAGES, *_SHARES):
-            write_frames(group, name, _as_bytes(getattr(self, name)))
+        for name in _STEPPED:
+            write_frames(group, name, self._as_steps(name))
         if self.expected_error is not None:
             # 8 bits would be too coarse: expected errors are only a few steps of 1/255.
             write_frames(group, "expected_error", self.expected_error.astype(np.float16))
@@ -141,12 +144,18 @@ class PseudoViews(Storable):
             }
         )
 
+    def _as_steps(self, name: str) -> np.ndarray:
+        """An array in steps of 1/255; equal values give equal steps whatever else the array holds."""
+        most = np.iinfo(np.uint16).max if name == "pixel_confidence" else 255
+        steps = np.clip(np.rint(getattr(self, name) * 255), 0, most)
+        return np.asarray(steps, dtype=np.uint8 if steps.max(initial=0) <= 255 else np.uint16)
+
     @classmethod
     def load(cls, path: Path) -> PseudoViews:
         """Read what `save` wrote; values in [0, 1] come back quantised to steps of 1/255."""
         group = zarr.open_group(str(path), mode="r")
         attributes: Any = dict(group.attrs)
-        arrays: dict[str, Any] = {name: _from_bytes(read_array(group, name)) for name in (*_IMAGES, *_SHARES)}
+        arrays: dict[str, Any] = {name: _from_steps(read_array(group, name)) for name in _STEPPED}
         if "expected_error" in group:
             arrays["expected_error"] = read_array(group, "expected_error").astype(np.float32)
         for name in ("depth_mm", "image_confidence", "reference", "clip"):
@@ -160,9 +169,5 @@ class PseudoViews(Storable):
         return cls(cameras, **arrays, provenance=dict(attributes["provenance"]))
 
 
-def _from_bytes(values: np.ndarray) -> np.ndarray:
+def _from_steps(values: np.ndarray) -> np.ndarray:
     return np.asarray(values.astype(np.float32) / np.float32(255))
-
-
-def _as_bytes(values: np.ndarray) -> np.ndarray:
-    return np.asarray(np.rint(np.clip(values, 0, 1) * 255), dtype=np.uint8)

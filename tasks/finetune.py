@@ -11,7 +11,7 @@ from tasks.stage import stage
 __all__ = ["finetune"]
 
 
-@stage("finetune", version=3)
+@stage("finetune", version=4)
 def finetune(
     slot: Slot,
     scene: Ref,

@@ -149,6 +149,11 @@ class EnhanceConfig(StageConfig):
     references: int = Field(8, ge=1, description="real views blended into the reference")
     max_views: int = Field(160, ge=1, description="virtual views restored at most")
     clips_per_batch: int = Field(4, ge=1, description="clips restored by one task")
+    pixel_confidence: Literal["bounded", "raw"] = Field(
+        "bounded",
+        description="U_pixel. bounded: 1 - exp(-LPIPS / 0.25), in [0, 1], of rendering and target; raw: "
+        "LPIPS itself, without an upper bound, of rendering and restored image, as the paper has it",
+    )
     caption: CaptionConfig = CaptionConfig()
     pretrained: PretrainedConfig = PretrainedConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()

@@ -354,8 +354,29 @@ class FinetuneConfig(StageConfig):
     pseudo_depth: bool = Field(
         True, description="restored depth supervises where the scene knows nothing of a pixel"
     )
+    loss: Literal["weighted_mean", "weighted_sum", "paper"] = Field(
+        "weighted_mean",
+        description="colour terms of a virtual view. weighted_mean: L1 and D-SSIM weighted by U_pixel, over "
+        "its sum, so that only its pattern counts; weighted_sum: the same over the number of pixels, so that "
+        "its magnitude counts; paper: over the number of pixels, D-SSIM without weights",
+    )
+    dssim_weight: float | None = Field(
+        None, ge=0, le=1, description="lambda in fine-tuning; None: coarse.dssim_weight"
+    )
+    photometric_weight: float = Field(
+        1.0,
+        gt=0,
+        description="factor of (1 - lambda) L1 + lambda (1 - SSIM) / 2 of all views; 3 with lambda = 2/3 is "
+        "L1 + (1 - SSIM)",
+    )
+    depth_weight: float | None = Field(
+        None, ge=0, description="weight of the inverse-depth term; None: coarse.depth_weight"
+    )
     growth: float = Field(
-        2.0, ge=1, description="limit on the number of Gaussians, times coarse.densify.max_gaussians"
+        2.0,
+        ge=1,
+        description="limit on the number of Gaussians, seeds and densification together, times "
+        "coarse.densify.max_gaussians",
     )
     seed_holes: bool = Field(
         True, description="place new Gaussians where the restored view has surface and none is"

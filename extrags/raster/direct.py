@@ -31,6 +31,8 @@ class Target:
         K: intrinsics in pixels, [3, 3].
         rgb: ground-truth colours, [H, W, 3].
         weight: weight of the colour loss per pixel, [H, W]; None weights all pixels equally.
+        ssim_weight: weight of its SSIM term where that is another, [H, W]; None takes `weight`.
+        normalisation: pixels that the weighted sums are divided by; None is the sum of `weight`.
         depth: z-depth in world units, 0 where there is none, [H, W].
 
     Raises:
@@ -45,6 +47,8 @@ class Target:
         rgb: Float[Tensor, "h w 3"],
         *,
         weight: Float[Tensor, "h w"] | None = None,
+        ssim_weight: Float[Tensor, "h w"] | None = None,
+        normalisation: float | None = None,
         depth: Float[Tensor, "h w"] | None = None,
     ) -> None:
         if rgb.ndim != 3 or rgb.shape[2] != 3:
@@ -52,8 +56,10 @@ class Target:
         self.height, self.width = int(rgb.shape[0]), int(rgb.shape[1])
         self.rgb = _contiguous_array(rgb)
         self.weight = None if weight is None else _contiguous_array(weight)
+        self.ssim_weight = None if ssim_weight is None else _contiguous_array(ssim_weight)
         self.depth = None if depth is None else _contiguous_array(depth)
-        for name, image in (("weight", self.weight), ("depth", self.depth)):
+        images = {"weight": self.weight, "ssim_weight": self.ssim_weight, "depth": self.depth}
+        for name, image in images.items():
             if image is not None and image.shape != (self.height, self.width):
                 raise ShapeError(f"{name} has shape {image.shape}, expected {(self.height, self.width)}")
         self.viewmat = np.ascontiguousarray(viewmat, dtype=np.float32)
@@ -61,9 +67,10 @@ class Target:
         for name, matrix in (("viewmats", self.viewmat), ("Ks", self.K)):
             if not np.isfinite(matrix).all():
                 raise nonfinite_error(name, torch.from_numpy(matrix)[None])
-        pixels = self.height * self.width
-        total = 3 * (pixels if self.weight is None else float(self.weight.sum(dtype=np.float64)))
-        self.scale = 1 / total if total != 0 else 1.0
+        if normalisation is None:
+            pixels = self.height * self.width
+            normalisation = pixels if self.weight is None else float(self.weight.sum(dtype=np.float64))
+        self.scale = 1 / (3 * normalisation) if normalisation != 0 else 1.0
 
 
 def _contiguous_array(values: Tensor) -> np.ndarray:
@@ -103,7 +110,13 @@ class _Images:
         """The loss, and the kernels' struct of its gradients with respect to the images."""
         kernels, image = native.compiled_kernels(), self.arrays
         loss: float = kernels.l1_ssim(
-            image["rgb"], target.rgb, target.weight, image["v_rgb"], dssim_weight, rgb_weight
+            image["rgb"],
+            target.rgb,
+            target.weight,
+            image["v_rgb"],
+            dssim_weight,
+            rgb_weight,
+            ssim_mask=target.ssim_weight,
         )
         gradients = {"rgb": image["v_rgb"]}
         if target.depth is not None and depth_weight > 0:
@@ -179,6 +192,7 @@ class DirectStep:
         sh_degree: int,
         light: Float[np.ndarray, "12"] | None = None,
         dssim_weight: float = 0.2,
+        photometric_weight: float = 1.0,
         loss_weight: float = 1.0,
         depth_weight: float = 0.0,
         depth_scale: float = 1.0,
@@ -192,6 +206,7 @@ class DirectStep:
             sh_degree: use the harmonics up to this degree.
             light: a row of `CameraLight.packed`; given exactly if the step was made `lit`.
             dssim_weight: as in `l1_ssim_loss`.
+            photometric_weight: of `l1_ssim_loss`.
             loss_weight: of the whole view.
             depth_weight: of `inverse_depth_loss`; without effect where the target has no depth.
             depth_scale: as in `inverse_depth_loss`.
@@ -218,7 +233,7 @@ class DirectStep:
         loss, image_gradients = images.loss_and_gradients(
             target,
             dssim_weight=dssim_weight,
-            rgb_weight=loss_weight * target.scale,
+            rgb_weight=loss_weight * photometric_weight * target.scale,
             depth_weight=loss_weight * depth_weight,
             depth_scale=depth_scale,
         )

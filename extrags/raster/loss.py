@@ -1,9 +1,13 @@
 r"""L1 + SSIM loss with its gradient in one pass.
 
-For an image x, a target y and per-pixel weights m in [0, 1],
+For an image x, a target y, per-pixel weights m of the L1 term and s of the SSIM term, and a normalisation Z
+in pixels,
 
-.. math:: L = (1 - \lambda) \frac{\sum_p m_p \sum_c |x - y|}{3 \sum_p m_p}
-        + \lambda \frac{\sum_p m_p \sum_c (1 - \mathrm{SSIM}_{pc}) / 2}{3 \sum_p m_p}.
+.. math:: L = \frac{1}{3 Z} \sum_p \Bigl( (1 - \lambda) \, m_p \sum_c |x - y|
+        + \lambda \, s_p \sum_c (1 - \mathrm{SSIM}_{pc}) / 2 \Bigr).
+
+Where nothing else is said s = m and :math:`Z = \sum_p m_p`, which makes L a weighted mean: a factor common to
+all weights then cancels. Any other Z, such as the number of valid pixels, keeps the magnitude of the weights.
 
 The SSIM map is that of Wang et al. 2004: 11 x 11 Gaussian window of sigma 1.5 px, zero padding,
 C1 = 0.01^2, C2 = 0.03^2 for a data range of one. It is computed on the unweighted images; the weights apply
@@ -16,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrags.errors import ShapeError
+from extrags.errors import ConfigError, ShapeError
 from extrags.raster import native
 from extrags.thresholds import HOLE_ALPHA
 
@@ -34,6 +38,8 @@ def l1_ssim_loss(
     *,
     dssim_weight: float = 0.2,
     mask: Float[Tensor, "*c h w"] | None = None,
+    ssim_mask: Float[Tensor, "*c h w"] | None = None,
+    normalisation: float | None = None,
 ) -> Float[Tensor, ""]:
     """Weighted (1 - dssim_weight) L1 + dssim_weight (1 - SSIM) / 2; see the module for the formula.
 
@@ -45,20 +51,30 @@ def l1_ssim_loss(
         target: ground-truth colour in [0, 1].
         dssim_weight: lambda, in [0, 1].
         mask: weights per pixel, not negative; None weights all pixels equally.
+        ssim_mask: weights of the SSIM term where they are others; None takes `mask` for both terms.
+        normalisation: Z, in pixels, over the whole batch; None is the sum of `mask`, a weighted mean.
 
     Returns:
         The loss.
 
     Raises:
         ShapeError: when shapes or dtypes do not fit together.
+        ConfigError: when the normalisation is not positive.
 
     Source: Kerbl et al. 2023, eq. 7; Wang et al., Image quality assessment, TIP 2004.
     """
-    _check(image, target, mask)
+    _check(image, target, mask, ssim_mask, normalisation)
     plain = image.device.type == "cpu" and image.dtype == torch.float32
     if plain and native.native_isa() is not None:
-        return native.l1_ssim_loss_native(image, target, dssim_weight, mask)
-    return l1_ssim_loss_reference(image, target, dssim_weight=dssim_weight, mask=mask)
+        return native.l1_ssim_loss_native(image, target, dssim_weight, mask, ssim_mask, normalisation)
+    return l1_ssim_loss_reference(
+        image,
+        target,
+        dssim_weight=dssim_weight,
+        mask=mask,
+        ssim_mask=ssim_mask,
+        normalisation=normalisation,
+    )
 
 
 def l1_ssim_loss_reference(
@@ -67,20 +83,22 @@ def l1_ssim_loss_reference(
     *,
     dssim_weight: float = 0.2,
     mask: Float[Tensor, "*c h w"] | None = None,
+    ssim_mask: Float[Tensor, "*c h w"] | None = None,
+    normalisation: float | None = None,
 ) -> Float[Tensor, ""]:
     """Reference implementation of `l1_ssim_loss` in plain torch, for any floating-point dtype."""
-    _check(image, target, mask)
+    _check(image, target, mask, ssim_mask, normalisation)
     target = target.detach()
     height, width = image.shape[-3:-1]
     weights = torch.ones_like(image[..., 0]) if mask is None else mask.detach()
-    total = 3 * weights.sum()
+    total = 3 * (float(weights.sum()) if normalisation is None else normalisation)
     x = image.reshape(-1, height, width, 3).permute(0, 3, 1, 2)
     y = target.reshape(-1, height, width, 3).permute(0, 3, 1, 2)
-    m = weights.reshape(-1, 1, height, width)
-    dissimilarity = (1 - dssim_weight) * (x - y).abs() + dssim_weight * (1 - _ssim_map(x, y)) / 2
-    if float(total) == 0:
-        return (dissimilarity * m).sum()
-    return (dissimilarity * m).sum() / total
+    l1_weights = weights.reshape(-1, 1, height, width)
+    ssim_weights = l1_weights if ssim_mask is None else ssim_mask.detach().reshape(-1, 1, height, width)
+    l1 = (1 - dssim_weight) * l1_weights * (x - y).abs()
+    dssim = dssim_weight * ssim_weights * (1 - _ssim_map(x, y)) / 2
+    return (l1 + dssim).sum() / (total if total != 0 else 1)
 
 
 def inverse_depth_loss(
@@ -131,14 +149,24 @@ def window_means(x: Float[Tensor, "n 3 h w"], y: Float[Tensor, "n 3 h w"]) -> tu
     return tuple(filter2d_separable(moments, taps, taps, border_type="constant").split(3, dim=1))
 
 
-def _check(image: Tensor, target: Tensor, mask: Tensor | None) -> None:
+def _check(
+    image: Tensor,
+    target: Tensor,
+    mask: Tensor | None,
+    ssim_mask: Tensor | None,
+    normalisation: float | None,
+) -> None:
     if image.ndim not in (3, 4) or image.shape[-1] != 3:
         raise ShapeError(f"image has shape {tuple(image.shape)}, expected ([C,] H, W, 3)")
     if target.shape != image.shape or target.dtype != image.dtype:
         raise ShapeError(
             f"target is {target.dtype} {tuple(target.shape)}, image is {image.dtype} {tuple(image.shape)}"
         )
-    if mask is not None and (mask.shape != image.shape[:-1] or mask.dtype != image.dtype):
-        raise ShapeError(
-            f"mask is {mask.dtype} {tuple(mask.shape)}, expected {image.dtype} {tuple(image.shape[:-1])}"
-        )
+    for name, weights in (("mask", mask), ("ssim_mask", ssim_mask)):
+        if weights is not None and (weights.shape != image.shape[:-1] or weights.dtype != image.dtype):
+            raise ShapeError(
+                f"{name} is {weights.dtype} {tuple(weights.shape)}, expected {image.dtype} "
+                f"{tuple(image.shape[:-1])}"
+            )
+    if normalisation is not None and normalisation <= 0:
+        raise ConfigError(f"normalisation is {normalisation}, expected a positive number of pixels")

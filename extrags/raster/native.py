@@ -295,22 +295,41 @@ class _Rasterize(torch.autograd.Function):
         return (None, *shared.values(), g_colors, g_viewmats, g_background, g_light)
 
 
-def l1_ssim_loss_native(image: Tensor, target: Tensor, dssim_weight: float, mask: Tensor | None) -> Tensor:
+def l1_ssim_loss_native(
+    image: Tensor,
+    target: Tensor,
+    dssim_weight: float,
+    mask: Tensor | None,
+    ssim_mask: Tensor | None,
+    normalisation: float | None,
+) -> Tensor:
     """`l1_ssim_loss` of float32 CPU tensors; arguments as checked there."""
-    loss: Tensor = _L1Ssim.apply(image, target, dssim_weight, mask)  # type: ignore[no-untyped-call]
+    loss: Tensor = _L1Ssim.apply(image, target, dssim_weight, mask, ssim_mask, normalisation)  # type: ignore[no-untyped-call]
     return loss
 
 
 class _L1Ssim(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, dssim_weight: float, mask: Tensor | None) -> Tensor:
+    def forward(
+        ctx: Any,
+        image: Tensor,
+        target: Tensor,
+        dssim_weight: float,
+        mask: Tensor | None,
+        ssim_mask: Tensor | None,
+        normalisation: float | None,
+    ) -> Tensor:
         kernels = compiled_kernels()
         height, width = image.shape[-3:-1]
         x = image.detach().reshape(-1, height, width, 3).contiguous()
         y = target.detach().reshape(-1, height, width, 3).contiguous()
-        m = None if mask is None else mask.detach().reshape(-1, height, width).contiguous()
-        total = 3 * (float(x[..., 0].numel()) if m is None else float(m.sum(dtype=torch.float64)))
-        scale = 1 / total if total != 0 else 1.0
+        m, s = (
+            None if weights is None else weights.detach().reshape(-1, height, width).contiguous()
+            for weights in (mask, ssim_mask)
+        )
+        if normalisation is None:
+            normalisation = float(x[..., 0].numel()) if m is None else float(m.sum(dtype=torch.float64))
+        scale = 1 / (3 * normalisation) if normalisation != 0 else 1.0
         gradient = torch.empty_like(x)
         loss = 0.0
         for index in range(len(x)):
@@ -321,17 +340,18 @@ class _L1Ssim(torch.autograd.Function):
                 gradient[index],
                 dssim_weight,
                 scale,
+                ssim_mask=_of_camera(s, index),
             )
         ctx.save_for_backward(gradient.reshape(image.shape))
         return image.new_tensor(loss)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None]:
+    def backward(ctx: Any, v_loss: Tensor) -> tuple[Tensor, None, None, None, None, None]:
         (gradient,) = ctx.saved_tensors
         # Nearly always one: not worth another pass over the image.
         scaled = gradient if float(v_loss) == 1 else gradient * v_loss
-        return scaled, None, None, None
+        return scaled, None, None, None, None, None
 
 
 def adam_step(

@@ -209,7 +209,7 @@ def _pseudo_observation(clip: Clip, restoration: Restoration, measure: Perceptua
         alpha=as_planes(clip.layers.get("alpha")),
         depth_mm=depth,
         uncertainty=uncertainty,
-        pixel_confidence=pixel_confidence(rendered, target, measure),
+        pixel_confidence=pixel_confidence(rendered, restoration.rgb if measure.raw else target, measure),
         image_confidence=clip.image_confidence,
         reference=clip.reference,
         clip=np.full(len(clip), clip.index, dtype=np.int64),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
@@ -67,9 +68,9 @@ def restore_batch(
         sequence: its frames; only training frames are used.
         trajectories: all of them, the real start of each first.
         enhancer: the scene's restorer.
-        config: number of views and of clips per batch.
+        config: number of views and of clips per batch, and the form of the pixel-level confidence.
         batch: which batch.
-        measure: behind the pixel-level confidence.
+        measure: behind the pixel-level confidence; whether it is `raw` is the settings' to say.
 
     Raises:
         ConfigError: when `enhance.max_views` does not allow a view per trajectory.
@@ -83,7 +84,7 @@ def restore_batch(
         gather_references(scene, sequence, sequence.train),
         [trajectories[index][views[index]] for index in chosen],
         enhancer,
-        measure,
+        replace(measure, raw=config.pixel_confidence == "raw"),
         count=config.references,
         first_index=first,
     )

@@ -1,6 +1,8 @@
-"""Joint fine-tuning on real views and confidence-weighted pseudo_views-observations."""
+"""Joint fine-tuning on real views and confidence-weighted pseudo-observations."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -46,12 +48,26 @@ def finetune(
 ) -> TrainingResult:
     r"""Fine-tune a scene on real and virtual views together.
 
-    Virtual views weigh
-    :math:`w U_{img} (|I^P - \hat I| \odot U_{pixel} + L_{D-SSIM} + \lambda_d L_{depth})` with w the
-    `pseudo_weight`; the depth term, with `pseudo_depth` alone, is that of the real views, on pixels whose
-    surface the scene does not know. Which kind a step draws follows a fixed pattern whose share of virtual
-    views falls linearly. The position learning rate starts anew. Without pseudo_views-observations only real
-    views are used: the control of a comparison.
+    With P pixels in an image, :math:`\ell_1 = \sum_c |I - \hat I| / 3` and
+    :math:`\ell_s = \sum_c (1 - \mathrm{SSIM}_c) / 6` of each of them, a virtual view's loss is
+
+    .. math:: w \, U_{img} \Bigl( \frac{\phi}{Z} \sum_p \bigl( (1 - \lambda) \, U_{pixel} \, \ell_1
+            + \lambda \, s \, \ell_s \bigr) + w_d \, L_{depth} \Bigr)
+
+    with w the `pseudo_weight`, :math:`\phi` the `photometric_weight` and :math:`U_{pixel}` not below
+    `confidence_floor`. `loss` chooses Z and s: `weighted_mean` :math:`Z = \sum_p U_{pixel}` and
+    :math:`s = U_{pixel}`, in which the magnitude of :math:`U_{pixel}` cancels; `weighted_sum` Z = P and
+    :math:`s = U_{pixel}`; `paper` Z = P and s = 1. For a real view w, :math:`U_{img}` and :math:`U_{pixel}`
+    are one and sums are over its valid pixels. The depth term, for virtual views with `pseudo_depth` alone,
+    is `inverse_depth_loss`; there on pixels whose surface the scene does not know.
+
+    [ExtraGS, eq. 24 and 25] are loss `paper`, `dssim_weight` 2/3 and `photometric_weight` 3, which is
+    L1 + (1 - SSIM), the D-SSIM of the published code; `pseudo_weight` 1, `confidence_floor` 0, `depth_weight`
+    0, and U_pixel from `enhance.pixel_confidence` raw.
+
+    Which kind a step draws follows a fixed pattern whose share of virtual views falls linearly. The position
+    learning rate starts anew. Seeds and densification together may bring the scene to `growth` times the
+    coarse limit. Without pseudo-observations only real views are used: the control of a comparison.
 
     Args:
         scene: the coarse scene.
@@ -86,16 +102,24 @@ def finetune(
     def draw(iteration: int) -> View:
         return virtual[next(next_virtual)] if pattern[iteration] else real[next(next_real)]
 
+    densify = {"start_share": 0.0, "stop_share": config.densify_share, "max_gaussians": max_gaussians}
     schedule = coarse_schedule(
-        coarse,
+        _with_loss_weights(coarse, config),
         scene_extent(sequence, frames),
         depth,
         "finetune",
         iterations=config.iterations,
-        densify=coarse.densify.model_copy(update={"stop_share": config.densify_share, "start_share": 0.0}),
+        densify=coarse.densify.model_copy(update=densify),
     )
+    schedule = replace(schedule, photometric_weight=config.photometric_weight)
     # All harmonics are active from the first step: the scene is optimised already.
     return optimise(start, draw, schedule.resumed(seed=config.seed))
+
+
+def _with_loss_weights(coarse: CoarseConfig, config: FinetuneConfig) -> CoarseConfig:
+    """The coarse stage's weights of the loss, where fine-tuning sets none of its own."""
+    own = {"dssim_weight": config.dssim_weight, "depth_weight": config.depth_weight}
+    return coarse.model_copy(update={name: value for name, value in own.items() if value is not None})
 
 
 def virtual_steps(config: FinetuneConfig, *, any_virtual: bool = True) -> Bool[np.ndarray, "i"]:
@@ -112,24 +136,35 @@ def virtual_steps(config: FinetuneConfig, *, any_virtual: bool = True) -> Bool[n
 
 
 def virtual_views(pseudo_views: PseudoViews, config: FinetuneConfig) -> list[View]:
-    """Pseudo-observations as views, with both levels of confidence as weights."""
+    """Pseudo-observations as views, with both levels of confidence as weights.
+
+    Args:
+        pseudo_views: restored virtual views; those of image-level confidence zero are left out.
+        config: which form the loss has (see `finetune`), and what weights and targets are made of.
+    """
     views = []
+    cameras = pseudo_views.cameras
     confidence = np.maximum(pseudo_views.pixel_confidence, config.confidence_floor)
+    # Virtual cameras have no mask: every pixel is valid.
+    normalisation = None if config.loss == "weighted_mean" else float(cameras.height * cameras.width)
+    ssim_weight = torch.ones(cameras.height, cameras.width) if config.loss == "paper" else None
     # Completed depth supervises only where the scene has no reliable surface.
     depth = np.where(pseudo_views.uncertainty > UNKNOWN, pseudo_views.depth_mm, 0).astype(np.float32)
-    for index in range(len(pseudo_views.cameras)):
+    for index in range(len(cameras)):
         weight = config.pseudo_weight * float(pseudo_views.image_confidence[index])
         if weight <= 0:
             continue
         target = pseudo_views.target[index] if config.keep_known else pseudo_views.restored[index]
         views.append(
             View(
-                camera=pseudo_views.cameras[index],
+                camera=cameras[index],
                 rgb=torch.from_numpy(np.asarray(target, dtype=np.float32)),
                 weight=torch.from_numpy(confidence[index].astype(np.float32)),
                 depth_mm=torch.from_numpy(depth[index]) if config.pseudo_depth else None,
                 frame=None,
                 loss_weight=weight,
+                ssim_weight=ssim_weight,
+                normalisation=normalisation,
             )
         )
     return views

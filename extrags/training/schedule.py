@@ -26,6 +26,8 @@ class Schedule:
     depth_scale: float
     sh_every: int
     seed: int
+    photometric_weight: float = 1.0
+    """Factor of the L1 and SSIM terms of every view; the depth term is beside it."""
 
     def learning_rates(self, iteration: int) -> dict[str, float]:
         """Rates at an iteration; positions fall log-linearly."""

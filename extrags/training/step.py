@@ -110,7 +110,14 @@ class AutogradStep:
             viewmats=None if pose is None else pose[None],
             absgrad=density.needs_absgrad,
         )
-        loss = l1_ssim_loss(rendering.rgb[0], view.rgb, dssim_weight=schedule.dssim_weight, mask=view.weight)
+        loss = schedule.photometric_weight * l1_ssim_loss(
+            rendering.rgb[0],
+            view.rgb,
+            dssim_weight=schedule.dssim_weight,
+            mask=view.weight,
+            ssim_mask=view.ssim_weight,
+            normalisation=view.normalisation,
+        )
         if view.depth_mm is not None and schedule.depth_weight > 0:
             loss = loss + schedule.depth_weight_at(iteration) * inverse_depth_loss(
                 rendering.depth[0], rendering.alpha[0], view.depth_mm, scale=schedule.depth_scale
@@ -175,6 +182,7 @@ class NativeStep:
             sh_degree=min(iteration // schedule.sh_every, self._sh_degree),
             light=None if self.light_fit is None else self.light_fit.row(view.frame),
             dssim_weight=schedule.dssim_weight,
+            photometric_weight=schedule.photometric_weight,
             loss_weight=view.loss_weight,
             depth_weight=schedule.depth_weight_at(iteration),
             depth_scale=schedule.depth_scale,
@@ -230,6 +238,8 @@ class NativeStep:
             camera.K[0].astype(np.float32),
             view.rgb,
             weight=view.weight,
+            ssim_weight=view.ssim_weight,
+            normalisation=view.normalisation,
             depth=view.depth_mm if self._schedule.depth_weight > 0 else None,
         )
         targets = self.targets

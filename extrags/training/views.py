@@ -27,6 +27,9 @@ class View:
         depth_mm: z-depth, 0 where it does not supervise, [H, W]; None without depth.
         frame: position among the training frames, for its exposure; None for a virtual view.
         loss_weight: weight of the whole view.
+        ssim_weight: per-pixel weight of the SSIM term where that is another, [H, W]; None takes `weight`.
+        normalisation: pixels that the weighted sums of the colour terms are divided by; None is the sum of
+            `weight`, which makes them weighted means.
     """
 
     camera: Cameras
@@ -35,6 +38,8 @@ class View:
     depth_mm: Float[Tensor, "h w"] | None
     frame: int | None
     loss_weight: float = 1.0
+    ssim_weight: Float[Tensor, "h w"] | None = None
+    normalisation: float | None = None
 
 
 def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> list[View]:

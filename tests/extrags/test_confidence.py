@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,6 +67,21 @@ class TestPixelConfidence:
         measure = PerceptualDifference.available(EvaluateConfig(lpips_weights=str(weights)))
         assert measure.name == "lpips_alex"
         self._check(measure)
+
+    def test_raw_lpips_is_the_map_itself(self, shared_data: Path) -> None:
+        weights = next((shared_data / "lpips_weights").glob("*alex*.npz"))
+        bounded = PerceptualDifference.available(EvaluateConfig(lpips_weights=str(weights)))
+        raw = replace(bounded, raw=True)
+        assert raw.name == "raw_lpips_alex"
+        assert bounded.lpips is not None
+        rendered, restored = self._images()
+        confidence = pixel_confidence(rendered, restored, raw)
+        images = torch.from_numpy(rendered), torch.from_numpy(restored)
+        with torch.no_grad():
+            expected = bounded.lpips.distance_map(*images).numpy()
+        assert np.array_equal(confidence, expected)
+        mapped = pixel_confidence(rendered, restored, bounded)
+        np.testing.assert_allclose(1 - np.exp(-confidence / 0.25), mapped, rtol=1e-5, atol=1e-6)
 
     def test_a_named_file_must_work(self, tmp_path: Path) -> None:
         with pytest.raises(WeightsError):

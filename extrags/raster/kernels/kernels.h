@@ -168,12 +168,13 @@ struct AdamStep {
 
 struct LossImages {
   int height, width;
-  const float* image;   // [h, w, 3]
-  const float* target;  // [h, w, 3]
-  const float* mask;    // [h, w] or null
-  float* gradient;      // [h, w, 3]: of the sum
+  const float* image;      // [h, w, 3]
+  const float* target;     // [h, w, 3]
+  const float* mask;       // [h, w] or null: weights of both terms, or of L1 alone
+  const float* ssim_mask;  // [h, w] or null: weights of SSIM where they are others
+  float* gradient;         // [h, w, 3]: of the sum
   float dssim_weight;
-  double scale;  // 1 / (3 sum of weights)
+  double scale;  // of both weighted sums
 };
 
 struct DepthImages {

@@ -60,9 +60,9 @@ static void blur_products(const float* x, const float* y, float* maps, int n, co
   }
 }
 
-static void expand_mask(const LossImages& images, int y, float* weights) {
-  for (int x = 0; x < images.width; ++x) {
-    const float m = images.mask == nullptr ? 1.f : images.mask[static_cast<size_t>(y) * images.width + x];
+static void expand_mask(const float* mask, int width, int y, float* weights) {
+  for (int x = 0; x < width; ++x) {
+    const float m = mask == nullptr ? 1.f : mask[static_cast<size_t>(y) * width + x];
     weights[3 * x] = weights[3 * x + 1] = weights[3 * x + 2] = m;
   }
 }
@@ -141,7 +141,8 @@ static void loss_band(void* data, int band, int) {
   // A row of zeros for each kind of map
   const float* const no_products = gradients + static_cast<size_t>(kRing) * 3 * c.padded;
   const float* rows[2 * kTaps + 1];
-  if (images.mask == nullptr) expand_mask(images, 0, weights);
+  const float* const ssim_mask = images.ssim_mask != nullptr ? images.ssim_mask : images.mask;
+  if (ssim_mask == nullptr) expand_mask(nullptr, images.width, 0, weights);
   const int first = begin - 2 * kTaps > 0 ? begin - 2 * kTaps : 0;
   for (int row = first; row < end + 2 * kTaps; ++row) {
     if (row < height) {
@@ -157,7 +158,7 @@ static void loss_band(void* data, int band, int) {
                               ? no_products
                               : products + static_cast<size_t>(at % kRing) * 5 * c.padded;
       }
-      if (images.mask != nullptr) expand_mask(images, middle, weights);
+      if (ssim_mask != nullptr) expand_mask(ssim_mask, images.width, middle, weights);
       const float loss = ssim_row(rows, weights, derivatives, n, taps);
       if (middle >= begin && middle < end) c.row_losses[height + middle] = loss;
       float* to = gradients + static_cast<size_t>(middle % kRing) * 3 * c.padded;
@@ -173,13 +174,13 @@ static void loss_band(void* data, int band, int) {
                               ? no_products
                               : gradients + static_cast<size_t>(at % kRing) * 3 * c.padded;
       }
-      if (images.mask != nullptr) expand_mask(images, last, weights);
+      if (ssim_mask != nullptr) expand_mask(images.mask, images.width, last, weights);
       c.row_losses[last] = gradient_row(images, last, rows, weights, n, taps);
     }
   }
 }
 
-// Returns the loss times the sum of weights over `scale`, that is the loss of this image alone.
+// Returns `scale` times the weighted sums over this image.
 static double loss(const LossImages* images, Buffer* working) {
   LossContext c;
   c.images = images;

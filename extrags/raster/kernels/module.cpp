@@ -336,14 +336,16 @@ Buffer* thread_working() {
 }
 
 double l1_ssim(const In& image, const In& target, std::optional<In> mask, Out gradient, float dssim_weight,
-               double scale) {
+               double scale, std::optional<In> ssim_mask) {
   expect(image.ndim() == 3 && image.shape(2) == 3, "image");
   const size_t height = image.shape(0), width = image.shape(1);
   expect(target.size() == image.size(), "target");
   expect(gradient.size() == image.size(), "gradient");
   expect(!mask || mask->size() == height * width, "mask");
-  const LossImages images{static_cast<int>(height), static_cast<int>(width), image.data(), target.data(),
-                          data_or_null(mask), gradient.data(), dssim_weight, scale};
+  expect(!ssim_mask || ssim_mask->size() == height * width, "ssim_mask");
+  const LossImages images{static_cast<int>(height), static_cast<int>(width),  image.data(),
+                          target.data(),            data_or_null(mask),       data_or_null(ssim_mask),
+                          gradient.data(),          dssim_weight,             scale};
   nb::gil_scoped_release release_gil;
   return active()->loss(&images, thread_working());
 }
@@ -465,7 +467,8 @@ NB_MODULE(_native, m) {
   m.def("render", &render, nb::arg("gaussians"), nb::arg("camera"), nb::arg("images"), nb::kw_only(),
         nb::arg("degree"), "Render one camera; `degree` is that of the harmonics used.");
   m.def("l1_ssim", &l1_ssim, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(),
-        nb::arg("gradient").noconvert(), nb::arg("dssim_weight"), nb::arg("scale"));
+        nb::arg("gradient").noconvert(), nb::arg("dssim_weight"), nb::arg("scale"),
+        nb::arg("ssim_mask").none() = nb::none());
   m.def("inverse_depth", &inverse_depth, nb::arg("depth"), nb::arg("alpha"), nb::arg("target"),
         nb::arg("gradient").noconvert(), nb::arg("scale"), nb::arg("weight"));
   m.def("adam", &adam, nb::arg("parameters"), nb::arg("steps").noconvert(), nb::arg("bias1"),

@@ -132,6 +132,8 @@ def test_targets_are_checked(unchecked: None) -> None:
         Target(np.eye(4), eye, rgb[0])
     with pytest.raises(ShapeError, match="weight has shape"):
         Target(np.eye(4), eye, rgb, weight=torch.zeros(5, 4))
+    with pytest.raises(ShapeError, match="ssim_weight has shape"):
+        Target(np.eye(4), eye, rgb, ssim_weight=torch.zeros(5, 4))
     with pytest.raises(NonFiniteError, match="Ks"):
         Target(np.eye(4), eye * np.nan, rgb)
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from extrags.errors import ShapeError
+from extrags.errors import ConfigError, ShapeError
 from extrags.raster import l1_ssim_loss, native, set_num_threads
 from extrags.raster.loss import l1_ssim_loss_reference
 from tests.extrags.raster.scenes import relative_l2
@@ -45,6 +45,62 @@ def test_native_equals_reference(shape: tuple[int, ...], masked: bool, isa: str)
     )
     assert float(value) == pytest.approx(float(expected), rel=2e-6)
     assert relative_l2(gradient, expected_gradient) < 1e-5
+
+
+@pytest.mark.parametrize("shape", [(37, 53, 3), (3, 200, 3), (90, 5, 3), (2, 40, 33, 3)])
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("normalisation", [None, 321.0])
+def test_native_equals_reference_with_other_weights_for_ssim(
+    shape: tuple[int, ...], masked: bool, normalisation: float | None, isa: str
+) -> None:
+    image, target = _images(*shape)
+    mask, ssim_mask = (
+        0.1 + torch.rand(*shape[:-1], generator=torch.Generator().manual_seed(seed)) for seed in (3, 4)
+    )
+    options = {"dssim_weight": 0.3, "normalisation": normalisation}
+    value, gradient = _with_gradient(
+        l1_ssim_loss, image, target, mask=mask if masked else None, ssim_mask=ssim_mask, **options
+    )
+    expected, expected_gradient = _with_gradient(
+        l1_ssim_loss_reference,
+        image.double(),
+        target.double(),
+        mask=mask.double() if masked else None,
+        ssim_mask=ssim_mask.double(),
+        **options,
+    )
+    assert float(value) == pytest.approx(float(expected), rel=2e-6)
+    assert relative_l2(gradient, expected_gradient) < 1e-5
+
+
+@pytest.mark.parametrize("function", [l1_ssim_loss, l1_ssim_loss_reference])
+def test_what_weights_and_normalisation_mean(function) -> None:
+    image, target = _images(12, 14, 3)
+    weights = torch.rand(12, 14, generator=torch.Generator().manual_seed(3))
+
+    def loss(factor: float, **options: float | torch.Tensor) -> float:
+        return float(function(image, target, mask=factor * weights, **options))
+
+    # The magnitude cancels in a weighted mean, and counts where the number of pixels is given.
+    assert loss(0.1) == pytest.approx(loss(1), rel=1e-5)
+    assert loss(0.1, normalisation=168.0) == pytest.approx(0.1 * loss(1, normalisation=168.0), rel=1e-5)
+    # Weights of the SSIM term leave the L1 term alone, and the other way round.
+    ones = torch.ones(12, 14)
+    l1, dssim = (float(function(image, target, dssim_weight=w)) for w in (0.0, 1.0))
+    options = {"normalisation": 168.0, "dssim_weight": 0.25}
+    mixed = float(function(image, target, mask=0.5 * ones, ssim_mask=2 * ones, **options))
+    assert mixed == pytest.approx(0.5 * 0.75 * l1 + 2 * 0.25 * dssim, rel=1e-5)
+
+
+def test_ssim_weights_equal_to_the_mask_change_no_bit(isa: str) -> None:
+    image, target = _images(40, 50, 3)
+    mask = torch.rand(40, 50, generator=torch.Generator().manual_seed(3))
+    value, gradient = _with_gradient(l1_ssim_loss, image, target, mask=mask)
+    total = float(mask.sum(dtype=torch.float64))
+    for options in ({"ssim_mask": mask}, {"ssim_mask": mask.clone(), "normalisation": total}):
+        other, other_gradient = _with_gradient(l1_ssim_loss, image, target, mask=mask, **options)
+        assert torch.equal(value, other)
+        assert torch.equal(gradient, other_gradient)
 
 
 def test_ssim_is_that_of_scikit_image() -> None:
@@ -120,6 +176,10 @@ def test_errors(unchecked: None) -> None:
         l1_ssim_loss(image, image, mask=torch.zeros(5, 4))
     with pytest.raises(ShapeError, match="image has shape"):
         l1_ssim_loss(torch.zeros(4, 5), torch.zeros(4, 5))
+    with pytest.raises(ShapeError, match="ssim_mask is"):
+        l1_ssim_loss(image, image, ssim_mask=torch.zeros(5, 4))
+    with pytest.raises(ConfigError, match="normalisation is 0"):
+        l1_ssim_loss(image, image, normalisation=0)
 
 
 def test_native_is_what_runs() -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -8,11 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
-from extrags.confidence import PerceptualDifference
+from extrags.confidence import PerceptualDifference, pixel_confidence
+from extrags.config import EnhanceConfig
 from extrags.errors import ConfigError, ShapeError
+from extrags.metrics.lpips import Lpips
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import choose_views, keep_known, make_pseudo_observations
+from extrags.restoration.trajectories import restore_batch
 from tests.extrags.lit_tube import Tube, tube_cameras
 
 
@@ -75,6 +80,39 @@ class TestPseudoObservations:
         loaded.save(tmp_path / "again")
         twice = PseudoViews.load(tmp_path / "again")
         assert np.array_equal(twice.target, loaded.target)
+
+    def test_confidences_above_one_keep_their_steps(self, pseudo: PseudoViews, tmp_path) -> None:
+        confidence = 3 * pseudo.pixel_confidence
+        confidence[0] = np.minimum(confidence[0], 1)
+        assert confidence.max() > 1
+        raw = replace(pseudo, pixel_confidence=confidence)
+        raw.save(tmp_path / "pseudo")
+        loaded = PseudoViews.load(tmp_path / "pseudo").pixel_confidence
+        assert np.abs(loaded - confidence).max() <= 0.5 / 255 + 1e-6
+        assert np.array_equal(loaded, raw.quantised().pixel_confidence)
+        # What a batch is stored with does not depend on the others.
+        bounded = replace(raw, pixel_confidence=np.minimum(confidence, 1))
+        assert np.array_equal(loaded[0], bounded.quantised().pixel_confidence[0])
+
+    @pytest.mark.parametrize("form", ["bounded", "raw"])
+    def test_the_settings_say_which_form_confidences_have(
+        self, tube: Tube, shared_data: Path, form: Literal["bounded", "raw"]
+    ) -> None:
+        weights = next((shared_data / "lpips_weights").glob("*alex*.npz"))
+        measure = PerceptualDifference(Lpips.load(weights, "alex"))
+        views = restore_batch(
+            tube.scene,
+            tube.sequence,
+            [tube_cameras(2, offset_mm=6.0, turn=0.5)],
+            ClassicalEnhancer(),
+            EnhanceConfig(pixel_confidence=form),
+            0,
+            measure,
+        )
+        compared = views.restored if form == "raw" else views.target
+        expected = pixel_confidence(views.rendered, compared, replace(measure, raw=form == "raw"))
+        assert np.array_equal(views.pixel_confidence, expected)
+        assert views.provenance["pixel_confidence"] == {"bounded": "", "raw": "raw_"}[form] + "lpips_alex"
 
     def test_sizes_are_checked(self, pseudo: PseudoViews) -> None:
         with pytest.raises((ShapeError, TypeCheckError), match="alpha"):
