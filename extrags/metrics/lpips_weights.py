@@ -54,7 +54,8 @@ def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> tuple[P
     (each a file, or a folder that holds `lpips_<net>_v0.1.npz`), at `extrags/lpips` in the user's data and
     cache directories (`extrags.data_directories`), and at an installed package's heads together with
     torchvision's backbone in torch's cache. A named path that does not exist is an error; later places are
-    then not searched. A file that the variable names says nothing about other backbones than the one it holds.
+    then not searched. A file that the variable names serves the backbone it holds; others are looked for in
+    the later places.
 
     Args:
         explicit: path the user named, or None.
