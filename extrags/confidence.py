@@ -84,14 +84,14 @@ class PerceptualDifference:
         """LPIPS if its weights can be found, else `perceptual_map`.
 
         Args:
-            config: the backbone, and optionally the file of its weights; None takes the defaults.
+            config: its first backbone, and optionally where the weights are; None takes the defaults.
 
         Raises:
             WeightsError: when the settings name a file that cannot be used.
         """
         config = EvaluateConfig() if config is None else config
         try:
-            return cls(Lpips.load(config.lpips_weights, config.lpips_net))
+            return cls(Lpips.load(config.lpips_weights, config.lpips_nets[0]))
         except WeightsError as error:
             if config.lpips_weights is not None:
                 raise

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
-from extrags.confidence import PerceptualDifference
 from extrags.events import Progress, emit
+from extrags.metrics.lpips import LpipsByNet, available_lpips
 from extrags.metrics.protocol import EvaluationResult, RenderedViews, evaluate_views
 from extrags.metrics.surface import TrueSurface, evaluate_surface, scene_surface
 from extrags.scene import Scene
@@ -55,7 +55,7 @@ def evaluate_renders(
     *,
     mesh: Mesh | None = None,
     true_surface: TrueSurface | None = None,
-    measure: PerceptualDifference | None = None,
+    lpips: LpipsByNet | None = None,
 ) -> EvaluationResult:
     """Metrics of rendered held-out views, and of the surface where ground truth is known.
 
@@ -64,20 +64,18 @@ def evaluate_renders(
         sequence: the sequence of these frames.
         mesh: the scene's surface (`extrags.metrics.surface.scene_surface`); None where it has none.
         true_surface: ground truth of the surface; None omits the surface metrics.
-        measure: LPIPS with its weights, or the reason why there is none; None searches for the weights.
+        lpips: LPIPS by backbone; None searches for the weights of the default backbones.
 
     Raises:
         ShapeError: when renders and frames differ in number or size.
         NonFiniteError: for NaN or infinity in the renders; names the frame.
     """
-    measure = PerceptualDifference.available() if measure is None else measure
     surface = None if true_surface is None else evaluate_surface(mesh, true_surface, sequence)
     return evaluate_views(
         renders,
         sequence,
         sequence.test,
-        measure.lpips,
-        lpips_reason=measure.reason,
+        available_lpips() if lpips is None else lpips,
         surface=surface,
         surface_reason="the sequence has no true depth"
         if sequence.depth_mm is None
@@ -90,7 +88,7 @@ def evaluate(
     sequence: EndoscopicSequence,
     *,
     true_surface: TrueSurface | None = None,
-    measure: PerceptualDifference | None = None,
+    lpips: LpipsByNet | None = None,
 ) -> EvaluationResult:
     """Render the held-out views of a scene and compute their metrics (`render`, `evaluate_renders`).
 
@@ -98,7 +96,7 @@ def evaluate(
         scene: the scene.
         sequence: posed frames, including the held-out ones.
         true_surface: ground truth of the surface; None omits the surface metrics.
-        measure: LPIPS with its weights, or the reason why there is none; None searches for the weights.
+        lpips: LPIPS by backbone; None searches for the weights of the default backbones.
 
     Raises:
         ShapeError: when there is no held-out frame.
@@ -109,5 +107,5 @@ def evaluate(
         sequence,
         mesh=mesh,
         true_surface=true_surface,
-        measure=measure,
+        lpips=lpips,
     )

@@ -389,12 +389,13 @@ class InMemoryPipeline(Pipeline):
     def evaluate(self) -> None:
         """`extrags.evaluation` of the coarse and the final scene."""
         from extrags.evaluation import evaluate_renders, render
+        from extrags.metrics.lpips import available_lpips
         from extrags.metrics.surface import scene_surface
 
         scenes = {"coarse": self.result.coarse}
         if self.result.finetuning is not None:
             scenes["final"] = self.result.finetuning.scene
-        measure = self._perceptual_difference()
+        lpips = available_lpips(self.config.evaluate)
         sequence = self.result.sequence
         with self._timed("evaluate"):
             for which, scene in scenes.items():
@@ -404,7 +405,7 @@ class InMemoryPipeline(Pipeline):
                     sequence,
                     mesh=None if self.true_surface is None else scene_surface(scene, sequence),
                     true_surface=self.true_surface,
-                    measure=measure,
+                    lpips=lpips,
                 )
         # Where nothing was fine-tuned, the coarse scene is the final one.
         self.result.evaluations.setdefault("final", self.result.evaluations["coarse"])

@@ -25,6 +25,7 @@ VERBS = {
     "export": "write a reconstructed scene as PLY, or a sequence as COLMAP model or transforms.json",
     "data": "what sequences there are, and whether a source is right",
     "cache": "what is in the store",
+    "weights": "which weights of networks are on this machine, and their download",
     "evaluate": "measure renders made elsewhere, or show the figures of a finished run",
     "benchmark": "compare methods over sequences and seeds",
     "bench": "measure speed and error of the parts or of the whole",

@@ -94,7 +94,8 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("sequence", "status", "stages"):
         table.add_column(column)
-    for name in table_figures()[:4]:
+    columns = table_figures(*(tree for outcome in run.sequences for tree in outcome.metrics.values()))[:4]
+    for name in columns:
         table.add_column(name, justify="right")
     for outcome in run.sequences:
         states = [row.state for row in outcome.stages]
@@ -109,7 +110,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
             outcome.name,
             f"[{colour}]{outcome.status}[/]",
             counts,
-            *(_change(name, coarse.get(name), final.get(name)) for name in table_figures()[:4]),
+            *(_change(name, coarse.get(name), final.get(name)) for name in columns),
         )
     out.print(table)
     for outcome in run.sequences:

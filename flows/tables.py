@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from extrags.metrics.registry import figures, metric_named
+from extrags.metrics.registry import Figure, figures, metric_named
 from flows.outcome import SequenceOutcome
 
 __all__ = [
@@ -21,14 +21,23 @@ __all__ = [
 ]
 
 
-def table_figures() -> list[str]:
-    """Names of the figures in tables of runs; narrow tables show the first few."""
-    return [shown.name for shown in figures("tables")]
+def table_figures(*trees: Mapping[str, Any] | None) -> list[str]:
+    """Names of the figures in tables of runs with these metrics; narrow tables show the first few."""
+    return _asked_for(figures("tables"), trees)
 
 
-def difference_figures() -> list[str]:
-    """Names of the figures whose differences between methods are shown."""
-    return [shown.name for shown in figures("differences")]
+def difference_figures(*trees: Mapping[str, Any] | None) -> list[str]:
+    """Names of the figures whose differences between methods are shown, for runs with these metrics."""
+    return _asked_for(figures("differences"), trees)
+
+
+def _asked_for(shown: Sequence[Figure], trees: Sequence[Mapping[str, Any] | None]) -> list[str]:
+    """All but LPIPS with a backbone that no run was asked to measure."""
+    return [
+        item.name
+        for item in shown
+        if metric_named(item.key).lpips_net is None or any(item.key in (tree or {}) for tree in trees)
+    ]
 
 
 def figure(name: str, value: float | None) -> str:
@@ -55,10 +64,11 @@ def sequence_markdown(outcome: SequenceOutcome) -> str:
             for row in outcome.stages
         ],
     )
+    columns = table_figures(*outcome.metrics.values())
     metrics = markdown_table(
-        ["scene", *table_figures(), "Gaussians"],
+        ["scene", *columns, "Gaussians"],
         [
-            [which, *(figure(name, tree.get(name)) for name in table_figures()), tree.get("n_gaussians", "")]
+            [which, *(figure(name, tree.get(name)) for name in columns), tree.get("n_gaussians", "")]
             for which, tree in outcome.metrics.items()
             if tree is not None
         ],
@@ -69,6 +79,7 @@ def sequence_markdown(outcome: SequenceOutcome) -> str:
 
 def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
     """One row per sequence: coarse and final figures, or why it failed."""
+    columns = table_figures(*(tree for outcome in outcomes for tree in outcome.metrics.values()))[:3]
     rows = []
     for outcome in outcomes:
         coarse, final = (outcome.metrics.get(which) or {} for which in ("coarse", "final"))
@@ -78,14 +89,11 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
                 outcome.name,
                 outcome.status,
                 f"{outcome.seconds:.1f}",
-                *(
-                    f"{figure(name, coarse.get(name))} → {figure(name, final.get(name))}"
-                    for name in table_figures()[:3]
-                ),
+                *(f"{figure(name, coarse.get(name))} → {figure(name, final.get(name))}" for name in columns),
                 "" if failed is None else f"{failed.stage}: {failed.reason}",
             ]
         )
-    return markdown_table(["sequence", "status", "seconds", *table_figures()[:3], "problem"], rows)
+    return markdown_table(["sequence", "status", "seconds", *columns, "problem"], rows)
 
 
 def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
@@ -93,21 +101,23 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
     from extrags.metrics.comparison import compare_runs
 
     comparison = compare_runs(cases, baseline)
+    trees = [case["metrics"] for case in cases]
+    columns, differences = table_figures(*trees), difference_figures(*trees)
     paired = markdown_table(
-        ["dataset", "profile", "method", "sequences", *difference_figures()],
+        ["dataset", "profile", "method", "sequences", *differences],
         [
             [
                 row["dataset"],
                 row["profile"],
                 row["method"],
                 row["n_sequences"],
-                *(difference_text(name, row["figures"].get(name)) for name in difference_figures()),
+                *(difference_text(name, row["figures"].get(name)) for name in differences),
             ]
             for row in comparison["paired_datasets"]
         ],
     )
     spread = markdown_table(
-        ["sequence", "setting", "profile", "method", "seeds", *table_figures()],
+        ["sequence", "setting", "profile", "method", "seeds", *columns],
         [
             [
                 row["sequence"],
@@ -115,13 +125,13 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
                 row["profile"],
                 row["method"],
                 row["n_seeds"],
-                *(spread_text(name, row["figures"].get(name)) for name in table_figures()),
+                *(spread_text(name, row["figures"].get(name)) for name in columns),
             ]
             for row in comparison["sequences"]
         ],
     )
     runs = markdown_table(
-        ["sequence", "setting", "profile", "method", "seed", "seconds", "MiB", *table_figures(), "problem"],
+        ["sequence", "setting", "profile", "method", "seed", "seconds", "MiB", *columns, "problem"],
         [
             [
                 case["sequence"],
@@ -131,7 +141,7 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
                 case["seed"],
                 f"{case['seconds']:.1f}",
                 "" if case["peak_mib"] is None else f"{case['peak_mib']:.0f}",
-                *(figure(name, (case["metrics"] or {}).get(name)) for name in table_figures()),
+                *(figure(name, (case["metrics"] or {}).get(name)) for name in columns),
                 case["error"],
             ]
             for case in cases

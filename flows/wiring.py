@@ -226,7 +226,7 @@ class SequenceRun(Pipeline):
                 "model_digest": restorer_digest(settings),
             }
             self.refs["restorer"] = self._run_task(row, Call(train, inputs))
-            weights = self._weights()
+            weights, *_ = self._weights()
             shared = {
                 **self._scene_inputs(),
                 "explore": self.refs["explore"],
@@ -263,8 +263,7 @@ class SequenceRun(Pipeline):
             )
             weights = self._weights()
             settings = {
-                "net": weights.net,
-                "weights_digest": weights.digest,
+                "lpips_digests": {item.net: item.digest for item in weights},
                 "weights": weights,
                 "added": added_metrics(),
             }
@@ -297,7 +296,7 @@ class SequenceRun(Pipeline):
     def _scene_inputs(self) -> dict[str, Any]:
         return {"scene": self.refs["coarse"], "sequence": self.refs["training"]}
 
-    def _weights(self) -> Weights:
+    def _weights(self) -> list[Weights]:
         return lpips_weights(self.config.evaluate)
 
     def _run_uncounted(self, call: Call) -> Ref:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from extrags.config import LpipsNet
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Ref, Slot
 from tasks.stage import stage
-from tasks.weights import Weights
+from tasks.weights import Weights, lpips_by_net
 
 __all__ = ["METRICS_FILE", "measure", "render"]
 
@@ -43,13 +44,13 @@ def measure(
     slot: Slot,
     renders: Ref,
     sequence: Ref,
-    net: str,
-    weights_digest: str | None,
-    weights: Weights,
+    lpips_digests: dict[LpipsNet, str | None],
+    weights: list[Weights],
     added: list[str],
 ) -> None:
     """Metrics of rendered views and of the surface; writes `metrics.json`.
 
+    `lpips_digests` names the backbones of LPIPS with the digests of their weights, None for missing ones.
     `added` names the metrics that a program has registered beside the protocol's
     (`extrags.metrics.registry.added_metrics`).
     """
@@ -58,7 +59,7 @@ def measure(
     from extrags.evaluation import evaluate_renders
     from extrags.metrics.comparison import figure_of
     from extrags.metrics.protocol import RenderedViews
-    from extrags.metrics.registry import added_metrics, figures
+    from extrags.metrics.registry import added_metrics, figures, metric_named
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 
@@ -73,8 +74,9 @@ def measure(
         frames,
         mesh=slot.load(Mesh, renders) if (slot.open(renders) / Mesh.stored_as).exists() else None,
         true_surface=None if frames.depth_mm is None else true_surface(frames),
-        measure=weights.perceptual_difference(),
+        lpips=lpips_by_net(weights),
     )
     slot.save_json(METRICS_FILE, result.to_json(), indent=1)
     for figure in figures("counts"):
-        slot.counts[figure.key] = figure_of(result.metrics, figure.name)
+        if metric_named(figure.key).lpips_net is None or figure.key in result.metrics:
+            slot.counts[figure.key] = figure_of(result.metrics, figure.name)

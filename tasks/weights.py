@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
+from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
@@ -12,8 +15,9 @@ from extrags.errors import WeightsError
 
 if TYPE_CHECKING:
     from extrags.confidence import PerceptualDifference
+    from extrags.metrics.lpips import Lpips
 
-__all__ = ["Weights", "lpips_weights", "restorer_digest"]
+__all__ = ["Weights", "lpips_by_net", "lpips_weights", "restorer_digest"]
 
 
 class Weights(BaseModel):
@@ -22,35 +26,58 @@ class Weights(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     net: LpipsNet
-    path: str | None = None
+    paths: tuple[str, ...] = ()
     digest: str | None = None
     reason: str = ""
 
     def perceptual_difference(self) -> PerceptualDifference:
         """LPIPS with these weights, else `perceptual_map` with the reason."""
         from extrags.confidence import PerceptualDifference
+
+        return PerceptualDifference(self.lpips(), self.reason)
+
+    def lpips(self) -> Lpips | None:
+        """LPIPS with these weights; None without."""
         from extrags.metrics.lpips import Lpips
 
-        lpips = None if self.path is None else Lpips.load(self.path, net=self.net)
-        return PerceptualDifference(lpips, self.reason)
+        return Lpips.read(tuple(map(Path, self.paths)), self.net) if self.paths else None
 
 
-def lpips_weights(config: EvaluateConfig) -> Weights:
-    """Search LPIPS weights (`extrags.metrics.lpips.find_weights`).
+def lpips_weights(config: EvaluateConfig) -> list[Weights]:
+    """Search the weights of each LPIPS backbone that is asked for (`extrags.metrics.lpips_weights`).
 
     Raises:
         WeightsError: when the settings name a file that is not there.
     """
-    from extrags.metrics.lpips import find_weights
+    from extrags.metrics import lpips_weights as search
 
-    try:
-        path = find_weights(config.lpips_weights, config.lpips_net)
-    except WeightsError as error:
-        if config.lpips_weights is not None:
-            raise
-        return Weights(net=config.lpips_net, reason=str(error))
-    digest = hashlib.blake2b(path.read_bytes(), digest_size=16).hexdigest()
-    return Weights(net=config.lpips_net, path=str(path), digest=digest)
+    found = []
+    for net in config.lpips_nets:
+        try:
+            files = search.find_weights(config.lpips_weights, net)
+        except WeightsError as error:
+            if config.lpips_weights is not None:
+                raise
+            found.append(Weights(net=net, reason=str(error)))
+            continue
+        digest = _digest(tuple((file, file.stat().st_size, file.stat().st_mtime_ns) for file in files))
+        found.append(Weights(net=net, paths=tuple(map(str, files)), digest=digest))
+    return found
+
+
+def lpips_by_net(weights: Sequence[Weights]) -> dict[LpipsNet, Lpips | str]:
+    """LPIPS by backbone: the metric with its weights, or the reason why there are none."""
+    return {item.net: item.lpips() or item.reason for item in weights}
+
+
+@lru_cache(maxsize=8)
+def _digest(files: tuple[tuple[Path, int, int], ...]) -> str:
+    """Digest of the content of files, one after the other; sizes and times of change are for the cache."""
+    digest = hashlib.blake2b(digest_size=16)
+    for file, _, _ in files:
+        with file.open("rb") as opened:
+            hashlib.file_digest(opened, lambda: digest)
+    return digest.hexdigest()
 
 
 def restorer_digest(config: EnhanceConfig) -> str | None:

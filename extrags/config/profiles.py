@@ -8,6 +8,7 @@ from extrags.config.restorer import EnhanceConfig
 from extrags.config.stages import (
     CoarseConfig,
     DensifyConfig,
+    EvaluateConfig,
     ExploreConfig,
     FinetuneConfig,
     OptimiserConfig,
@@ -47,6 +48,7 @@ PROFILES: dict[str, PipelineConfig] = {
         ),
         explore=ExploreConfig(rotation_deg=20.0, orbit_deg=20.0),
         finetune=FinetuneConfig(iterations=4000),
+        evaluate=EvaluateConfig(lpips_nets=("alex", "vgg")),
     ),
     # The paper's counts.
     "paper": PipelineConfig(
@@ -65,6 +67,7 @@ PROFILES: dict[str, PipelineConfig] = {
             samples=4,
         ),
         finetune=FinetuneConfig(iterations=15_000),
+        evaluate=EvaluateConfig(lpips_nets=("alex", "vgg")),
         explore=ExploreConfig(render_width=160, max_expansions=200),
     ),
 }

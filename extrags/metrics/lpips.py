@@ -1,77 +1,36 @@
-"""LPIPS v0.1 with an AlexNet or SqueezeNet backbone, its weights read from one npz file.
+"""LPIPS v0.1 with an AlexNet, VGG16 or SqueezeNet backbone.
 
 Source: Zhang, Isola, Efros, Shechtman, Wang: The Unreasonable Effectiveness of Deep Features as a
 Perceptual Metric, CVPR 2018, equation 1.
 
-Values of different backbones are not comparable; state the network with every value. Much of the literature
-on 3D Gaussians reports LPIPS-VGG.
+Values of different backbones are not comparable; state the network with every value. Most of the literature
+on 3D Gaussians reports LPIPS with VGG, which takes sixteen times as long as AlexNet on a processor.
 """
 
 from __future__ import annotations
 
-import os
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrags.config import LpipsNet
-from extrags.data_directories import weights_roots
-from extrags.errors import ConfigError, ShapeError, WeightsError
+from extrags.config import EvaluateConfig, LpipsNet
+from extrags.errors import ShapeError, WeightsError
+from extrags.metrics.lpips_networks import LAYERS
+from extrags.metrics.lpips_weights import find_weights, read_weights
 
-__all__ = ["WEIGHTS_VARIABLE", "Lpips", "find_weights"]
+__all__ = ["Lpips", "LpipsByNet", "available_lpips"]
 
-WEIGHTS_VARIABLE = "EXTRAGS_LPIPS_WEIGHTS"
-"""Environment variable: an npz file, or a folder that holds `lpips_<net>_v0.1.npz`."""
-
-_Step = tuple[str, int]
-# Layers by torchvision's numbers; "tap" hands the current activation out.
-_STEPS: dict[str, tuple[_Step, ...]] = {
-    "alex": (
-        ("conv stride 4 pad 2", 0),
-        ("tap", 0),
-        ("pool", 0),
-        ("conv stride 1 pad 2", 3),
-        ("tap", 1),
-        ("pool", 0),
-        ("conv stride 1 pad 1", 6),
-        ("tap", 2),
-        ("conv stride 1 pad 1", 8),
-        ("tap", 3),
-        ("conv stride 1 pad 1", 10),
-        ("tap", 4),
-    ),
-    "squeeze": (
-        ("conv stride 2 pad 0", 0),
-        ("tap", 0),
-        ("pool ceil", 0),
-        ("fire", 3),
-        ("fire", 4),
-        ("tap", 1),
-        ("pool ceil", 0),
-        ("fire", 6),
-        ("fire", 7),
-        ("tap", 2),
-        ("pool ceil", 0),
-        ("fire", 9),
-        ("tap", 3),
-        ("fire", 10),
-        ("tap", 4),
-        ("fire", 11),
-        ("tap", 5),
-        ("fire", 12),
-        ("tap", 6),
-    ),
-}
 _CHANNEL_SHIFT = (-0.030, -0.088, -0.188)
 _CHANNEL_SCALE = (0.458, 0.448, 0.450)
 _MIN_SIDE_PX = 32
 _NORM_EPS = 1e-10
-_IMAGES_AT_ONCE = 16
+# A few images at a time: the activations of a long stack would not fit into memory.
+_IMAGES_AT_ONCE: dict[LpipsNet, int] = {"alex": 16, "vgg": 1, "squeeze": 16}
 
 
 @dataclass(frozen=True)
@@ -80,7 +39,7 @@ class Lpips:
 
     Args:
         net: backbone.
-        weights: tensors by the names of the npz file.
+        weights: tensors by the names of `extrags.metrics.lpips_networks.array_names`.
     """
 
     net: LpipsNet
@@ -91,26 +50,23 @@ class Lpips:
         """Read the weights.
 
         Args:
-            path: npz file, or None to look where `find_weights` looks.
+            path: npz file or the folder that holds it; None looks where `find_weights` looks.
             net: backbone.
 
         Raises:
             WeightsError: when there is no file, or it does not hold this network.
             ConfigError: for an unknown network.
         """
-        file = find_weights(None if path is None else str(path), net)
-        try:
-            with np.load(file) as archive:
-                weights = {name: torch.from_numpy(archive[name].astype(np.float32)) for name in archive.files}
-        except (OSError, ValueError) as error:
-            raise WeightsError(f"{file}: not a readable npz file ({error})") from error
-        missing = [name for name in _expected_names(net) if name not in weights]
-        if missing:
-            raise WeightsError(
-                f"{file}: not the weights of LPIPS with {net}; {missing[0]} "
-                f"and {len(missing) - 1} more arrays are missing"
-            )
-        return cls(net, weights)
+        return cls.read(find_weights(None if path is None else str(path), net), net)
+
+    @classmethod
+    def read(cls, files: tuple[Path, ...], net: LpipsNet) -> Lpips:
+        """Read the weights from the files that `find_weights` found.
+
+        Raises:
+            WeightsError: when they cannot be read, or do not hold this network.
+        """
+        return cls(net, read_weights(files, net))
 
     def to(self, device: torch.device | str) -> Lpips:
         """The same metric on another device."""
@@ -214,43 +170,40 @@ class Lpips:
             )
         firsts = first.reshape(-1, *first.shape[-3:])
         seconds = second.reshape(-1, *second.shape[-3:])
-        # A few images at a time: the activations of a long stack would not fit into memory.
+        at_once = _IMAGES_AT_ONCE[self.net]
         parts = [
-            self._differences_of_chunk(
-                firsts[start : start + _IMAGES_AT_ONCE], seconds[start : start + _IMAGES_AT_ONCE]
-            )
-            for start in range(0, len(firsts), _IMAGES_AT_ONCE)
+            self._differences_of_chunk(firsts[start : start + at_once], seconds[start : start + at_once])
+            for start in range(0, len(firsts), at_once)
         ]
         if not parts:
             raise ShapeError("LPIPS needs at least one pair of images")
         return [torch.cat(layers) for layers in zip(*parts, strict=True)]
 
     def _differences_of_chunk(self, first: Tensor, second: Tensor) -> list[Tensor]:
-        taps = self._activations(torch.cat([first, second]))
         layers = []
-        for index, tap in enumerate(taps):
+        for index, tap in enumerate(self._activations(torch.cat([first, second]))):
             unit = tap / (tap.square().sum(1, keepdim=True).sqrt() + _NORM_EPS)
             one, other = unit.chunk(2)
             head = self.weights[f"lin{index}"].reshape(1, -1, 1, 1)
             layers.append(((one - other).square() * head).sum(1))
         return layers
 
-    def _activations(self, images: Float[Tensor, "n h w 3"]) -> list[Tensor]:
+    def _activations(self, images: Float[Tensor, "n h w 3"]) -> Iterator[Tensor]:
         shift = images.new_tensor(_CHANNEL_SHIFT)
         scale = images.new_tensor(_CHANNEL_SCALE)
         x = ((2 * images - 1 - shift) / scale).movedim(-1, 1).contiguous()
-        taps = []
-        for kind, number in _STEPS[self.net]:
+        for kind, number in LAYERS[self.net]:
             if kind == "tap":
-                taps.append(x)
+                yield x
             elif kind.startswith("conv"):
                 _, _, stride, _, pad = kind.split()
                 x = self._convolved(x, f"features.{number}", int(stride), int(pad))
             elif kind == "fire":
                 x = self._fire(x, f"features.{number}")
+            elif kind == "halve":
+                x = F.max_pool2d(x, 2, 2)
             else:
                 x = F.max_pool2d(x, 3, 2, ceil_mode=kind == "pool ceil")
-        return taps
 
     def _fire(self, x: Tensor, name: str) -> Tensor:
         squeezed = self._convolved(x, f"{name}.squeeze", 1, 0)
@@ -267,55 +220,26 @@ class Lpips:
         return F.conv2d(x, weight, bias, stride=stride, padding=pad).relu_()
 
 
-def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> Path:
-    """The npz file with LPIPS weights of a backbone.
+LpipsByNet = Mapping[LpipsNet, Lpips | str]
+"""LPIPS as it was asked for: by backbone the metric with its weights, or the reason why there are none."""
 
-    Looks, in this order, at the explicit path, at the environment variable `EXTRAGS_LPIPS_WEIGHTS`
-    (each a file, or a folder that holds `lpips_<net>_v0.1.npz`), and at `extrags/lpips` in the user's
-    data and cache directories (`extrags.data_directories`). A named path that does not exist is an error;
-    later places are then not searched.
+
+def available_lpips(config: EvaluateConfig | None = None) -> dict[LpipsNet, Lpips | str]:
+    """LPIPS with each backbone that the settings ask for.
 
     Args:
-        explicit: path the user named, or None.
-        net: backbone.
+        config: the backbones, and optionally where their weights are; None takes the defaults.
 
     Raises:
-        WeightsError: when there is none; says how to get them.
-        ConfigError: for an unknown network.
+        WeightsError: when the settings name weights that cannot be used.
     """
-    if net not in _STEPS:
-        raise ConfigError(f"no LPIPS network {net!r}; known: {', '.join(_STEPS)}")
-    filename = f"lpips_{net}_v0.1.npz"
-    for origin, text in (("the setting", explicit), (WEIGHTS_VARIABLE, os.environ.get(WEIGHTS_VARIABLE))):
-        if text:
-            file = Path(text).expanduser()
-            file = file / filename if file.is_dir() else file
-            if not file.is_file():
-                raise WeightsError(f"LPIPS weights: {origin} names {file}, which does not exist")
-            return file
-    folders = weights_roots("lpips")
-    for folder in folders:
-        if (folder / filename).is_file():
-            return folder / filename
-    searched = " and no ".join(str(folder / filename) for folder in folders)
-    raise WeightsError(
-        f"no LPIPS weights for {net}: there is no {searched}. Convert the published LPIPS v0.1 weights to "
-        "npz (features.N.weight, features.N.bias, lin0, lin1, ...) and put the file there, or name it, or "
-        f"the folder that holds it, in {WEIGHTS_VARIABLE} or evaluate.lpips_weights"
-    )
-
-
-def _expected_names(net: LpipsNet) -> list[str]:
-    names = []
-    for kind, number in _STEPS[net]:
-        if kind == "tap":
-            names.append(f"lin{number}")
-        elif kind.startswith("conv"):
-            names += [f"features.{number}.weight", f"features.{number}.bias"]
-        elif kind == "fire":
-            names += [
-                f"features.{number}.{part}.{what}"
-                for part in ("squeeze", "expand1x1", "expand3x3")
-                for what in ("weight", "bias")
-            ]
-    return names
+    config = EvaluateConfig() if config is None else config
+    found: dict[LpipsNet, Lpips | str] = {}
+    for net in config.lpips_nets:
+        try:
+            found[net] = Lpips.load(config.lpips_weights, net)
+        except WeightsError as error:
+            if config.lpips_weights is not None:
+                raise
+            found[net] = str(error)
+    return found

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.errors import NonFiniteError, ShapeError
-from extrags.metrics.lpips import Lpips
+from extrags.metrics.lpips import Lpips, LpipsByNet
 from extrags.metrics.registry import Metric
 
 __all__ = ["photometric_values"]
@@ -20,7 +20,7 @@ def photometric_values(
     target: Float[Tensor, "n h w 3"],
     regions: dict[str, Bool[Tensor, "n h w"]],
     metrics: Iterable[Metric],
-    lpips: Lpips | None,
+    lpips: LpipsByNet | None,
 ) -> dict[str, dict[str, list[float | None]]]:
     """Values of photometric metrics for each image inside each region.
 
@@ -29,25 +29,26 @@ def photometric_values(
         target: images in [0, 1].
         regions: pixels that count, by name.
         metrics: what to measure.
-        lpips: the network with its weights; None leaves LPIPS out.
+        lpips: LPIPS by backbone; None leaves it out.
 
     Returns:
-        By region and by key of the metric, one value per image; None where there is none. Metrics that are
-        optional and were not measured have no key.
+        By region and by key of the metric, one value per image; None where there is none. LPIPS has a key for
+        each backbone in `lpips`; its values are None where the weights are missing.
 
     Raises:
         ShapeError: when a metric returns another number of values than there are images.
         NonFiniteError: when a metric returns NaN or infinity.
     """
-    wanted = list(metrics)
+    asked = {} if lpips is None else lpips
+    wanted = [metric for metric in metrics if metric.lpips_net is None or metric.lpips_net in asked]
     found: dict[str, dict[str, list[float | None]]] = {
-        name: {metric.key: [None] * len(region) for metric in wanted if not metric.optional}
-        for name, region in regions.items()
+        name: {metric.key: [None] * len(region) for metric in wanted} for name, region in regions.items()
     }
     for metric in wanted:
         measure = metric.measure
-        if lpips is not None and metric.lpips_net == lpips.net:
-            measure = lpips.regional_distances
+        if metric.lpips_net is not None:
+            network = asked[metric.lpips_net]
+            measure = network.regional_distances if isinstance(network, Lpips) else None
         if measure is None:
             continue
         values = measure(render, target, regions)

@@ -9,6 +9,7 @@ Metrics of a sequence are means over the views that have a value. Metrics withou
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -24,7 +25,7 @@ from extrags.events import Progress, emit
 from extrags.metrics.depth import depth_errors
 from extrags.metrics.exposure import align_exposure, exposure_gain
 from extrags.metrics.image import mean_of_known
-from extrags.metrics.lpips import Lpips
+from extrags.metrics.lpips import LpipsByNet
 from extrags.metrics.photometric import photometric_values
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.metrics.registry import metrics as registered_metrics
@@ -34,6 +35,8 @@ from extrags.store.storable import Storable
 from extrags.zarr_io import open_group, read_array, write_frames
 
 __all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
+
+logger = logging.getLogger(__name__)
 
 MIN_REGION_SHARE = 0.003
 """Regions with a smaller share of the image are not evaluated: metrics of a few pixels are noise."""
@@ -143,9 +146,8 @@ def evaluate_views(
     renders: RenderedViews,
     sequence: EndoscopicSequence,
     frames: Int[np.ndarray, "v"],
-    lpips: Lpips | None,
+    lpips: LpipsByNet | None,
     *,
-    lpips_reason: str = "no LPIPS weights were given",
     surface: SurfaceResult | None = None,
     surface_reason: str = "no surface was given",
 ) -> EvaluationResult:
@@ -156,8 +158,8 @@ def evaluate_views(
             rounded to 8 bits.
         sequence: the frames and masks, and true depth and observed masks where it has them.
         frames: indices into the sequence.
-        lpips: the metric with its weights, or None.
-        lpips_reason: said in `reasons` when `lpips` is None.
+        lpips: LPIPS by backbone (`extrags.metrics.lpips.available_lpips`); None measures none. A backbone
+            without weights has the figure None, with its reason in `reasons`.
         surface: figures of the scene's surface, from `extrags.metrics.surface`.
         surface_reason: said in `reasons` when `surface` is None.
 
@@ -169,6 +171,9 @@ def evaluate_views(
         NonFiniteError: for NaN or infinity in the renders; names the frame.
     """
     _check(renders, sequence, frames)
+    for net, network in ({} if lpips is None else lpips).items():
+        if isinstance(network, str):
+            logger.warning("%s: LPIPS with %s is not measured: %s", sequence.name, net, network)
     per_view: list[dict[str, Any]] = []
     at_once = max(1, _PIXELS_AT_ONCE // (sequence.height * sequence.width))
     for start in range(0, len(frames), at_once):
@@ -178,7 +183,7 @@ def evaluate_views(
     metrics = _mean_tree([{k: v for k, v in view.items() if k not in ("frame", "name")} for view in per_view])
     metrics["n_gaussians"] = renders.n_gaussians
     metrics["surface"] = _NO_SURFACE if surface is None else surface.to_json()
-    reasons = _reasons(metrics, sequence, frames, lpips, lpips_reason)
+    reasons = _reasons(metrics, sequence, frames, lpips)
     reasons |= _surface_reasons(surface, surface_reason)
     return EvaluationResult(
         sequence.name,
@@ -205,7 +210,11 @@ def _check(renders: RenderedViews, sequence: EndoscopicSequence, frames: np.ndar
 
 
 def _evaluate_chunk(
-    renders: RenderedViews, sequence: EndoscopicSequence, frames: np.ndarray, part: slice, lpips: Lpips | None
+    renders: RenderedViews,
+    sequence: EndoscopicSequence,
+    frames: np.ndarray,
+    part: slice,
+    lpips: LpipsByNet | None,
 ) -> list[dict[str, Any]]:
     chosen = frames[part]
     render = torch.from_numpy(renders.rgb[part].astype(np.float32)).clamp(0, 1)
@@ -269,7 +278,7 @@ def _photometric(
     render: Float[Tensor, "n h w 3"],
     target: Float[Tensor, "n h w 3"],
     regions: dict[str, Tensor],
-    lpips: Lpips | None,
+    lpips: LpipsByNet | None,
 ) -> dict[str, list[dict[str, Any]]]:
     """Photometric figures of each image inside each region."""
     found = photometric_values(render, target, regions, registered_metrics("photometric"), lpips)
@@ -304,19 +313,17 @@ def _reasons(
     metrics: dict[str, Any],
     sequence: EndoscopicSequence,
     frames: np.ndarray,
-    lpips: Lpips | None,
-    lpips_reason: str,
+    lpips: LpipsByNet | None,
 ) -> dict[str, str]:
     reasons = {}
     if metrics["psnr"] is None:
         reasons["psnr"] = "the validity masks of all views are empty"
     else:
         for metric in registered_metrics("photometric"):
-            if metric.optional or metrics[metric.key] is not None:
+            if metrics.get(metric.key, 0) is not None:
                 continue
-            reasons[metric.key] = "no view has a value"
-            if metric.lpips_net is not None:
-                reasons[metric.key] = lpips_reason if lpips is None else f"LPIPS was taken with {lpips.net}"
+            network = None if lpips is None or metric.lpips_net is None else lpips[metric.lpips_net]
+            reasons[metric.key] = network if isinstance(network, str) else "no view has a value"
     if metrics["n_gaussians"] is None:
         reasons["n_gaussians"] = "the renders were made elsewhere"
     if metrics["depth_absrel"] is None:

@@ -46,7 +46,7 @@ __all__ = [
     "unregister_metric",
 ]
 
-PROTOCOL_VERSION = 3
+PROTOCOL_VERSION = 4
 """Of the protocol in `PROTOCOL.md`; raised by hand whenever a figure could change for the same renders, or
 one is added."""
 
@@ -100,9 +100,8 @@ class Metric:
         kind: photometric metrics are measured by `measure`, the others by `extrags.metrics.depth` and
             `extrags.metrics.surface`.
         measure: computes a photometric metric. LPIPS has none: its network brings it.
-        lpips_net: the backbone, for LPIPS.
+        lpips_net: the backbone, for LPIPS. Results have the key only where the backbone was asked for.
         network: display name of the backbone.
-        optional: the key is left out of the results where it was not measured; otherwise it is null.
         groups: groups of pixels it is measured in; None is all of its kind.
         shown: by place, the groups of pixels for which the metric is shown there.
         description: a sentence on the metric for the pages.
@@ -123,7 +122,6 @@ class Metric:
     measure: Measure | None = None
     lpips_net: LpipsNet | None = None
     network: str = ""
-    optional: bool = False
     groups: tuple[str, ...] | None = None
     shown: Mapping[Place, tuple[str, ...]] = field(default_factory=lambda: _EVERYWHERE)
     description: str = ""
@@ -207,10 +205,10 @@ _BUILT_IN = (
         description="11 × 11 Gaussian window, σ = 1.5 px; the mean of the map over the pixels.",  # noqa: RUF001
     ),
     _lpips("alex", "AlexNet", shown={**_EVERYWHERE, "charts": _TOP, "counts": _TOP}),
+    _lpips("vgg", "VGG16"),
     _lpips(
         "squeeze",
         "SqueezeNet",
-        optional=True,
         shown={"tiles": _TOP, "columns": _TOP, "restoration": _TOP},
     ),
     Metric(

@@ -98,12 +98,14 @@ def compare(
 
 
 def shown_metrics(*trees: Mapping[str, Any] | None) -> list[Metric]:
-    """The metrics a page has columns for: all but an LPIPS whose network was not used."""
-    shown = [metric for metric in metrics() if metric.shown.get("tiles")]
-    lpips = [metric for metric in shown if metric.lpips_net is not None]
-    # Where there is none at all, its absence is worth a column of its own, with the reason.
-    kept = _measured(lpips, trees) or lpips[:1]
-    return [metric for metric in shown if metric not in lpips or metric in kept]
+    """The metrics a page has columns for: all but LPIPS with a network that was not asked for."""
+    return [
+        metric
+        for metric in metrics()
+        if metric.shown.get("tiles")
+        # A network without weights keeps its column: its absence has a reason.
+        and (metric.lpips_net is None or any(metric.key in (tree or {}) for tree in trees))
+    ]
 
 
 def described_metrics(*trees: Mapping[str, Any] | None) -> dict[str, str]:

@@ -147,19 +147,21 @@ def enhance(given: argparse.Namespace) -> int:
 
     config = pipeline_config(given.profile, given.settings, given.seed)
     from data_catalog.catalog import read, resolve
-    from extrags.metrics.lpips import Lpips
     from extrags.restoration.benchmark.comparison import bench_enhance, check_methods
-    from tasks.weights import lpips_weights
+    from tasks.weights import lpips_by_net, lpips_weights
 
     methods = check_methods(items(given.methods))
     # All of them before the first takes its minutes: a name that is wrong is said at once.
     sources = [resolve(name) for name in given.sequences]
-    weights = lpips_weights(config.evaluate)
-    lpips = None if weights.path is None else Lpips.load(weights.path, net=weights.net)
+    lpips = lpips_by_net(lpips_weights(config.evaluate))
     found = bench_enhance(
-        (read(source, config.ingest) for source in sources), config, methods=methods, lpips=lpips
+        (read(source, config.ingest) for source in sources),
+        config,
+        methods=methods,
+        lpips=lpips,
     )
-    found = {"profile": given.profile, **found, "lpips_reason": weights.reason}
+    reasons = {net: network for net, network in lpips.items() if isinstance(network, str)}
+    found = {"profile": given.profile, **found, "lpips_reasons": reasons}
     if given.json != "-":
         _print_restorers(found["cases"])
     write_json(found, given.json)

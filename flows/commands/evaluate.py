@@ -58,12 +58,11 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
     root, config = store_root(given), run_config(given)
     prepare(Store(root).state, debug=given.debug)
     from extrags.metrics.folder import read_renders
-    from extrags.metrics.lpips import Lpips
     from extrags.metrics.protocol import evaluate_views
     from extrags.sequence import EndoscopicSequence
     from flows.runners import DirectRunner
     from flows.wiring import SequenceRun
-    from tasks.weights import lpips_weights
+    from tasks.weights import lpips_by_net, lpips_weights
 
     run = SequenceRun(given.sequence, config, root, DirectRunner(root), given.profile)
     outcome = run.run("ingest")
@@ -76,13 +75,11 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
         depth_folder=None if given.depth is None else Path(given.depth),
         depth_step_mm=given.depth_step,
     )
-    weights = lpips_weights(config.evaluate)
     return evaluate_views(
         views,
         sequence,
         sequence.test,
-        None if weights.path is None else Lpips.load(weights.path, net=weights.net),
-        lpips_reason=weights.reason,
+        lpips_by_net(lpips_weights(config.evaluate)),
         surface_reason="a folder of renders holds no surface",
     ).to_json()
 
@@ -107,12 +104,13 @@ def _print(found: dict[str, Any]) -> None:
 
     out = console()
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("pixels", *table_figures()):
-        table.add_column(column)
     metrics = found["metrics"]
+    columns = table_figures(metrics)
+    for column in ("pixels", *columns):
+        table.add_column(column)
     for group in GROUPS:
         tree = metrics[group] if group else metrics
-        table.add_row(group or "valid", *(figure(name, tree.get(name)) for name in table_figures()))
+        table.add_row(group or "valid", *(figure(name, tree.get(name)) for name in columns))
     out.print(table)
     surface = {name: value for name, value in metrics["surface"].items() if isinstance(value, float)}
     if surface:

@@ -121,7 +121,7 @@ def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
         ConfigError: for settings that do not fit each other, or a folder that cannot be written.
         WeightsError: when the perceptual distance has no weights.
     """
-    from extrags.metrics.lpips import find_weights
+    from extrags.metrics.lpips_weights import find_weights
 
     if config.validation_scenes >= config.scenes:
         raise ConfigError(

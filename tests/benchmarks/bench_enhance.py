@@ -35,12 +35,11 @@ from scipy.ndimage import gaussian_filter
 from data_catalog.catalog import read, resolve
 from data_catalog.content import content_circle
 from extrags.cameras import Cameras, pixel_rays
-from extrags.confidence import PerceptualDifference
 from extrags.config import PipelineConfig
 from extrags.data_directories import data_roots
 from extrags.evaluation import render
 from extrags.metrics.image import mean_of_known, psnr
-from extrags.metrics.lpips import Lpips
+from extrags.metrics.lpips import LpipsByNet
 from extrags.metrics.protocol import evaluate_views
 from extrags.metrics.registry import figures, metric_named
 from extrags.pipeline import InMemoryPipeline
@@ -72,7 +71,7 @@ from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import LightTransfer
 from flows.commands.common import parsed_settings
 from flows.settings import pipeline_config
-from tasks.weights import lpips_weights
+from tasks.weights import lpips_by_net, lpips_weights
 
 Case = dict[str, Any]
 Sink = Callable[[list[Case]], None]
@@ -89,9 +88,8 @@ def loaded(name: str, config: PipelineConfig) -> EndoscopicSequence:
     return read(resolve(name), config.ingest)
 
 
-def perceptual(config: PipelineConfig) -> Lpips | None:
-    weights = lpips_weights(config.evaluate)
-    return None if weights.path is None else Lpips.load(weights.path, net=weights.net)
+def perceptual(config: PipelineConfig) -> LpipsByNet:
+    return lpips_by_net(lpips_weights(config.evaluate))
 
 
 # table
@@ -265,7 +263,7 @@ def _arms(sequence: EndoscopicSequence, arms: list[str], config: PipelineConfig)
                 references,
                 virtual,
                 enhancer,
-                PerceptualDifference(lpips, "" if lpips is not None else "no LPIPS weights"),
+                lpips_weights(config.evaluate)[0].perceptual_difference(),
                 count=config.enhance.references,
             )
         with timed(seconds, "finetune"):
@@ -285,7 +283,7 @@ def _contents(scene: Scene) -> list[torch.Tensor]:
     return contents if scene.light is None else [*contents, *scene.light.parameters().values()]
 
 
-def held_out_figures(scene: Scene, sequence: EndoscopicSequence, lpips: Lpips | None) -> Case:
+def held_out_figures(scene: Scene, sequence: EndoscopicSequence, lpips: LpipsByNet) -> Case:
     """Metrics of the protocol on held-out views, and the PSNR of the training views."""
     frames = np.asarray(sequence.test)
     metrics = evaluate_views(render(scene, sequence, frames), sequence, frames, lpips).metrics
@@ -357,7 +355,7 @@ def shown(
     return cases
 
 
-def laparoscopy_benchmark(frames: int, seed: int, lpips: Lpips | None) -> RestorerBenchmark:
+def laparoscopy_benchmark(frames: int, seed: int, lpips: LpipsByNet) -> RestorerBenchmark:
     """Real frames with holes and blur, at a constant depth, without any real view to borrow from."""
     from PIL import Image
 

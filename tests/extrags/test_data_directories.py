@@ -9,14 +9,21 @@ import pytest
 from data_catalog.catalog import list_sequences, resolve
 from extrags.data_directories import cache_directory, data_roots, user_directories, weights_roots
 from extrags.errors import SourceNotFoundError, WeightsError
-from extrags.metrics.lpips import WEIGHTS_VARIABLE, find_weights
+from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE, find_weights
 from extrags.store.url import default_cache_directory
 
 
 @pytest.fixture
 def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A user without variables and files."""
-    for name in ("EXTRAGS_DATA", "EXTRAGS_CACHE", WEIGHTS_VARIABLE, "XDG_CACHE_HOME", "XDG_DATA_HOME"):
+    for name in (
+        "EXTRAGS_DATA",
+        "EXTRAGS_CACHE",
+        WEIGHTS_VARIABLE,
+        "XDG_CACHE_HOME",
+        "XDG_DATA_HOME",
+        "TORCH_HOME",
+    ):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     return tmp_path / "home"

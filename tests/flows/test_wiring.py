@@ -154,18 +154,18 @@ def test_named_weights_that_are_missing_fail_the_run(finished: tuple[str, Sequen
 def test_absent_weights_are_a_reason_not_a_failure(
     finished: tuple[str, SequenceOutcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from extrags.metrics import lpips
+    from extrags.metrics import lpips_weights as search
     from tasks.weights import lpips_weights
 
-    def nowhere(explicit: str | None, net: str) -> Path:
+    def nowhere(explicit: str | None, net: str) -> tuple[Path, ...]:
         raise WeightsError("no LPIPS weights here; put them there")
 
-    monkeypatch.setattr(lpips, "find_weights", nowhere)
+    monkeypatch.setattr(search, "find_weights", nowhere)
     store, _ = finished
     outcome = run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), until="evaluate")
     assert outcome.status == "ok"
     assert outcome.metrics["final"]["lpips_alex"] is None
-    assert lpips_weights(tiny_config().evaluate).reason == "no LPIPS weights here; put them there"
+    assert lpips_weights(tiny_config().evaluate)[0].reason == "no LPIPS weights here; put them there"
     (measured,) = [
         json.loads((Store(store).open(ref) / "metrics.json").read_bytes())
         for ref in [Store(store).find(Path(outcome.artefacts["metrics_final"]).name)]

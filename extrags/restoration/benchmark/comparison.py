@@ -14,7 +14,7 @@ from extrags.config import CoarseConfig, EnhanceConfig, PipelineConfig
 from extrags.config.backends import BACKENDS
 from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, emit
-from extrags.metrics.lpips import Lpips
+from extrags.metrics.lpips import LpipsByNet
 from extrags.raster.bench import machine
 from extrags.restoration.backends import train_enhancer
 from extrags.restoration.benchmark.evaluation import (
@@ -207,7 +207,7 @@ def compare_methods(
     sequence: EndoscopicSequence,
     config: PipelineConfig,
     methods: Sequence[str],
-    lpips: Lpips | None,
+    lpips: LpipsByNet | None,
 ) -> list[dict[str, Any]]:
     """Compare methods on the held-out views of a sequence.
 
@@ -216,7 +216,7 @@ def compare_methods(
         sequence: with the held-out frames; restorers are given the training frames alone.
         config: settings; `enhance` and `coarse` count.
         methods: names.
-        lpips: the metric; None leaves it out.
+        lpips: LPIPS by backbone; None leaves it out.
 
     Returns:
         One case per method: `{sequence, seed, method, steps, psnr, ssim, lpips_alex, well, hole, ...,
@@ -260,7 +260,7 @@ def bench_enhance(
     config: PipelineConfig,
     *,
     methods: Sequence[str] = ("none", "classical", "embedded"),
-    lpips: Lpips | None = None,
+    lpips: LpipsByNet | None = None,
 ) -> dict[str, Any]:
     """Reconstruct each sequence and compare restorers on its held-out views.
 
@@ -268,7 +268,7 @@ def bench_enhance(
         sequences: with poses and held-out frames.
         config: settings of `coarse` and `enhance`, seeds included.
         methods: names of `METHODS` or of backends, possibly with `/no-references`.
-        lpips: the metric; None leaves it out.
+        lpips: LPIPS by backbone; None leaves it out.
 
     Returns:
         `{machine, cases}`; see `compare_methods`. `coarse_seconds` is beside each case.

@@ -24,7 +24,7 @@ from extrags.cameras import Cameras, pixel_rays
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.metrics.exposure import align_exposure
 from extrags.metrics.image import mean_of_known, psnr
-from extrags.metrics.lpips import Lpips
+from extrags.metrics.lpips import LpipsByNet
 from extrags.metrics.photometric import photometric_values
 from extrags.metrics.protocol import COLOR_LEVELS, MIN_REGION_SHARE
 from extrags.metrics.registry import figures, metric_named
@@ -254,7 +254,7 @@ class RestorerBenchmark:
     Args:
         clips: rendered views.
         truth: of the same views in the same order.
-        lpips: the metric; None where its weights are not there.
+        lpips: LPIPS by backbone; None leaves it out.
 
     Raises:
         ShapeError: when clips and truth have different numbers of views, or sizes.
@@ -262,7 +262,7 @@ class RestorerBenchmark:
 
     clips: Sequence[Clip]
     truth: TrueViews
-    lpips: Lpips | None = None
+    lpips: LpipsByNet | None = None
 
     def __post_init__(self) -> None:
         views = sum(len(clip) for clip in self.clips)

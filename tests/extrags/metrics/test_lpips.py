@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 
 import numpy as np
@@ -9,9 +10,12 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
-from extrags.config import LpipsNet
+from extrags.config import EvaluateConfig, LpipsNet
 from extrags.errors import ConfigError, ShapeError, WeightsError
-from extrags.metrics.lpips import WEIGHTS_VARIABLE, Lpips, find_weights
+from extrags.metrics import lpips_weights as weights_module
+from extrags.metrics.lpips import Lpips, available_lpips
+from extrags.metrics.lpips_networks import LAYERS, array_names
+from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE, download_backbone, find_weights, read_weights
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +45,13 @@ def random_pair(n: int, height: int, width: int, seed: int = 0) -> tuple[torch.T
     ("net", "far", "near", "doctest"),
     [
         ("alex", 0.7218807, 0.1375656, (0.1311690, 0.1419626)),
+        # The weights at hand are rounded to 16 bits.
+        ("vgg", 0.5686128, 0.4216643, None),
         ("squeeze", 0.7110476, 0.1479016, (0.1023802, 0.0937736)),
     ],
 )
 def test_published_figures(
-    weights_folder: Path, net: LpipsNet, far: float, near: float, doctest: tuple[float, float]
+    weights_folder: Path, net: LpipsNet, far: float, near: float, doctest: tuple[float, float] | None
 ) -> None:
     metric = Lpips.load(weights_folder / f"lpips_{net}_v0.1.npz", net)
     reference = example(weights_folder, "ex_ref.png")
@@ -55,10 +61,20 @@ def test_published_figures(
     assert float(metric.distance(reference, example(weights_folder, "ex_p1.png"))) == pytest.approx(
         near, abs=2e-5
     )
+    if doctest is None:
+        return
     generator = torch.Generator().manual_seed(42)
     first = torch.rand(2, 3, 100, 100, generator=generator).movedim(1, -1)
     second = torch.rand(2, 3, 100, 100, generator=generator).movedim(1, -1)
     assert metric.distance(first, second).tolist() == pytest.approx(doctest, abs=2e-5)
+
+
+def test_vgg_against_a_figure_published_by_torchmetrics(weights_folder: Path) -> None:
+    metric = Lpips.load(weights_folder, "vgg")
+    rng = np.random.RandomState(123)
+    first, second = (torch.from_numpy(rng.rand(10, 3, 100, 100)).float().movedim(1, -1) for _ in range(2))
+    with torch.inference_mode():
+        assert float(metric.distance(first, second).mean()) == pytest.approx(0.3494, abs=5e-5)
 
 
 def test_map_has_image_size_and_points_at_the_change(alex: Lpips) -> None:
@@ -114,6 +130,7 @@ def test_search_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
     with pytest.raises(WeightsError, match=r"no .*/data/extrags/lpips/lpips_alex_v0\.1\.npz and no "):
         find_weights(None, "alex")
 
@@ -126,7 +143,7 @@ def test_search_order(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         file.touch()
         if file == by_variable:
             monkeypatch.setenv(WEIGHTS_VARIABLE, str(by_variable.parent))
-        assert find_weights(str(explicit) if file == explicit else None, "alex") == file
+        assert find_weights(str(explicit) if file == explicit else None, "alex") == (file,)
     with pytest.raises(WeightsError, match=r"lpips_squeeze_v0\.1\.npz, which does not exist"):
         find_weights(None, "squeeze")
 
@@ -145,5 +162,141 @@ def test_wrong_files_are_refused(tmp_path: Path, weights_folder: Path) -> None:
     (tmp_path / "text.npz").write_text("no archive")
     with pytest.raises(WeightsError, match="not a readable npz"):
         Lpips.load(tmp_path / "text.npz")
-    with pytest.raises((ConfigError, TypeCheckError), match=r"known: alex, squeeze|Type-check"):
-        find_weights(None, "vgg")  # type: ignore[arg-type]
+    with pytest.raises((ConfigError, TypeCheckError), match=r"known: alex, vgg, squeeze|Type-check"):
+        find_weights(None, "resnet")  # type: ignore[arg-type]
+
+
+CHANNELS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
+
+
+def random_weights(net: LpipsNet) -> dict[str, torch.Tensor]:
+    """Arrays of the right shapes with random values; heads are not negative."""
+    generator = torch.Generator().manual_seed(3)
+    sizes = {"conv stride 4 pad 2": 11, "conv stride 1 pad 2": 5}
+    weights, channels, head = {}, 3, iter(CHANNELS[net])
+    # The channels of a convolution are those of the next tap.
+    upcoming = next(head)
+    for kind, number in LAYERS[net]:
+        if kind == "tap":
+            weights[f"lin{number}"] = torch.rand(upcoming, generator=generator)
+            upcoming = next(head, 0)
+        elif kind.startswith("conv"):
+            side = sizes.get(kind, 3)
+            scale = (2 / (channels * side * side)) ** 0.5
+            weights[f"features.{number}.weight"] = scale * torch.randn(
+                upcoming, channels, side, side, generator=generator
+            )
+            weights[f"features.{number}.bias"] = 0.1 * torch.randn(upcoming, generator=generator)
+            channels = upcoming
+    assert set(weights) == set(array_names(net))
+    return weights
+
+
+def as_pytorch_has_it(
+    net: LpipsNet, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[dict[str, torch.Tensor], Path, Path]:
+    """A package with heads, and a backbone with its classifier for torch's cache, named by its digest."""
+    weights = random_weights(net)
+    package = root / "site" / "lpips"
+    heads = package / "weights" / "v0.1" / f"{net}.pth"
+    heads.parent.mkdir(parents=True)
+    (package / "__init__.py").write_text("raise RuntimeError('nobody should import this')")
+    lin = {
+        f"{name}.model.1.weight": value.reshape(1, -1, 1, 1)
+        for name, value in weights.items()
+        if "lin" in name
+    }
+    torch.save(lin, heads)
+    monkeypatch.syspath_prepend(root / "site")
+    features = {name: value for name, value in weights.items() if "lin" not in name}
+    made = root / "made.pth"
+    torch.save({**features, "classifier.0.weight": torch.zeros(4, 4)}, made)
+    name = f"{net}-{hashlib.sha256(made.read_bytes()).hexdigest()[:8]}.pth"
+    monkeypatch.setitem(weights_module.BACKBONES, net, name)
+    for variable in ("TORCH_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME"):
+        monkeypatch.setenv(variable, str(root / variable))
+    monkeypatch.delenv(WEIGHTS_VARIABLE, raising=False)
+    made.rename(root / name)
+    return weights, root / name, root / "TORCH_HOME" / "hub" / "checkpoints" / name
+
+
+class TestPytorchsFiles:
+    @pytest.mark.parametrize("net", ["alex", "vgg"])
+    def test_agree_with_the_npz_file(
+        self, net: LpipsNet, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        weights, made, cached = as_pytorch_has_it(net, tmp_path, monkeypatch)
+        with pytest.raises(WeightsError, match=r"no .*checkpoints.*extrags weights lpips --download"):
+            find_weights(None, net)
+        cached.parent.mkdir(parents=True)
+        made.rename(cached)
+        files = find_weights(None, net)
+        assert [file.name for file in files] == [f"{net}.pth", cached.name]
+        np.savez(tmp_path / "one.npz", **{name: value.numpy() for name, value in weights.items()})
+        read, expected = read_weights(files, net), read_weights((tmp_path / "one.npz",), net)
+        assert read.keys() == expected.keys()
+        assert all(torch.equal(read[name], expected[name]) for name in read)
+        first, second = random_pair(1, 48, 40)
+        distance = Lpips.load(None, net).distance(first, second)
+        assert torch.equal(distance, Lpips.load(tmp_path / "one.npz", net).distance(first, second))
+        assert float(distance) > 0
+
+    def test_a_file_with_another_digest_is_refused(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        _, made, cached = as_pytorch_has_it("alex", tmp_path, monkeypatch)
+        cached.parent.mkdir(parents=True)
+        cached.write_bytes(made.read_bytes()[:-1])
+        with pytest.raises(WeightsError, match="its SHA-256 does not begin with"):
+            find_weights(None, "alex")
+        with pytest.raises(WeightsError, match="its SHA-256 does not begin with"):
+            download_backbone("alex")
+
+    def test_without_heads(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        as_pytorch_has_it("alex", tmp_path, monkeypatch)
+        monkeypatch.setattr(weights_module, "find_spec", lambda name: None)
+        with pytest.raises(WeightsError, match=r"pip install 'extrags\[lpips\]'"):
+            find_weights(None, "alex")
+
+    def test_heads_of_torchmetrics_are_those_of_the_npz_file(self, weights_folder: Path) -> None:
+        pytest.importorskip("torchmetrics")
+        for net, heads in (("alex", 5), ("vgg", 5), ("squeeze", 7)):
+            file = weights_module.find_heads(net)
+            assert file is not None
+            found = torch.load(file, map_location="cpu", weights_only=True)
+            expected = read_weights((weights_folder / f"lpips_{net}_v0.1.npz",), net)
+            for index in range(heads):
+                head = found[f"lin{index}.model.1.weight"].flatten()
+                assert torch.equal(head, expected[f"lin{index}"])
+
+    def test_download(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        _, made, cached = as_pytorch_has_it("alex", tmp_path, monkeypatch)
+        monkeypatch.setattr(weights_module, "BACKBONES_URL", f"{tmp_path.as_uri()}/")
+        assert download_backbone("alex") == cached
+        assert cached.read_bytes() == made.read_bytes()
+        made.unlink()
+        assert download_backbone("alex") == cached
+        cached.unlink()
+        with pytest.raises(WeightsError, match="could not be downloaded"):
+            download_backbone("alex")
+        made.write_bytes(b"something else")
+        with pytest.raises(WeightsError, match="invalid hash value"):
+            download_backbone("alex")
+        assert not cached.exists()
+
+
+def test_a_file_named_by_the_variable_serves_its_own_backbone_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for variable in ("TORCH_HOME", "XDG_CACHE_HOME", "XDG_DATA_HOME"):
+        monkeypatch.setenv(variable, str(tmp_path / variable))
+    file = tmp_path / "mine.npz"
+    np.savez(file, **{name: value.numpy() for name, value in random_weights("alex").items()})
+    monkeypatch.setenv(WEIGHTS_VARIABLE, str(file))
+    found = available_lpips(EvaluateConfig(lpips_nets=("alex", "vgg")))
+    assert isinstance(found["alex"], Lpips)
+    assert isinstance(found["vgg"], str)
+    assert "no LPIPS weights for vgg" in found["vgg"]
+    named = EvaluateConfig(lpips_nets=("alex", "vgg"), lpips_weights=str(file))
+    with pytest.raises(WeightsError, match="not the weights of LPIPS with vgg, but with alex"):
+        available_lpips(named)

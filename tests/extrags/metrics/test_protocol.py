@@ -67,7 +67,8 @@ def test_perfect_renders(sequence: EndoscopicSequence) -> None:
 
 
 def test_stable_keys_and_json(sequence: EndoscopicSequence) -> None:
-    result = evaluate_views(renders_of(sequence, TEST), sequence, TEST, None)
+    given = {"alex": "no LPIPS weights were given"}
+    result = evaluate_views(renders_of(sequence, TEST), sequence, TEST, given)
     tree = json.loads(json.dumps(result.to_json(), allow_nan=False))
     photometric = {"psnr", "ssim", "lpips_alex", "flip"}
     keys = photometric | {"depth_absrel", "n_gaussians", "aligned", "observed", "unobserved", "whole"}
@@ -153,7 +154,7 @@ def test_empty_render_has_depth_coverage_only(sequence: EndoscopicSequence) -> N
 
 def test_what_cannot_be_had_is_null_with_a_reason(sequence: EndoscopicSequence) -> None:
     bare = replace(sequence, depth_mm=None, observed=None)
-    result = evaluate_views(renders_of(bare, TEST), bare, TEST, None, lpips_reason="no file")
+    result = evaluate_views(renders_of(bare, TEST), bare, TEST, {"alex": "no file"})
     assert result.metrics["depth_absrel"] is None
     assert result.metrics["observed"]["psnr"] is None
     assert result.metrics["observed"]["pixel_share"] is None
@@ -194,17 +195,46 @@ def test_lpips_inside_the_mask(sequence: EndoscopicSequence, shared_data: Path) 
     rng = np.random.default_rng(1)
     levels = np.rint(np.clip(clean.rgb + rng.normal(0, 0.1, clean.rgb.shape), 0, 1) * 255)
     noisy = replace(clean, rgb=levels.astype(np.float32) / 255)
-    result = evaluate_views(noisy, sequence, TEST, metric)
+    result = evaluate_views(noisy, sequence, TEST, {"alex": metric})
     whole = metric.distance(
         torch.from_numpy(noisy.rgb), torch.from_numpy(sequence.rgb[TEST].astype(np.float32) / 255)
     )
     assert result.metrics["whole"]["lpips_alex"] == pytest.approx(float(whole.mean()), abs=1e-5)
     assert 0 < result.metrics["lpips_alex"] < 1
     assert result.metrics["unobserved"]["lpips_alex"] > 0
-    squeeze = evaluate_views(noisy, sequence, TEST, Lpips.load(shared_data / "lpips_weights", "squeeze"))
-    assert squeeze.metrics["lpips_alex"] is None
-    assert squeeze.metrics["lpips_squeeze"] > 0
-    assert squeeze.reasons["lpips_alex"] == "LPIPS was taken with squeeze"
+
+
+def test_each_backbone_of_lpips_that_was_asked_for_has_figures_in_every_group(
+    sequence: EndoscopicSequence, shared_data: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    clean = renders_of(sequence, TEST)
+    noise = np.random.default_rng(1).normal(0, 0.1, clean.rgb.shape).astype(np.float32)
+    noisy = replace(clean, rgb=clean.rgb + noise)
+    given = {
+        "alex": Lpips.load(shared_data / "lpips_weights"),
+        "vgg": Lpips.load(shared_data / "lpips_weights", "vgg"),
+    }
+    both = evaluate_views(noisy, sequence, TEST, given)
+    for tree in (both.metrics, *both.per_view):
+        for path in ("", "whole", "aligned", "observed", "unobserved", "observed.aligned"):
+            group = tree
+            for name in filter(None, path.split(".")):
+                group = group[name]
+            assert (group["lpips_vgg"] is None) == (group["psnr"] is None)
+            if group["lpips_vgg"] is not None:
+                assert group["lpips_vgg"] > 0
+                assert group["lpips_vgg"] != group["lpips_alex"]
+            assert "lpips_squeeze" not in group
+    assert both.metrics["unobserved"]["lpips_vgg"] is not None
+    assert not {"lpips_alex", "lpips_vgg"} & set(both.reasons)
+    assert "lpips_vgg" not in evaluate_views(noisy, sequence, TEST, {"alex": given["alex"]}).metrics
+    assert not any(key.startswith("lpips") for key in evaluate_views(noisy, sequence, TEST, None).metrics)
+
+    missing = evaluate_views(noisy, sequence, TEST, {**given, "vgg": "no file of VGG"})
+    assert missing.metrics["lpips_vgg"] is None
+    assert missing.metrics["lpips_alex"] == both.metrics["lpips_alex"]
+    assert missing.reasons["lpips_vgg"] == "no file of VGG"
+    assert "LPIPS with vgg is not measured: no file of VGG" in caplog.text
 
 
 def test_same_bits_twice_and_whatever_the_batch(

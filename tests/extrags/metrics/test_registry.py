@@ -87,7 +87,7 @@ def evaluated(sequence: EndoscopicSequence, offset: float) -> EvaluationResult:
     renders = RenderedViews(rgb, np.ones(rgb.shape[:-1], np.float32), sequence.depth_mm[TEST], 7)
     errors = SurfaceErrors(0.4, 0.2, 0.5, 0.3, 0.9, 0.8, 0.85)
     surface = SurfaceResult(errors, replace(errors, recall=0.1), 0.6, 0.7, 1.0, "mesh")
-    return evaluate_views(renders, sequence, TEST, None, surface=surface)
+    return evaluate_views(renders, sequence, TEST, {"alex": "no file"}, surface=surface)
 
 
 class TestRegistry:
@@ -115,7 +115,9 @@ class TestRegistry:
         render, target = torch.full((2, 16, 16, 3), 0.6), torch.full((2, 16, 16, 3), 0.5)
         half = torch.zeros(2, 16, 16, dtype=torch.bool)
         half[0, 4:] = True
-        found = photometric_values(render, target, {"half": half}, metrics("photometric"), None)["half"]
+        found = photometric_values(
+            render, target, {"half": half}, metrics("photometric"), {"alex": "no file"}
+        )["half"]
         assert {"psnr", "ssim", "lpips_alex", "flip"} <= set(found)
         for metric in metrics("photometric"):
             if metric.measure is not None:

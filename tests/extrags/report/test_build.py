@@ -230,3 +230,22 @@ def test_real_types_fit_the_protocols() -> None:
     for kind, names in fields.items():
         assert set(names) <= set(kind.__dataclass_fields__), kind
     assert callable(Exploration.summary)
+
+
+def test_networks_of_lpips_that_were_asked_for_have_columns(inputs: ReportInputs) -> None:
+    first = "LPIPS (VGG16)"
+    assert first not in Page(build_report(inputs, CONFIG)).text
+    result = result_of(20.0, 10)
+    result["reasons"] = {"lpips_vgg": "no file of VGG"}
+    for tree in (result["metrics"], *result["per_view"]):
+        for part in (tree, tree["aligned"], tree["observed"], tree["unobserved"]):
+            part["lpips_vgg"] = None
+    text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
+    assert f"{first}: not available, no file of VGG." in text
+    assert "LPIPS (AlexNet)" in text
+    for tree in (result["metrics"], *result["per_view"]):
+        for part in (tree, tree["aligned"], tree["observed"], tree["unobserved"]):
+            part["lpips_vgg"] = 0.4321
+    text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
+    assert "0.432" in text
+    assert "on the network AlexNet and VGG16" in text
