@@ -131,12 +131,7 @@ def measure(
         )
     small = cameras.at_most_width(coverage.render_width)
     depth_unit_mm, training_holes = _training_view_measurements(scene, small, settings)
-    covered = training_coverage(
-        scene,
-        small,
-        visible_weight=coverage.visible_weight,
-        n_directions=coverage.directions,
-    )
+    covered = training_coverage(scene, small, **coverage.options)
     directions = direction_counts(covered)
     probes = probe_views(scene, small, depth_unit_mm, settings)
     holes, poor = _lacking_pixels(scene, probes, directions < settings.min_directions, settings)
@@ -276,12 +271,16 @@ def _decisions(lacking: float, config: PipelineConfig) -> tuple[Decision, ...]:
         why = f"{share}, no more than {limit}: the training views show the scene well enough"
 
     need = 1.0 if settings.force else min(1.0, lacking / settings.full_budget_share)
-    trajectories = max(1, math.ceil(need * config.explore.trajectories)) if run else 0
+    wanted = max(1, math.ceil(need * config.explore.trajectories)) if run else 0
+    # A trajectory of which no view is restored would be searched for nothing.
+    trajectories = min(wanted, config.enhance.max_views)
     views = min(config.enhance.max_views, trajectories * (config.explore.length - 1))
     spent = (
         f"{trajectories} of {config.explore.trajectories} trajectories "
         f"(all of them from {100 * settings.full_budget_share:.0f} % on)"
     )
+    if trajectories < wanted:
+        spent += f", not {wanted}: enhance.max_views={config.enhance.max_views} allows no more"
 
     def line(stage: str, reason: str, **budget: int) -> Decision:
         return Decision(

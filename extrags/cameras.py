@@ -236,6 +236,24 @@ def rotation_angle_deg(
     return np.asarray(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))))
 
 
+def pose_distances(first: Cameras, second: Cameras, length_unit_mm: float) -> Float[np.ndarray, "a b"]:
+    """How far each view of one batch is from each of another: centres apart plus radians turned.
+
+    Centres count in `length_unit_mm`, best a typical depth: a turn by one radian moves what is seen as much
+    as a step of one depth.
+
+    Args:
+        first: A views.
+        second: B views.
+        length_unit_mm: in world units.
+    """
+    apart = np.linalg.norm(first.centers[:, None] - second.centers[None], axis=-1) / length_unit_mm
+    rotations = np.broadcast_arrays(
+        first.world_from_camera[:, None, :3, :3], second.world_from_camera[None, :, :3, :3]
+    )
+    return np.asarray(apart + np.radians(rotation_angle_deg(*rotations)))
+
+
 def look_at(
     center: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrags.config import EvaluateConfig
+from extrags.config import EvaluateConfig, IouSet
 from extrags.errors import ShapeError, WeightsError
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.perceptual import perceptual_map
@@ -24,19 +24,23 @@ LPIPS_SCALE = 0.25
 VIEWS_AT_ONCE = 8
 
 
-def gaussian_iou(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"]) -> Float[Tensor, "v"]:
+def gaussian_iou(
+    virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"], over: IouSet = "reference"
+) -> Float[Tensor, "v"]:
     r"""Share of the Gaussians seen by a reference view that the virtual view also sees.
 
     .. math:: GIOU = |vis(V) \cap vis(ref)| / |vis(ref)|
 
-    Visibility is taken from blending weights, so occluded Gaussians do not count.
+    Visibility is taken from blending weights, so occluded Gaussians do not count. The published code of
+    [ExtraGS] and [Kim2025] divides by :math:`|vis(V) \cup vis(ref)|`: `over="union"`.
 
     Args:
         virtual: Gaussians seen by each virtual view.
         reference: Gaussians seen by the reference view of each.
+        over: the set whose size divides.
 
     Returns:
-        Values in [0, 1]; 0 where the reference sees no Gaussian.
+        Values in [0, 1]; 0 where that set is empty.
 
     Raises:
         ShapeError: when the shapes differ.
@@ -46,22 +50,26 @@ def gaussian_iou(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"]) -
     if virtual.shape != reference.shape:
         raise ShapeError(f"visibilities {tuple(virtual.shape)} and {tuple(reference.shape)} do not fit")
     common = (virtual & reference).sum(dim=1)
-    return common / reference.sum(dim=1).clamp_min(1)
+    whole = reference if over == "reference" else virtual | reference
+    return common / whole.sum(dim=1).clamp_min(1)
 
 
-def image_confidence(virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"]) -> Float[Tensor, "v"]:
+def image_confidence(
+    virtual: Bool[Tensor, "v n"], reference: Bool[Tensor, "v n"], over: IouSet = "reference"
+) -> Float[Tensor, "v"]:
     """U_img = 1 - GIOU: the less a virtual view overlaps its reference view, the higher its weight.
 
     Args:
         virtual: Gaussians seen by each virtual view.
         reference: Gaussians seen by its reference view.
+        over: as `gaussian_iou`.
 
     Raises:
         ShapeError: when the shapes differ.
 
     Source: [ExtraGS, eq. 22], see docs/references.md.
     """
-    return 1 - gaussian_iou(virtual, reference)
+    return 1 - gaussian_iou(virtual, reference, over)
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,10 @@ class FreeSpace(Storable):
         """World positions in continuous voxel coordinates: voxel i covers [i, i + 1)."""
         return _to_grid(points, self.origin_mm, self.axes, self.voxel_mm)
 
+    def from_grid(self, grid: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
+        """World positions of continuous voxel coordinates; the inverse of `to_grid`."""
+        return np.asarray(self.origin_mm + _rotated(grid * self.voxel_mm, self.axes.T))
+
     def voxel_centers(self) -> Float[np.ndarray, "v 3"]:
         """World positions of all voxel centres, last axis fastest."""
         return _voxel_centers(self.grid_size, self.origin_mm, self.axes, self.voxel_mm)

@@ -26,7 +26,7 @@ def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig, coverage
     slot.counts["lacking_share"] = found["lacking_share"]
 
 
-@stage("plan", version=2)
+@stage("plan", version=3)
 def plan(slot: Slot, measured: Ref, config: PipelineConfig) -> None:
     """Derive the plan from the measurements and the budgets of the run; writes `plan.json`."""
     from extrags.assessment import decide

@@ -22,7 +22,7 @@ __all__ = ["NEXT", "branch", "explore", "merge", "start"]
 NEXT = "next.json"
 
 
-@stage("explore-start", version=2)
+@stage("explore-start", version=3)
 def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig) -> None:
     """Choose the anchors; writes `state/` and `next.json`."""
     from extrags.exploration import start_exploration
@@ -31,7 +31,7 @@ def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: Explore
     _write_state(slot, start_exploration(context, frames.training_cameras))
 
 
-@stage("explore-branch", version=2)
+@stage("explore-branch", version=3)
 def branch(
     slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, anchor: int, config: ExploreConfig
 ) -> None:
@@ -44,7 +44,7 @@ def branch(
     slot.counts.update(views=len(grown), renders=grown.renders)
 
 
-@stage("explore-merge", version=1)
+@stage("explore-merge", version=2)
 def merge(slot: Slot, state: Ref, branches: list[Ref]) -> None:
     """Accept the branches of a wave; writes the next `state/` and `next.json`."""
     from extrags.exploration import Branch, WaveState
@@ -53,7 +53,7 @@ def merge(slot: Slot, state: Ref, branches: list[Ref]) -> None:
     _write_state(slot, before.merged([slot.load(Branch, ref) for ref in branches]))
 
 
-@stage("explore", version=1)
+@stage("explore", version=2)
 def explore(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, config: ExploreConfig) -> None:
     """Collect the accepted trajectories; writes `trajectories/` and `exploration.json`."""
     from extrags.exploration import WaveState, finish

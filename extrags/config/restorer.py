@@ -9,7 +9,20 @@ from pydantic import Field
 from extrags.config.backends import BACKEND_NAME, backend_schema, backend_summaries
 from extrags.config.base import StageConfig
 
-__all__ = ["CaptionConfig", "CheckpointConfig", "EnhanceConfig", "PretrainedConfig"]
+__all__ = [
+    "CaptionConfig",
+    "CheckpointConfig",
+    "EnhanceConfig",
+    "IouSet",
+    "PretrainedConfig",
+    "ReferenceChoice",
+]
+
+ReferenceChoice = Literal["covisibility", "nearest"]
+"""Which real view is the reference of a virtual one."""
+
+IouSet = Literal["reference", "union"]
+"""What the overlap of two views is a share of."""
 
 
 class CaptionConfig(StageConfig):
@@ -147,7 +160,21 @@ class EnhanceConfig(StageConfig):
         "auto", description="of the convolutions; auto: bfloat16 where the processor computes it faster"
     )
     references: int = Field(8, ge=1, description="real views blended into the reference")
-    max_views: int = Field(160, ge=1, description="virtual views restored at most")
+    reference: ReferenceChoice = Field(
+        "covisibility",
+        description="the first of them, which U_img compares with. covisibility: that which saw most of the "
+        "virtual view well; nearest: the nearest by pose, as in the paper",
+    )
+    iou: IouSet = Field(
+        "reference",
+        description="what U_img divides the Gaussians by that both see: reference: those the reference "
+        "sees, as in the paper; union: those either sees, as in ExploreGS",
+    )
+    max_views: int = Field(
+        160,
+        ge=1,
+        description="virtual views restored at most; no more trajectories than this are planned or restored",
+    )
     clips_per_batch: int = Field(4, ge=1, description="clips restored by one task")
     pixel_confidence: Literal["bounded", "raw"] = Field(
         "bounded",
@@ -160,5 +187,5 @@ class EnhanceConfig(StageConfig):
     seed: int = Field(0, ge=0, description="seed of all random sampling")
 
     def batches(self, trajectories: int) -> int:
-        """Number of batches that so many trajectories are restored in."""
-        return -(-trajectories // self.clips_per_batch)
+        """Number of batches that so many trajectories, of which `max_views` at most, are restored in."""
+        return -(-min(trajectories, self.max_views) // self.clips_per_batch)

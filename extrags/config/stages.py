@@ -35,6 +35,7 @@ __all__ = [
     "PosesConfig",
     "ReportConfig",
     "SurfaceConfig",
+    "Visibility",
 ]
 
 
@@ -278,6 +279,10 @@ class FreespaceConfig(StageConfig):
     render_width: int = Field(160, ge=16, description="width of the renders in pixels")
 
 
+Visibility = Literal["blending", "frustum"]
+"""When a view sees a Gaussian."""
+
+
 class CoverageConfig(StageConfig):
     """Coverage: which Gaussians were seen from which directions."""
 
@@ -285,7 +290,19 @@ class CoverageConfig(StageConfig):
     visible_weight: float = Field(
         0.02, gt=0, lt=1, description="a Gaussian is seen when its largest T * alpha exceeds this"
     )
+    visibility: Visibility = Field(
+        "blending", description="blending: by visible_weight; frustum: every Gaussian inside the image"
+    )
     render_width: int = Field(80, ge=16, description="width of the renders in pixels")
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The arguments of `extrags.exploration.coverage.rendered_pairs`."""
+        return {
+            "visible_weight": self.visible_weight,
+            "n_directions": self.directions,
+            "visibility": self.visibility,
+        }
 
 
 class ExploreConfig(StageConfig):
@@ -301,8 +318,17 @@ class ExploreConfig(StageConfig):
     visible_weight: float = Field(
         0.02, gt=0, lt=1, description="a Gaussian is seen when its largest T * alpha exceeds this"
     )
+    visibility: Visibility = Field(
+        "blending",
+        description="blending: a Gaussian is seen by its weight in the image, so not behind a fold; frustum: "
+        "wherever it projects into the image, as the published code",
+    )
     max_hole_share: float = Field(
-        0.5, gt=0, le=1, description="a candidate with a larger share of empty pixels is rejected"
+        0.5,
+        gt=0,
+        le=1,
+        description="a candidate with a larger share of empty pixels is rejected; one without any surface "
+        "always is",
     )
     max_saturated_share: float = Field(
         0.2,
@@ -311,20 +337,43 @@ class ExploreConfig(StageConfig):
         description="a candidate is rejected when the light that rides on the camera overexposes more",
     )
     hole_weight: float = Field(
-        16.0,
+        4.0,
         ge=0,
-        description="gain grows by this times the share of holes in view: missing surface has no Gaussians "
-        "that could be counted as covered; 0 is the paper's rule",
+        description="worth of a voxel where a view through a hole leaves known space, in voxels of known "
+        "surface: missing surface has no Gaussians that could count as covered; 0 is the paper's rule",
     )
     darkness_weight: float = Field(0.5, ge=0, description="lambda_l of the illumination weight")
-    fold_angle_deg: float = Field(25.0, gt=0, description="tau_R, on the rotation over the last three steps")
-    fold_penalty: float = Field(0.6, gt=0, lt=1, description="eta")
-    max_expansions: int = Field(60, ge=1, description="budget of expansions per trajectory")
-    wave: int = Field(5, ge=1, description="branches that grow from one coverage snapshot")
+    fold_angle_deg: float = Field(
+        25.0,
+        gt=0,
+        description="tau_R, on the net rotation over the last fold_steps moves: two turns by 20 degrees in "
+        "the same direction exceed 25, three by 10 do",
+    )
+    fold_steps: int = Field(
+        3, ge=1, description="moves the net rotation is taken over; 1 is the paper's inter-step rule"
+    )
+    fold_penalty: float = Field(0.6, gt=0, le=1, description="eta; 1 switches the term off")
+    top_candidates: int = Field(
+        14,
+        ge=1,
+        le=14,
+        description="best candidates of an expansion that are kept: the next view, and the rest for the "
+        "queue; the paper's code keeps 3",
+    )
+    max_expansions: int = Field(
+        60, ge=1, description="budget of expansions per trajectory; the paper has none: take a large number"
+    )
+    wave: int = Field(
+        5,
+        ge=1,
+        description="branches that grow from one coverage snapshot; with 1 each trajectory sees the coverage "
+        "of all before it, as in the paper",
+    )
     min_gain_share: float = Field(
         0.002,
         ge=0,
-        description="stop when a trajectory adds less than this share of all pairs",
+        description="stop when what a trajectory adds is worth less than this share of all pairs; 0: when it "
+        "adds nothing",
     )
     render_width: int = Field(80, ge=16, description="width of the scoring renders in pixels")
 
@@ -332,7 +381,10 @@ class ExploreConfig(StageConfig):
     def coverage(self) -> CoverageConfig:
         """The settings of coverage measurement, which `assess` uses as well."""
         return CoverageConfig(
-            directions=self.directions, visible_weight=self.visible_weight, render_width=self.render_width
+            directions=self.directions,
+            visible_weight=self.visible_weight,
+            visibility=self.visibility,
+            render_width=self.render_width,
         )
 
 

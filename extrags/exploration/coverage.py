@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import cast
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt32
+from jaxtyping import Bool, Float, Int, UInt32
 
 from extrags.cameras import Cameras
+from extrags.config import Visibility
 from extrags.errors import ConfigError
 from extrags.raster import Rendering
 from extrags.scene import Scene
 
 __all__ = [
+    "PairValue",
     "count_pairs",
     "coverage_gain",
     "direction_bin",
@@ -75,49 +77,63 @@ def _collars(n: int) -> tuple[Float[np.ndarray, "e"], Int[np.ndarray, "c"], Int[
 def view_pairs(
     scene: Scene,
     cameras: Cameras,
-    visibility: Float[np.ndarray, "c n"],
-    *,
-    visible_weight: float,
+    seen: Bool[np.ndarray, "c n"],
     n_directions: int,
 ) -> UInt32[np.ndarray, "c n"]:
     """(Gaussian, direction) pairs that each view covers, at most one per Gaussian and view.
 
-    A Gaussian counts as seen by its largest blending weight T * alpha, so that what lies behind a
-    fold stays unseen although it is inside the frustum.
-
     Args:
         scene: its Gaussians' centres give the directions.
         cameras: the views.
-        visibility: `Rendering.visibility_max` of these views.
-        visible_weight: the weight above which a Gaussian is seen.
+        seen: which Gaussians each of them sees.
         n_directions: D.
 
     Returns:
         Bit k of word [c, j] is set when view c sees Gaussian j in direction bin k.
     """
     means = scene.gaussians.means.detach().numpy().astype(np.float64)
-    pairs = np.zeros(visibility.shape, dtype=np.uint32)
+    pairs = np.zeros(seen.shape, dtype=np.uint32)
     for index, center in enumerate(cameras.centers):
-        seen = np.flatnonzero(visibility[index] > visible_weight)
-        toward = center - means[seen]
+        those = np.flatnonzero(seen[index])
+        toward = center - means[those]
         toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-12)
-        pairs[index, seen] = np.uint32(1) << direction_bin(toward, n_directions).astype(np.uint32)
+        pairs[index, those] = np.uint32(1) << direction_bin(toward, n_directions).astype(np.uint32)
     return pairs
 
 
 def rendered_pairs(
-    scene: Scene, cameras: Cameras, *, visible_weight: float, n_directions: int
+    scene: Scene,
+    cameras: Cameras,
+    *,
+    visible_weight: float,
+    n_directions: int,
+    visibility: Visibility = "blending",
 ) -> tuple[Rendering, UInt32[np.ndarray, "c n"]]:
-    """Render views in one batch; the images, and the pairs each view covers (see `view_pairs`)."""
+    """Render views in one batch; the images, and the pairs each view covers.
+
+    Args:
+        scene: the reconstructed scene.
+        cameras: the views.
+        visible_weight: of `blending`: the largest T * alpha above which a Gaussian is seen.
+        n_directions: D.
+        visibility: `blending`: a Gaussian counts as seen by its largest blending weight T * alpha, so that
+            what lies behind a fold stays unseen although it is inside the frustum; `frustum`: by its
+            footprint in the image, occluded or not, as the published code of [ExtraGS] and [Kim2025].
+    """
     # The diffuse colour is all the search looks at, and saves the harmonics of every Gaussian and view.
-    rendering = scene.render(cameras, visibility=True, sh_degree=0)
-    visibility = cast("torch.Tensor", rendering.visibility_max).numpy()
-    pairs = view_pairs(scene, cameras, visibility, visible_weight=visible_weight, n_directions=n_directions)
-    return rendering, pairs
+    rendering = scene.render(cameras, visibility=visibility == "blending", sh_degree=0)
+    weight = rendering.visibility_max
+    seen = rendering.visible if weight is None else weight > visible_weight
+    return rendering, view_pairs(scene, cameras, seen.numpy(), n_directions)
 
 
 def training_coverage(
-    scene: Scene, cameras: Cameras, *, visible_weight: float, n_directions: int
+    scene: Scene,
+    cameras: Cameras,
+    *,
+    visible_weight: float,
+    n_directions: int,
+    visibility: Visibility = "blending",
 ) -> UInt32[np.ndarray, "n"]:
     """Coverage by a set of views: M packed to one word per Gaussian.
 
@@ -126,6 +142,7 @@ def training_coverage(
         cameras: the views, at the size they shall be rendered.
         visible_weight: the largest T * alpha above which a Gaussian is seen.
         n_directions: D.
+        visibility: as `rendered_pairs`.
     """
     covered = np.zeros(len(scene.gaussians), dtype=np.uint32)
     with torch.no_grad():
@@ -135,6 +152,7 @@ def training_coverage(
                 cameras[start : start + VIEWS_PER_BATCH],
                 visible_weight=visible_weight,
                 n_directions=n_directions,
+                visibility=visibility,
             )
             covered |= np.bitwise_or.reduce(pairs, axis=0)
     return covered
@@ -150,6 +168,33 @@ def coverage_gain(
 ) -> Int[np.ndarray, "*b"]:
     r"""Newly covered pairs, :math:`IG_c = \sum_{j,k} \Delta M[j,k]` [ExtraGS, eq. 11]."""
     return count_pairs(pairs & ~covered)
+
+
+@dataclass(frozen=True)
+class PairValue:
+    """What newly covered pairs are worth, in (Gaussian, direction) pairs.
+
+    The rows of the coverage map are the N Gaussians and then F frontier voxels
+    (`extrags.exploration.frontier`).
+
+    Args:
+        n_gaussians: N.
+        frontier_pair: worth of a pair of a frontier voxel; 0 where there are none.
+    """
+
+    n_gaussians: int
+    frontier_pair: float = 0.0
+
+    def gain(self, covered: UInt32[np.ndarray, "r"], pairs: UInt32[np.ndarray, "r"]) -> float:
+        r"""Worth of the pairs that are not covered yet.
+
+        .. math:: V = \sum_{j \le N, k} \Delta M[j, k] + \lambda_h \rho \sum_{j > N, k} \Delta M[j, k]
+
+        A weighted coverage function: monotone and submodular. Without frontier it is `coverage_gain`.
+        """
+        new = pairs & ~covered
+        gaussians = int(count_pairs(new[: self.n_gaussians]))
+        return gaussians + self.frontier_pair * int(count_pairs(new[self.n_gaussians :]))
 
 
 def direction_counts(covered: UInt32[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:

@@ -1,7 +1,9 @@
-"""Score of a candidate view: its coverage gain, times the factors listed in `FACTORS`.
+"""Score of a candidate view: what it newly covers, times the factors listed in `FACTORS`.
 
 To change what the search looks for, add a factor here and its setting to `ExploreConfig`; the search itself
-only ranks. `stage_inventory` then names the stages whose version has to be raised.
+only ranks. Factors steer the choice of the next move alone: which path is kept and which trajectory is
+accepted is decided by the worth of the new pairs itself. `stage_inventory` then names the stages whose
+version has to be raised.
 """
 
 from __future__ import annotations
@@ -10,12 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from extrags.cameras import rotation_angle_deg
 from extrags.config import ExploreConfig
 from extrags.exploration.darkness import illumination_weight
 
-__all__ = ["FACTORS", "Candidates", "fold_weight", "hole_weight", "score"]
+__all__ = ["FACTORS", "Candidates", "fold_weight", "net_turn_deg", "score"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,25 +26,23 @@ class Candidates:
     """The feasible moves from one view, with the measurements of their scoring renders.
 
     Args:
-        gain: newly covered (Gaussian, direction) pairs of each, [A].
-        hole_share: share of pixels without a surface, [A].
+        value: worth of the newly covered pairs of each (`PairValue.gain`), [A].
         poses: `world_from_camera` of each, [A, 4, 4].
         start: that of the view they start from, [4, 4].
         dark: world-space unit ray through the darkest patch of that view; zero where none is dark, [3].
-        turns_deg: angles turned in the last moves, the candidate's own last, [A, K].
+        turned_deg: net rotation over the last `fold_steps` moves, the candidate's own included, [A].
     """
 
-    gain: Int[np.ndarray, "a"]
-    hole_share: Float[np.ndarray, "a"]
+    value: Float[np.ndarray, "a"]
     poses: Float[np.ndarray, "a 4 4"]
     start: Float[np.ndarray, "4 4"]
     dark: Float[np.ndarray, "3"]
-    turns_deg: Float[np.ndarray, "a k"]
+    turned_deg: Float[np.ndarray, "a"]
 
 
 def score(candidates: Candidates, config: ExploreConfig) -> Float[np.ndarray, "a"]:
-    """Coverage gain times all factors, [A]; the search takes the largest."""
-    total = candidates.gain.astype(np.float64)
+    """Value times all factors, [A]; the search takes the largest."""
+    total = candidates.value
     for factor in FACTORS.values():
         total = total * factor(candidates, config)
     return total
@@ -52,29 +53,40 @@ def _illumination(candidates: Candidates, config: ExploreConfig) -> Float[np.nda
 
 
 def _fold(candidates: Candidates, config: ExploreConfig) -> Float[np.ndarray, "a"]:
-    return fold_weight(candidates.turns_deg, config)
+    return fold_weight(candidates.turned_deg, config)
 
 
-def fold_weight(turns_deg: Float[np.ndarray, "*b k"], config: ExploreConfig) -> Float[np.ndarray, "*b"]:
-    """Factor eta where the last moves together turn by more than tau_R, else one.
+def net_turn_deg(
+    path: Float[np.ndarray, "t 4 4"], candidates: Float[np.ndarray, "a 4 4"], steps: int
+) -> Float[np.ndarray, "a"]:
+    r"""Rotation between a path's view `steps` moves ago and each candidate for its next view, in degrees.
 
-    One primitive alone turns by less than tau_R in every profile: a threshold on single moves would never
-    be passed, so the turns of the last moves, the candidate's own included, are added up.
+    .. math:: \Delta R^{(a)} = \angle(R_{t + 1 - s}^{-1} R_t^{(a)})
 
-    Source: [ExtraGS, eq. 15 and 16], see docs/references.md.
+    Args:
+        path: `world_from_camera` of the views so far, the present one last.
+        candidates: `world_from_camera` of the candidates.
+        steps: s moves, the candidate's own included; on a shorter path, those since its start.
+
+    Source: [ExtraGS, eq. 15] with one step, see docs/references.md.
     """
-    return np.where(turns_deg.sum(axis=-1) > config.fold_angle_deg, config.fold_penalty, 1.0)
+    before = path[max(0, len(path) - steps), :3, :3]
+    return rotation_angle_deg(np.broadcast_to(before, (len(candidates), 3, 3)), candidates[:, :3, :3])
 
 
-def hole_weight(candidates: Candidates, config: ExploreConfig) -> Float[np.ndarray, "a"]:
-    """Factor 1 + `hole_weight` x hole share: missing surface has no Gaussians that could count as covered.
+def fold_weight(turned_deg: Float[np.ndarray, "*b"], config: ExploreConfig) -> Float[np.ndarray, "*b"]:
+    """Factor eta where the camera has turned by more than tau_R since the view `fold_steps` moves ago.
 
-    Not in the paper; `explore.hole_weight=0` is the paper's rule.
+    The angle is that of the net rotation: a turn to the left and back again is none. With `fold_steps` of 1
+    it is the rotation of the move alone, as in the paper, where tau_R of 20 degrees is never exceeded by
+    turns of 10; over three moves turns in the same direction are.
+
+    Source: [ExtraGS, eq. 15 and 16], see docs/references.md; more than one step is our own.
     """
-    return 1 + config.hole_weight * candidates.hole_share
+    return np.where(turned_deg > config.fold_angle_deg, config.fold_penalty, 1.0)
 
 
 Factor = Callable[[Candidates, ExploreConfig], Float[np.ndarray, "a"]]
 
-FACTORS: dict[str, Factor] = {"illumination": _illumination, "fold": _fold, "holes": hole_weight}
+FACTORS: dict[str, Factor] = {"illumination": _illumination, "fold": _fold}
 """By name; one factor per candidate, [A]. The order is part of the result's last bits."""

@@ -16,22 +16,22 @@ from extrags.cameras import Cameras, rotation_angle_deg
 from extrags.config import ExploreConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
-from extrags.exploration.coverage import coverage_gain, rendered_pairs
+from extrags.exploration.coverage import PairValue, coverage_gain, rendered_pairs
 from extrags.exploration.darkness import dark_direction, luminance
+from extrags.exploration.frontier import Frontier, find_frontier
 from extrags.exploration.primitives import PRIMITIVES, apply_primitives, primitive_motions
-from extrags.exploration.score import Candidates, score
+from extrags.exploration.score import Candidates, net_turn_deg, score
 from extrags.freespace import FREE, FreeSpace
+from extrags.raster import Rendering
 from extrags.scene import Scene
 from extrags.store.storable import Storable
 from extrags.thresholds import HOLE_ALPHA
 from extrags.zarr_io import open_group, read_array, write_array
 
-__all__ = ["Branch", "SearchContext", "grow_branch", "prepare_search"]
+__all__ = ["Branch", "SearchContext", "grow_branch", "known_coverage", "prepare_search"]
 
 NEAR_SHARE = 0.5
 """A candidate is too near when more than this share of its surface pixels is inside the safety margin."""
-FOLD_STEPS = 3
-"""Rotation is added up over so many steps."""
 SAME_POSE_SHARE = 0.25
 """Poses nearer than this share of a step and of a turn are the same pose."""
 VIEWS_PER_BATCH = 16
@@ -49,6 +49,7 @@ class SearchContext:
         height: full image height in pixels.
         depth_unit_mm: median rendered depth of the training views: the unit of step and margin.
         config: settings of the search.
+        frontier: where missing surface begins; empty with `explore.hole_weight=0`.
     """
 
     scene: Scene
@@ -58,6 +59,12 @@ class SearchContext:
     height: int
     depth_unit_mm: float
     config: ExploreConfig
+    frontier: Frontier
+
+    @property
+    def value(self) -> PairValue:
+        """What newly covered pairs are worth."""
+        return PairValue(len(self.scene.gaussians), self.frontier.pair_value)
 
     @property
     def step_mm(self) -> float:
@@ -87,8 +94,9 @@ class Branch(Storable):
         anchor: index of the training view it starts from (its position among the training views).
         poses: `world_from_camera` of the views, the start first, [L', 4, 4]; L' <= L.
         moves: name of the move that led to each further view, L' - 1 of them.
-        gains: newly covered pairs of each further view against the snapshot, [L' - 1].
-        pairs: all pairs the views cover, packed, [N].
+        gains: newly covered (Gaussian, direction) pairs of each further view against the snapshot, [L' - 1].
+        values: worth of all newly covered pairs of each further view, [L' - 1].
+        pairs: all pairs the views add to the snapshot, packed: N Gaussians, then F frontier voxels, [N + F].
         expansions: states expanded.
         renders: images rendered.
         reason: why the search ended.
@@ -100,7 +108,8 @@ class Branch(Storable):
     poses: Float[np.ndarray, "l 4 4"]
     moves: tuple[str, ...]
     gains: tuple[int, ...]
-    pairs: UInt32[np.ndarray, "n"]
+    values: tuple[float, ...]
+    pairs: UInt32[np.ndarray, "r"]
     expansions: int
     renders: int
     reason: str
@@ -118,6 +127,7 @@ class Branch(Storable):
                 "anchor": self.anchor,
                 "moves": list(self.moves),
                 "gains": list(self.gains),
+                "values": list(self.values),
                 "expansions": self.expansions,
                 "renders": self.renders,
                 "reason": self.reason,
@@ -134,6 +144,7 @@ class Branch(Storable):
             poses=read_array(group, "poses"),
             moves=tuple(attributes["moves"]),
             gains=tuple(attributes["gains"]),
+            values=tuple(attributes["values"]),
             pairs=read_array(group, "pairs"),
             expansions=attributes["expansions"],
             renders=attributes["renders"],
@@ -147,19 +158,18 @@ class _State:
 
     pose: Float[np.ndarray, "4 4"]
     pairs: UInt32[np.ndarray, "m"]
-    """Words of the pairs this view adds to its path, for the Gaussians in `index` alone."""
+    """Words of the pairs this view adds to its path, for the rows in `index` alone."""
     index: Int[np.ndarray, "m"]
     look_at_mm: float
     dark: Float[np.ndarray, "3"]
     clearance_mm: float
     gain: int = 0
+    value: float = 0.0
     move: str = ""
-    turn_deg: float = 0.0
     parent: _State | None = None
     length: int = 1
-    path_gain: int = 0
+    path_value: float = 0.0
     saturated_share: float = 0.0
-    hole_share: float = 0.0
     rejected: bool = False
 
     def path(self) -> list[_State]:
@@ -224,35 +234,66 @@ def prepare_search(
         cameras.height,
         float(np.median(depth)),
         config,
+        find_frontier(scene, freespace, config.hole_weight),
     )
+
+
+def known_coverage(context: SearchContext, cameras: Cameras) -> UInt32[np.ndarray, "r"]:
+    """Coverage by the training views: of the Gaussians, then of the frontier voxels, packed, [N + F].
+
+    Args:
+        context: from `prepare_search`.
+        cameras: the training views.
+    """
+    small = cameras.at_most_width(context.config.render_width)
+    covered = np.zeros(len(context.scene.gaussians) + len(context.frontier), dtype=np.uint32)
+    for start in range(0, len(small), VIEWS_PER_BATCH):
+        _, pairs = _rendered_pairs(context, small[start : start + VIEWS_PER_BATCH])
+        covered |= np.bitwise_or.reduce(pairs, axis=0)
+    return covered
+
+
+def _rendered_pairs(context: SearchContext, cameras: Cameras) -> tuple[Rendering, UInt32[np.ndarray, "c r"]]:
+    """Images of views, and the pairs each of them covers: of Gaussians, then of frontier voxels."""
+    config = context.config
+    with torch.no_grad():
+        rendering, pairs = rendered_pairs(context.scene, cameras, **config.coverage.options)
+    holes = rendering.alpha.numpy() < HOLE_ALPHA
+    frontier = [
+        context.frontier.pairs(cameras[index], holes[index], config.directions)
+        for index in range(len(cameras))
+    ]
+    return rendering, np.concatenate([pairs, np.stack(frontier)], axis=1)
 
 
 def grow_branch(
     context: SearchContext,
     start: Float[np.ndarray, "4 4"],
-    coverage: UInt32[np.ndarray, "n"],
+    coverage: UInt32[np.ndarray, "r"],
     anchor: int = 0,
 ) -> Branch:
     """Search one trajectory alone from a snapshot of the shared coverage.
 
-    The best candidate of each expansion becomes the next state; the others wait in a priority queue.
-    Where no candidate is left, the search goes on from the best of the queue. It ends with L views,
-    with an empty queue, or when the budget of expansions is spent; in the last two cases the path of
-    the largest gain so far is kept. A pure function: same inputs, same branch.
+    The best candidate of each expansion becomes the next state; the next `top_candidates` - 1 wait in a
+    priority queue. Where no candidate is left, the search goes on from the best of the queue. It ends with L
+    views, with an empty queue, or when the budget of expansions is spent; in the last two cases the path
+    whose new pairs are worth most is kept. A pure function: same inputs, same branch.
 
     Args:
         context: what all branches share.
         start: `world_from_camera` of the training view it starts from.
-        coverage: packed coverage that counts as known, [N].
+        coverage: packed coverage that counts as known (`known_coverage`), [N + F].
         anchor: index of that view, kept in the result.
 
     Raises:
         ShapeError: when the coverage belongs to another scene.
     """
     config = context.config
-    if len(coverage) != len(context.scene.gaussians):
+    rows = len(context.scene.gaussians) + len(context.frontier)
+    if len(coverage) != rows:
         raise ShapeError(
-            f"coverage of {len(coverage)} Gaussians, but the scene has {len(context.scene.gaussians)}"
+            f"coverage of {len(coverage)} rows, but the scene has {len(context.scene.gaussians)} Gaussians "
+            f"and {len(context.frontier)} frontier voxels"
         )
     root = _observe(context, start[None], coverage, context.freespace.clearance_at(start[None, :3, 3]))[0]
     visited = _VisitedPoses(context.step_mm, min(config.rotation_deg, config.orbit_deg), [start])
@@ -278,8 +319,8 @@ def grow_branch(
             reason = f"no further move is possible after {best.length} views"
             break
         current = following
-        emit(Progress("explore-branch", current.length, config.length, {"gain": float(current.path_gain)}))
-        if (current.path_gain, current.length) > (best.path_gain, best.length):
+        emit(Progress("explore-branch", current.length, config.length, {"value": current.path_value}))
+        if (current.path_value, current.length) > (best.path_value, best.length):
             best = current
         if current.length >= config.length:
             best = current
@@ -290,7 +331,7 @@ def grow_branch(
 
 
 def _branch_of(
-    last: _State, anchor: int, pairs: UInt32[np.ndarray, "n"], expansions: int, renders: int, reason: str
+    last: _State, anchor: int, pairs: UInt32[np.ndarray, "r"], expansions: int, renders: int, reason: str
 ) -> Branch:
     """The path to a state; `pairs` comes empty and is filled with what the path adds."""
     path = last.path()
@@ -301,6 +342,7 @@ def _branch_of(
         poses=np.stack([state.pose for state in path]),
         moves=tuple(state.move for state in path[1:]),
         gains=tuple(state.gain for state in path[1:]),
+        values=tuple(state.value for state in path[1:]),
         pairs=pairs,
         expansions=expansions,
         renders=renders,
@@ -309,9 +351,9 @@ def _branch_of(
 
 
 def _expand(
-    context: SearchContext, state: _State, coverage: UInt32[np.ndarray, "n"], visited: _VisitedPoses
+    context: SearchContext, state: _State, coverage: UInt32[np.ndarray, "r"], visited: _VisitedPoses
 ) -> tuple[list[tuple[float, _State]], int]:
-    """All valid candidates of a state, best score first, and how many images that took."""
+    """The best valid candidates of a state, best score first, and how many images that took."""
     config = context.config
     motions = primitive_motions(context.step_mm, config.rotation_deg, config.orbit_deg, state.look_at_mm)
     poses = apply_primitives(state.pose, motions)
@@ -330,18 +372,19 @@ def _expand(
     if len(kept) == 0:
         return [], 0
     known = coverage.copy()
-    for earlier in state.path():
+    path = state.path()
+    for earlier in path:
         known[earlier.index] |= earlier.pairs
     candidates = _observe(context, poses[kept], known, clearance[kept], state, [PRIMITIVES[i] for i in kept])
-    recent = [earlier.turn_deg for earlier in state.path()[1:]][-(FOLD_STEPS - 1) :]
     scores = score(
         Candidates(
-            gain=np.array([candidate.gain for candidate in candidates]),
-            hole_share=np.array([candidate.hole_share for candidate in candidates]),
+            value=np.array([candidate.value for candidate in candidates]),
             poses=poses[kept],
             start=state.pose,
             dark=state.dark,
-            turns_deg=np.array([[*recent, candidate.turn_deg] for candidate in candidates]),
+            turned_deg=net_turn_deg(
+                np.stack([earlier.pose for earlier in path]), poses[kept], config.fold_steps
+            ),
         ),
         config,
     )
@@ -350,15 +393,16 @@ def _expand(
         for value, candidate in zip(scores.tolist(), candidates, strict=True)
         if not candidate.rejected
     ]
-    visited.poses += [candidate.pose for _, candidate in scored]
     # Stable: equal scores keep the order of the primitives.
-    return sorted(scored, key=lambda item: -item[0]), len(kept)
+    scored = sorted(scored, key=lambda item: -item[0])[: config.top_candidates]
+    visited.poses += [candidate.pose for _, candidate in scored]
+    return scored, len(kept)
 
 
 def _observe(
     context: SearchContext,
     poses: Float[np.ndarray, "a 4 4"],
-    known: UInt32[np.ndarray, "n"],
+    known: UInt32[np.ndarray, "r"],
     clearance_mm: Float[np.ndarray, "a"],
     parent: _State | None = None,
     moves: list[str] | None = None,
@@ -366,14 +410,9 @@ def _observe(
     """Render poses in one batch; reject those with too many holes, overexposure or too little clearance."""
     config = context.config
     cameras = context.scoring_cameras(poses)
-    with torch.no_grad():
-        rendering, pairs = rendered_pairs(
-            context.scene,
-            cameras,
-            visible_weight=config.visible_weight,
-            n_directions=config.directions,
-        )
-    gains = coverage_gain(known, pairs)
+    rendering, pairs = _rendered_pairs(context, cameras)
+    n = context.value.n_gaussians
+    gains = coverage_gain(known[:n], pairs[:, :n])
     alpha, depth, rgb = rendering.alpha.numpy(), rendering.depth.numpy(), rendering.rgb.numpy()
     states = []
     for index in range(len(poses)):
@@ -383,10 +422,16 @@ def _observe(
         # it. A recording may itself be overexposed; from there the share must not grow.
         saturated = float((luminance(rgb[index]) >= 1.0).mean())
         glare = saturated > max(config.max_saturated_share, 0.0 if parent is None else parent.saturated_share)
-        hole_share = float(1 - surface.mean())
+        # A view of no surface at all shows nothing that a restorer could continue.
+        rejected = bool(
+            glare
+            or not surface.any()
+            or 1 - surface.mean() > config.max_hole_share
+            or near.mean() > NEAR_SHARE
+        )
         new = pairs[index] & ~known
         touched = np.flatnonzero(new).astype(np.int32)
-        turn = 0.0 if parent is None else float(rotation_angle_deg(parent.pose[:3, :3], poses[index, :3, :3]))
+        value = context.value.gain(known, pairs[index])
         states.append(
             _State(
                 pose=poses[index],
@@ -398,14 +443,13 @@ def _observe(
                 ),
                 clearance_mm=float(clearance_mm[index]),
                 gain=int(gains[index]),
+                value=value,
                 move="" if moves is None else moves[index],
-                turn_deg=turn,
                 parent=parent,
                 length=1 if parent is None else parent.length + 1,
-                path_gain=int(gains[index]) + (0 if parent is None else parent.path_gain),
+                path_value=value + (0.0 if parent is None else parent.path_value),
                 saturated_share=saturated,
-                hole_share=hole_share,
-                rejected=bool(hole_share > config.max_hole_share or glare or near.mean() > NEAR_SHARE),
+                rejected=rejected,
             )
         )
     return states

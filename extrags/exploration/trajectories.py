@@ -12,14 +12,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 import zarr
-from jaxtyping import Int, UInt32
+from jaxtyping import Float, Int, UInt32
 
 from extrags.cameras import Cameras
 from extrags.config import ExploreConfig
 from extrags.errors import ShapeError
 from extrags.events import MetricRecorded, Progress, emit
-from extrags.exploration.coverage import count_pairs, training_coverage
-from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
+from extrags.exploration.coverage import count_pairs
+from extrags.exploration.search import Branch, SearchContext, grow_branch, known_coverage, prepare_search
 from extrags.exploration.waves import WaveState, start_views
 from extrags.freespace import FreeSpace, carve
 from extrags.scene import Scene
@@ -45,6 +45,7 @@ class Exploration(Storable):
         trajectory: index of each view's trajectory, rising, [V].
         anchors: frame of the sequence each trajectory starts from, [T].
         gains: newly covered (Gaussian, direction) pairs of each trajectory, in order of acceptance, [T].
+        values: worth of what each trajectory adds, holes included, in the same unit, [T].
         moves: names of the moves of each trajectory.
         reasons: why each search ended.
         rejected: why other branches were not accepted.
@@ -64,6 +65,7 @@ class Exploration(Storable):
     trajectory: Int[np.ndarray, "v"]
     anchors: Int[np.ndarray, "t"]
     gains: Int[np.ndarray, "t"]
+    values: Float[np.ndarray, "t"]
     moves: tuple[tuple[str, ...], ...]
     reasons: tuple[str, ...]
     rejected: tuple[str, ...]
@@ -77,8 +79,8 @@ class Exploration(Storable):
         count = len(self.anchors)
         if len(self.trajectory) != len(self.cameras):
             raise ShapeError(f"{len(self.trajectory)} trajectory indices for {len(self.cameras)} cameras")
-        if not len(self.gains) == len(self.moves) == len(self.reasons) == count:
-            raise ShapeError(f"gains, moves and reasons must all have {count} entries")
+        if not len(self.gains) == len(self.values) == len(self.moves) == len(self.reasons) == count:
+            raise ShapeError(f"gains, values, moves and reasons must all have {count} entries")
 
     def __len__(self) -> int:
         """Number of trajectories."""
@@ -123,6 +125,7 @@ class Exploration(Storable):
                     "anchor_frame": int(self.anchors[index]),
                     "views": int((self.trajectory == index).sum()),
                     "gain": int(self.gains[index]),
+                    "value": round(float(self.values[index])),
                     "moves": list(self.moves[index]),
                     "reason": self.reasons[index],
                 }
@@ -142,7 +145,7 @@ class Exploration(Storable):
         """Write `trajectories/` (zarr v3) and `exploration.json` into a directory."""
         directory.mkdir(parents=True, exist_ok=True)
         group = open_group(directory / "trajectories", mode="w")
-        for name in ("trajectory", "anchors", "gains", "coverage_before", "coverage_after"):
+        for name in ("trajectory", "anchors", "gains", "values", "coverage_before", "coverage_after"):
             write_array(group, name, getattr(self, name))
         write_array(group, "K", self.cameras.K)
         write_array(group, "world_from_camera", self.cameras.world_from_camera)
@@ -168,7 +171,7 @@ class Exploration(Storable):
         attributes: dict[str, Any] = dict(group.attrs)
         arrays = {
             name: read_array(group, name)
-            for name in ("trajectory", "anchors", "gains", "coverage_before", "coverage_after")
+            for name in ("trajectory", "anchors", "gains", "values", "coverage_before", "coverage_after")
         }
         poses = read_array(group, "world_from_camera")
         return cls(
@@ -192,16 +195,12 @@ def start_exploration(context: SearchContext, cameras: Cameras) -> WaveState:
     """
     config = context.config
     anchors = start_views(cameras, config.trajectories, context.depth_unit_mm)
-    covered = training_coverage(
-        context.scene,
-        cameras.at_most_width(config.render_width),
-        visible_weight=config.visible_weight,
-        n_directions=config.directions,
-    )
-    pairs = len(covered) * config.directions
+    covered = known_coverage(context, cameras)
+    pairs = len(context.scene.gaussians) * config.directions
     return WaveState(
         coverage_before=covered,
         coverage=covered,
+        value=context.value,
         waiting=tuple(int(anchor) for anchor in anchors),
         room=config.trajectories,
         min_gain=max(1, int(np.ceil(config.min_gain_share * pairs))),
@@ -209,7 +208,7 @@ def start_exploration(context: SearchContext, cameras: Cameras) -> WaveState:
     )
 
 
-def grow(context: SearchContext, cameras: Cameras, coverage: UInt32[np.ndarray, "n"], anchor: int) -> Branch:
+def grow(context: SearchContext, cameras: Cameras, coverage: UInt32[np.ndarray, "r"], anchor: int) -> Branch:
     """Grow the branch of one anchor: the unit of parallel work."""
     return grow_branch(context, cameras.world_from_camera[anchor], coverage, anchor)
 
@@ -229,11 +228,12 @@ def finish(context: SearchContext, state: WaveState, train_frames: Int[np.ndarra
         trajectory=np.repeat(np.arange(len(lengths), dtype=np.int64), lengths),
         anchors=np.array([train_frames[branch.anchor] for branch in state.branches], dtype=np.int64),
         gains=np.array(state.gains, dtype=np.int64),
+        values=np.array(state.values, dtype=np.float64),
         moves=tuple(branch.moves for branch in state.branches),
         reasons=tuple(branch.reason for branch in state.branches),
         rejected=state.rejected,
-        coverage_before=state.coverage_before,
-        coverage_after=state.coverage,
+        coverage_before=state.coverage_before[: len(context.scene.gaussians)],
+        coverage_after=state.coverage[: len(context.scene.gaussians)],
         directions=context.config.directions,
         renders=state.renders,
         waves=state.waves,

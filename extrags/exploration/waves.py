@@ -15,9 +15,9 @@ import numpy as np
 import zarr
 from jaxtyping import Float, Int, UInt32
 
-from extrags.cameras import Cameras, rotation_angle_deg
+from extrags.cameras import Cameras, pose_distances
 from extrags.errors import ConfigError
-from extrags.exploration.coverage import coverage_gain
+from extrags.exploration.coverage import PairValue, coverage_gain
 from extrags.exploration.search import Branch
 from extrags.store.storable import Storable
 from extrags.zarr_io import open_group, read_array, write_array
@@ -28,8 +28,7 @@ __all__ = ["Merge", "WaveState", "merge_wave", "start_views"]
 def start_views(cameras: Cameras, count: int, depth_unit_mm: float) -> Int[np.ndarray, "t"]:
     """Training views spread evenly over space, by farthest point sampling.
 
-    Two views are as far apart as their centres in depth units plus their rotation in radians: a turn by
-    one radian moves what is seen as much as a step of one depth. The first is the view nearest to the
+    Their distance is `extrags.cameras.pose_distances` in depth units. The first is the view nearest to the
     middle of all, each further one the farthest from those before it; so any number of the first views
     is spread evenly, too.
 
@@ -48,12 +47,9 @@ def start_views(cameras: Cameras, count: int, depth_unit_mm: float) -> Int[np.nd
     """
     if count < 1:
         raise ConfigError(f"the search needs at least one start, found {count}")
-    rotation = cameras.world_from_camera[:, :3, :3]
 
     def distance_from(index: int) -> Float[np.ndarray, "c"]:
-        apart = np.linalg.norm(cameras.centers - cameras.centers[index], axis=1) / depth_unit_mm
-        turned = rotation_angle_deg(rotation, np.broadcast_to(rotation[index], rotation.shape))
-        return np.asarray(apart + np.radians(turned))
+        return pose_distances(cameras, cameras[index], depth_unit_mm)[:, 0]
 
     middle = np.linalg.norm(cameras.centers - cameras.centers.mean(axis=0), axis=1)
     chosen = [int(np.argmin(middle))]
@@ -70,49 +66,56 @@ class Merge:
     """Result of a merge.
 
     Args:
-        coverage: the shared coverage with the accepted branches added, packed, [N].
+        coverage: the shared coverage with the accepted branches added, packed, [N + F].
         accepted: positions of the accepted branches in the wave, in the order of acceptance.
-        gains: newly covered pairs each of them added when it was accepted.
+        gains: newly covered (Gaussian, direction) pairs each of them added when it was accepted.
+        values: worth of all pairs it added then.
     """
 
-    coverage: UInt32[np.ndarray, "n"]
+    coverage: UInt32[np.ndarray, "r"]
     accepted: tuple[int, ...]
     gains: tuple[int, ...]
+    values: tuple[float, ...]
 
 
 def merge_wave(
-    coverage: UInt32[np.ndarray, "n"],
+    coverage: UInt32[np.ndarray, "r"],
     branches: Sequence[Branch],
+    value: PairValue,
     *,
     min_gain: int,
     room: int,
 ) -> Merge:
-    """Accept branches greedily by what each still adds to the shared coverage.
+    """Accept branches greedily by the worth of what each still adds to the shared coverage.
 
-    Coverage is submodular, so greedy acceptance is within 1 - 1/e of the best choice (Nemhauser, Wolsey
-    and Fisher 1978), and once the largest marginal gain is below the threshold all others are, too.
+    Weighted coverage is submodular, so greedy acceptance is within 1 - 1/e of the best choice (Nemhauser,
+    Wolsey and Fisher 1978), and once the largest marginal gain is below the threshold all others are, too.
 
     Args:
-        coverage: the snapshot the branches grew from, packed, [N].
+        coverage: the snapshot the branches grew from, packed, [N + F].
         branches: the wave.
-        min_gain: a branch must add at least so many pairs.
+        value: what pairs are worth; the same as in the search.
+        min_gain: a branch must add pairs of at least this worth.
         room: accept at most so many.
     """
     coverage = coverage.copy()
     left = [index for index, branch in enumerate(branches) if len(branch) >= 2]
     accepted: list[int] = []
     gains: list[int] = []
+    values: list[float] = []
     while left and len(accepted) < room:
-        marginal = [int(coverage_gain(coverage, branches[index].pairs)) for index in left]
+        marginal = [value.gain(coverage, branches[index].pairs) for index in left]
         # The first of equals, so that the order of the wave decides and nothing else.
         top = int(np.argmax(marginal))
         if marginal[top] < max(1, min_gain):
             break
         chosen = left.pop(top)
+        n = value.n_gaussians
+        gains.append(int(coverage_gain(coverage[:n], branches[chosen].pairs[:n])))
+        values.append(marginal[top])
         coverage |= branches[chosen].pairs
         accepted.append(chosen)
-        gains.append(marginal[top])
-    return Merge(coverage, tuple(accepted), tuple(gains))
+    return Merge(coverage, tuple(accepted), tuple(gains), tuple(values))
 
 
 @dataclass(frozen=True)
@@ -120,14 +123,16 @@ class WaveState(Storable):
     """State of the exploration between two waves.
 
     Args:
-        coverage_before: coverage by the training views, packed, [N].
-        coverage: coverage with all accepted trajectories, packed, [N].
+        coverage_before: coverage by the training views, packed: N Gaussians, F frontier voxels, [N + F].
+        coverage: coverage with all accepted trajectories, packed, [N + F].
+        value: what newly covered pairs are worth.
         waiting: queue of anchors, the next one first.
         room: trajectories that may still be accepted.
-        min_gain: pairs a trajectory must add.
+        min_gain: worth of the pairs a trajectory must add.
         wave: branches per wave.
         branches: accepted so far.
-        gains: marginal gain of each of them.
+        gains: (Gaussian, direction) pairs each of them added.
+        values: worth of all pairs each of them added.
         rejected: why branches were not accepted, one sentence each.
         waves: waves finished.
         renders: images rendered by all branches, rejected ones included.
@@ -135,14 +140,16 @@ class WaveState(Storable):
 
     stored_as: ClassVar[str] = "state"
 
-    coverage_before: UInt32[np.ndarray, "n"]
-    coverage: UInt32[np.ndarray, "n"]
+    coverage_before: UInt32[np.ndarray, "r"]
+    coverage: UInt32[np.ndarray, "r"]
+    value: PairValue
     waiting: tuple[int, ...]
     room: int
     min_gain: int
     wave: int
     branches: tuple[Branch, ...] = ()
     gains: tuple[int, ...] = ()
+    values: tuple[float, ...] = ()
     rejected: tuple[str, ...] = ()
     waves: int = 0
     renders: int = 0
@@ -176,15 +183,16 @@ class WaveState(Storable):
                 f"the wave has the anchors {anchors}, but the branches start from "
                 f"{tuple(branch.anchor for branch in branches)}"
             )
-        merge = merge_wave(self.coverage, branches, min_gain=self.min_gain, room=self.room)
+        merge = merge_wave(self.coverage, branches, self.value, min_gain=self.min_gain, room=self.room)
         again, rejected = [], []
         for index, branch in enumerate(branches):
-            alone = int(coverage_gain(self.coverage, branch.pairs))
+            alone = self.value.gain(self.coverage, branch.pairs)
             if index not in merge.accepted:
-                left = int(coverage_gain(merge.coverage, branch.pairs))
+                left = self.value.gain(merge.coverage, branch.pairs)
                 why = f"needs {self.min_gain}" if left < self.min_gain else "there was no room left"
                 rejected.append(
-                    f"from view {branch.anchor}: adds {left} pairs ({alone} alone), {why}; {branch.reason}"
+                    f"from view {branch.anchor}: adds {left:.0f} pairs ({alone:.0f} alone), {why}; "
+                    f"{branch.reason}"
                 )
             if len(branch) >= 2 and alone >= max(1, self.min_gain):
                 again.append(branch.anchor)
@@ -195,6 +203,7 @@ class WaveState(Storable):
             room=self.room - len(merge.accepted),
             branches=(*self.branches, *(branches[index] for index in merge.accepted)),
             gains=(*self.gains, *merge.gains),
+            values=(*self.values, *merge.values),
             rejected=(*self.rejected, *rejected),
             waves=self.waves + 1,
             renders=self.renders + sum(branch.renders for branch in branches),
@@ -212,6 +221,9 @@ class WaveState(Storable):
                 "min_gain": self.min_gain,
                 "wave": self.wave,
                 "gains": list(self.gains),
+                "values": list(self.values),
+                "n_gaussians": self.value.n_gaussians,
+                "frontier_pair": self.value.frontier_pair,
                 "rejected": list(self.rejected),
                 "waves": self.waves,
                 "renders": self.renders,
@@ -229,6 +241,7 @@ class WaveState(Storable):
         return cls(
             coverage_before=read_array(group, "coverage_before"),
             coverage=read_array(group, "coverage"),
+            value=PairValue(attributes["n_gaussians"], attributes["frontier_pair"]),
             waiting=tuple(attributes["waiting"]),
             room=attributes["room"],
             min_gain=attributes["min_gain"],
@@ -237,6 +250,7 @@ class WaveState(Storable):
                 Branch.load(path / f"branch_{index:04d}") for index in range(attributes["n_branches"])
             ),
             gains=tuple(attributes["gains"]),
+            values=tuple(attributes["values"]),
             rejected=tuple(attributes["rejected"]),
             waves=attributes["waves"],
             renders=attributes["renders"],

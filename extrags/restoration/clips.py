@@ -11,7 +11,8 @@ from torch import Tensor
 
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference, image_confidence, pixel_confidence
-from extrags.errors import ConfigError, ShapeError
+from extrags.config import IouSet, ReferenceChoice
+from extrags.errors import ShapeError
 from extrags.events import Progress, emit
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.pseudo_views import PseudoViews
@@ -38,20 +39,17 @@ def choose_views(lengths: Sequence[int], max_views: int) -> list[Int[np.ndarray,
     """Which views of each trajectory are restored when there are too many.
 
     The first view of a trajectory is a real one and is left out. What remains is thinned evenly; the last
-    view, the farthest from what is known, always stays.
+    view, the farthest from what is known, always stays. Where there are more trajectories than views, the
+    first `max_views`, which exploration accepted first, keep their last view alone; the others have none.
 
     Args:
         lengths: views of each trajectory, the start included.
         max_views: at most so many in all.
-
-    Raises:
-        ConfigError: when not even one view per trajectory is allowed.
     """
-    available = [max(0, length - 1) for length in lengths]
+    longer = np.array(lengths) > 1
+    available = np.where(longer & (np.cumsum(longer) <= max_views), np.array(lengths) - 1, 0).tolist()
     total = sum(available)
     longest = sum(count > 0 for count in available)
-    if max_views < longest:
-        raise ConfigError(f"enhance.max_views is {max_views}, there are {longest} trajectories")
     # One view each, then the rest in proportion to what is left: rounding down never exceeds the budget.
     spare = min(max_views, total) - longest
     left = max(1, total - longest)
@@ -70,6 +68,8 @@ def render_clips(
     trajectories: Sequence[Cameras],
     *,
     count: int,
+    reference: ReferenceChoice = "covisibility",
+    iou: IouSet = "reference",
     first_index: int = 0,
 ) -> list[Clip]:
     """Render trajectories at the mean exposure, and warp real views into them.
@@ -79,14 +79,16 @@ def render_clips(
         references: its training views.
         trajectories: virtual views; empty ones give no clip.
         count: references blended per view.
+        reference: which of them U_img compares with.
+        iou: set that their overlap is divided by.
         first_index: index of the first clip; a batch of many passes where it begins.
     """
     clips = []
     for offset, cameras in enumerate(trajectories):
         if len(cameras) == 0:
             continue
-        observation = observe_views(scene, references, cameras, count=count)
-        confidence = image_confidence(observation.seen, references.seen[observation.reference])
+        observation = observe_views(scene, references, cameras, count=count, reference=reference)
+        confidence = image_confidence(observation.seen, references.seen[observation.reference], iou)
         clips.append(
             Clip(
                 index=first_index + offset,
@@ -166,6 +168,8 @@ def make_pseudo_observations(
     measure: PerceptualDifference,
     *,
     count: int,
+    reference: ReferenceChoice = "covisibility",
+    iou: IouSet = "reference",
     first_index: int = 0,
 ) -> PseudoViews:
     """Render, restore and weigh trajectories: the work of one batch of clips.
@@ -177,6 +181,8 @@ def make_pseudo_observations(
         enhancer: the restorer.
         measure: behind the pixel-level confidence.
         count: references blended per view.
+        reference: which of them U_img compares with.
+        iou: set that their overlap is divided by.
         first_index: index of the first clip.
 
     Raises:
@@ -184,7 +190,15 @@ def make_pseudo_observations(
     """
     parts = []
     for offset, cameras in enumerate(trajectories):
-        clips = render_clips(scene, references, [cameras], count=count, first_index=first_index + offset)
+        clips = render_clips(
+            scene,
+            references,
+            [cameras],
+            count=count,
+            reference=reference,
+            iou=iou,
+            first_index=first_index + offset,
+        )
         if clips:
             parts.append(pseudo_observations(clips, restore_clips(enhancer, clips), measure))
         emit(Progress("enhance", offset + 1, len(trajectories)))

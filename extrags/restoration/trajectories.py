@@ -33,7 +33,8 @@ def restore(
     Args:
         scene: the coarse scene.
         sequence: its frames; only training frames are used.
-        trajectories: virtual views of each trajectory, its real start first (`Exploration.trajectories`).
+        trajectories: virtual views of each trajectory, its real start first (`Exploration.trajectories`);
+            those without another are left out.
         config: backend and budgets; None takes the defaults.
         coarse: settings the scene was reconstructed with; None takes the defaults.
         measure: behind the pixel-level confidence; None takes LPIPS where its weights can be found.
@@ -45,6 +46,7 @@ def restore(
     config = EnhanceConfig() if config is None else config
     enhancer = train_enhancer(scene, sequence, config, CoarseConfig() if coarse is None else coarse)
     measure = PerceptualDifference.available() if measure is None else measure
+    trajectories = [cameras for cameras in trajectories if len(cameras) > 1]
     parts = [
         restore_batch(scene, sequence, trajectories, enhancer, config, batch, measure)
         for batch in range(config.batches(len(trajectories)))
@@ -73,7 +75,6 @@ def restore_batch(
         measure: behind the pixel-level confidence; whether it is `raw` is the settings' to say.
 
     Raises:
-        ConfigError: when `enhance.max_views` does not allow a view per trajectory.
         ShapeError: when the batch has no view at all.
     """
     views = choose_views([len(cameras) for cameras in trajectories], config.max_views)
@@ -86,5 +87,7 @@ def restore_batch(
         enhancer,
         replace(measure, raw=config.pixel_confidence == "raw"),
         count=config.references,
+        reference=config.reference,
+        iou=config.iou,
         first_index=first,
     )

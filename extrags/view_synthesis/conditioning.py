@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrags.cameras import Cameras, pixel_rays
+from extrags.config import ReferenceChoice
 from extrags.errors import ShapeError
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.scene import Scene
@@ -127,7 +128,7 @@ class Observation:
 
     Args:
         layers: raw observations.
-        reference: index (among the references) of the view that sees most of the same surface, [V].
+        reference: index (among the references) of the first reference of each view, [V].
         seen: which Gaussians each view sees, [V, N].
     """
 
@@ -142,6 +143,7 @@ def observe_views(
     cameras: Cameras,
     *,
     count: int,
+    reference: ReferenceChoice = "covisibility",
     exposure: Float[Tensor, "v"] | None = None,
 ) -> Observation:
     """Render virtual views and carry real ones into them.
@@ -154,11 +156,13 @@ def observe_views(
         references: real views of this scene.
         cameras: the virtual views.
         count: references blended per view.
+        reference: which of them comes first, as `warp_references`.
         exposure: gain of each view; None is 1.
     """
+    gains = [None if exposure is None else exposure[[view]] for view in range(len(cameras))]
     parts = [
-        _observe_one(scene, references, cameras[view], count, None if exposure is None else exposure[[view]])
-        for view in range(len(cameras))
+        _observe_one(scene, references, cameras[view], count, reference, gain)
+        for view, gain in enumerate(gains)
     ]
     return Observation(
         Layers(torch.cat([part.layers.data for part in parts])),
@@ -172,6 +176,7 @@ def _observe_one(
     references: ReferenceViews,
     camera: Cameras,
     count: int,
+    reference: ReferenceChoice,
     exposure: Float[Tensor, "1"] | None,
 ) -> Observation:
     scale = references.transfer.scale_mm
@@ -186,7 +191,9 @@ def _observe_one(
         depth = torch.where((median > 0) & (alpha > HOLE_ALPHA), median, expected)
         depth = torch.where(alpha > 0.02, depth, torch.zeros(()))
         complete = completed_depth(depth, alpha, scale)
-        warped = warp_references(references, camera, complete, count=count, exposure=exposure)
+        warped = warp_references(
+            references, camera, complete, count=count, reference=reference, exposure=exposure
+        )
         known, spread = _known_and_spread(scene, references, camera, warped.chosen[0], alpha, expected)
         ray_length = torch.from_numpy(np.linalg.norm(pixel_rays(camera), axis=-1).astype(np.float32)[:, None])
     layers = Layers.of(

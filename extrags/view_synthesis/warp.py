@@ -15,7 +15,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-from extrags.cameras import Cameras, pixel_rays
+from extrags.cameras import Cameras, pixel_rays, pose_distances
+from extrags.config import ReferenceChoice
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 
@@ -46,13 +47,13 @@ class Warped:
     """Real views as seen from V virtual ones.
 
     Args:
-        nearest: the single best reference, light-compensated, zero where it has no information, [V, 3, H, W].
+        nearest: the first reference, light-compensated, zero where it has no information, [V, 3, H, W].
         nearest_weight: how far it can be trusted, [V, 1, H, W].
         blend: weighted mean of the best references, zero where none has information, [V, 3, H, W].
         blend_weight: feathered trust in the blend, [V, 1, H, W].
         log_ratio: log of (distance from the references / distance from the virtual view), [V, 1, H, W].
-        reference: index of the best reference among the `ReferenceViews`, [V].
-        chosen: indices of the blended references, best first, [V, K].
+        reference: index of the first reference among the `ReferenceViews`, [V].
+        chosen: indices of the blended references, `reference` first, [V, K].
     """
 
     nearest: Float[Tensor, "v 3 h w"]
@@ -93,18 +94,29 @@ def warp_references(
     depth_mm: Float[Tensor, "v 1 h w"],
     *,
     count: int,
+    reference: ReferenceChoice = "covisibility",
     exposure: Float[Tensor, "v"] | None = None,
 ) -> Warped:
     """Carry the `count` most co-visible references into each virtual view.
+
+    With `reference="nearest"` the nearest by pose (`extrags.cameras.pose_distances`, in the references'
+    typical distance) comes first, whatever it saw: it is then `nearest` and `reference`, and one of the
+    blend; the others are the most co-visible as before.
 
     Args:
         references: real views with depth, exposure and the scene's light.
         cameras: the virtual views.
         depth_mm: their z-depth without gaps.
         count: references blended per view.
+        reference: which of them comes first.
         exposure: gain of each virtual view; None is 1, the mean of the training frames.
+
+    Source: v_nn of [ExtraGS, eq. 18] with `nearest`, see docs/references.md.
     """
     scores = covisibility(references, cameras, depth_mm)
+    if reference == "nearest":
+        apart = pose_distances(cameras, references.cameras, references.transfer.scale_mm)
+        scores[torch.arange(len(cameras)), torch.from_numpy(apart.argmin(axis=1))] = torch.inf
     chosen = torch.argsort(scores, dim=1, descending=True, stable=True)[:, : min(count, len(references))]
     gain = torch.ones(len(cameras)) if exposure is None else exposure
     parts = [

@@ -265,6 +265,8 @@ def _arms(sequence: EndoscopicSequence, arms: list[str], config: PipelineConfig)
                 enhancer,
                 lpips_weights(config.evaluate)[0].perceptual_difference(),
                 count=config.enhance.references,
+                reference=config.enhance.reference,
+                iou=config.enhance.iou,
             )
         with timed(seconds, "finetune"):
             result = finetune(scene, training, pseudo, config.finetune, config.coarse)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.assessment import ScenePlan, assess, probe_views
+from extrags.assessment import ScenePlan, assess, decide, probe_views
 from extrags.cameras import rotation_angle_deg
-from extrags.config import AssessConfig, ExploreConfig, PipelineConfig
+from extrags.config import AssessConfig, EnhanceConfig, ExploreConfig, PipelineConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.scene import Scene
 
@@ -86,6 +86,15 @@ class TestAssess:
             plan = assess(tube.scene, tube.sequence, config(full_budget_share=full))
             share = lacking / full if expected < 1 else 1.0
             assert plan.decision("explore").budget["trajectories"] == int(np.ceil(share * 20))
+
+    def test_no_more_trajectories_than_views_that_are_restored(self):
+        # With more, restoration would have to leave some without a view, after all of them were searched.
+        settings = PipelineConfig(enhance=EnhanceConfig(max_views=2))
+        plan = decide({"lacking_share": 1.0}, settings)
+        assert plan.decision("explore").budget == {"trajectories": 2}
+        assert plan.decision("enhance").budget == {"max_views": 2}
+        assert "2 of 20 trajectories" in plan.decision("explore").reason
+        assert "enhance.max_views=2 allows no more" in plan.decision("explore").reason
 
     def test_every_number_is_finite_and_every_share_a_share(self):
         for plan in (tube_plan(), ball_plan()):

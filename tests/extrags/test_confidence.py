@@ -22,6 +22,12 @@ class TestImageConfidence:
         assert gaussian_iou(virtual, reference).tolist() == [0.5, 0, 1]
         assert image_confidence(virtual, reference).tolist() == [0.5, 1, 0]
 
+    def test_over_the_union_by_hand(self) -> None:
+        virtual = torch.tensor([[1, 1, 0, 0, 1], [0, 0, 0, 0, 0], [1, 1, 1, 1, 1]]).bool()
+        reference = torch.tensor([[1, 1, 1, 1, 0], [1, 0, 0, 0, 0], [1, 0, 1, 0, 0]]).bool()
+        np.testing.assert_allclose(gaussian_iou(virtual, reference, "union"), [0.4, 0, 0.4])
+        np.testing.assert_allclose(image_confidence(virtual, reference, "union"), [0.6, 1, 0.6])
+
     def test_a_blind_reference_gives_full_weight(self) -> None:
         nothing = torch.zeros(1, 4, dtype=torch.bool)
         assert image_confidence(~nothing, nothing).tolist() == [1]

@@ -180,7 +180,12 @@ def fold_pairs(
     parts = []
     for degraded, views in ((partial, references), (perturbed, references.of_scene(perturbed))):
         observation = observe_views(
-            degraded, views, sequence.cameras[left], count=config.references, exposure=gain
+            degraded,
+            views,
+            sequence.cameras[left],
+            count=config.references,
+            reference=config.reference,
+            exposure=gain,
         )
         parts.append(pair_views(sequence, observation.layers, left, synthetic=degraded is perturbed))
     return Pairs.concatenated(parts)
@@ -298,7 +303,12 @@ def synthetic_pairs(scene: Scene, sequence: EndoscopicSequence, config: EnhanceC
         views = views.of_scene(crude)
         gain = everything.exposure[torch.from_numpy(targets)]
         observation = observe_views(
-            crude, views, sequence.cameras[train[targets]], count=config.references, exposure=gain
+            crude,
+            views,
+            sequence.cameras[train[targets]],
+            count=config.references,
+            reference=config.reference,
+            exposure=gain,
         )
         parts.append(pair_views(sequence, observation.layers, train[targets], synthetic=True))
         remaining -= count

@@ -109,6 +109,20 @@ class TestViewPairs:
         _, from_behind = rendered_pairs(scene, back, **SEEN)
         assert from_behind[0, -1] != 0
 
+    def test_by_the_frustum_a_hidden_gaussian_counts_as_well(self):
+        x, y = (a.ravel() for a in np.meshgrid(np.linspace(-4, 4, 15), np.linspace(-4, 4, 15)))
+        wall = np.stack([x, y, np.full_like(x, 5.0)], axis=1)
+        # Behind the wall, behind the camera, beside the image.
+        scene = scene_of_points(np.concatenate([wall, [[0.0, 0, 9], [0, 0, -5], [30, 0, 5]]]))
+        _, hidden = rendered_pairs(scene, square_camera(), **SEEN)
+        _, found = rendered_pairs(scene, square_camera(), **SEEN, visibility="frustum")
+        assert (hidden[0, -3:] > 0).tolist() == [False, False, False]
+        assert (found[0, -3:] > 0).tolist() == [True, False, False]
+        np.testing.assert_array_equal(found[0, :-3], hidden[0, :-3])
+        np.testing.assert_array_equal(
+            training_coverage(scene, square_camera(), **SEEN, visibility="frustum"), found[0]
+        )
+
     def test_the_direction_points_from_the_gaussian_to_the_camera(self):
         scene = scene_of_points(np.array([[0.0, 0.0, 5.0]]))
         _, seen = rendered_pairs(scene, square_camera(), **SEEN)

@@ -9,11 +9,12 @@ import pytest
 
 from extrags.cameras import rotation_angle_deg
 from extrags.errors import CaptureError, ShapeError
-from extrags.exploration.coverage import coverage_gain, rendered_pairs, training_coverage
+from extrags.exploration.coverage import PairValue, coverage_gain, rendered_pairs, training_coverage
 from extrags.exploration.darkness import luminance
-from extrags.exploration.primitives import apply_primitives, primitive_motions
-from extrags.exploration.score import fold_weight
-from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
+from extrags.exploration.primitives import PRIMITIVES, apply_primitives, primitive_motions
+from extrags.exploration.score import fold_weight, net_turn_deg
+from extrags.exploration.search import Branch, SearchContext, grow_branch, known_coverage, prepare_search
+from extrags.exploration.waves import WaveState
 from extrags.freespace import FREE, OCCUPIED, FreeSpace
 from extrags.scene import Scene
 
@@ -33,17 +34,51 @@ def context(**changes: object) -> SearchContext:
 
 @cache
 def known() -> np.ndarray:
-    tube = small_tube()
-    return training_coverage(tube.scene, tube.cameras.resized(32, 24), **SEEN)
+    return known_coverage(context(), small_tube().cameras)
 
 
 def branch_of(ready: SearchContext) -> Branch:
-    return grow_branch(ready, small_tube().cameras.world_from_camera[START], known(), START)
+    coverage = known_coverage(ready, small_tube().cameras)
+    return grow_branch(ready, small_tube().cameras.world_from_camera[START], coverage, START)
 
 
 @cache
 def branch(**changes: object) -> Branch:
     return branch_of(context(**changes))
+
+
+def disc_context(**changes: object) -> tuple[SearchContext, np.ndarray]:
+    """A disc that hardly fills the view, seen from a place too small to leave; and the four turns there.
+
+    One turn to any side is allowed, a second one sees too little. So each of the four turns is a dead end.
+    """
+    x, y = (a.ravel() for a in np.meshgrid(np.linspace(-9, 9, 25), np.linspace(-9, 9, 25)))
+    points = np.stack([x, y, np.full_like(x, 10.0)], axis=1)[np.hypot(x, y) <= 9]
+    scene = scene_of_points(points)
+    turns = apply_primitives(np.eye(4), primitive_motions(1.2, 15.0, 15.0, 10.0))[6:10]
+    seen = [
+        float((scene.render(square_camera(pose)).alpha >= 0.5).float().mean())
+        for pose in (*turns, *(turns[i] @ turns[j] for i in range(4) for j in range(4) if i != j ^ 1))
+    ]
+    assert min(seen[:4]) > max(seen[4:])
+    settings = {
+        "length": 9,
+        "max_expansions": 99,
+        "step_share": 0.12,
+        "safety_share": 0.01,
+        "rotation_deg": 15.0,
+        "orbit_deg": 15.0,
+        "hole_weight": 0.0,
+        "max_hole_share": 1 - (min(seen[:4]) + max(seen[4:])) / 2,
+    }
+    return prepare_search(scene, square_camera(), small_room(), small_config(**settings | changes)), turns
+
+
+def small_room() -> FreeSpace:
+    """A millimetre of free space to each side of the origin."""
+    occupancy = np.full((8, 8, 8), OCCUPIED, np.uint8)
+    occupancy[3:5, 3:5, 3:5] = FREE
+    return FreeSpace(occupancy, np.full(3, -4.0), np.eye(3), 1.0, np.ones((8, 8, 8), np.float32))
 
 
 class TestGrowBranch:
@@ -57,17 +92,31 @@ class TestGrowBranch:
 
     def test_its_gains_are_what_its_views_add(self):
         found, ready = branch(), context()
-        covered = known().copy()
+        n = len(ready.scene.gaussians)
+        covered = known()[:n].copy()
         for pose, gain in zip(found.poses[1:], found.gains, strict=True):
             _, pairs = rendered_pairs(ready.scene, ready.scoring_cameras(pose[None]), **SEEN)
             assert coverage_gain(covered, pairs[0]) == gain
             covered |= pairs[0]
-        assert coverage_gain(known(), found.pairs) == sum(found.gains) > 0
+        assert coverage_gain(known()[:n], found.pairs[:n]) == sum(found.gains) > 0
+        assert ready.value.gain(known(), found.pairs) == pytest.approx(sum(found.values))
+
+    def test_without_holes_the_value_is_the_gain(self):
+        ready = context(hole_weight=0.0)
+        assert ready.value == PairValue(len(ready.scene.gaussians), 0.0)
+        found = branch(hole_weight=0.0)
+        assert found.values == found.gains
+        np.testing.assert_array_equal(
+            known_coverage(ready, small_tube().cameras),
+            training_coverage(ready.scene, small_tube().cameras.resized(32, 24), **SEEN),
+        )
 
     def test_the_first_move_is_the_best_of_all(self):
-        # With neither light nor folds the score is the gain alone.
-        plain = branch(darkness_weight=0.0, fold_angle_deg=179.0)
-        assert plain.gains[0] >= branch().gains[0]
+        # With neither light nor folds the score is the value alone.
+        plain = branch(darkness_weight=0.0, fold_penalty=1.0)
+        assert plain.values[0] >= branch().values[0]
+        paper = branch(darkness_weight=0.0, fold_penalty=1.0, hole_weight=0.0)
+        assert paper.gains[0] >= plain.gains[0]
 
     def test_stays_in_free_space_with_its_margin(self):
         space, ready = small_freespace(), context()
@@ -117,42 +166,16 @@ class TestGrowBranch:
         np.testing.assert_array_equal(found.poses, branch().poses)
 
     def test_a_dead_end_resumes_from_the_queue(self):
-        # A disc that hardly fills the view, seen from a place too small to leave: one turn to any side
-        # is allowed, a second one sees too little. So each of the four turns is a dead end.
-        x, y = (a.ravel() for a in np.meshgrid(np.linspace(-9, 9, 25), np.linspace(-9, 9, 25)))
-        points = np.stack([x, y, np.full_like(x, 10.0)], axis=1)[np.hypot(x, y) <= 9]
-        scene = scene_of_points(points)
-        occupancy = np.full((8, 8, 8), OCCUPIED, np.uint8)
-        occupancy[3:5, 3:5, 3:5] = FREE
-        space = FreeSpace(occupancy, np.full(3, -4.0), np.eye(3), 1.0, np.ones((8, 8, 8), np.float32))
-        turns = apply_primitives(np.eye(4), primitive_motions(1.2, 15.0, 15.0, 10.0))[6:10]
-        seen = [
-            float((scene.render(square_camera(pose)).alpha >= 0.5).float().mean())
-            for pose in (*turns, *(turns[i] @ turns[j] for i in range(4) for j in range(4) if i != j ^ 1))
-        ]
-        assert min(seen[:4]) > max(seen[4:])
-        ready = prepare_search(
-            scene,
-            square_camera(),
-            space,
-            small_config(
-                length=9,
-                max_expansions=99,
-                step_share=0.12,
-                safety_share=0.01,
-                rotation_deg=15.0,
-                orbit_deg=15.0,
-                max_hole_share=1 - (min(seen[:4]) + max(seen[4:])) / 2,
-            ),
-        )
-        found = grow_branch(ready, np.eye(4), np.zeros(len(points), np.uint32))
+        ready, turns = disc_context()
+        n = len(ready.scene.gaussians)
+        found = grow_branch(ready, np.eye(4), np.zeros(n, np.uint32))
         assert found.reason == "no further move is possible after 2 views"
         assert found.expansions == 5
         assert found.moves[0].startswith("turn")
         # The best of the four dead ends is kept.
-        alone = [rendered_pairs(scene, ready.scoring_cameras(pose[None]), **SEEN)[1] for pose in turns]
+        alone = [rendered_pairs(ready.scene, ready.scoring_cameras(pose[None]), **SEEN)[1] for pose in turns]
         start = found.pairs & 0
-        start |= rendered_pairs(scene, ready.scoring_cameras(np.eye(4)[None]), **SEEN)[1][0]
+        start |= rendered_pairs(ready.scene, ready.scoring_cameras(np.eye(4)[None]), **SEEN)[1][0]
         assert found.gains[0] == max(int(coverage_gain(start, pairs[0])) for pairs in alone)
 
     def test_a_spent_budget_keeps_the_best_path(self):
@@ -174,12 +197,53 @@ class TestGrowBranch:
         loaded = Branch.load(tmp_path / "branch")
         np.testing.assert_array_equal(loaded.poses, found.poses)
         np.testing.assert_array_equal(loaded.pairs, found.pairs)
-        for name in ("anchor", "moves", "gains", "expansions", "renders", "reason"):
+        for name in ("anchor", "moves", "gains", "values", "expansions", "renders", "reason"):
             assert getattr(loaded, name) == getattr(found, name)
 
     def test_coverage_of_another_scene_is_refused(self):
-        with pytest.raises(ShapeError, match="coverage of 3 Gaussians"):
+        with pytest.raises(ShapeError, match="coverage of 3 rows"):
             grow_branch(context(), np.eye(4), np.zeros(3, np.uint32))
+
+
+class TestHoles:
+    def hole_alone(self) -> tuple[SearchContext, np.ndarray, np.ndarray]:
+        """A start turned to the open end of the tube, with every direction of every Gaussian known."""
+        ready, coverage = context(), known().copy()
+        coverage[: len(ready.scene.gaussians)] = np.uint32(0xFFFFFFFF)
+        return ready, small_tube().cameras.world_from_camera[3] @ np.diag([-1.0, 1, -1, 1]), coverage
+
+    def test_draw_the_search_where_no_gaussian_is_left_to_cover(self):
+        ready, start, coverage = self.hole_alone()
+        found = grow_branch(ready, start, coverage, START)
+        assert sum(found.gains) == 0
+        assert sum(found.values) > 0
+        state = WaveState(
+            coverage, coverage, ready.value, waiting=(START,), room=1, min_gain=1, wave=1
+        ).merged([found])
+        assert len(state.branches) == 1
+        # No training view has looked there: what the start itself sees counts as well.
+        assert state.values == (ready.value.gain(coverage, found.pairs),)
+        assert state.values[0] >= sum(found.values)
+        # Seen into once, a hole is worth nothing more from there.
+        assert ready.value.gain(state.coverage, found.pairs) == 0
+
+    def test_a_spent_budget_keeps_the_path_of_the_largest_value(self):
+        ready, start, coverage = self.hole_alone()
+        longer, shorter = (
+            grow_branch(replace(ready, config=small_config(length=16, max_expansions=count)), start, coverage)
+            for count in (6, 3)
+        )
+        assert sum(longer.values) >= sum(shorter.values) > 0
+
+    def test_a_view_without_any_surface_is_rejected(self):
+        # Turned by 90 degrees the camera sees nothing at all; the limit on holes alone would allow that.
+        scene = scene_of_points(np.stack(np.meshgrid([-1.0, 0, 1], [-1.0, 0, 1], [10.0]), -1).reshape(-1, 3))
+        ready = prepare_search(
+            scene, square_camera(), small_room(), small_config(max_hole_share=1.0, rotation_deg=90.0)
+        )
+        found = grow_branch(ready, np.eye(4), known_coverage(ready, square_camera()))
+        images = scene.render(ready.scoring_cameras(found.poses)).alpha.numpy()
+        assert (images >= 0.5).any(axis=(1, 2)).all()
 
 
 class TestPrepareSearch:
@@ -207,26 +271,52 @@ class TestPrepareSearch:
             prepare_search(tube.scene, cameras, small_freespace(), small_config())
 
 
+class TestTopCandidates:
+    @pytest.mark.parametrize(("kept", "expansions"), [(1, 2), (3, 4), (14, 5)])
+    def test_bounds_what_the_queue_holds(self, kept, expansions):
+        # Four turns are possible at the start and each is a dead end: every one kept is expanded once.
+        ready, _ = disc_context(top_candidates=kept)
+        found = grow_branch(ready, np.eye(4), np.zeros(len(ready.scene.gaussians), np.uint32))
+        assert found.expansions == expansions
+
+
 class TestFoldWeight:
-    def test_fires_on_the_third_turn_in_a_row(self):
+    def test_fires_above_the_angle(self):
         config = small_config()
-        assert fold_weight(np.array([10.0]), config) == 1.0
-        assert fold_weight(np.array([10.0, 10.0]), config) == 1.0
-        assert fold_weight(np.array([10.0, 10.0, 10.0]), config) == 0.6
-        assert fold_weight(np.array([10.0, 0.0, 10.0]), config) == 1.0
+        np.testing.assert_array_equal(fold_weight(np.array([0.0, 20.0, 25.0, 26.0]), config), [1, 1, 1, 0.6])
+        np.testing.assert_array_equal(fold_weight(np.array([20.0, 26.0]), small_config(fold_penalty=1)), 1)
+
+    @pytest.mark.parametrize(
+        ("moves", "steps", "turned_deg"),
+        [
+            ("turn_right", 3, 20),
+            ("turn_right turn_right", 3, 40),
+            ("turn_right turn_left", 3, 0),
+            ("turn_right move_forward turn_left", 3, 0),
+            ("orbit_up move_left turn_up turn_up", 3, 40),
+            ("turn_right turn_right turn_right", 1, 20),
+            ("turn_right turn_right turn_right", 9, 60),
+        ],
+    )
+    def test_counts_the_net_rotation(self, moves, steps, turned_deg):
+        motions = primitive_motions(1.0, 20.0, 20.0, 10.0)
+        path = [small_tube().cameras.world_from_camera[START]]
+        for move in moves.split():
+            path.append(apply_primitives(path[-1], motions)[PRIMITIVES.index(move)])
+        found = net_turn_deg(np.stack(path[:-1]), path[-1][None], steps)
+        assert found.tolist() == pytest.approx([turned_deg], abs=1e-5)
 
     def test_changes_what_the_search_does(self):
         tube, covered = small_tube(), known()
 
-        def most_turns(**changes: object) -> int:
-            ready = context(length=12, max_expansions=12, **changes)
-            runs = 0
+        def most_turned(**changes: object) -> float:
+            ready = context(length=8, max_expansions=8, rotation_deg=20.0, orbit_deg=20.0, **changes)
+            turned = []
             for start in (0, 5):
-                moves = grow_branch(ready, tube.cameras.world_from_camera[start], covered, start).moves
-                still = [move.startswith("move") for move in moves]
-                runs += sum(not any(still[i : i + 3]) for i in range(len(still) - 2))
-            return runs
+                poses = grow_branch(ready, tube.cameras.world_from_camera[start], covered, start).poses
+                turned += [net_turn_deg(poses[:t], poses[[t]], 3)[0] for t in range(1, len(poses))]
+            return float(np.mean(np.array(turned) > 25.0))
 
-        free, held = most_turns(fold_angle_deg=179.0), most_turns(fold_penalty=0.05)
+        free, held = most_turned(fold_penalty=1.0), most_turned(fold_penalty=0.05)
         assert free > 0
         assert held < free

@@ -14,8 +14,14 @@ from hypothesis import strategies as st
 from extrags.cameras import Cameras
 from extrags.errors import ConfigError
 from extrags.exploration import Exploration, WaveState, explore, merge_wave, start_views
-from extrags.exploration.coverage import count_pairs, coverage_gain, rendered_pairs, training_coverage
-from extrags.exploration.search import Branch
+from extrags.exploration.coverage import (
+    PairValue,
+    count_pairs,
+    coverage_gain,
+    rendered_pairs,
+    training_coverage,
+)
+from extrags.exploration.search import Branch, grow_branch, prepare_search
 
 from .tube import SEEN, make_tube, small_config, small_freespace, small_tube
 
@@ -26,6 +32,7 @@ def made_branch(anchor: int, pairs: np.ndarray, length: int = 3) -> Branch:
         np.stack([np.eye(4)] * length),
         ("move_right",) * (length - 1),
         (1,) * (length - 1),
+        (1.0,) * (length - 1),
         pairs,
         1,
         1,
@@ -35,7 +42,7 @@ def made_branch(anchor: int, pairs: np.ndarray, length: int = 3) -> Branch:
 
 def made_state(**changes: object) -> WaveState:
     nothing = np.zeros(6, np.uint32)
-    state = WaveState(nothing, nothing, waiting=(0, 1, 2, 3), room=4, min_gain=2, wave=2)
+    state = WaveState(nothing, nothing, PairValue(4, 2.5), waiting=(0, 1, 2, 3), room=4, min_gain=2, wave=2)
     return replace(state, **changes)
 
 
@@ -74,26 +81,41 @@ class TestStartViews:
 
 class TestMergeWave:
     @settings(max_examples=40, deadline=None)
-    @given(seed=st.integers(0, 10_000), room=st.integers(0, 6), min_gain=st.integers(1, 120))
-    def test_accepts_greedily_by_marginal_gain(self, seed, room, min_gain):
+    @given(
+        seed=st.integers(0, 10_000),
+        room=st.integers(0, 6),
+        min_gain=st.integers(1, 120),
+        frontier_pair=st.sampled_from([0.0, 0.5, 1.0, 7.5]),
+    )
+    def test_accepts_greedily_by_marginal_value(self, seed, room, min_gain, frontier_pair):
+        # Five Gaussians and three frontier voxels.
+        def value(covered, pairs):
+            new = pairs & ~covered
+            return count_pairs(new[:5]) + frontier_pair * count_pairs(new[5:])
+
         rng = np.random.default_rng(seed)
         words = rng.integers(0, 2**32, (6, 8), dtype=np.uint32)
         words &= rng.integers(0, 2**32, (6, 8), dtype=np.uint32)
         covered = words[0] & words[1]
         merge = merge_wave(
-            covered, [made_branch(i, w) for i, w in enumerate(words)], min_gain=min_gain, room=room
+            covered,
+            [made_branch(i, w) for i, w in enumerate(words)],
+            PairValue(5, frontier_pair),
+            min_gain=min_gain,
+            room=room,
         )
         assert len(merge.accepted) <= room
-        assert list(merge.gains) == sorted(merge.gains, reverse=True)
+        assert list(merge.values) == sorted(merge.values, reverse=True)
         check = covered.copy()
-        for index, gain in zip(merge.accepted, merge.gains, strict=True):
-            left = [coverage_gain(check, words[i]) for i in range(6)]
-            assert coverage_gain(check, words[index]) == gain == max(left) >= min_gain
+        for index, gain, worth in zip(merge.accepted, merge.gains, merge.values, strict=True):
+            left = [value(check, words[i]) for i in range(6)]
+            assert value(check, words[index]) == worth == max(left) >= min_gain
+            assert coverage_gain(check[:5], words[index][:5]) == gain
             check |= words[index]
         np.testing.assert_array_equal(check, merge.coverage)
         if len(merge.accepted) < room:
             rest = [i for i in range(6) if i not in merge.accepted]
-            assert all(coverage_gain(check, words[i]) < min_gain for i in rest)
+            assert all(value(check, words[i]) < min_gain for i in rest)
 
     def test_greedy_keeps_its_bound(self):
         rng = np.random.default_rng(5)
@@ -101,7 +123,9 @@ class TestMergeWave:
             0, 2**32, (7, 4), dtype=np.uint32
         )
         nothing = np.zeros(4, np.uint32)
-        merge = merge_wave(nothing, [made_branch(i, w) for i, w in enumerate(words)], min_gain=1, room=3)
+        merge = merge_wave(
+            nothing, [made_branch(i, w) for i, w in enumerate(words)], PairValue(4), min_gain=1, room=3
+        )
         best = max(
             int(count_pairs(words[a] | words[b] | words[c]))
             for a, b, c in itertools.combinations(range(7), 3)
@@ -110,7 +134,11 @@ class TestMergeWave:
 
     def test_a_branch_that_never_left_its_start_is_not_accepted(self):
         merge = merge_wave(
-            np.zeros(2, np.uint32), [made_branch(0, np.full(2, 255, np.uint32), length=1)], min_gain=1, room=3
+            np.zeros(2, np.uint32),
+            [made_branch(0, np.full(2, 255, np.uint32), length=1)],
+            PairValue(2),
+            min_gain=1,
+            room=3,
         )
         assert merge.accepted == ()
 
@@ -134,6 +162,14 @@ class TestWaveState:
         assert state.waiting == (2, 3, 0, 1)
         assert "adds 0 pairs (3 alone)" in state.rejected[0]
 
+    def test_a_trajectory_into_a_hole_is_accepted(self):
+        # Rows 4 and 5 are frontier voxels: this branch covers no Gaussian anew.
+        into = np.array([0, 0, 0, 0, 3, 1], np.uint32)
+        state = made_state().merged([made_branch(0, into), made_branch(1, into)])
+        assert state.gains == (0,)
+        assert state.values == (7.5,)
+        assert "from view 1: adds 0 pairs (8 alone)" in state.rejected[0]
+
     def test_ends_when_there_is_no_room(self):
         full = np.array([7, 0, 0, 0, 0, 0], np.uint32)
         state = made_state(room=1).merged([made_branch(0, full), made_branch(1, full << 3)])
@@ -151,7 +187,7 @@ class TestWaveState:
         loaded = WaveState.load(tmp_path / "state")
         np.testing.assert_array_equal(loaded.coverage, state.coverage)
         np.testing.assert_array_equal(loaded.branches[0].pairs, state.branches[0].pairs)
-        for name in ("waiting", "room", "min_gain", "wave", "gains", "rejected", "waves", "renders"):
+        for name in ("value", "waiting", "room", "min_gain", "wave", "gains", "values", "rejected", "waves"):
             assert getattr(loaded, name) == getattr(state, name)
 
 
@@ -161,6 +197,23 @@ def explored(**changes: object) -> Exploration:
     return explore(tube.scene, tube.sequence, small_config(**changes), freespace=small_freespace())
 
 
+class TestOneAtATime:
+    def test_each_trajectory_sees_the_coverage_of_all_before_it(self):
+        # The paper's shared map: updated by finished trajectories, before the next one starts.
+        tube = small_tube()
+        config = small_config(wave=1, hole_weight=0.0, trajectories=3, min_gain_share=0.0)
+        context = prepare_search(tube.scene, tube.cameras, small_freespace(), config)
+        coverage = training_coverage(tube.scene, tube.cameras.resized(32, 24), **SEEN)
+        poses = []
+        for anchor in start_views(tube.cameras, 3, context.depth_unit_mm):
+            found = grow_branch(context, tube.cameras.world_from_camera[anchor], coverage)
+            coverage = coverage | found.pairs
+            poses.append(found.poses)
+        found = explored(wave=1, hole_weight=0.0, trajectories=3, min_gain_share=0.0)
+        np.testing.assert_array_equal(found.cameras.world_from_camera, np.concatenate(poses))
+        np.testing.assert_array_equal(found.coverage_after, coverage)
+
+
 class TestExplore:
     def test_adds_coverage_and_counts_it_right(self):
         found = explored()
@@ -168,6 +221,7 @@ class TestExplore:
         assert found.gain_share > 0.01
         assert found.gain_share == pytest.approx(found.coverage_share_after - found.coverage_share_before)
         assert found.gains.sum() == round(found.gain_share * found.n_pairs)
+        assert (found.values >= found.gains).all()
         assert found.cameras.width == small_tube().sequence.width
         assert found.n_virtual == sum(len(views) - 1 for views in found.trajectories)
         for views, anchor in zip(found.trajectories, found.anchors, strict=True):

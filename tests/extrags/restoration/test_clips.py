@@ -10,14 +10,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import TypeCheckError
 
-from extrags.confidence import PerceptualDifference, pixel_confidence
+from extrags.cameras import pose_distances
+from extrags.confidence import PerceptualDifference, image_confidence, pixel_confidence
 from extrags.config import EnhanceConfig
-from extrags.errors import ConfigError, ShapeError
+from extrags.errors import ShapeError
 from extrags.metrics.lpips import Lpips
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.classical import ClassicalEnhancer
-from extrags.restoration.clips import choose_views, keep_known, make_pseudo_observations
+from extrags.restoration.clips import choose_views, keep_known, make_pseudo_observations, render_clips
 from extrags.restoration.trajectories import restore_batch
+from extrags.view_synthesis.conditioning import observe_views
 from tests.extrags.lit_tube import Tube, tube_cameras
 
 
@@ -48,6 +50,21 @@ class TestPseudoObservations:
             assert values.max() <= 1
         assert pseudo.depth_mm.min() > 0
         assert 0 < pseudo.changed_share < 1
+
+    def test_the_image_weight_compares_with_the_nearest_view(self, tube: Tube) -> None:
+        cameras = tube_cameras(3, offset_mm=6.0, turn=0.8)
+        scale = tube.references.transfer.scale_mm
+        nearest = pose_distances(cameras, tube.references.cameras, scale).argmin(axis=1)
+        named = observe_views(tube.scene, tube.references, cameras, count=4, reference="nearest")
+        np.testing.assert_array_equal(named.reference, nearest)
+        for iou in ("reference", "union"):
+            (clip,) = render_clips(
+                tube.scene, tube.references, [cameras], count=4, reference="nearest", iou=iou
+            )
+            np.testing.assert_array_equal(clip.reference, nearest)
+            expected = image_confidence(named.seen, tube.references.seen[nearest], iou)
+            np.testing.assert_allclose(clip.image_confidence, expected)
+        assert (image_confidence(named.seen, tube.references.seen[nearest]) < expected).all()
 
     def test_holes_take_the_restored_colour(self, pseudo: PseudoViews) -> None:
         hole = pseudo.alpha < 0.05
@@ -160,6 +177,7 @@ class TestChooseViews:
     def test_all_views_fit(self) -> None:
         assert [v.tolist() for v in choose_views([4, 3], 100)] == [[1, 2, 3], [1, 2]]
 
-    def test_less_than_one_view_each_is_refused(self) -> None:
-        with pytest.raises(ConfigError, match="max_views"):
-            choose_views([5, 5, 5], 2)
+    def test_fewer_views_than_trajectories_keep_the_ends_of_the_first(self) -> None:
+        assert [v.tolist() for v in choose_views([5, 4, 6], 2)] == [[4], [3], []]
+        # A batch would fail without any view: there is none for the third trajectory.
+        assert EnhanceConfig(max_views=2, clips_per_batch=1).batches(3) == 2

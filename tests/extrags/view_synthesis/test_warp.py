@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.cameras import pixel_rays
+from extrags.cameras import pixel_rays, pose_distances
 from extrags.view_synthesis.references import LightTransfer
 from extrags.view_synthesis.warp import covisibility, depth_normals, fit_falloff_exponent, warp_references
 from tests.extrags.lit_tube import cast_tube, exact_references, tube_cameras, tube_light
@@ -32,6 +32,21 @@ def test_compensated_warp_reproduces_an_exactly_lit_scene() -> None:
     assert _error(warped, target) < 5e-3
     near = (warped.nearest_weight > 0.5).expand_as(target)
     assert (warped.nearest - target).abs()[near].mean() < 5e-3
+
+
+def test_the_nearest_reference_comes_first_on_request() -> None:
+    light, cameras, _, depth = _target()
+    references = exact_references(tube_cameras(8), light)
+    # Of what the nearest view shows nothing is known: no co-visibility would choose it.
+    nearest = pose_distances(cameras, references.cameras, references.transfer.scale_mm).argmin(axis=1)
+    references.packed[nearest, 3] = 0
+    best = warp_references(references, cameras, depth, count=4)
+    named = warp_references(references, cameras, depth, count=4, reference="nearest")
+    assert not (best.reference.numpy() == nearest).any()
+    np.testing.assert_array_equal(named.reference, nearest)
+    np.testing.assert_array_equal(named.chosen[:, 1:], best.chosen[:, :3])
+    assert named.nearest_weight.max() == 0
+    assert best.nearest_weight.max() > 0.5
 
 
 def test_without_compensation_it_does_not() -> None:
