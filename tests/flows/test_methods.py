@@ -9,11 +9,13 @@ import pytest
 from extrags.config import PROFILES, CoarseConfig, PipelineConfig
 from extrags.config.settings import settings_of
 from extrags.errors import ConfigError
+from flows.benchmark import check_methods
 from flows.methods import (
     METHODS,
     THREE_DGS_SHARED,
     MethodName,
     check_not_pinned,
+    gaussian_pancakes,
     method_config,
     profile_label,
     three_dgs,
@@ -57,6 +59,43 @@ def test_the_baseline_is_plain() -> None:
     assert set(METHODS["3dgs"].leave_out) >= {"explore", "enhance", "finetune"}
 
 
+def test_gaussian_pancakes_is_the_baseline_with_two_terms() -> None:
+    plain, pancakes = three_dgs(PipelineConfig()), gaussian_pancakes(PipelineConfig())
+    changed = {name.removeprefix("coarse.") for name in pancakes if pancakes[name] != plain.get(name)}
+    assert changed == {
+        "densify.stop_share",
+        "depth_loss",
+        "depth_weight",
+        "depth_weight_final_share",
+        "depth_huber_delta",
+        "normal_weight",
+        "normal_start_share",
+        "normal_every",
+    }
+    assert set(plain) <= set(pancakes)
+    config = method_config("gaussian-pancakes", "paper").coarse
+    assert config.normal_start_share * config.iterations == pytest.approx(1000)
+    assert config.densify.start_share * config.iterations == pytest.approx(500)
+    assert config.densify.stop_share * config.iterations == pytest.approx(4000)
+    assert (config.depth_weight, config.normal_weight) == (0.2, 0.2)
+
+
+def test_the_oracle_alone_trains_on_held_out_frames() -> None:
+    for method in METHODS:
+        config = method_config(method, "quick")
+        assert config.coarse.train_on == ("all" if method == "oracle" else "train")
+        # Neither openly nor by a variant or an override for all methods.
+        other = "train" if method == "oracle" else "all"
+        with pytest.raises(ConfigError, match=r"sets coarse\.train_on itself"):
+            check_not_pinned(method, {"coarse.train_on": other})
+        with pytest.raises(ConfigError, match=r"sets coarse\.train_on itself"):
+            method_config(method, "quick", {"coarse.train_on": other})
+    with pytest.raises(ConfigError, match=r"variant seen: coarse\.train_on cannot be changed"):
+        check_methods(["coarse"], {"seen": {"coarse.train_on": "all"}})
+    oracle, ours = method_config("oracle", "balanced"), method_config("coarse", "balanced")
+    assert oracle.with_overrides({"coarse.train_on": "train"}) == ours
+
+
 def test_overrides_and_seeds_reach_what_is_open_only() -> None:
     config = method_config("3dgs", "quick", {"coarse.iterations": 600, "coarse.sh_degree": 0}, 4)
     assert (config.coarse.iterations, config.coarse.seed) == (600, 4)
@@ -77,3 +116,4 @@ def test_an_override_of_a_pinned_setting_is_refused_where_both_are_named() -> No
 def test_pages_name_the_method() -> None:
     assert profile_label("quick", "extrags") == "quick"
     assert profile_label("quick", "3dgs") == "quick, method 3dgs"
+    assert profile_label("quick", "oracle") == "quick, oracle: held-out frames were trained on"
