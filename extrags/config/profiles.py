@@ -10,6 +10,7 @@ from extrags.config.stages import (
     DensifyConfig,
     ExploreConfig,
     FinetuneConfig,
+    IngestConfig,
     OptimiserConfig,
     PipelineConfig,
 )
@@ -48,8 +49,9 @@ PROFILES: dict[str, PipelineConfig] = {
         explore=ExploreConfig(rotation_deg=20.0, orbit_deg=20.0),
         finetune=FinetuneConfig(iterations=4000),
     ),
-    # The paper's counts.
+    # The paper's counts, at the full size of the source's frames.
     "paper": PipelineConfig(
+        ingest=IngestConfig(downscale=1),
         coarse=CoarseConfig(
             iterations=30_000,
             max_points=60_000,
@@ -64,7 +66,7 @@ PROFILES: dict[str, PipelineConfig] = {
             max_views=320,
             samples=4,
         ),
-        finetune=FinetuneConfig(iterations=15_000),
+        finetune=FinetuneConfig(iterations=15_000, densify_share=0.6),
         explore=ExploreConfig(render_width=160, max_expansions=200),
     ),
 }

@@ -165,7 +165,7 @@ class TestExport:
     ) -> None:
         """The source has poses; those that the run has refined are written, not the source's."""
         store, target = str(tmp_path / "store"), tmp_path / "scene"
-        refining = {**TINY, "coarse.refine_poses": True, "coarse.iterations": 40}
+        refining = {**TINY, "ingest.max_frames": 8, "coarse.refine_poses": True}
         arguments = [
             "export", SEQUENCE, "--to", to, "--out", str(target), "--profile", "quick", "--store", store,
             *(part for name, value in refining.items() for part in ("--set", f"{name}={json.dumps(value)}")),
@@ -178,6 +178,14 @@ class TestExport:
         given = read(SEQUENCE, config.ingest)
         used = Store(store).load(EndoscopicSequence, outcome.refs["sequence"])
         written = read(target)
-        np.testing.assert_allclose(written.world_from_camera, used.world_from_camera, atol=1e-10)
         np.testing.assert_allclose(written.K, used.K, atol=1e-10)
-        assert np.abs(used.world_from_camera - given.world_from_camera).max() > 1e-5  # type: ignore[operator]
+
+        def differences(frames: EndoscopicSequence) -> np.ndarray:
+            """To the nearest pose written; names give frames another order."""
+            there, own = written.world_from_camera, frames.world_from_camera
+            assert there is not None
+            assert own is not None
+            return np.asarray(np.abs(there[None] - own[:, None]).max(axis=(2, 3)).min(axis=1))
+
+        assert differences(used).max() < 1e-9
+        assert differences(given)[given.train].min() > 1e-5
