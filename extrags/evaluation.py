@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import torch
 from jaxtyping import Int
@@ -18,7 +20,11 @@ __all__ = ["evaluate", "evaluate_renders", "render"]
 
 
 def render(
-    scene: Scene, sequence: EndoscopicSequence, frames: Int[np.ndarray, "v"] | None = None
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    frames: Int[np.ndarray, "v"] | None = None,
+    *,
+    train_on: Literal["train", "all"] = "train",
 ) -> RenderedViews:
     """Render frames of a sequence by the rules of the evaluation protocol.
 
@@ -29,6 +35,9 @@ def render(
         scene: the scene.
         sequence: posed frames in the scene's world.
         frames: indices of the frames; None takes the held-out ones.
+        train_on: which frames the scene was made from (`coarse.train_on`). The oracle's scene was made from
+            all of them, so that its held-out frames are at the exposures it has learned for them: the
+            ceiling is one of geometry, colour and exposure together.
 
     Returns:
         Colour, alpha and expected z-depth of each view, at the size of the sequence.
@@ -36,7 +45,8 @@ def render(
     frames = np.asarray(sequence.test if frames is None else frames)
     gains = None
     if scene.light is not None:
-        gains = scene.light.interpolated_exposures(frames, sequence.train, sequence.recording)
+        trained = sequence.train if train_on == "train" else np.arange(len(sequence))
+        gains = scene.light.interpolated_exposures(frames, trained, sequence.recording)
     rgb, alpha, depth = [], [], []
     with torch.no_grad():
         for done, frame in enumerate(frames, start=1):

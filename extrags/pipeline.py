@@ -14,7 +14,7 @@ from __future__ import annotations
 import logging
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
@@ -35,7 +35,17 @@ if TYPE_CHECKING:
     from extrags.surface import Mesh
     from extrags.training import TrainingResult
 
-__all__ = ["STAGES", "InMemoryPipeline", "Pipeline", "Result", "StageName", "check_stage", "run_pipeline"]
+__all__ = [
+    "HELD_OUT_TRAINED_ON",
+    "STAGES",
+    "InMemoryPipeline",
+    "Pipeline",
+    "Result",
+    "StageName",
+    "check_stage",
+    "needs_plan",
+    "run_pipeline",
+]
 
 log = logging.getLogger(__name__)
 
@@ -64,6 +74,12 @@ INDISPENSABLE: frozenset[StageName] = frozenset({"ingest", "coarse"})
 NEEDS: dict[StageName, StageName] = {"freespace": "surface", "explore": "freespace", "enhance": "explore"}
 """What a stage cannot do without, besides the indispensable ones; skipped with it."""
 
+HELD_OUT_TRAINED_ON = "oracle: held-out frames were trained on"
+"""Said wherever figures of such a scene are shown."""
+
+AFTER_COARSE: tuple[StageName, ...] = ("surface", "freespace", "explore", "enhance", "finetune")
+"""The stages that the plan decides on."""
+
 
 class Pipeline(ABC):
     """The stages of one sequence in their order, and the rules by which one is skipped.
@@ -75,7 +91,8 @@ class Pipeline(ABC):
         leave_out: stages to skip regardless of the plan, with the reason.
 
     Raises:
-        ConfigError: for a stage that does not exist, or that cannot be left out.
+        ConfigError: for a stage that does not exist, or that cannot be left out; for a reconstruction from
+            held-out frames (`coarse.train_on`) that a later stage or refined poses would rest on.
     """
 
     def __init__(self, config: PipelineConfig, leave_out: Mapping[str, str] | None = None) -> None:
@@ -87,6 +104,15 @@ class Pipeline(ABC):
             check_stage(stage)
             if stage in INDISPENSABLE:
                 raise ConfigError(f"the stage {stage} cannot be left out: everything rests on it")
+        if config.coarse.train_on == "all":
+            resting: list[str] = [stage for stage in AFTER_COARSE if stage not in self.leave_out]
+            resting += ["coarse.refine_poses"] if config.coarse.refine_poses else []
+            if resting:
+                raise ConfigError(
+                    "coarse.train_on is all: held-out frames are trained on, so nothing may rest on the "
+                    f"coarse scene but its evaluation, and {', '.join(resting)} would; the method oracle is "
+                    "such a run"
+                )
 
     def run_stages(self, until: StageName = "report") -> None:
         """Run all stages up to and including one.
@@ -109,6 +135,8 @@ class Pipeline(ABC):
         """Why a stage is skipped, or None if it runs; called after the stages before it have run."""
         if stage in self.leave_out:
             return self.leave_out[stage]
+        if stage == "assess" and not needs_plan(self.leave_out):
+            return "no stage of this run depends on the plan"
         planned = self.planned(stage)
         # Stages are left out to compare methods. The remaining stages then run regardless of the plan, so
         # that all methods are compared under the same conditions.
@@ -201,6 +229,15 @@ def check_stage(stage: str) -> None:
     """
     if stage not in STAGES:
         raise ConfigError(f"no stage {stage!r}; known: {', '.join(STAGES)}")
+
+
+def needs_plan(leave_out: Collection[str]) -> bool:
+    """Whether a run that leaves these stages out depends on the plan.
+
+    With any stage left out the plan skips none of the others (`Pipeline.reason_to_skip`). What it then still
+    sets are the budgets of exploration and of what follows it.
+    """
+    return not leave_out or not {"assess", "surface", "freespace", "explore"}.intersection(leave_out)
 
 
 @dataclass
@@ -316,7 +353,9 @@ class InMemoryPipeline(Pipeline):
 
         with self._timed("coarse"):
             self._training = self.result.sequence.training_part()
-            found = reconstruct(self._training, self.config.coarse)
+            # The oracle alone is shown held-out frames, and no later stage sees what it made.
+            oracle = self.config.coarse.train_on == "all"
+            found = reconstruct(self.result.sequence if oracle else self._training, self.config.coarse)
             if found.refined is not None:
                 # The scene was optimised with the corrected poses: later stages need them.
                 refined = with_refined_poses(self.result.sequence, found.refined.world_from_camera)
@@ -399,7 +438,7 @@ class InMemoryPipeline(Pipeline):
         sequence = self.result.sequence
         with self._timed("evaluate"):
             for which, scene in scenes.items():
-                self.result.renders[which] = render(scene, sequence)
+                self.result.renders[which] = render(scene, sequence, train_on=self.config.coarse.train_on)
                 self.result.evaluations[which] = evaluate_renders(
                     self.result.renders[which],
                     sequence,

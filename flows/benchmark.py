@@ -12,6 +12,7 @@ from pydantic import Field
 
 from extrags.config import ProfileName
 from extrags.errors import ConfigError
+from extrags.pipeline import HELD_OUT_TRAINED_ON
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
 from flows.pages import benchmark_page
@@ -124,7 +125,8 @@ def check_methods(
     """Check the names of methods, variants and baseline; returns the baseline.
 
     Raises:
-        ConfigError: for unknown methods, duplicate names, or a baseline that is not among the methods.
+        ConfigError: for unknown methods, duplicate names, a variant that would train on held-out frames, or
+            a baseline that is not among the methods.
     """
     for method in methods:
         if method not in METHODS:
@@ -139,6 +141,8 @@ def check_methods(
         base = changed.get("method", "coarse")
         if base not in METHODS:
             raise ConfigError(f"variant {name}: no method {base!r}; known: {', '.join(METHODS)}")
+        if "coarse.train_on" in changed:
+            raise ConfigError(f"variant {name}: coarse.train_on cannot be changed; see the method oracle")
     if baseline is None:
         return PREFERRED_BASELINE if PREFERRED_BASELINE in wanted else wanted[0]
     if baseline not in wanted:
@@ -189,7 +193,8 @@ def case_of(case: Case) -> dict[str, Any]:
     """A run as JSON.
 
     `seconds` is what its stages took when they were made, without evaluation and report; `peak_mib` the
-    largest resident memory of the process meanwhile; `evaluation` where the figures of each view are.
+    largest resident memory of the process meanwhile; `evaluation` where the figures of each view are;
+    `held_out_trained_on` is true of the oracle alone.
     """
     outcome = case.outcome
     rows = [row for row in outcome.stages if row.stage not in NOT_COUNTED]
@@ -207,6 +212,7 @@ def case_of(case: Case) -> dict[str, Any]:
         "peak_mib": max(peaks) if peaks else None,
         "metrics": outcome.metrics["final"] if failed is None else None,
         "evaluation": None if measured is None else f"{measured.uri}/{METRICS_FILE}",
+        "held_out_trained_on": any(row.reason == HELD_OUT_TRAINED_ON for row in rows),
         "error": "" if failed is None else f"{failed.stage}: {failed.reason}",
     }
 

@@ -12,22 +12,39 @@ from typing import Any, Literal
 
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
+from extrags.pipeline import HELD_OUT_TRAINED_ON
 from flows.settings import pipeline_config
 
 __all__ = [
     "METHODS",
+    "PAPER_SHARED",
     "THREE_DGS_SHARED",
     "Method",
     "MethodName",
     "check_not_pinned",
+    "gaussian_pancakes",
     "method_config",
+    "paper",
     "profile_label",
     "three_dgs",
 ]
 
-MethodName = Literal["extrags", "coarse", "3dgs", "classical", "real-only"]
+MethodName = Literal[
+    "extrags",
+    "paper",
+    "paper-no-illum-fold",
+    "exploregs",
+    "coarse",
+    "oracle",
+    "3dgs",
+    "gaussian-pancakes",
+    "classical",
+    "real-only",
+]
 
 EXPLORING = ("surface", "freespace", "explore", "enhance")
+
+PAPER_HAS_NO_PLAN = "the paper's pipeline runs every stage with its whole budget"
 
 SCHEDULE_ITERATIONS = 30_000
 """Iterations of the published 3DGS schedule; its other counts are kept as shares of it."""
@@ -51,6 +68,10 @@ THREE_DGS_SHARED = frozenset(
         "pose_refinement.start_share",
         "densify.opacity_penalty",
         "densify.scale_penalty",
+        "depth_loss",  # of a term whose weight is zero
+        "depth_huber_delta",
+        "normal_start_share",  # of a term whose weight is zero
+        "normal_every",
     }
 )
 """Settings of the coarse stage that the baseline takes from the profile, like every other method. A test
@@ -78,6 +99,8 @@ def three_dgs(config: PipelineConfig) -> dict[str, Any]:
         "coarse.sh_every": max(1, round(iterations * 1000 / SCHEDULE_ITERATIONS)),
         "coarse.dssim_weight": 0.2,
         "coarse.depth_weight": 0.0,
+        "coarse.normal_weight": 0.0,
+        "coarse.train_on": "train",
         "coarse.thickness": 1.0,
         "coarse.optimiser.means": 1.6e-4,
         "coarse.optimiser.means_final": 1.6e-6,
@@ -99,6 +122,131 @@ def three_dgs(config: PipelineConfig) -> dict[str, Any]:
         "coarse.light.enabled": False,
         "coarse.refine_poses": False,
     }
+
+
+def gaussian_pancakes(config: PipelineConfig) -> dict[str, Any]:
+    """Settings that make the coarse stage Gaussian Pancakes: plain 3DGS held to depth and surface normals.
+
+    To the photometric loss of `three_dgs` it adds 0.2 times a Huber loss of rendered depth and, from
+    1/30 of the iterations on and at every second one, 0.2 times 1 - |cos| between a Gaussian's shortest axis
+    and the normal of the nearest starting point. Densification ends at 4,000 of 30,000 iterations, from where
+    the set of Gaussians is fixed.
+
+    What differs from the published system, and why:
+
+    * The published one takes depth, poses and points from a SLAM system that is not available. Here
+      they are the sequence's, as for every method.
+    * Its Huber delta of 0.2 is in that system's units. Here it is 0.2 median depths
+      (`extrags.raster.loss.huber_depth_loss`), so that scenes in millimetres and in arbitrary units are
+      treated alike: an interpretation. Pixels without known depth or without a rendered surface are left out.
+    * Normals are those of planes through 12 neighbours of a starting point.
+    * Opacities are reset as in `three_dgs`: not at all by default, instead of every 3,000 iterations.
+
+    Source: Bonilla et al.: Gaussian Pancakes, MICCAI 2024, and its published defaults.
+    """
+    return {
+        **three_dgs(config),
+        "coarse.densify.stop_share": 4000 / SCHEDULE_ITERATIONS,
+        "coarse.depth_loss": "huber",
+        "coarse.depth_weight": 0.2,
+        "coarse.depth_weight_final_share": 1.0,
+        "coarse.depth_huber_delta": 0.2,
+        "coarse.normal_weight": 0.2,
+        "coarse.normal_start_share": 1000 / SCHEDULE_ITERATIONS,
+        "coarse.normal_every": 2,
+    }
+
+
+PAPER_SHARED = frozenset(
+    {
+        # Budgets.
+        "explore.trajectories",
+        "explore.length",
+        "explore.render_width",
+        "finetune.iterations",
+        "finetune.growth",
+        # The published code gives lengths by other rules, in units of its grid.
+        "explore.step_share",
+        "explore.safety_share",
+        "explore.max_hole_share",
+        "explore.visible_weight",
+        "finetune.seed",
+    }
+)
+"""Settings of exploration and fine-tuning that `paper` takes from the profile. A test checks that each one is
+either listed here or pinned."""
+
+
+def paper(config: PipelineConfig) -> dict[str, Any]:
+    """Settings that make the pipeline the paper's; docs/paper.md lists where it still differs, and why.
+
+    Numbers that the paper does not give are those of its published code. Budgets are the profile's:
+    those of profile `paper` are the paper's own.
+
+    Source: [ExtraGS, eq. 3] (coarse scene), [ExtraGS, eq. 7 to 16] (exploration) and [ExtraGS, eq. 17 to 25]
+    (restoration and fine-tuning).
+    """
+    return {
+        **three_dgs(config),
+        "freespace.top_views": 3,
+        "freespace.occupied_below": 0.5,
+        "explore.directions": 32,
+        "explore.visibility": "blending",
+        "explore.rotation_deg": 10.0,
+        "explore.orbit_deg": 10.0,
+        "explore.hole_weight": 0.0,
+        "explore.darkness_weight": 0.5,
+        "explore.fold_steps": 1,
+        "explore.fold_angle_deg": 20.0,
+        "explore.fold_penalty": 0.6,
+        "explore.top_candidates": 3,
+        "explore.wave": 1,
+        "explore.min_gain_share": 0.0,
+        "explore.max_saturated_share": 1.0,
+        "explore.max_expansions": 10_000,
+        "enhance.references": 1,
+        "enhance.reference": "nearest",
+        "enhance.iou": "reference",
+        "enhance.pixel_confidence": "raw",
+        "finetune.loss": "paper",
+        # With these two the colour terms are L1 + (1 - SSIM).
+        "finetune.dssim_weight": 2 / 3,
+        "finetune.photometric_weight": 3.0,
+        "finetune.depth_weight": 0.0,
+        "finetune.densify_share": 0.6,
+        "finetune.pseudo_share": 0.5,
+        "finetune.pseudo_share_final": 0.5,
+        "finetune.pseudo_weight": 1.0,
+        "finetune.pseudo_depth": False,
+        "finetune.seed_holes": False,
+        "finetune.keep_known": False,
+        "finetune.confidence_floor": 0.0,
+    }
+
+
+def _paper_without_illumination_and_fold(config: PipelineConfig) -> dict[str, Any]:
+    return {**paper(config), "explore.darkness_weight": 0.0, "explore.fold_penalty": 1.0}
+
+
+def _exploregs(config: PipelineConfig) -> dict[str, Any]:
+    """ExploreGS, in what its published code has that the paper's text changes.
+
+    Source: Kim et al.: ExploreGS, 2025, and its published code.
+    """
+    return {
+        **_paper_without_illumination_and_fold(config),
+        "explore.visibility": "frustum",
+        "enhance.iou": "union",
+    }
+
+
+def _oracle(_: PipelineConfig) -> dict[str, Any]:
+    """The coarse stage of `extrags`, shown held-out frames too.
+
+    Pixels, depth and exposure of the frames it is evaluated on are known to it; the number of iterations is
+    that of the other methods. Refined poses of held-out frames would leave the evaluation's.
+    """
+    return {"coarse.train_on": "all", "coarse.refine_poses": False}
 
 
 def _classical(_: PipelineConfig) -> dict[str, Any]:
@@ -126,14 +274,35 @@ class Method:
 
 METHODS: dict[str, Method] = {
     "extrags": Method("explored, restored by the diffusion, fine-tuned"),
+    "paper": Method("the paper's pipeline, equation by equation", paper, {"assess": PAPER_HAS_NO_PLAN}),
+    "paper-no-illum-fold": Method(
+        "the paper's ablation: paper without illumination weight and fold penalty",
+        _paper_without_illumination_and_fold,
+        {"assess": PAPER_HAS_NO_PLAN},
+    ),
+    "exploregs": Method(
+        "ExploreGS: frustum coverage, no illumination or fold term, G-IOU over the union",
+        _exploregs,
+        {"assess": PAPER_HAS_NO_PLAN},
+    ),
     "coarse": Method(
         "the light-aware coarse scene alone",
         leave_out=dict.fromkeys([*EXPLORING, "finetune"], "the run measures the coarse scene"),
+    ),
+    "oracle": Method(
+        "a ceiling, no method: the coarse scene of extrags made from held-out frames too",
+        _oracle,
+        dict.fromkeys([*EXPLORING, "finetune"], "nothing may rest on a scene that has seen held-out frames"),
     ),
     "3dgs": Method(
         "plain 3D Gaussian Splatting: standard loss and schedule, SH 3, no light, no enhancement",
         three_dgs,
         dict.fromkeys([*EXPLORING, "finetune"], "plain 3DGS has no such stage"),
+    ),
+    "gaussian-pancakes": Method(
+        "Gaussian Pancakes: plain 3DGS held to depth and surface normals, densified early only",
+        gaussian_pancakes,
+        dict.fromkeys([*EXPLORING, "finetune"], "Gaussian Pancakes has no such stage"),
     ),
     "classical": Method("as extrags, with the classical fill instead of the diffusion", _classical),
     "real-only": Method(
@@ -149,10 +318,15 @@ def method_config(
     """A profile with overrides, and with what the method pins on top.
 
     Raises:
-        ConfigError: for an unknown method, profile or setting, or a value out of range.
+        ConfigError: for an unknown method, profile or setting, or a value out of range; for
+            `coarse.train_on`, which is the oracle's alone.
     """
+    if "coarse.train_on" in (settings or {}):
+        # Not ignored like other pinned settings: figures of a run that has seen held-out frames, or only
+        # seems to, must not pass for another method's.
+        check_not_pinned(method, {"coarse.train_on": None})
     config = pipeline_config(profile, settings, seed)
-    return config.with_overrides(_known(method).pinned(config))
+    return config.with_overrides(_pinned(method, config))
 
 
 def check_not_pinned(method: str, settings: Mapping[str, Any]) -> None:
@@ -163,7 +337,7 @@ def check_not_pinned(method: str, settings: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: names the setting.
     """
-    pinned = _known(method).pinned(PipelineConfig())
+    pinned = _pinned(method, PipelineConfig())
     for name in settings:
         if name in pinned:
             raise ConfigError(f"the method {method} sets {name} itself; leave it out, or take another method")
@@ -171,7 +345,14 @@ def check_not_pinned(method: str, settings: Mapping[str, Any]) -> None:
 
 def profile_label(profile: str, method: str) -> str:
     """Label of the settings on pages: the profile, and the method unless it is the whole pipeline."""
+    if method == "oracle":
+        return f"{profile}, {HELD_OUT_TRAINED_ON}"
     return profile if method == "extrags" else f"{profile}, method {method}"
+
+
+def _pinned(method: str, config: PipelineConfig) -> dict[str, Any]:
+    """Which frames are trained on is part of every method."""
+    return {"coarse.train_on": "train", **_known(method).pinned(config)}
 
 
 def _known(method: str) -> Method:

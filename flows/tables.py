@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from extrags.metrics.registry import Figure, figures, metric_named
+from extrags.pipeline import HELD_OUT_TRAINED_ON
 from flows.outcome import SequenceOutcome
 
 __all__ = [
@@ -147,8 +148,10 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
             for case in cases
         ],
     )
+    seen = sorted({case["method"] for case in cases if case["held_out_trained_on"]})
+    warning = f"{HELD_OUT_TRAINED_ON} in {', '.join(seen)}.\n\n" if seen else ""
     return (
-        f"## Differences to {baseline}\n\nMean over sequences and its 95 % interval.\n\n{paired}\n\n"
+        f"{warning}## Differences to {baseline}\n\nMean over sequences and its 95 % interval.\n\n{paired}\n\n"
         f"## Spread over seeds\n\n{spread}\n\n## Runs\n\n{runs}\n"
     )
 

@@ -12,7 +12,7 @@ from data_catalog.catalog import resolve, source_fingerprint
 from extrags.config import PipelineConfig
 from extrags.errors import ExtragsError
 from extrags.metrics.registry import added_metrics
-from extrags.pipeline import STAGES, Pipeline, StageName
+from extrags.pipeline import HELD_OUT_TRAINED_ON, STAGES, Pipeline, StageName
 from extrags.store import Manifest, Ref, Store
 from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner
@@ -161,8 +161,14 @@ class SequenceRun(Pipeline):
             self.refs["training"] = self._run_uncounted(
                 Call(training_frames, {"sequence": self.refs["sequence"]})
             )
-            inputs = {"sequence": self.refs["training"], "config": self.config.coarse}
-            self.refs["coarse"] = self._run_task(row, Call(coarse, inputs))
+            # The oracle alone is shown held-out frames, and no later stage sees what it made.
+            oracle = self.config.coarse.train_on == "all"
+            frames = self.refs["sequence" if oracle else "training"]
+            self.refs["coarse"] = self._run_task(
+                row, Call(coarse, {"sequence": frames, "config": self.config.coarse})
+            )
+            if oracle:
+                row.reason = HELD_OUT_TRAINED_ON
             counts = self._manifest("coarse").counts
             if counts.get("refined_poses"):
                 # The scene was optimised with the corrected poses: later stages need them.
@@ -258,9 +264,8 @@ class SequenceRun(Pipeline):
             scenes = [self.refs["coarse"]]
             if "finetune" in self.refs:
                 scenes.append(self.refs["finetune"])
-            renders = self._run_tasks(
-                row, [Call(render, {"scene": ref, "sequence": sequence}) for ref in scenes]
-            )
+            shown = {"sequence": sequence, "train_on": self.config.coarse.train_on}
+            renders = self._run_tasks(row, [Call(render, {"scene": ref, **shown}) for ref in scenes])
             weights = self._weights()
             settings = {
                 "lpips_digests": {item.net: item.digest for item in weights},

@@ -13,7 +13,7 @@ HISTORY = "history.json"
 """Training curve: a list of `{iteration, loss, psnr, n_gaussians}`."""
 
 
-@stage("coarse", version=3)
+@stage("coarse", version=4)
 def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     """Optimise the coarse scene; writes `scene/` and `history.json`.
 
@@ -23,8 +23,11 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     from extrags.sequence import EndoscopicSequence
     from extrags.training import reconstruct
 
+    frames = slot.load(EndoscopicSequence, sequence)
+    if config.train_on == "all":
+        slot.counts["held_out_frames_trained_on"] = len(frames.test)
     with keep_last_finite_scene(slot):
-        result = reconstruct(slot.load(EndoscopicSequence, sequence), config)
+        result = reconstruct(frames, config)
     slot.save(result.scene)
     slot.save_json(HISTORY, result.history)
     slot.counts["n_gaussians"] = len(result.scene.gaussians)

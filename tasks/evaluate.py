@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from extrags.config import LpipsNet
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Ref, Slot
@@ -14,11 +16,11 @@ METRICS_FILE = "metrics.json"
 """`EvaluationResult.to_json()`, per-view figures included."""
 
 
-@stage("evaluate-render", version=3)
-def render(slot: Slot, scene: Ref, sequence: Ref) -> None:
+@stage("evaluate-render", version=4)
+def render(slot: Slot, scene: Ref, sequence: Ref, train_on: Literal["train", "all"]) -> None:
     """Render the held-out views at the exposure defined by the protocol, and extract the scene's surface.
 
-    Writes `renders/`, and `mesh/` if the sequence has a true surface.
+    Writes `renders/`, and `mesh/` if the sequence has a true surface. `train_on` as in `coarse.train_on`.
     """
     from extrags import evaluation
     from extrags.metrics.surface import scene_surface
@@ -26,7 +28,7 @@ def render(slot: Slot, scene: Ref, sequence: Ref) -> None:
     from extrags.sequence import EndoscopicSequence
 
     shown, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
-    views = evaluation.render(shown, frames)
+    views = evaluation.render(shown, frames, train_on=train_on)
     slot.save(views)
     slot.counts.update(views=len(views), n_gaussians=views.n_gaussians)
     # Without true depth there is no true surface either, so the mesh is not needed.

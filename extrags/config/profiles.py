@@ -11,6 +11,7 @@ from extrags.config.stages import (
     EvaluateConfig,
     ExploreConfig,
     FinetuneConfig,
+    IngestConfig,
     OptimiserConfig,
     PipelineConfig,
 )
@@ -50,8 +51,9 @@ PROFILES: dict[str, PipelineConfig] = {
         finetune=FinetuneConfig(iterations=4000),
         evaluate=EvaluateConfig(lpips_nets=("alex", "vgg")),
     ),
-    # The paper's counts.
+    # The paper's counts, at the full size of the source's frames.
     "paper": PipelineConfig(
+        ingest=IngestConfig(downscale=1),
         coarse=CoarseConfig(
             iterations=30_000,
             max_points=60_000,
@@ -66,7 +68,7 @@ PROFILES: dict[str, PipelineConfig] = {
             max_views=320,
             samples=4,
         ),
-        finetune=FinetuneConfig(iterations=15_000),
+        finetune=FinetuneConfig(iterations=15_000, densify_share=0.6),
         evaluate=EvaluateConfig(lpips_nets=("alex", "vgg")),
         explore=ExploreConfig(render_width=160, max_expansions=200),
     ),

@@ -206,6 +206,29 @@ class CoarseConfig(StageConfig):
     depth_weight_final_share: float = Field(
         0.5, ge=0, le=1, description="the term decays to this share, log-linearly"
     )
+    depth_loss: Literal["inverse", "huber"] = Field(
+        "inverse",
+        description="inverse: mean absolute difference of inverse depths; huber: Huber loss of depths, in "
+        "median depths",
+    )
+    depth_huber_delta: float = Field(
+        0.2, gt=0, description="huber: depths that differ by more, in median depths, count linearly"
+    )
+    normal_weight: float = Field(
+        0.0,
+        ge=0,
+        description="weight of the normal term: the shortest axis of a Gaussian along the normal of the "
+        "nearest starting point; 0: no such term",
+    )
+    normal_start_share: float = Field(
+        1 / 30, ge=0, lt=1, description="from this share of the iterations the normal term is active"
+    )
+    normal_every: int = Field(2, ge=1, description="iterations from one use of the normal term to the next")
+    train_on: Literal["train", "all"] = Field(
+        "train",
+        description="all: held-out frames are trained on too. The method oracle alone does this, as a "
+        "ceiling; its figures say nothing about views that were not seen",
+    )
     max_points: int = Field(12_000, ge=10, description="starting points at most")
     thickness: float = Field(
         0.1,

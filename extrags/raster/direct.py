@@ -18,6 +18,7 @@ from torch import Tensor
 
 from extrags.errors import ShapeError
 from extrags.raster import native
+from extrags.raster.loss import huber_depth_gradient
 from extrags.raster.rendering import Rendering, nonfinite_error
 
 __all__ = ["DirectStep", "Target"]
@@ -106,6 +107,7 @@ class _Images:
         rgb_weight: float,
         depth_weight: float,
         depth_scale: float,
+        depth_huber_delta: float | None,
     ) -> tuple[float, Any]:
         """The loss, and the kernels' struct of its gradients with respect to the images."""
         kernels, image = native.compiled_kernels(), self.arrays
@@ -120,9 +122,13 @@ class _Images:
         )
         gradients = {"rgb": image["v_rgb"]}
         if target.depth is not None and depth_weight > 0:
-            depth_loss, compared = kernels.inverse_depth(
-                image["depth"], image["alpha"], target.depth, image["v_depth"], depth_scale, depth_weight
-            )
+            images = image["depth"], image["alpha"], target.depth, image["v_depth"]
+            if depth_huber_delta is None:
+                depth_loss, compared = kernels.inverse_depth(*images, depth_scale, depth_weight)
+            else:
+                depth_loss, compared = huber_depth_gradient(
+                    *images, scale=depth_scale, delta=depth_huber_delta, weight=depth_weight
+                )
             loss += depth_loss
             if compared:
                 gradients |= {"depth": image["v_depth"], "depth_image": image["depth"]}
@@ -196,6 +202,7 @@ class DirectStep:
         loss_weight: float = 1.0,
         depth_weight: float = 0.0,
         depth_scale: float = 1.0,
+        depth_huber_delta: float | None = None,
         near: float = 0.01,
         pose: bool = False,
     ) -> float:
@@ -208,8 +215,9 @@ class DirectStep:
             dssim_weight: as in `l1_ssim_loss`.
             photometric_weight: of `l1_ssim_loss`.
             loss_weight: of the whole view.
-            depth_weight: of `inverse_depth_loss`; without effect where the target has no depth.
-            depth_scale: as in `inverse_depth_loss`.
+            depth_weight: of `depth_loss`; without effect where the target has no depth.
+            depth_scale: as in `depth_loss`.
+            depth_huber_delta: as in `depth_loss`.
             near: as in `rasterize`.
             pose: fill `viewmat_gradient` too.
 
@@ -236,6 +244,7 @@ class DirectStep:
             rgb_weight=loss_weight * photometric_weight * target.scale,
             depth_weight=loss_weight * depth_weight,
             depth_scale=depth_scale,
+            depth_huber_delta=depth_huber_delta,
         )
         frame.backward(
             self._gaussians,

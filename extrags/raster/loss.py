@@ -16,15 +16,24 @@ to the map only. If all weights are zero the loss is zero.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import huber_loss
 
 from extrags.errors import ConfigError, ShapeError
 from extrags.raster import native
 from extrags.thresholds import HOLE_ALPHA
 
-__all__ = ["inverse_depth_loss", "l1_ssim_loss", "l1_ssim_loss_reference"]
+__all__ = [
+    "depth_loss",
+    "huber_depth_gradient",
+    "huber_depth_loss",
+    "inverse_depth_loss",
+    "l1_ssim_loss",
+    "l1_ssim_loss_reference",
+]
 
 SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
@@ -127,6 +136,90 @@ def inverse_depth_loss(
         return depth.sum() * 0
     difference = scale / depth[valid] - scale / target.detach()[valid]
     return difference.abs().mean()
+
+
+def huber_depth_loss(
+    depth: Float[Tensor, "*c h w"],
+    alpha: Float[Tensor, "*c h w"],
+    target: Float[Tensor, "*c h w"],
+    *,
+    scale: float,
+    delta: float,
+) -> Float[Tensor, ""]:
+    r"""Mean Huber loss of depth differences in units of a typical depth.
+
+    With x the difference, the loss is :math:`x^2 / 2` up to `delta` and :math:`\delta (|x| - \delta / 2)`
+    beyond. The mean is over pixels with both a rendered surface and a target depth.
+
+    Args:
+        depth: rendered z-depth in world units; only this argument gets a gradient.
+        alpha: rendered opacity; pixels at `HOLE_ALPHA` or below are ignored.
+        target: z-depth of the ground truth in world units, 0 where unknown.
+        scale: the typical depth, in world units.
+        delta: where the loss becomes linear, in typical depths.
+
+    Returns:
+        The loss; zero if no pixel can be compared.
+
+    Source: Bonilla et al., Gaussian Pancakes, MICCAI 2024 (see docs/references.md). Its delta of 0.2 is in
+    the units of its SLAM system; to measure it in typical depths, so that it means the same in every scene,
+    is our interpretation.
+    """
+    valid = (target > 0) & (alpha.detach() > HOLE_ALPHA)
+    if not bool(valid.any()):
+        return depth.sum() * 0
+    return huber_loss(depth[valid] / scale, target.detach()[valid] / scale, delta=delta)
+
+
+def huber_depth_gradient(
+    depth: Float[np.ndarray, "h w"],
+    alpha: Float[np.ndarray, "h w"],
+    target: Float[np.ndarray, "h w"],
+    gradient: Float[np.ndarray, "h w"],
+    *,
+    scale: float,
+    delta: float,
+    weight: float,
+) -> tuple[float, int]:
+    """`huber_depth_loss` times a weight, with its gradient, without autograd.
+
+    Args:
+        depth: as in `huber_depth_loss`, like the next four.
+        alpha: rendered opacity.
+        target: z-depth of the ground truth.
+        gradient: filled with the derivatives by `depth`.
+        scale: the typical depth.
+        delta: where the loss becomes linear.
+        weight: of the loss.
+
+    Returns:
+        The weighted loss, and the number of pixels compared.
+    """
+    valid = (target > 0) & (alpha > HOLE_ALPHA)
+    count = int(valid.sum())
+    if count == 0:
+        gradient[...] = 0
+        return 0.0, 0
+    difference = np.where(valid, depth - target, 0) / np.float32(scale)
+    slope = np.clip(difference, -delta, delta)
+    # slope * (difference - slope / 2) is x^2 / 2 where nothing is clipped, delta (|x| - delta / 2) elsewhere.
+    loss = float((slope * (difference - slope / 2)).sum(dtype=np.float64)) / count
+    np.multiply(slope, np.float32(weight / (count * scale)), out=gradient)
+    return weight * loss, count
+
+
+def depth_loss(
+    depth: Float[Tensor, "*c h w"],
+    alpha: Float[Tensor, "*c h w"],
+    target: Float[Tensor, "*c h w"],
+    *,
+    scale: float,
+    huber_delta: float | None,
+) -> Float[Tensor, ""]:
+    """`huber_depth_loss`, or `inverse_depth_loss` where `huber_delta` is None; see there."""
+    if huber_delta is None:
+        return inverse_depth_loss(depth, alpha, target, scale=scale)
+    return huber_depth_loss(depth, alpha, target, scale=scale, delta=huber_delta)
 
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Int
 
@@ -10,6 +12,7 @@ from extrags.errors import CaptureError
 from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.training.normal_term import NormalTerm
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.pose_refinement import PoseRefinement
 from extrags.training.schedule import Schedule
@@ -31,7 +34,8 @@ def reconstruct(
     Args:
         sequence: posed frames.
         config: budgets, rates and weights; None takes the defaults.
-        frames: which frames to use; default: the split's training frames.
+        frames: which frames to use; default: those of `config.train_on`, the split's training frames or,
+            for the oracle, all.
         stage: named in progress events.
 
     Raises:
@@ -46,7 +50,8 @@ def reconstruct(
     docs/references.md.
     """
     config = CoarseConfig() if config is None else config
-    chosen = sequence.train if frames is None else np.asarray(frames)
+    default = sequence.train if config.train_on == "train" else np.arange(len(sequence))
+    chosen = default if frames is None else np.asarray(frames)
     if len(chosen) == 0:
         raise CaptureError(f"{sequence.name}: no training frames")
     depth = median_depth(sequence, chosen)
@@ -65,6 +70,8 @@ def reconstruct(
     views = real_views(sequence, chosen)
     order = epochs(len(views), np.random.default_rng(config.seed))
     schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
+    if config.normal_weight > 0:
+        schedule = replace(schedule, normals=NormalTerm.at(gaussians.means.numpy(), config))
     poses = None
     if refines_poses(sequence, config):
         settings = config.pose_refinement
@@ -103,6 +110,7 @@ def coarse_schedule(
         depth_weight=config.depth_weight,
         depth_weight_final_share=config.depth_weight_final_share,
         depth_scale=depth,
+        depth_huber_delta=config.depth_huber_delta if config.depth_loss == "huber" else None,
         sh_every=config.sh_every,
         seed=config.seed,
     )

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from extrags.config import DensifyConfig, LightConfig, OptimiserConfig
+from extrags.training.normal_term import NormalTerm
 
 __all__ = ["Schedule"]
 
@@ -28,6 +29,9 @@ class Schedule:
     seed: int
     photometric_weight: float = 1.0
     """Factor of the L1 and SSIM terms of every view; the depth term is beside it."""
+    depth_huber_delta: float | None = None
+    """Of a Huber loss of depths, in `depth_scale`; None: the depth term compares inverse depths."""
+    normals: NormalTerm | None = None
 
     def learning_rates(self, iteration: int) -> dict[str, float]:
         """Rates at an iteration; positions fall log-linearly."""

@@ -18,7 +18,7 @@ from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.raster import Rendering, SelectiveAdam, l1_ssim_loss, native_isa
 from extrags.raster.direct import DirectStep, Target
-from extrags.raster.loss import inverse_depth_loss
+from extrags.raster.loss import depth_loss
 from extrags.scene import Scene
 from extrags.training.density import DensityStrategy
 from extrags.training.light_fit import LightFit, learned_parameters
@@ -119,14 +119,17 @@ class AutogradStep:
             normalisation=view.normalisation,
         )
         if view.depth_mm is not None and schedule.depth_weight > 0:
-            loss = loss + schedule.depth_weight_at(iteration) * inverse_depth_loss(
-                rendering.depth[0], rendering.alpha[0], view.depth_mm, scale=schedule.depth_scale
+            loss = loss + schedule.depth_weight_at(iteration) * depth_loss(
+                rendering.depth[0],
+                rendering.alpha[0],
+                view.depth_mm,
+                scale=schedule.depth_scale,
+                huber_delta=schedule.depth_huber_delta,
             )
         loss = loss * view.loss_weight
         if scene.light is not None and view.frame is not None:
             loss = loss + schedule.light.exposure_prior * scene.light.log_exposure.square().mean()
-        penalty = density.penalty(self.adam.parameters)
-        if penalty is not None:
+        for penalty in _penalties(schedule, self.adam.parameters, density, iteration):
             loss = loss + penalty
         loss.backward()
         gradient = None if pose is None or pose.grad is None else pose.grad.numpy()
@@ -186,12 +189,12 @@ class NativeStep:
             loss_weight=view.loss_weight,
             depth_weight=schedule.depth_weight_at(iteration),
             depth_scale=schedule.depth_scale,
+            depth_huber_delta=schedule.depth_huber_delta,
             pose=viewmat is not None,
         )
         if self.light_fit is not None:
             loss += self.light_fit.prior()
-        penalty = density.penalty(self.adam.parameters)
-        if penalty is not None:
+        for penalty in _penalties(schedule, self.adam.parameters, density, iteration):
             self._add_penalty(penalty, direct.gradients)
             loss += float(penalty.detach())
         gradient = None if viewmat is None else direct.viewmat_gradient
@@ -246,6 +249,16 @@ class NativeStep:
         # An identity may be given again once its view is gone.
         targets[key] = (weakref.ref(view, lambda _: targets.pop(key, None)), target)
         return target
+
+
+def _penalties(
+    schedule: Schedule, parameters: dict[str, Tensor], density: DensityStrategy, iteration: int
+) -> list[Tensor]:
+    """Terms of the loss that depend on the parameters alone."""
+    found = [density.penalty(parameters)]
+    if schedule.normals is not None:
+        found.append(schedule.normals.penalty(parameters, iteration))
+    return [penalty for penalty in found if penalty is not None]
 
 
 def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, StoreError
 from flows.commands.common import finished_run, run_config, set_up_logging
 from flows.commands.options import Parser, add_method
+
+if TYPE_CHECKING:
+    from extrags.sequence import EndoscopicSequence
 
 __all__ = ["add_arguments", "export"]
 
@@ -16,7 +20,7 @@ def add_arguments(parser: Parser) -> None:
     """The options of `extrags export`."""
     parser.description = (
         "Write a finished run's scene as PLY, or a sequence with its poses, images, masks, depth and points "
-        "for COLMAP or nerfstudio. Poses that a run has estimated are taken from its store."
+        "for COLMAP or nerfstudio. Poses that the run estimates or refines are taken from its store."
     )
     parser.set_defaults(command=export)
     parser.add_argument("sequence", metavar="SEQUENCE")
@@ -59,19 +63,13 @@ def _scene(given: argparse.Namespace) -> int:
 
 
 def _sequence(given: argparse.Namespace) -> int:
-    from data_catalog.catalog import read
     from data_catalog.readers.colmap_model import points_of, write_colmap
     from data_catalog.readers.transforms_json import write_transforms
-    from extrags.sequence import EndoscopicSequence
 
     target = Path(given.output)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ConfigError(f"{target} exists and is not an empty folder; nothing is written over it")
-    sequence = read(given.sequence, run_config(given).ingest)
-    if sequence.world_from_camera is None:
-        # Poses of a source that has none come from its run.
-        run = finished_run(given, "poses")
-        sequence = run.store.load(EndoscopicSequence, run.refs["poses"])
+    sequence = _posed_sequence(given)
     found = points_of(sequence)
     points, points_rgb = found if found is not None else (None, None)
     try:
@@ -85,3 +83,24 @@ def _sequence(given: argparse.Namespace) -> int:
     count = 0 if points is None else len(points)
     print(f"{target}: {len(sequence)} frames with poses, {count} points")
     return 0
+
+
+def _posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:
+    """The frames with the poses and intrinsics that the scene of a run with these settings is made with.
+
+    Where no stage changes those of the source, no run is needed.
+
+    Raises:
+        StoreError: when a stage changes them and has not run.
+    """
+    from data_catalog.catalog import read
+    from extrags.sequence import EndoscopicSequence
+    from extrags.training.reconstruction import refines_poses
+
+    config = run_config(given)
+    source = read(given.sequence, config.ingest)
+    estimated = source.world_from_camera is None or config.poses.replace_given
+    if not estimated and not refines_poses(source, config.coarse):
+        return source
+    run = finished_run(given, "poses" if config.coarse.refine_poses is False else "coarse")
+    return run.store.load(EndoscopicSequence, run.refs["sequence"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from extrags.errors import ExtragsError
+from extrags.errors import ConfigError, ExtragsError
 from flows.commands.common import write_json
 from flows.commands.options import Parser, add_json, add_method, add_runner
 from flows.commands.run import execute
@@ -22,7 +22,16 @@ def add_arguments(parser: Parser) -> None:
 
 
 def plan(given: argparse.Namespace) -> int:
-    """`extrags plan`."""
+    """`extrags plan`.
+
+    Raises:
+        ConfigError: for a method that has no plan.
+    """
+    from extrags.pipeline import needs_plan
+    from flows.methods import METHODS
+
+    if not needs_plan(METHODS[given.method].leave_out):
+        raise ConfigError(f"no stage of the method {given.method} depends on a plan, so it has none")
     (outcome,) = execute([given.sequence], given, until="assess").sequences
     if outcome.status == "failed":
         raise outcome.error or ExtragsError(f"{outcome.name} failed")

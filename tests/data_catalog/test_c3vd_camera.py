@@ -7,7 +7,7 @@ import pytest
 
 from data_catalog.c3vd.pinhole import PinholeResampling
 from data_catalog.c3vd.scaramuzza import CALIBRATIONS, ScaramuzzaCamera, camera_from_json
-from extrags.config import IngestConfig
+from extrags.config import PROFILES, IngestConfig
 from extrags.errors import ConfigError, SourceError
 from tests.data_catalog.c3vd_fixture import PUBLISHED, lens_rays, scaled_lens
 
@@ -150,6 +150,11 @@ class TestPinhole:
                 slopes = np.stack([right[here].ravel(), down[here].ravel()], 1)
                 offset = np.linalg.lstsq(slopes, (found - expected)[here].ravel(), rcond=None)[0]
                 assert np.abs(offset).max() < 0.02
+
+    def test_the_profile_paper_keeps_the_size_of_the_frames(self) -> None:
+        camera = CALIBRATIONS["c3vdv2"]
+        plan = PinholeResampling.planned(camera, PROFILES["paper"].ingest)
+        assert (plan.width, plan.height) == (camera.width, camera.height)
 
     def test_usual_size_and_field_of_view(self) -> None:
         for width, height in ((1350, 1080), (675, 540)):

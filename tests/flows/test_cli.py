@@ -196,6 +196,10 @@ class TestSettings:
             _, _, behind = listed.partition(f"  --{setting.group}.*: ")
             assert setting.name.rpartition(".")[2] in behind.partition("--")[0].split()
 
+    def test_a_method_without_a_plan_says_so(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["plan", SEQUENCE, "--method", "coarse"]) == 2
+        assert "no stage of the method coarse depends on a plan" in capsys.readouterr().err
+
     @pytest.mark.parametrize("arguments", [["run"], ["export"], ["bench", "enhance"]])
     def test_settings_are_explained_with_the_defaults_of_the_profile(
         self, arguments: list[str], capsys: pytest.CaptureFixture[str]

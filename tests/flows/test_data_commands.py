@@ -15,7 +15,13 @@ from data_catalog.catalog import read
 from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.recording import record
 from data_catalog.readers.colmap_model import write_colmap
+from extrags.sequence import EndoscopicSequence
+from extrags.store import Store
 from flows.cli import main
+from flows.methods import method_config
+from flows.runners import DirectRunner
+from flows.wiring import run_sequence
+from tests.flows.tiny import SEQUENCE, TINY
 
 SMALL = ["--set", "ingest.width=48", "--set", "ingest.max_frames=8"]
 
@@ -152,3 +158,34 @@ class TestExport:
         arguments = ["export", str(folder), "--to", "colmap", "--out", str(tmp_path / "scene")]
         assert main([*arguments, "--store", str(tmp_path / "store")]) == 1
         assert "run it first" in capsys.readouterr().err
+
+    @pytest.mark.parametrize("to", ["colmap", "transforms"])
+    def test_poses_are_those_the_scene_was_made_with(
+        self, to: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        """The source has poses; those that the run has refined are written, not the source's."""
+        store, target = str(tmp_path / "store"), tmp_path / "scene"
+        refining = {**TINY, "ingest.max_frames": 8, "coarse.refine_poses": True}
+        arguments = [
+            "export", SEQUENCE, "--to", to, "--out", str(target), "--profile", "quick", "--store", store,
+            *(part for name, value in refining.items() for part in ("--set", f"{name}={json.dumps(value)}")),
+        ]  # fmt: skip
+        assert main(arguments) == 1
+        assert "run it first" in capsys.readouterr().err
+        config = method_config("extrags", "quick", refining)
+        outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="coarse")
+        assert main(arguments) == 0, capsys.readouterr().err
+        given = read(SEQUENCE, config.ingest)
+        used = Store(store).load(EndoscopicSequence, outcome.refs["sequence"])
+        written = read(target)
+        np.testing.assert_allclose(written.K, used.K, atol=1e-10)
+
+        def differences(frames: EndoscopicSequence) -> np.ndarray:
+            """To the nearest pose written; names give frames another order."""
+            there, own = written.world_from_camera, frames.world_from_camera
+            assert there is not None
+            assert own is not None
+            return np.asarray(np.abs(there[None] - own[:, None]).max(axis=(2, 3)).min(axis=1))
+
+        assert differences(used).max() < 1e-9
+        assert differences(given)[given.train].min() > 1e-5

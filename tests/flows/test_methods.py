@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
-from typing import get_args
+from typing import Any, get_args
 
 import pytest
 
 from extrags.config import PROFILES, CoarseConfig, PipelineConfig
 from extrags.config.settings import settings_of
 from extrags.errors import ConfigError
+from extrags.pipeline import HELD_OUT_TRAINED_ON
+from flows.benchmark import Case, case_of, check_methods
 from flows.methods import (
     METHODS,
+    PAPER_SHARED,
     THREE_DGS_SHARED,
     MethodName,
     check_not_pinned,
+    gaussian_pancakes,
     method_config,
+    paper,
     profile_label,
     three_dgs,
 )
+from flows.outcome import SequenceOutcome, StageRow
+from flows.tables import benchmark_markdown
 
 
 def test_the_names_are_those_of_the_flows_parameter() -> None:
@@ -57,6 +64,115 @@ def test_the_baseline_is_plain() -> None:
     assert set(METHODS["3dgs"].leave_out) >= {"explore", "enhance", "finetune"}
 
 
+def test_gaussian_pancakes_is_the_baseline_with_two_terms() -> None:
+    plain, pancakes = three_dgs(PipelineConfig()), gaussian_pancakes(PipelineConfig())
+    changed = {name.removeprefix("coarse.") for name in pancakes if pancakes[name] != plain.get(name)}
+    assert changed == {
+        "densify.stop_share",
+        "depth_loss",
+        "depth_weight",
+        "depth_weight_final_share",
+        "depth_huber_delta",
+        "normal_weight",
+        "normal_start_share",
+        "normal_every",
+    }
+    assert set(plain) <= set(pancakes)
+    config = method_config("gaussian-pancakes", "paper").coarse
+    assert config.normal_start_share * config.iterations == pytest.approx(1000)
+    assert config.densify.start_share * config.iterations == pytest.approx(500)
+    assert config.densify.stop_share * config.iterations == pytest.approx(4000)
+    assert (config.depth_weight, config.normal_weight) == (0.2, 0.2)
+
+
+def test_the_paper_decides_on_every_setting_of_its_own_stages() -> None:
+    """A new setting of exploration or fine-tuning must be pinned in `paper`, or named in `PAPER_SHARED`."""
+    pinned = set(paper(PipelineConfig()))
+    every = {name for name in settings_of(PipelineConfig) if name.startswith(("explore.", "finetune."))} - {
+        "explore.seed"
+    }
+    assert pinned & PAPER_SHARED == set()
+    assert every - pinned - PAPER_SHARED == set()
+    assert every >= PAPER_SHARED
+    # Its coarse scene is plain 3DGS, every setting of which is decided on.
+    assert three_dgs(PipelineConfig()).items() <= paper(PipelineConfig()).items()
+
+
+def test_the_paper_s_counts_with_its_own_profile() -> None:
+    config = method_config("paper", "paper")
+    assert (config.coarse.iterations, config.finetune.iterations) == (30_000, 15_000)
+    assert config.finetune.densify_share * config.finetune.iterations == pytest.approx(9_000)
+    assert (config.explore.trajectories, config.explore.directions, config.freespace.grid_size) == (
+        20,
+        32,
+        64,
+    )
+    # Every virtual view is restored.
+    assert config.enhance.max_views >= config.explore.trajectories * (config.explore.length - 1)
+    assert config.ingest.downscale == 1
+    assert (config.ingest.width, config.ingest.height) == (None, None)
+    quick = method_config("paper", "quick")
+    assert quick.finetune.iterations == method_config("extrags", "quick").finetune.iterations
+
+
+def test_the_paper_s_losses() -> None:
+    """L1 + (1 - SSIM), the pixel weight on L1 alone, U_img once."""
+    found = method_config("paper", "quick").finetune
+    assert found.loss == "paper"
+    assert found.dssim_weight is not None
+    assert found.photometric_weight * (1 - found.dssim_weight) == pytest.approx(1)
+    # The term is (1 - SSIM) / 2.
+    assert found.photometric_weight * found.dssim_weight / 2 == pytest.approx(1)
+    assert found.pseudo_weight == 1
+    assert (found.pseudo_depth, found.seed_holes, found.keep_known) == (False, False, False)
+    assert (found.depth_weight, found.confidence_floor) == (0, 0)
+
+
+def test_the_rows_beside_the_paper_s_differ_in_their_parts_alone() -> None:
+    def changes(method: str, base: str) -> dict[str, object]:
+        one, other = (METHODS[name].pinned(PipelineConfig()) for name in (method, base))
+        assert set(one) == set(other)
+        assert METHODS[method].leave_out == METHODS[base].leave_out
+        return {name: value for name, value in one.items() if value != other[name]}
+
+    assert changes("paper-no-illum-fold", "paper") == {
+        "explore.darkness_weight": 0.0,
+        "explore.fold_penalty": 1.0,
+    }
+    assert changes("exploregs", "paper-no-illum-fold") == {
+        "explore.visibility": "frustum",
+        "enhance.iou": "union",
+    }
+
+
+def test_the_oracle_alone_trains_on_held_out_frames() -> None:
+    for method in METHODS:
+        config = method_config(method, "quick")
+        assert config.coarse.train_on == ("all" if method == "oracle" else "train")
+        # Neither openly nor by a variant or an override for all methods.
+        other = "train" if method == "oracle" else "all"
+        with pytest.raises(ConfigError, match=r"sets coarse\.train_on itself"):
+            check_not_pinned(method, {"coarse.train_on": other})
+        with pytest.raises(ConfigError, match=r"sets coarse\.train_on itself"):
+            method_config(method, "quick", {"coarse.train_on": other})
+    with pytest.raises(ConfigError, match=r"variant seen: coarse\.train_on cannot be changed"):
+        check_methods(["coarse"], {"seen": {"coarse.train_on": "all"}})
+    oracle, ours = method_config("oracle", "balanced"), method_config("coarse", "balanced")
+    assert oracle.with_overrides({"coarse.train_on": "train"}) == ours
+
+
+def test_tables_say_which_method_has_seen_held_out_frames() -> None:
+    def case(method: str, reason: str) -> dict[str, Any]:
+        outcome = SequenceOutcome("made/up@sparse", stages=[StageRow("coarse", "ran", reason=reason)])
+        return case_of(Case(method, "quick", 0, outcome))
+
+    plain, ceiling = case("3dgs", "poses refined"), case("ceiling", HELD_OUT_TRAINED_ON)
+    assert (plain["held_out_trained_on"], ceiling["held_out_trained_on"]) == (False, True)
+    assert "oracle" not in benchmark_markdown([plain], "3dgs")
+    found = benchmark_markdown([plain, ceiling], "3dgs")
+    assert found.startswith("oracle: held-out frames were trained on in ceiling.")
+
+
 def test_overrides_and_seeds_reach_what_is_open_only() -> None:
     config = method_config("3dgs", "quick", {"coarse.iterations": 600, "coarse.sh_degree": 0}, 4)
     assert (config.coarse.iterations, config.coarse.seed) == (600, 4)
@@ -77,3 +193,4 @@ def test_an_override_of_a_pinned_setting_is_refused_where_both_are_named() -> No
 def test_pages_name_the_method() -> None:
     assert profile_label("quick", "extrags") == "quick"
     assert profile_label("quick", "3dgs") == "quick, method 3dgs"
+    assert profile_label("quick", "oracle") == "quick, oracle: held-out frames were trained on"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,16 @@ import torch
 
 import extrags
 from data_catalog.true_surface import true_surface
+from extrags.assessment import measure
+from extrags.config import ExploreConfig
 from extrags.errors import ConfigError
 from extrags.exploration import Exploration
-from extrags.pipeline import INDISPENSABLE, NEEDS, STAGES
+from extrags.pipeline import HELD_OUT_TRAINED_ON, INDISPENSABLE, NEEDS, STAGES, needs_plan
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
 from extrags.store import Store
+from flows.methods import METHODS
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
@@ -27,6 +32,9 @@ from tests.flows.tiny import SEQUENCE, tiny_config
 def in_memory() -> extrags.Result:
     sequence = extrags.read(SEQUENCE, tiny_config().ingest)
     return extrags.run_pipeline(sequence, tiny_config(), true_surface=true_surface(sequence))
+
+
+NO_PLAN = "no stage of this run depends on the plan"
 
 
 class TestAgreement:
@@ -81,6 +89,7 @@ class TestRules:
     def test_what_rests_on_a_left_out_stage_is_skipped_too(self, tmp_path: Path) -> None:
         assert self.reasons(tmp_path, {"freespace": "not wanted"}) == {
             "poses": "the source has poses",
+            "assess": NO_PLAN,
             "freespace": "not wanted",
             "explore": "it needs the stage freespace, which was skipped",
             "enhance": "it needs the stage explore, which was skipped",
@@ -89,7 +98,46 @@ class TestRules:
 
     def test_without_enhance_fine_tuning_is_a_control(self, tmp_path: Path) -> None:
         left_out = dict.fromkeys(("surface", "freespace", "explore", "enhance"), "a control")
-        assert set(self.reasons(tmp_path, left_out)) == {"poses", *left_out}
+        reasons = self.reasons(tmp_path, left_out)
+        assert set(reasons) == {"poses", "assess", *left_out}
+        assert reasons["assess"] == NO_PLAN
+
+    def test_who_pays_for_the_assessment(self) -> None:
+        """The plan skips stages of whole runs, and sets the budgets of those that explore."""
+        needing = {method for method, found in METHODS.items() if needs_plan(found.leave_out)}
+        assert needing == {"extrags", "classical"}
+        assert needs_plan({"finetune": "not wanted"})
+        assert needs_plan({"enhance": "not wanted"})
+
+    def test_the_assessment_measures_as_the_run_explores(self, tmp_path: Path) -> None:
+        config = tiny_config(
+            coarse__iterations=20,
+            explore__directions=8,
+            explore__visible_weight=0.2,
+            explore__render_width=24,
+        )
+        store = Store(str(tmp_path))
+        outcome = run_sequence(SEQUENCE, config, str(tmp_path), DirectRunner(str(tmp_path)), until="assess")
+        assert outcome.plan is not None
+        result = extrags.run_pipeline(extrags.read(SEQUENCE, config.ingest), config, until="assess")
+        assert result.plan is not None
+        scene = store.load(Scene, outcome.refs["coarse"])
+        frames = store.load(EndoscopicSequence, outcome.refs["training"])
+        own = measure(scene, frames, config.assess, config.explore.coverage)
+        default = measure(scene, frames, config.assess, ExploreConfig().coverage)
+        assert own["coverage_share"] != pytest.approx(default["coverage_share"], rel=0.05)
+        assert outcome.plan["measurements"] == result.plan.measurements == own
+
+    def test_nothing_rests_on_a_scene_that_has_seen_held_out_frames(self) -> None:
+        sequence = extrags.read(SEQUENCE, tiny_config().ingest)
+        seen = tiny_config(coarse__train_on="all", coarse__iterations=2)
+        with pytest.raises(ConfigError, match="and surface, freespace, explore, enhance, finetune would"):
+            extrags.run_pipeline(sequence, seen)
+        with pytest.raises(ConfigError, match="and finetune would; the method oracle"):
+            extrags.run_pipeline(sequence, seen, leave_out=METHODS["real-only"].leave_out)
+        refined = seen.with_overrides({"coarse.refine_poses": "auto"})
+        with pytest.raises(ConfigError, match=r"and coarse\.refine_poses would"):
+            extrags.run_pipeline(sequence, refined, leave_out=METHODS["oracle"].leave_out)
 
     @pytest.mark.parametrize("stage", sorted(INDISPENSABLE))
     def test_what_everything_rests_on_cannot_be_left_out(self, stage: str) -> None:
@@ -108,3 +156,56 @@ class TestRules:
     def test_needs_point_backwards(self) -> None:
         for stage, needed in NEEDS.items():
             assert STAGES.index(needed) < STAGES.index(stage)
+
+
+class TestOracle:
+    """Held-out frames are trained on, and whoever reads the figures is told."""
+
+    settings = tiny_config(coarse__train_on="all", coarse__iterations=40)
+
+    def test_held_out_frames_reach_the_oracle_alone(self) -> None:
+        sequence = extrags.read(SEQUENCE, self.settings.ingest)
+        rgb = sequence.rgb.copy()
+        rgb[sequence.test] = 255 - rgb[sequence.test]
+        other = replace(sequence, rgb=rgb)
+        leave_out = METHODS["oracle"].leave_out
+        means = {}
+        for method in ("oracle", "coarse"):
+            config = self.settings if method == "oracle" else tiny_config(coarse__iterations=40)
+            for name, frames in (("given", sequence), ("changed", other)):
+                found = extrags.run_pipeline(frames, config, until="coarse", leave_out=leave_out)
+                means[method, name] = found.coarse.gaussians.means
+        assert torch.equal(means["coarse", "given"], means["coarse", "changed"])
+        assert not torch.equal(means["oracle", "given"], means["oracle", "changed"])
+
+    def test_the_run_says_so_and_agrees_with_the_one_in_memory(self, tmp_path: Path) -> None:
+        leave_out = METHODS["oracle"].leave_out
+        root = str(tmp_path)
+        outcome = run_sequence(
+            SEQUENCE, self.settings, root, DirectRunner(root), until="evaluate", leave_out=leave_out
+        )
+        assert outcome.status == "ok", outcome.error
+        row = outcome.row("coarse")
+        assert row is not None
+        assert row.reason == HELD_OUT_TRAINED_ON
+        store = Store(root)
+        sequence = store.load(EndoscopicSequence, outcome.refs["sequence"])
+        counts = store.manifest(outcome.refs["coarse"]).counts
+        assert counts["held_out_frames_trained_on"] == len(sequence.test) > 0
+        # Later stages would get the training frames alone.
+        assert len(store.load(EndoscopicSequence, outcome.refs["training"])) == len(sequence.train)
+        result = extrags.run_pipeline(
+            sequence, self.settings, leave_out=leave_out, true_surface=true_surface(sequence)
+        )
+        assert json.loads(json.dumps(result.evaluations["final"].metrics)) == outcome.metrics["final"]
+
+    def test_held_out_frames_are_shown_at_the_exposure_it_learned(self) -> None:
+        sequence = extrags.read(SEQUENCE, self.settings.ingest)
+        scene = extrags.reconstruct(sequence, self.settings.coarse).scene
+        assert scene.light is not None
+        logs = torch.linspace(-0.5, 0.5, len(sequence))
+        lit = replace(scene, light=replace(scene.light, log_exposure=logs))
+        frame = int(sequence.test[len(sequence.test) // 2])
+        own = extrags.render(lit, sequence, np.array([frame]), train_on="all").rgb[0]
+        expected = lit.render(sequence.cameras[frame], exposure=lit.light.exposures()[frame][None])  # type: ignore[union-attr]
+        np.testing.assert_allclose(own, expected.rgb[0].detach().numpy(), atol=1e-6)

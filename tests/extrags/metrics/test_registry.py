@@ -235,5 +235,6 @@ def run(method: str, tree: dict[str, Any]) -> dict[str, Any]:
         "seconds": 1.0,
         "peak_mib": None,
         "metrics": tree,
+        "held_out_trained_on": False,
         "error": "",
     }
