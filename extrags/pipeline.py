@@ -24,6 +24,7 @@ from extrags.errors import CaptureError, ConfigError
 
 if TYPE_CHECKING:
     from extrags.assessment import Decision, ScenePlan
+    from extrags.baselines.uc_nerf.training import UcNerfResult
     from extrags.confidence import PerceptualDifference
     from extrags.exploration import Exploration
     from extrags.freespace import FreeSpace
@@ -63,6 +64,12 @@ INDISPENSABLE: frozenset[StageName] = frozenset({"ingest", "coarse"})
 
 NEEDS: dict[StageName, StageName] = {"freespace": "surface", "explore": "freespace", "enhance": "explore"}
 """What a stage cannot do without, besides the indispensable ones; skipped with it."""
+
+NEED_GAUSSIANS: tuple[StageName, ...] = ("assess", "surface", "freespace", "explore", "enhance", "finetune")
+"""Stages that work on Gaussians; skipped where the scene is a radiance field."""
+
+NO_GAUSSIANS = "the scene is a radiance field, and the stage needs Gaussians"
+"""Why they are."""
 
 
 class Pipeline(ABC):
@@ -109,6 +116,8 @@ class Pipeline(ABC):
         """Why a stage is skipped, or None if it runs; called after the stages before it have run."""
         if stage in self.leave_out:
             return self.leave_out[stage]
+        if stage in NEED_GAUSSIANS and self.config.uc_nerf.enabled:
+            return NO_GAUSSIANS
         planned = self.planned(stage)
         # Stages are left out to compare methods. The remaining stages then run regardless of the plan, so
         # that all methods are compared under the same conditions.
@@ -210,6 +219,8 @@ class Result:
     Args:
         sequence: all frames, with the poses the scene belongs to.
         reconstruction: the coarse scene and its training history.
+        uc_nerf: the radiance field and its training history, instead of `reconstruction`, where
+            `uc_nerf.enabled` is set.
         plan: measurements of the coarse scene, and the decisions on later stages.
         mesh: the surface mesh.
         freespace: occupancy and clearance for virtual cameras.
@@ -224,6 +235,7 @@ class Result:
 
     sequence: EndoscopicSequence
     reconstruction: TrainingResult | None = None
+    uc_nerf: UcNerfResult | None = None
     plan: ScenePlan | None = None
     mesh: Mesh | None = None
     freespace: FreeSpace | None = None
@@ -240,8 +252,10 @@ class Result:
         """The coarse scene.
 
         Raises:
-            CaptureError: when the run ended before the stage `coarse`.
+            CaptureError: when the run ended before the stage `coarse`, or the scene is a radiance field.
         """
+        if self.uc_nerf is not None:
+            raise CaptureError(f"{self.sequence.name}: there are no Gaussians; the scene is `uc_nerf`")
         if self.reconstruction is None:
             raise CaptureError(f"{self.sequence.name}: the run ended before the scene was reconstructed")
         return self.reconstruction.scene
@@ -316,6 +330,9 @@ class InMemoryPipeline(Pipeline):
 
         with self._timed("coarse"):
             self._training = self.result.sequence.training_part()
+            if self.config.uc_nerf.enabled:
+                self.result.uc_nerf = self._train_uc_nerf()
+                return
             found = reconstruct(self._training, self.config.coarse)
             if found.refined is not None:
                 # The scene was optimised with the corrected poses: later stages need them.
@@ -391,18 +408,30 @@ class InMemoryPipeline(Pipeline):
         from extrags.evaluation import evaluate_renders, render
         from extrags.metrics.surface import scene_surface
 
-        scenes = {"coarse": self.result.coarse}
-        if self.result.finetuning is not None:
-            scenes["final"] = self.result.finetuning.scene
         measure = self._perceptual_difference()
         sequence = self.result.sequence
         with self._timed("evaluate"):
-            for which, scene in scenes.items():
-                self.result.renders[which] = render(scene, sequence)
+            meshes: dict[str, Mesh | None] = {}
+            if self.result.uc_nerf is not None:
+                from extrags.baselines.uc_nerf import rendering
+
+                field = self.result.uc_nerf.scene
+                self.result.renders["coarse"] = rendering.render(field, sequence)
+                if self.true_surface is not None:
+                    meshes["coarse"] = rendering.surface(field, sequence)
+            else:
+                scenes = {"coarse": self.result.coarse}
+                if self.result.finetuning is not None:
+                    scenes["final"] = self.result.finetuning.scene
+                for which, scene in scenes.items():
+                    self.result.renders[which] = render(scene, sequence)
+                    if self.true_surface is not None:
+                        meshes[which] = scene_surface(scene, sequence)
+            for which, renders in self.result.renders.items():
                 self.result.evaluations[which] = evaluate_renders(
-                    self.result.renders[which],
+                    renders,
                     sequence,
-                    mesh=None if self.true_surface is None else scene_surface(scene, sequence),
+                    mesh=meshes.get(which),
                     true_surface=self.true_surface,
                     measure=measure,
                 )
@@ -411,6 +440,11 @@ class InMemoryPipeline(Pipeline):
 
     def report(self) -> None:
         """Nothing: the HTML report is built from artefacts, which a run in memory does not have."""
+
+    def _train_uc_nerf(self) -> UcNerfResult:
+        from extrags.baselines.uc_nerf.training import train
+
+        return train(self._training, self.config.uc_nerf)
 
     def _perceptual_difference(self) -> PerceptualDifference:
         from extrags.confidence import PerceptualDifference

@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
+from extrags.pipeline import NEED_GAUSSIANS, NO_GAUSSIANS
 from flows.settings import pipeline_config
 
 __all__ = [
@@ -25,7 +26,7 @@ __all__ = [
     "three_dgs",
 ]
 
-MethodName = Literal["extrags", "coarse", "3dgs", "classical", "real-only"]
+MethodName = Literal["extrags", "coarse", "3dgs", "classical", "real-only", "uc-nerf"]
 
 EXPLORING = ("surface", "freespace", "explore", "enhance")
 
@@ -105,6 +106,10 @@ def _classical(_: PipelineConfig) -> dict[str, Any]:
     return {"enhance.backend": "classical"}
 
 
+def _uc_nerf(_: PipelineConfig) -> dict[str, Any]:
+    return {"uc_nerf.enabled": True}
+
+
 def _nothing(_: PipelineConfig) -> dict[str, Any]:
     return {}
 
@@ -139,6 +144,11 @@ METHODS: dict[str, Method] = {
     "real-only": Method(
         "fine-tuned on the real views alone: the control",
         leave_out=dict.fromkeys(EXPLORING, "the run is a control on real views alone"),
+    ),
+    "uc-nerf": Method(
+        "UC-NeRF: radiance field conditioned on uncertainty-aware multi-view stereo",
+        _uc_nerf,
+        dict.fromkeys(NEED_GAUSSIANS, NO_GAUSSIANS),
     ),
 }
 

@@ -28,6 +28,7 @@ from tasks.poses import poses
 from tasks.progress import StageProgress, notify
 from tasks.report import PAGE, REPORT_PARTS, report
 from tasks.surface import surface
+from tasks.uc_nerf import render_uc_nerf, uc_nerf
 from tasks.weights import Weights, lpips_weights, restorer_digest
 
 __all__ = ["SequenceRun", "run_sequence"]
@@ -161,6 +162,10 @@ class SequenceRun(Pipeline):
             self.refs["training"] = self._run_uncounted(
                 Call(training_frames, {"sequence": self.refs["sequence"]})
             )
+            if self.config.uc_nerf.enabled:
+                inputs = {"sequence": self.refs["training"], "config": self.config.uc_nerf}
+                self.refs["coarse"] = self._run_task(row, Call(uc_nerf, inputs))
+                return
             inputs = {"sequence": self.refs["training"], "config": self.config.coarse}
             self.refs["coarse"] = self._run_task(row, Call(coarse, inputs))
             counts = self._manifest("coarse").counts
@@ -258,8 +263,9 @@ class SequenceRun(Pipeline):
             scenes = [self.refs["coarse"]]
             if "finetune" in self.refs:
                 scenes.append(self.refs["finetune"])
+            task = render_uc_nerf if self.config.uc_nerf.enabled else render
             renders = self._run_tasks(
-                row, [Call(render, {"scene": ref, "sequence": sequence}) for ref in scenes]
+                row, [Call(task, {"scene": ref, "sequence": sequence}) for ref in scenes]
             )
             weights = self._weights()
             settings = {

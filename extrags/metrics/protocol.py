@@ -61,7 +61,8 @@ class RenderedViews(Storable):
         rgb: colours, [V, H, W, 3], float32.
         alpha: opacities, [V, H, W], float32.
         depth_mm: expected z-depth in the unit of the sequence, [V, H, W], float32.
-        n_gaussians: size of the scene that was rendered; None for renders made elsewhere.
+        n_gaussians: size of the scene that was rendered; None for renders made elsewhere, or not of
+            Gaussians.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -318,7 +319,7 @@ def _reasons(
             if metric.lpips_net is not None:
                 reasons[metric.key] = lpips_reason if lpips is None else f"LPIPS was taken with {lpips.net}"
     if metrics["n_gaussians"] is None:
-        reasons["n_gaussians"] = "the renders were made elsewhere"
+        reasons["n_gaussians"] = "the renders were made elsewhere, or are not of Gaussians"
     if metrics["depth_absrel"] is None:
         reasons["depth_absrel"] = (
             "the sequence has no true depth"

@@ -9,6 +9,7 @@ import pytest
 from extrags.config import PROFILES, CoarseConfig, PipelineConfig
 from extrags.config.settings import settings_of
 from extrags.errors import ConfigError
+from extrags.pipeline import NEED_GAUSSIANS
 from flows.methods import (
     METHODS,
     THREE_DGS_SHARED,
@@ -55,6 +56,13 @@ def test_the_baseline_is_plain() -> None:
     assert plain.densify.start_share * plain.iterations == pytest.approx(500)
     assert plain.densify.stop_share * plain.iterations == pytest.approx(15_000)
     assert set(METHODS["3dgs"].leave_out) >= {"explore", "enhance", "finetune"}
+
+
+def test_a_baseline_of_its_own_representation_leaves_out_what_needs_gaussians() -> None:
+    assert method_config("uc-nerf", "quick").uc_nerf.enabled
+    assert set(METHODS["uc-nerf"].leave_out) == set(NEED_GAUSSIANS)
+    for name in set(METHODS) - {"uc-nerf"}:
+        assert not method_config(name, "quick").uc_nerf.enabled
 
 
 def test_overrides_and_seeds_reach_what_is_open_only() -> None:

@@ -11,14 +11,15 @@ import torch
 
 import extrags
 from data_catalog.true_surface import true_surface
-from extrags.errors import ConfigError
+from extrags.errors import CaptureError, ConfigError
 from extrags.exploration import Exploration
-from extrags.pipeline import INDISPENSABLE, NEEDS, STAGES
+from extrags.pipeline import INDISPENSABLE, NEED_GAUSSIANS, NEEDS, STAGES
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.store import Store
+from flows.methods import METHODS
 from flows.outcome import SequenceOutcome
-from flows.runners import DirectRunner
+from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
 
@@ -60,6 +61,57 @@ class TestAgreement:
         assert outcome.plan == in_memory.plan.model_dump(mode="json")
         for which in ("coarse", "final"):
             assert json.loads(json.dumps(in_memory.evaluations[which].metrics)) == outcome.metrics[which]
+
+
+class TestUcNerf:
+    """The baseline that brings a scene of its own: the same rules and results in memory and cached."""
+
+    @pytest.fixture(scope="class")
+    def cached(self, finished: tuple[str, SequenceOutcome]) -> SequenceOutcome:
+        store, _ = finished
+        config = tiny_config(uc_nerf__enabled=True)
+        outcome = run_sequence(
+            SEQUENCE, config, store, DirectRunner(store), leave_out=METHODS["uc-nerf"].leave_out
+        )
+        assert outcome.status == "ok", outcome.error
+        return outcome
+
+    def test_in_memory_and_cached(self, cached: SequenceOutcome) -> None:
+        config = tiny_config(uc_nerf__enabled=True)
+        sequence = extrags.read(SEQUENCE, config.ingest)
+        # Without `leave_out`: the pipeline knows by itself what needs Gaussians.
+        result = extrags.run_pipeline(sequence, config, true_surface=true_surface(sequence))
+        reasons = {row.stage: row.reason for row in cached.stages if row.state == "skipped"}
+        assert reasons == result.skipped
+        assert set(reasons) == {"poses", *NEED_GAUSSIANS}
+        assert json.loads(json.dumps(result.evaluations["final"].metrics)) == cached.metrics["final"]
+        assert cached.metrics["final"]["psnr"] > 10
+        assert cached.metrics["final"]["surface"]["recall"] is not None
+        with pytest.raises(CaptureError, match="there are no Gaussians"):
+            _ = result.scene
+
+    def test_the_second_run_is_cached(
+        self, cached: SequenceOutcome, finished: tuple[str, SequenceOutcome]
+    ) -> None:
+        store, ours = finished
+        config = tiny_config(uc_nerf__enabled=True)
+        again = run_sequence(
+            SEQUENCE, config, store, StoreRunner(store), leave_out=METHODS["uc-nerf"].leave_out
+        )
+        assert {row.state for row in again.stages} == {"cached", "skipped"}
+        assert again.digests["coarse"] == cached.digests["coarse"] != ours.digests["coarse"]
+        assert cached.report is not None
+        assert "radiance field" in Path(cached.report).read_text()
+
+    def test_settings_of_gaussians_do_not_concern_it(
+        self, cached: SequenceOutcome, finished: tuple[str, SequenceOutcome]
+    ) -> None:
+        store, _ = finished
+        config = tiny_config(uc_nerf__enabled=True, coarse__iterations=7)
+        again = run_sequence(SEQUENCE, config, store, StoreRunner(store), until="evaluate")
+        assert again.digests["coarse"] == cached.digests["coarse"]
+        with pytest.raises(NotInStoreError, match="uc-nerf-v"):
+            run_sequence(SEQUENCE, config.with_seed(5), store, StoreRunner(store), until="evaluate")
 
 
 class TestRules:
