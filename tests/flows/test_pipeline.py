@@ -63,20 +63,23 @@ class TestAgreement:
             assert json.loads(json.dumps(in_memory.evaluations[which].metrics)) == outcome.metrics[which]
 
 
+@pytest.fixture(scope="module")
+def uc_nerf(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, SequenceOutcome]:
+    """A store in which the tiny sequence was reconstructed and evaluated with the baseline."""
+    store = str(tmp_path_factory.mktemp("uc_nerf") / "store")
+    config = tiny_config(uc_nerf__enabled=True)
+    outcome = run_sequence(
+        SEQUENCE, config, store, DirectRunner(store), leave_out=METHODS["uc-nerf"].leave_out
+    )
+    assert outcome.status == "ok", outcome.error
+    return store, outcome
+
+
 class TestUcNerf:
     """The baseline that brings a scene of its own: the same rules and results in memory and cached."""
 
-    @pytest.fixture(scope="class")
-    def cached(self, finished: tuple[str, SequenceOutcome]) -> SequenceOutcome:
-        store, _ = finished
-        config = tiny_config(uc_nerf__enabled=True)
-        outcome = run_sequence(
-            SEQUENCE, config, store, DirectRunner(store), leave_out=METHODS["uc-nerf"].leave_out
-        )
-        assert outcome.status == "ok", outcome.error
-        return outcome
-
-    def test_in_memory_and_cached(self, cached: SequenceOutcome) -> None:
+    def test_in_memory_and_cached(self, uc_nerf: tuple[str, SequenceOutcome]) -> None:
+        _, cached = uc_nerf
         config = tiny_config(uc_nerf__enabled=True)
         sequence = extrags.read(SEQUENCE, config.ingest)
         # Without `leave_out`: the pipeline knows by itself what needs Gaussians.
@@ -90,28 +93,19 @@ class TestUcNerf:
         with pytest.raises(CaptureError, match="there are no Gaussians"):
             _ = result.scene
 
-    def test_the_second_run_is_cached(
-        self, cached: SequenceOutcome, finished: tuple[str, SequenceOutcome]
-    ) -> None:
-        store, ours = finished
-        config = tiny_config(uc_nerf__enabled=True)
-        again = run_sequence(
-            SEQUENCE, config, store, StoreRunner(store), leave_out=METHODS["uc-nerf"].leave_out
-        )
-        assert {row.state for row in again.stages} == {"cached", "skipped"}
-        assert again.digests["coarse"] == cached.digests["coarse"] != ours.digests["coarse"]
-        assert cached.report is not None
-        assert "radiance field" in Path(cached.report).read_text()
-
-    def test_settings_of_gaussians_do_not_concern_it(
-        self, cached: SequenceOutcome, finished: tuple[str, SequenceOutcome]
-    ) -> None:
-        store, _ = finished
+    def test_settings_of_gaussians_do_not_concern_it(self, uc_nerf: tuple[str, SequenceOutcome]) -> None:
+        store, cached = uc_nerf
         config = tiny_config(uc_nerf__enabled=True, coarse__iterations=7)
         again = run_sequence(SEQUENCE, config, store, StoreRunner(store), until="evaluate")
+        assert {row.state for row in again.stages} == {"cached", "skipped"}
         assert again.digests["coarse"] == cached.digests["coarse"]
         with pytest.raises(NotInStoreError, match="uc-nerf-v"):
             run_sequence(SEQUENCE, config.with_seed(5), store, StoreRunner(store), until="evaluate")
+
+    def test_the_page_says_why_stages_are_missing(self, uc_nerf: tuple[str, SequenceOutcome]) -> None:
+        _, cached = uc_nerf
+        assert cached.report is not None
+        assert "radiance field" in Path(cached.report).read_text()
 
 
 class TestRules:

@@ -226,7 +226,10 @@ class TestField:
         np.testing.assert_allclose(rays.center.numpy(), views.centers[0], atol=1e-12)
 
     def test_gradient_of_the_conditioned_field(self) -> None:
-        """Central differences in float64, on parameters of each part."""
+        """Central differences in float64, on parameters of each part.
+
+        Not of the coarse level: the place of the fine hypotheses is taken from it without gradient.
+        """
         torch.manual_seed(0)
         config = TINY.model_copy(update={"width": 8})
         views = cameras(np.array([[0.0, 0, 0], [2.5, 0, 0], [-2.5, 0.5, 0]]))
@@ -252,7 +255,7 @@ class TestField:
         loss().backward()
         chosen = [
             field.trunk[0].weight, field.score[0].weight, field.own.bias, field.adaptive[2].bias,
-            stereo.encoders[1][2].weight, stereo.regularisers[0].across.weight,
+            stereo.encoders[1][2].weight, stereo.regularisers[1].across.weight,
         ]  # fmt: skip
         for parameter in chosen:
             assert parameter.grad is not None
