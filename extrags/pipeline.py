@@ -24,6 +24,7 @@ from extrags.errors import CaptureError, ConfigError
 
 if TYPE_CHECKING:
     from extrags.assessment import Decision, ScenePlan
+    from extrags.baselines.uc_nerf.training import UcNerfResult
     from extrags.confidence import PerceptualDifference
     from extrags.exploration import Exploration
     from extrags.freespace import FreeSpace
@@ -79,6 +80,12 @@ HELD_OUT_TRAINED_ON = "oracle: held-out frames were trained on"
 
 AFTER_COARSE: tuple[StageName, ...] = ("surface", "freespace", "explore", "enhance", "finetune")
 """The stages that the plan decides on."""
+
+NEED_GAUSSIANS: tuple[StageName, ...] = ("assess", "surface", "freespace", "explore", "enhance", "finetune")
+"""Stages that work on Gaussians; skipped where the scene is a radiance field."""
+
+NO_GAUSSIANS = "the scene is a radiance field, and the stage needs Gaussians"
+"""Why they are."""
 
 
 class Pipeline(ABC):
@@ -137,6 +144,8 @@ class Pipeline(ABC):
             return self.leave_out[stage]
         if stage == "assess" and not needs_plan(self.leave_out):
             return "no stage of this run depends on the plan"
+        if stage in NEED_GAUSSIANS and self.config.uc_nerf.enabled:
+            return NO_GAUSSIANS
         planned = self.planned(stage)
         # Stages are left out to compare methods. The remaining stages then run regardless of the plan, so
         # that all methods are compared under the same conditions.
@@ -247,6 +256,8 @@ class Result:
     Args:
         sequence: all frames, with the poses the scene belongs to.
         reconstruction: the coarse scene and its training history.
+        uc_nerf: the radiance field and its training history, instead of `reconstruction`, where
+            `uc_nerf.enabled` is set.
         plan: measurements of the coarse scene, and the decisions on later stages.
         mesh: the surface mesh.
         freespace: occupancy and clearance for virtual cameras.
@@ -261,6 +272,7 @@ class Result:
 
     sequence: EndoscopicSequence
     reconstruction: TrainingResult | None = None
+    uc_nerf: UcNerfResult | None = None
     plan: ScenePlan | None = None
     mesh: Mesh | None = None
     freespace: FreeSpace | None = None
@@ -277,8 +289,10 @@ class Result:
         """The coarse scene.
 
         Raises:
-            CaptureError: when the run ended before the stage `coarse`.
+            CaptureError: when the run ended before the stage `coarse`, or the scene is a radiance field.
         """
+        if self.uc_nerf is not None:
+            raise CaptureError(f"{self.sequence.name}: there are no Gaussians; the scene is `uc_nerf`")
         if self.reconstruction is None:
             raise CaptureError(f"{self.sequence.name}: the run ended before the scene was reconstructed")
         return self.reconstruction.scene
@@ -353,6 +367,9 @@ class InMemoryPipeline(Pipeline):
 
         with self._timed("coarse"):
             self._training = self.result.sequence.training_part()
+            if self.config.uc_nerf.enabled:
+                self.result.uc_nerf = self._train_uc_nerf()
+                return
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
             found = reconstruct(self.result.sequence if oracle else self._training, self.config.coarse)
@@ -431,18 +448,30 @@ class InMemoryPipeline(Pipeline):
         from extrags.metrics.lpips import available_lpips
         from extrags.metrics.surface import scene_surface
 
-        scenes = {"coarse": self.result.coarse}
-        if self.result.finetuning is not None:
-            scenes["final"] = self.result.finetuning.scene
         lpips = available_lpips(self.config.evaluate)
         sequence = self.result.sequence
         with self._timed("evaluate"):
-            for which, scene in scenes.items():
-                self.result.renders[which] = render(scene, sequence, train_on=self.config.coarse.train_on)
+            meshes: dict[str, Mesh | None] = {}
+            if self.result.uc_nerf is not None:
+                from extrags.baselines.uc_nerf import rendering
+
+                field = self.result.uc_nerf.scene
+                self.result.renders["coarse"] = rendering.render(field, sequence)
+                if self.true_surface is not None:
+                    meshes["coarse"] = rendering.surface(field, sequence)
+            else:
+                scenes = {"coarse": self.result.coarse}
+                if self.result.finetuning is not None:
+                    scenes["final"] = self.result.finetuning.scene
+                for which, scene in scenes.items():
+                    self.result.renders[which] = render(scene, sequence, train_on=self.config.coarse.train_on)
+                    if self.true_surface is not None:
+                        meshes[which] = scene_surface(scene, sequence)
+            for which, renders in self.result.renders.items():
                 self.result.evaluations[which] = evaluate_renders(
-                    self.result.renders[which],
+                    renders,
                     sequence,
-                    mesh=None if self.true_surface is None else scene_surface(scene, sequence),
+                    mesh=meshes.get(which),
                     true_surface=self.true_surface,
                     lpips=lpips,
                 )
@@ -451,6 +480,11 @@ class InMemoryPipeline(Pipeline):
 
     def report(self) -> None:
         """Nothing: the HTML report is built from artefacts, which a run in memory does not have."""
+
+    def _train_uc_nerf(self) -> UcNerfResult:
+        from extrags.baselines.uc_nerf.training import train
+
+        return train(self._training, self.config.uc_nerf)
 
     def _perceptual_difference(self) -> PerceptualDifference:
         from extrags.confidence import PerceptualDifference

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
-from extrags.pipeline import HELD_OUT_TRAINED_ON
+from extrags.pipeline import HELD_OUT_TRAINED_ON, NEED_GAUSSIANS, NO_GAUSSIANS
 from flows.settings import pipeline_config
 
 __all__ = [
@@ -40,6 +40,7 @@ MethodName = Literal[
     "gaussian-pancakes",
     "classical",
     "real-only",
+    "uc-nerf",
 ]
 
 EXPLORING = ("surface", "freespace", "explore", "enhance")
@@ -253,6 +254,10 @@ def _classical(_: PipelineConfig) -> dict[str, Any]:
     return {"enhance.backend": "classical"}
 
 
+def _uc_nerf(_: PipelineConfig) -> dict[str, Any]:
+    return {"uc_nerf.enabled": True}
+
+
 def _nothing(_: PipelineConfig) -> dict[str, Any]:
     return {}
 
@@ -308,6 +313,11 @@ METHODS: dict[str, Method] = {
     "real-only": Method(
         "fine-tuned on the real views alone: the control",
         leave_out=dict.fromkeys(EXPLORING, "the run is a control on real views alone"),
+    ),
+    "uc-nerf": Method(
+        "UC-NeRF: radiance field conditioned on uncertainty-aware multi-view stereo",
+        _uc_nerf,
+        dict.fromkeys(NEED_GAUSSIANS, NO_GAUSSIANS),
     ),
 }
 

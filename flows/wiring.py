@@ -28,6 +28,7 @@ from tasks.poses import poses
 from tasks.progress import StageProgress, notify
 from tasks.report import PAGE, REPORT_PARTS, report
 from tasks.surface import surface
+from tasks.uc_nerf import render_uc_nerf, uc_nerf
 from tasks.weights import Weights, lpips_weights, restorer_digest
 
 __all__ = ["SequenceRun", "run_sequence"]
@@ -161,6 +162,10 @@ class SequenceRun(Pipeline):
             self.refs["training"] = self._run_uncounted(
                 Call(training_frames, {"sequence": self.refs["sequence"]})
             )
+            if self.config.uc_nerf.enabled:
+                inputs = {"sequence": self.refs["training"], "config": self.config.uc_nerf}
+                self.refs["coarse"] = self._run_task(row, Call(uc_nerf, inputs))
+                return
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
             frames = self.refs["sequence" if oracle else "training"]
@@ -264,8 +269,12 @@ class SequenceRun(Pipeline):
             scenes = [self.refs["coarse"]]
             if "finetune" in self.refs:
                 scenes.append(self.refs["finetune"])
-            shown = {"sequence": sequence, "train_on": self.config.coarse.train_on}
-            renders = self._run_tasks(row, [Call(render, {"scene": ref, **shown}) for ref in scenes])
+            if self.config.uc_nerf.enabled:
+                calls = [Call(render_uc_nerf, {"scene": ref, "sequence": sequence}) for ref in scenes]
+            else:
+                shown = {"sequence": sequence, "train_on": self.config.coarse.train_on}
+                calls = [Call(render, {"scene": ref, **shown}) for ref in scenes]
+            renders = self._run_tasks(row, calls)
             weights = self._weights()
             settings = {
                 "lpips_digests": {item.net: item.digest for item in weights},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from extrags.config.baselines import UcNerfConfig
 from extrags.config.restorer import EnhanceConfig
 from extrags.config.stages import (
     CoarseConfig,
@@ -31,6 +32,14 @@ PROFILES: dict[str, PipelineConfig] = {
             densify=DensifyConfig(max_gaussians=14_000),
             # The published learning rates are too small for a short run.
             optimiser=OptimiserConfig(means=3.2e-4, sh0=5e-3),
+        ),
+        uc_nerf=UcNerfConfig(
+            iterations=400,
+            source_views=3,
+            fine_planes=6,
+            samples_prior=8,
+            rays=192,
+            patches=4,
         ),
         explore=ExploreConfig(trajectories=12, length=10, rotation_deg=20.0, orbit_deg=20.0),
         enhance=EnhanceConfig(max_views=96),
@@ -60,6 +69,19 @@ PROFILES: dict[str, PipelineConfig] = {
             sh_degree=3,
             sh_every=1000,
             densify=DensifyConfig(max_gaussians=400_000, start_share=1 / 60, stop_share=0.5),
+        ),
+        # What is published of the counts; the widths are larger than for two cores, but not the original's.
+        uc_nerf=UcNerfConfig(
+            iterations=30_000,
+            source_views=6,
+            stereo_width=80,
+            coarse_planes=48,
+            samples_uniform=30,
+            samples_prior=60,
+            width=128,
+            rays=2000,
+            patches=50,
+            learning_rate=6e-4,
         ),
         enhance=EnhanceConfig(
             folds=4,

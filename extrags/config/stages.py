@@ -13,6 +13,7 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError, field_validator
 
 from extrags.config.base import StageConfig
+from extrags.config.baselines import UcNerfConfig
 from extrags.config.restorer import EnhanceConfig
 from extrags.config.settings import settings_of, unknown_setting
 from extrags.thresholds import HOLE_ALPHA
@@ -505,6 +506,7 @@ class PipelineConfig(StageConfig):
     ingest: IngestConfig = IngestConfig()
     poses: PosesConfig = PosesConfig()
     coarse: CoarseConfig = CoarseConfig()
+    uc_nerf: UcNerfConfig = UcNerfConfig()
     assess: AssessConfig = AssessConfig()
     surface: SurfaceConfig = SurfaceConfig()
     freespace: FreespaceConfig = FreespaceConfig()

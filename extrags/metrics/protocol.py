@@ -64,7 +64,8 @@ class RenderedViews(Storable):
         rgb: colours, [V, H, W, 3], float32.
         alpha: opacities, [V, H, W], float32.
         depth_mm: expected z-depth in the unit of the sequence, [V, H, W], float32.
-        n_gaussians: size of the scene that was rendered; None for renders made elsewhere.
+        n_gaussians: size of the scene that was rendered; None for renders made elsewhere, or not of
+            Gaussians.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -325,7 +326,7 @@ def _reasons(
             network = None if lpips is None or metric.lpips_net is None else lpips[metric.lpips_net]
             reasons[metric.key] = network if isinstance(network, str) else "no view has a value"
     if metrics["n_gaussians"] is None:
-        reasons["n_gaussians"] = "the renders were made elsewhere"
+        reasons["n_gaussians"] = "the renders were made elsewhere, or are not of Gaussians"
     if metrics["depth_absrel"] is None:
         reasons["depth_absrel"] = (
             "the sequence has no true depth"

@@ -41,6 +41,7 @@ __all__ = [
     "seen_by",
     "surface_errors",
     "surface_from_depth",
+    "surface_from_renders",
 ]
 
 PROTOCOL_FUSION = SurfaceConfig(
@@ -139,8 +140,18 @@ def scene_surface(scene: Scene, sequence: EndoscopicSequence) -> Mesh | None:
         sequence: provides the training and held-out cameras.
     """
     cameras = sequence.cameras[_all_frames(sequence)]
+    return surface_from_renders(*rendered_depth(scene, cameras, PROTOCOL_FUSION))
+
+
+def surface_from_renders(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"]) -> Mesh | None:
+    """The surface by the rules of the protocol from depth rendered by any representation; None when empty.
+
+    Args:
+        cameras: of the training and held-out frames, at the size of the renders.
+        depth_mm: median z-depth, 0 where nothing was hit.
+    """
     try:
-        return _fused(*rendered_depth(scene, cameras, PROTOCOL_FUSION))
+        return _fused(cameras, depth_mm)
     except CaptureError:
         # An empty scene is a result, not a fault of the evaluation: its recall is zero.
         return None

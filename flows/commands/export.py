@@ -46,6 +46,8 @@ def export(given: argparse.Namespace) -> int:
 
 
 def _scene(given: argparse.Namespace) -> int:
+    if run_config(given).uc_nerf.enabled:
+        raise ConfigError(f"the method {given.method} makes no Gaussians; --to ply has nothing to write")
     run = finished_run(given, "coarse" if given.scene == "coarse" else "finetune")
     from extrags.scene import Scene
 

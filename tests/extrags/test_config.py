@@ -50,7 +50,7 @@ class TestConfig:
             ("coarse.iteration", "did you mean coarse.iterations"),
             ("coars.iterations", "did you mean coarse"),
             ("coarse", "group of settings"),
-            ("iterations", "did you mean coarse.iterations or finetune.iterations"),
+            ("iterations", "did you mean coarse.iterations or uc_nerf.iterations or finetune.iterations"),
             ("qqq", "settings begin with ingest, poses, coarse"),
             ("coarse.iterations.more", "no setting"),
         ],

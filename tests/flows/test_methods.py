@@ -9,7 +9,7 @@ import pytest
 from extrags.config import PROFILES, CoarseConfig, PipelineConfig
 from extrags.config.settings import settings_of
 from extrags.errors import ConfigError
-from extrags.pipeline import HELD_OUT_TRAINED_ON
+from extrags.pipeline import HELD_OUT_TRAINED_ON, NEED_GAUSSIANS
 from flows.benchmark import Case, case_of, check_methods
 from flows.methods import (
     METHODS,
@@ -171,6 +171,13 @@ def test_tables_say_which_method_has_seen_held_out_frames() -> None:
     assert "oracle" not in benchmark_markdown([plain], "3dgs")
     found = benchmark_markdown([plain, ceiling], "3dgs")
     assert found.startswith("oracle: held-out frames were trained on in ceiling.")
+
+
+def test_a_baseline_of_its_own_representation_leaves_out_what_needs_gaussians() -> None:
+    assert method_config("uc-nerf", "quick").uc_nerf.enabled
+    assert set(METHODS["uc-nerf"].leave_out) == set(NEED_GAUSSIANS)
+    for name in set(METHODS) - {"uc-nerf"}:
+        assert not method_config(name, "quick").uc_nerf.enabled
 
 
 def test_overrides_and_seeds_reach_what_is_open_only() -> None:

@@ -14,16 +14,16 @@ import extrags
 from data_catalog.true_surface import true_surface
 from extrags.assessment import measure
 from extrags.config import ExploreConfig
-from extrags.errors import ConfigError
+from extrags.errors import CaptureError, ConfigError
 from extrags.exploration import Exploration
-from extrags.pipeline import HELD_OUT_TRAINED_ON, INDISPENSABLE, NEEDS, STAGES, needs_plan
+from extrags.pipeline import HELD_OUT_TRAINED_ON, INDISPENSABLE, NEED_GAUSSIANS, NEEDS, STAGES, needs_plan
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.store import Store
 from flows.methods import METHODS
 from flows.outcome import SequenceOutcome
-from flows.runners import DirectRunner
+from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
 
@@ -68,6 +68,51 @@ class TestAgreement:
         assert outcome.plan == in_memory.plan.model_dump(mode="json")
         for which in ("coarse", "final"):
             assert json.loads(json.dumps(in_memory.evaluations[which].metrics)) == outcome.metrics[which]
+
+
+@pytest.fixture(scope="module")
+def uc_nerf(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, SequenceOutcome]:
+    """A store in which the tiny sequence was reconstructed and evaluated with the baseline."""
+    store = str(tmp_path_factory.mktemp("uc_nerf") / "store")
+    config = tiny_config(uc_nerf__enabled=True)
+    outcome = run_sequence(
+        SEQUENCE, config, store, DirectRunner(store), leave_out=METHODS["uc-nerf"].leave_out
+    )
+    assert outcome.status == "ok", outcome.error
+    return store, outcome
+
+
+class TestUcNerf:
+    """The baseline that brings a scene of its own: the same rules and results in memory and cached."""
+
+    def test_in_memory_and_cached(self, uc_nerf: tuple[str, SequenceOutcome]) -> None:
+        _, cached = uc_nerf
+        config = tiny_config(uc_nerf__enabled=True)
+        sequence = extrags.read(SEQUENCE, config.ingest)
+        # Without `leave_out`: the pipeline knows by itself what needs Gaussians.
+        result = extrags.run_pipeline(sequence, config, true_surface=true_surface(sequence))
+        reasons = {row.stage: row.reason for row in cached.stages if row.state == "skipped"}
+        assert reasons == result.skipped
+        assert set(reasons) == {"poses", *NEED_GAUSSIANS}
+        assert json.loads(json.dumps(result.evaluations["final"].metrics)) == cached.metrics["final"]
+        assert cached.metrics["final"]["psnr"] > 10
+        assert cached.metrics["final"]["surface"]["recall"] is not None
+        with pytest.raises(CaptureError, match="there are no Gaussians"):
+            _ = result.scene
+
+    def test_settings_of_gaussians_do_not_concern_it(self, uc_nerf: tuple[str, SequenceOutcome]) -> None:
+        store, cached = uc_nerf
+        config = tiny_config(uc_nerf__enabled=True, coarse__iterations=7)
+        again = run_sequence(SEQUENCE, config, store, StoreRunner(store), until="evaluate")
+        assert {row.state for row in again.stages} == {"cached", "skipped"}
+        assert again.digests["coarse"] == cached.digests["coarse"]
+        with pytest.raises(NotInStoreError, match="uc-nerf-v"):
+            run_sequence(SEQUENCE, config.with_seed(5), store, StoreRunner(store), until="evaluate")
+
+    def test_the_page_says_why_stages_are_missing(self, uc_nerf: tuple[str, SequenceOutcome]) -> None:
+        _, cached = uc_nerf
+        assert cached.report is not None
+        assert "radiance field" in Path(cached.report).read_text()
 
 
 class TestRules:
