@@ -45,6 +45,8 @@ def finetune(
     pseudo_views: PseudoViews | None,
     config: FinetuneConfig | None = None,
     coarse: CoarseConfig | None = None,
+    *,
+    stage: str = "finetune",
 ) -> TrainingResult:
     r"""Fine-tune a scene on real and virtual views together.
 
@@ -75,6 +77,7 @@ def finetune(
         pseudo_views: restored virtual views with confidences, or None.
         config: budgets and shares; None takes the defaults.
         coarse: rates and weights, those the coarse scene was made with; None takes the defaults.
+        stage: named in progress events.
 
     Raises:
         DivergedError: when the optimisation does not stay finite.
@@ -107,7 +110,7 @@ def finetune(
         _with_loss_weights(coarse, config),
         scene_extent(sequence, frames),
         depth,
-        "finetune",
+        stage,
         iterations=config.iterations,
         densify=coarse.densify.model_copy(update=densify),
     )
