@@ -1,9 +1,9 @@
 """How much of the fine-tuning to keep: a trial on training frames that its scene has never seen.
 
 Virtual views are guesses. Where they are good they fill what was never observed; where they are not (a torn
-surface, a restorer outside its world) they spoil what was. Which of both a scene is, its own frames tell: some
-are left out, the whole chain runs briefly without them, and the trial's coarse and fine-tuned scenes are
-compared on them. Held-out frames are never used.
+surface, a restorer outside its training data) they spoil what was. The scene's own frames tell which: some are
+left out, the whole chain runs briefly without them, and the trial's coarse and fine-tuned scenes are compared
+on them. Held-out frames are never used.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ __all__ = ["AMOUNTS", "Judgement", "Trial", "judge_finetuning"]
 
 logger = logging.getLogger(__name__)
 
-AMOUNTS = (1.0, 0.3, 0.0)
-"""What is tried, as a factor of `finetune.pseudo_weight`, until one holds; 0 is real views alone."""
+AMOUNTS = (1.0, 0.3)
+"""What is tried, as a factor of `finetune.pseudo_weight`, until one holds."""
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,10 @@ def judge_finetuning(
     One in `finetune.judge.leave_out_every` training frames is left out, in short runs. Without them the scene
     is reconstructed briefly under its own light, some of its virtual views are rendered from that scene and
     restored with references among the kept frames, and it is fine-tuned as the whole scene would be. The
-    largest of `AMOUNTS` for which the left-out frames lose at most `finetune.judge.max_loss_db` is kept.
+    control is fine-tuning on the kept frames alone: a brief reconstruction gains by any further step. The
+    largest of `AMOUNTS` is kept with which the left-out frames come within `finetune.judge.max_loss_db` of
+    both the control and the coarse scene; else the control, if it holds against the coarse scene; else
+    nothing.
 
     Args:
         scene: the coarse scene, trained on `sequence.train`.
@@ -160,26 +163,28 @@ def judge_finetuning(
     if enhancer is not None:
         small = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
         views = _restored(start, part, small, enhancer, enhance, settings.views, measure)
+    brief = config.model_copy(
+        update={"iterations": max(1, round(settings.iterations_share * config.iterations))}
+    )
     before = _psnr_db(start, part)
-    trials = []
-    for amount in AMOUNTS if views is not None else (0.0,):
+
+    def trial(amount: float) -> Trial:
+        weight = {"pseudo_weight": amount * config.pseudo_weight} if amount > 0 else {}
+        pseudo_views = views if amount > 0 else None
         found = finetune(
-            start,
-            part,
-            views if amount > 0 else None,
-            config.model_copy(
-                update={
-                    "iterations": max(1, round(settings.iterations_share * config.iterations)),
-                    "pseudo_weight": max(amount, 1e-6) * config.pseudo_weight,
-                }
-            ),
-            trial_coarse,
-            stage="finetune-judge",
+            start, part, pseudo_views, brief.model_copy(update=weight), trial_coarse, stage="finetune-judge"
         )
-        trials.append(_trial(amount, before, _psnr_db(found.scene, part)))
-        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{amount:g}", trials[-1].gain_db))
-        if trials[-1].gain_db >= -settings.max_loss_db:
-            break
+        result = _trial(amount, before, _psnr_db(found.scene, part))
+        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{amount:g}", result.gain_db))
+        return result
+
+    control = trial(0.0)
+    trials = [control]
+    if views is not None:
+        for amount in AMOUNTS:
+            trials.append(trial(amount))
+            if trials[-1].gain_db >= max(control.gain_db, 0.0) - settings.max_loss_db:
+                break
     judgement = _decided(trials, settings.max_loss_db, left)
     logger.info("finetune: %s", judgement.reason)
     return judgement
@@ -215,7 +220,7 @@ def _restored(
 
 
 def _psnr_db(scene: Scene, sequence: EndoscopicSequence) -> list[float]:
-    """PSNR of the held-out frames of a sequence inside their masks; frames without valid pixels are omitted."""
+    """PSNR of the held-out frames of a sequence inside their masks, without frames that have no valid pixel."""
     renders = render(scene, sequence)
     truth = torch.from_numpy(sequence.rgb[sequence.test].astype(np.float32) / 255)
     mask = torch.from_numpy(sequence.mask[sequence.test])
@@ -230,19 +235,22 @@ def _trial(amount: float, before: list[float], after: list[float]) -> Trial:
 
 
 def _decided(trials: Sequence[Trial], max_loss_db: float, left: Int[np.ndarray, "m"]) -> Judgement:
-    last = trials[-1]
+    """The judgement on trials: the control first, then falling amounts, of which the last alone may hold."""
+    control, last = trials[0], trials[-1]
+    names = ["real views alone", *(f"weight x {trial.amount:g}" for trial in trials[1:])]
     changes = ", ".join(
-        f"{trial.gain_db:+.2f} dB ({'real views alone' if trial.amount == 0 else f'weight x {trial.amount:g}'})"
-        for trial in trials
+        f"{trial.gain_db:+.2f} dB ({name})" for name, trial in zip(names, trials, strict=True)
     )
     frames = f"on {len(left)} training frames left out of a trial, fine-tuning changes PSNR by {changes}"
-    holds = last.gain_db >= -max_loss_db
-    if not holds:
-        outcome = f"all lose more than {max_loss_db:g} dB: the coarse scene is kept"
-    elif last.amount == 0:
-        outcome = "virtual views are left out of the fine-tuning"
-    elif last.amount < 1:
-        outcome = f"virtual views weigh {last.amount:g} of finetune.pseudo_weight"
+    amount: float | None = None
+    if last.amount > 0 and last.gain_db >= max(control.gain_db, 0.0) - max_loss_db:
+        amount = last.amount
+        outcome = "virtual views are kept"
+        if amount < 1:
+            outcome = f"virtual views weigh {amount:g} of finetune.pseudo_weight"
+    elif control.gain_db >= -max_loss_db:
+        amount = 0.0
+        outcome = "fine-tuning is on real views alone"
     else:
-        outcome = "it is kept"
-    return Judgement(last.amount if holds else None, f"{frames}; {outcome}", tuple(trials), tuple(left.tolist()))
+        outcome = f"all lose more than {max_loss_db:g} dB: the coarse scene is kept"
+    return Judgement(amount, f"{frames}; {outcome}", tuple(trials), tuple(left.tolist()))

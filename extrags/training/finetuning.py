@@ -29,6 +29,15 @@ UNKNOWN = 0.5
 CARVED_MARGIN = 0.05
 """A new Gaussian nearer than a real view's surface by this share of its depth would hide it."""
 
+KNOWN_BELOW = 0.5
+"""Below this uncertainty a solid pixel of a virtual view shows surface the scene knows."""
+
+GUESSED_NEARER = 0.25
+"""A new Gaussian this much nearer than another virtual view's completed depth stands in that view's way."""
+
+MAX_GUESS_DISTANCE = 0.5
+"""Farther from known surface, in median depths, completed depth is too wrong to place a Gaussian by."""
+
 MIN_POINTS = 8
 """Fewer hole points have neither neighbours nor normals."""
 
@@ -185,7 +194,9 @@ def hole_gaussians(
 
     Points come from the completed depth of hole pixels, their albedo from the restored colour with the
     light divided out; like the scene's first Gaussians they lie flat on the surface, which the light's
-    cosine asks for. Points that would stand in front of what a real view saw are dropped.
+    cosine asks for. A guess must not hide what is known: dropped are points in front of what a real view saw,
+    of what a virtual view shows of known surface, or of the depth another virtual view completes there, and
+    points far from all known surface.
 
     Args:
         scene: the coarse scene.
@@ -216,8 +227,10 @@ def hole_gaussians(
         normals = np.einsum("nji,nj->ni", into_camera, surface_normals(points))
         lit = torch.from_numpy(rgb), torch.from_numpy(local), torch.from_numpy(normals)
         rgb = scene.light.albedo(*lit, min_gain=MIN_GAIN).detach().numpy()
-    unseen = ~_in_front_of_real_surface(points, scene, sequence)
-    points, rgb = points[unseen], rgb[unseen]
+    placed = _near_known_surface(points, scene, MAX_GUESS_DISTANCE * median_depth(sequence, sequence.train))
+    placed &= ~_in_front_of_real_surface(points, scene, sequence)
+    placed &= ~_in_front_of_virtual_surface(points, pseudo_views)
+    points, rgb = points[placed], rgb[placed]
     if len(points) < MIN_POINTS:
         return None
     spacing = _typical_spacing(scene.gaussians)
@@ -274,6 +287,31 @@ def _in_front_of_real_surface(
         seen = depth[row, column]
         hides[inside] |= (seen > 0) & (z[inside] < (1 - CARVED_MARGIN) * seen)
     return hides
+
+
+def _in_front_of_virtual_surface(
+    points: Float[np.ndarray, "n 3"], pseudo_views: PseudoViews
+) -> Bool[np.ndarray, "n"]:
+    """Points that stand between a virtual camera and the surface it shows, known or completed."""
+    hides = np.zeros(len(points), dtype=bool)
+    cameras = pseudo_views.cameras
+    for index in range(len(cameras)):
+        (pixels,), (z,) = cameras[index].project(points)
+        inside = cameras.contains(pixels)
+        column, row = pixels[inside].astype(np.int64).T
+        solid = pseudo_views.alpha[index][row, column] >= HOLE_ALPHA
+        known = solid & (pseudo_views.uncertainty[index][row, column] < KNOWN_BELOW)
+        # Completed depths of two views hardly ever agree closely; surface between both is uncertain.
+        margin = np.where(known, CARVED_MARGIN, np.where(solid, 1.0, GUESSED_NEARER))
+        hides[inside] |= z[inside] < (1 - margin) * pseudo_views.depth_mm[index][row, column]
+    return hides
+
+
+def _near_known_surface(
+    points: Float[np.ndarray, "n 3"], scene: Scene, distance: float
+) -> Bool[np.ndarray, "n"]:
+    found, _ = cKDTree(scene.gaussians.means.numpy()).query(points, distance_upper_bound=distance)
+    return np.isfinite(found)
 
 
 def _real_depth(scene: Scene, sequence: EndoscopicSequence, frame: int) -> Float[np.ndarray, "h w"]:
