@@ -1,9 +1,9 @@
 """How much of the fine-tuning to keep: a trial on training frames that its scene has never seen.
 
 Virtual views are guesses. Where they are good they fill what was never observed; where they are not (a torn
-surface, a restorer outside its training data) they spoil what was. The scene's own frames tell which: some are
-left out, the whole chain runs briefly without them, and the trial's coarse and fine-tuned scenes are compared
-on them. Held-out frames are never used.
+surface, a restorer outside its training data) they spoil what was. The scene's own frames tell which: some
+are left out, the whole chain runs briefly without them, and the trial's coarse and fine-tuned scenes are
+compared on them. Held-out frames are never used.
 """
 
 from __future__ import annotations
@@ -220,7 +220,7 @@ def _restored(
 
 
 def _psnr_db(scene: Scene, sequence: EndoscopicSequence) -> list[float]:
-    """PSNR of the held-out frames of a sequence inside their masks, without frames that have no valid pixel."""
+    """PSNR of each held-out frame of a sequence inside its mask; frames without valid pixels are omitted."""
     renders = render(scene, sequence)
     truth = torch.from_numpy(sequence.rgb[sequence.test].astype(np.float32) / 255)
     mask = torch.from_numpy(sequence.mask[sequence.test])

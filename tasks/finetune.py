@@ -1,6 +1,4 @@
-"""finetune: tries on left-out frames how much of it to keep, and optimises the coarse scene on real and
-restored views.
-"""
+"""finetune: judges on left-out frames how much to keep, and optimises on real and restored views."""
 
 from __future__ import annotations
 

@@ -311,7 +311,7 @@ def _near_known_surface(
     points: Float[np.ndarray, "n 3"], scene: Scene, distance: float
 ) -> Bool[np.ndarray, "n"]:
     found, _ = cKDTree(scene.gaussians.means.numpy()).query(points, distance_upper_bound=distance)
-    return np.isfinite(found)
+    return np.asarray(np.isfinite(found))
 
 
 def _real_depth(scene: Scene, sequence: EndoscopicSequence, frame: int) -> Float[np.ndarray, "h w"]:
