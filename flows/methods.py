@@ -121,6 +121,7 @@ def three_dgs(config: PipelineConfig) -> dict[str, Any]:
         "coarse.densify.prune_opacity": 0.005,
         "coarse.densify.split_scale_share": 0.01,
         "coarse.light.enabled": False,
+        "coarse.min_footprint_px": 0.0,
         "coarse.refine_poses": False,
     }
 

@@ -238,6 +238,13 @@ class CoarseConfig(StageConfig):
         le=1,
         description="starting Gaussians are discs on the surface, so thick against their radius; 1: round",
     )
+    min_footprint_px: float = Field(
+        0.0,
+        ge=0,
+        le=4,
+        description="standard deviation, in pixels of the training view that resolves it best, below which "
+        "the two larger axes of a Gaussian do not shrink; 0: no bound, as in 3DGS",
+    )
     optimiser: OptimiserConfig = OptimiserConfig()
     densify: DensifyConfig = DensifyConfig()
     light: LightConfig = LightConfig()

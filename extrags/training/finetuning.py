@@ -17,7 +17,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.thresholds import HOLE_ALPHA
 from extrags.training.optimise import TrainingResult, optimise
-from extrags.training.reconstruction import coarse_schedule, scene_extent
+from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
 from extrags.training.starting import median_depth, surface_normals, thin_out
 from extrags.training.views import View, epochs, real_views
 
@@ -125,7 +125,8 @@ def finetune(
     )
     schedule = replace(schedule, photometric_weight=config.photometric_weight)
     # All harmonics are active from the first step: the scene is optimised already.
-    return optimise(start, draw, schedule.resumed(seed=config.seed))
+    footprint = smallest_footprint(coarse, sequence.cameras[frames])
+    return optimise(start, draw, schedule.resumed(seed=config.seed), footprint=footprint)
 
 
 def _with_loss_weights(coarse: CoarseConfig, config: FinetuneConfig) -> CoarseConfig:

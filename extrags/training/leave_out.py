@@ -17,7 +17,7 @@ from extrags.errors import CaptureError
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training.optimise import optimise
-from extrags.training.reconstruction import coarse_schedule, scene_extent
+from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
 from extrags.training.starting import median_depth, starting_gaussians
 from extrags.training.views import epochs, real_views
 
@@ -99,7 +99,8 @@ def partial_scene(
     views = real_views(sequence, kept)
     order = epochs(len(views), np.random.default_rng(brief.seed))
     schedule = coarse_schedule(brief, scene_extent(sequence, kept), median_depth(sequence, kept), stage)
-    return optimise(Scene(start, light), lambda _: views[next(order)], schedule).scene
+    footprint = smallest_footprint(coarse, sequence.cameras[kept])
+    return optimise(Scene(start, light), lambda _: views[next(order)], schedule, footprint=footprint).scene
 
 
 def log_exposures(

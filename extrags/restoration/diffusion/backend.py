@@ -21,6 +21,7 @@ from extrags.restoration.protocol import Enhancer
 from extrags.restoration.training_data.pairs import Pairs, make_pairs
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.training.leave_out import MIN_FRAMES
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import LightTransfer
