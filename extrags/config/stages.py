@@ -239,7 +239,7 @@ class CoarseConfig(StageConfig):
         description="starting Gaussians are discs on the surface, so thick against their radius; 1: round",
     )
     min_footprint_px: float = Field(
-        0.0,
+        0.4,
         ge=0,
         le=4,
         description="standard deviation, in pixels of the training view that resolves it best, below which "

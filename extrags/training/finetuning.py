@@ -102,7 +102,14 @@ def finetune(
     max_gaussians = round(config.growth * coarse.densify.max_gaussians)
     if pseudo_views is not None and config.seed_holes:
         room = max_gaussians - len(scene.gaussians)
-        new_gaussians = hole_gaussians(scene, sequence, pseudo_views, room, thickness=coarse.thickness)
+        new_gaussians = hole_gaussians(
+            scene,
+            sequence,
+            pseudo_views,
+            room,
+            thickness=coarse.thickness,
+            max_distance=MAX_GUESS_DISTANCE * depth,
+        )
         if new_gaussians is not None:
             start = Scene(Gaussians.concatenated(scene.gaussians, new_gaussians), scene.light)
     real = real_views(sequence, frames)
@@ -190,6 +197,7 @@ def hole_gaussians(
     room: int,
     *,
     thickness: float = 1.0,
+    max_distance: float = np.inf,
 ) -> Gaussians | None:
     """New Gaussians where a restored virtual view shows surface and the scene has none.
 
@@ -205,6 +213,7 @@ def hole_gaussians(
         pseudo_views: restored virtual views.
         room: at most so many new Gaussians.
         thickness: along the surface's normal, as a share of the radius.
+        max_distance: points farther than this from all Gaussians of the scene are dropped, in world units.
 
     Returns:
         The new Gaussians, or None where there is nothing to fill.
@@ -228,7 +237,7 @@ def hole_gaussians(
         normals = np.einsum("nji,nj->ni", into_camera, surface_normals(points))
         lit = torch.from_numpy(rgb), torch.from_numpy(local), torch.from_numpy(normals)
         rgb = scene.light.albedo(*lit, min_gain=MIN_GAIN).detach().numpy()
-    placed = _near_known_surface(points, scene, MAX_GUESS_DISTANCE * median_depth(sequence, sequence.train))
+    placed = _near_known_surface(points, scene, max_distance)
     placed &= ~_in_front_of_real_surface(points, scene, sequence)
     placed &= ~_in_front_of_virtual_surface(points, pseudo_views)
     points, rgb = points[placed], rgb[placed]
