@@ -51,7 +51,7 @@ def judge(
     slot.counts["amount"] = judgement.amount
 
 
-@stage("finetune", version=4)
+@stage("finetune", version=5)
 def finetune(
     slot: Slot,
     scene: Ref,
