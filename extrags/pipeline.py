@@ -27,10 +27,12 @@ if TYPE_CHECKING:
     from extrags.baselines.uc_nerf.training import UcNerfResult
     from extrags.confidence import PerceptualDifference
     from extrags.exploration import Exploration
+    from extrags.finetuning_judge import Judgement
     from extrags.freespace import FreeSpace
     from extrags.metrics.protocol import EvaluationResult, RenderedViews
     from extrags.metrics.surface import TrueSurface
     from extrags.pseudo_views import PseudoViews
+    from extrags.restoration.protocol import Enhancer
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
@@ -263,7 +265,8 @@ class Result:
         freespace: occupancy and clearance for virtual cameras.
         exploration: the virtual trajectories.
         pseudo_views: restored virtual views.
-        finetuning: the fine-tuned scene and its training history.
+        judgement: how much of the fine-tuning is kept, and why.
+        finetuning: the fine-tuned scene and its training history; None where the coarse scene is kept.
         renders: held-out views of `coarse` and, if it was fine-tuned, of `final`.
         evaluations: metrics of `coarse` and `final`; without fine-tuning both are the coarse scene's.
         skipped: why stages were skipped, by name.
@@ -278,6 +281,7 @@ class Result:
     freespace: FreeSpace | None = None
     exploration: Exploration | None = None
     pseudo_views: PseudoViews | None = None
+    judgement: Judgement | None = None
     finetuning: TrainingResult | None = None
     renders: dict[str, RenderedViews] = field(default_factory=dict)
     evaluations: dict[str, EvaluationResult] = field(default_factory=dict)
@@ -330,6 +334,8 @@ class InMemoryPipeline(Pipeline):
         self.true_surface = true_surface
         self._training = sequence
         """The frames that the reconstruction uses: from `coarse` on, the training frames alone."""
+        self._enhancer: Enhancer | None = None
+        """The scene's restorer, which the judge of the fine-tuning uses as well."""
 
     def skip(self, stage: StageName, reason: str) -> None:
         """Record and log the reason."""
@@ -416,31 +422,48 @@ class InMemoryPipeline(Pipeline):
 
     def enhance(self) -> None:
         """`extrags.restoration.trajectories.restore`."""
+        from extrags.restoration.backends import train_enhancer
         from extrags.restoration.trajectories import restore
 
         exploration = _made(self.result.exploration, "explore")
+        scene, frames, settings = self.result.coarse, self._training, self.config.enhance
         with self._timed("enhance"):
+            self._enhancer = train_enhancer(scene, frames, settings, self.config.coarse)
             self.result.pseudo_views = restore(
+                scene,
+                frames,
+                exploration.trajectories,
+                settings,
+                self.config.coarse,
+                measure=self._perceptual_difference(),
+                enhancer=self._enhancer,
+            )
+
+    def finetune(self) -> None:
+        """`extrags.training.finetune`, as much of it as `extrags.finetuning_judge` keeps."""
+        from extrags.finetuning_judge import judge_finetuning
+        from extrags.training import finetune
+
+        exploration = self.result.exploration
+        with self._timed("finetune"):
+            judgement = self.result.judgement = judge_finetuning(
                 self.result.coarse,
                 self._training,
-                exploration.trajectories,
+                () if exploration is None else exploration.trajectories,
+                self._enhancer,
+                self.config.finetune,
                 self.config.enhance,
                 self.config.coarse,
                 measure=self._perceptual_difference(),
             )
-
-    def finetune(self) -> None:
-        """`extrags.training.finetune`."""
-        from extrags.training import finetune
-
-        with self._timed("finetune"):
-            self.result.finetuning = finetune(
-                self.result.coarse,
-                self._training,
-                self.result.pseudo_views,
-                self.config.finetune,
-                self.config.coarse,
-            )
+            if judgement.amount is not None:
+                self.result.finetuning = finetune(
+                    self.result.coarse,
+                    self._training,
+                    self.result.pseudo_views if judgement.amount > 0 else None,
+                    judgement.applied_to(self.config.finetune),
+                    self.config.coarse,
+                )
 
     def evaluate(self) -> None:
         """`extrags.evaluation` of the coarse and the final scene."""

@@ -18,6 +18,9 @@ from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
 __all__ = ["EndoscopicSequence", "PoseSource", "Split", "saturated_mask"]
 
+ALL_OF_AREA = 0.999
+"""A downscaled pixel is valid above this share of valid area; below one because of rounding."""
+
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
 """Origin of the poses. given: by the source; estimated: by COLMAP; aligned: by RGB-D alignment; refined:
 corrected during the reconstruction."""
@@ -169,6 +172,38 @@ class EndoscopicSequence(Storable):
     ) -> EndoscopicSequence:
         """A copy of the sequence with other poses, `world_from_camera` [F, 4, 4]."""
         return replace(self, world_from_camera=world_from_camera, pose_source=source)
+
+    def at_most_width(self, width: int) -> EndoscopicSequence:
+        """The same frames, downscaled to this width in pixels if they are wider; the aspect ratio is kept.
+
+        Colours are means over the area of a pixel. A pixel is valid where all of its area is; its depth is
+        that of the nearest source pixel, since a mean over an edge belongs to neither side.
+        """
+        import cv2
+
+        if self.width <= width:
+            return self
+        size = (width, max(1, round(self.height * width / self.width)))
+
+        def resized(stack: np.ndarray, interpolation: int) -> np.ndarray:
+            return np.stack([cv2.resize(image, size, interpolation=interpolation) for image in stack])
+
+        def share(stack: np.ndarray) -> np.ndarray:
+            return resized(stack.astype(np.float32), cv2.INTER_AREA)
+
+        K = self.K.copy()
+        K[:, 0] *= size[0] / self.width
+        K[:, 1] *= size[1] / self.height
+        depth, observed, specular = self.depth_mm, self.observed, self.specular
+        return replace(
+            self,
+            rgb=resized(self.rgb, cv2.INTER_AREA),
+            K=K,
+            mask=share(self.mask) > ALL_OF_AREA,
+            depth_mm=None if depth is None else resized(depth, cv2.INTER_NEAREST),
+            observed=None if observed is None else share(observed) > ALL_OF_AREA,
+            specular=None if specular is None else share(specular) > 0,
+        )
 
     def training_part(self) -> EndoscopicSequence:
         """The training frames alone, without any information on the held-out frames.

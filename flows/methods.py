@@ -121,6 +121,7 @@ def three_dgs(config: PipelineConfig) -> dict[str, Any]:
         "coarse.densify.prune_opacity": 0.005,
         "coarse.densify.split_scale_share": 0.01,
         "coarse.light.enabled": False,
+        "coarse.min_footprint_px": 0.0,
         "coarse.refine_poses": False,
     }
 
@@ -172,6 +173,11 @@ PAPER_SHARED = frozenset(
         "explore.max_hole_share",
         "explore.visible_weight",
         "finetune.seed",
+        "finetune.judge.iterations_share",  # switched off
+        "finetune.judge.leave_out_every",
+        "finetune.judge.max_loss_db",
+        "finetune.judge.max_width",
+        "finetune.judge.views",
     }
 )
 """Settings of exploration and fine-tuning that `paper` takes from the profile. A test checks that each one is
@@ -222,6 +228,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "finetune.seed_holes": False,
         "finetune.keep_known": False,
         "finetune.confidence_floor": 0.0,
+        "finetune.judge.enabled": False,
     }
 
 
@@ -256,6 +263,10 @@ def _classical(_: PipelineConfig) -> dict[str, Any]:
 
 def _uc_nerf(_: PipelineConfig) -> dict[str, Any]:
     return {"uc_nerf.enabled": True}
+
+
+def _real_only(_: PipelineConfig) -> dict[str, Any]:
+    return {"finetune.judge.enabled": False}
 
 
 def _nothing(_: PipelineConfig) -> dict[str, Any]:
@@ -312,7 +323,8 @@ METHODS: dict[str, Method] = {
     "classical": Method("as extrags, with the classical fill instead of the diffusion", _classical),
     "real-only": Method(
         "fine-tuned on the real views alone: the control",
-        leave_out=dict.fromkeys(EXPLORING, "the run is a control on real views alone"),
+        _real_only,
+        dict.fromkeys(EXPLORING, "the run is a control on real views alone"),
     ),
     "uc-nerf": Method(
         "UC-NeRF: radiance field conditioned on uncertainty-aware multi-view stereo",

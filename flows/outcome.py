@@ -24,6 +24,7 @@ Part = Literal[
     "explore",
     "restorer",
     "enhance",
+    "judgement",
     "finetune",
     "renders_coarse",
     "renders_final",
@@ -32,7 +33,8 @@ Part = Literal[
     "report",
 ]
 """Artefacts of a run. `sequence` has all frames with the latest poses, `training` the training frames alone,
-`waves` the state of the exploration, `restorer` the restorer prepared for this scene."""
+`waves` the state of the exploration, `restorer` the restorer prepared for this scene, `judgement` how much of
+the fine-tuning is kept."""
 
 StageState = Literal["ran", "cached", "skipped", "failed"]
 

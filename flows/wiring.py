@@ -21,7 +21,7 @@ from tasks.coarse import coarse, refined_frames
 from tasks.enhance import assemble, restore, train
 from tasks.evaluate import METRICS_FILE, measure, render
 from tasks.explore import NEXT, branch, explore, merge, start
-from tasks.finetune import finetune
+from tasks.finetune import finetune, judge
 from tasks.freespace import freespace
 from tasks.ingest import ingest, training_frames
 from tasks.poses import poses
@@ -252,13 +252,32 @@ class SequenceRun(Pipeline):
             self.refs["enhance"] = self._run_task(row, Call(assemble, {"parts": parts}))
 
     def finetune(self) -> None:
-        """The final scene."""
+        """The final scene; there is none where the judge keeps the coarse one."""
+        from extrags.finetuning_judge import Judgement
+
         with self._stage("finetune") as row:
+            settings, coarse = self.config.finetune, self.config.coarse
+            weights, *_ = self._weights()
             inputs = {
                 **self._scene_inputs(),
-                "pseudo_views": self.refs.get("enhance"),
-                "config": self.config.finetune,
-                "coarse": self.config.coarse,
+                "explore": self.refs.get("explore"),
+                "restorer": self.refs.get("restorer"),
+                "config": settings,
+                "enhance": self.config.enhance,
+                "coarse": coarse,
+                "weights_digest": weights.digest,
+                "weights": weights,
+            }
+            self.refs["judgement"] = self._run_task(row, Call(judge, inputs))
+            judgement = self.store.load(Judgement, self.refs["judgement"])
+            row.reason = judgement.reason
+            if judgement.amount is None:
+                return
+            inputs = {
+                **self._scene_inputs(),
+                "pseudo_views": self.refs.get("enhance") if judgement.amount > 0 else None,
+                "config": judgement.applied_to(settings),
+                "coarse": coarse,
             }
             self.refs["finetune"] = self._run_task(row, Call(finetune, inputs))
 

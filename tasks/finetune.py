@@ -1,17 +1,57 @@
-"""finetune: optimises the coarse scene on real and restored views."""
+"""finetune: judges on left-out frames how much to keep, and optimises on real and restored views."""
 
 from __future__ import annotations
 
-from extrags.config import CoarseConfig, FinetuneConfig
+from extrags.config import CoarseConfig, EnhanceConfig, FinetuneConfig
 from extrags.store import Ref, Slot
 from tasks.coarse import HISTORY
 from tasks.divergence import keep_last_finite_scene
+from tasks.enhance import RESTORER
 from tasks.stage import stage
+from tasks.weights import Weights
 
-__all__ = ["finetune"]
+__all__ = ["finetune", "judge"]
 
 
-@stage("finetune", version=4)
+# The weights' digest is in the key; where their file lies is not.
+@stage("finetune-judge", version=1, ignore=("weights",))
+def judge(
+    slot: Slot,
+    scene: Ref,
+    sequence: Ref,
+    explore: Ref | None,
+    restorer: Ref | None,
+    config: FinetuneConfig,
+    enhance: EnhanceConfig,
+    coarse: CoarseConfig,
+    weights_digest: str | None,
+    weights: Weights,
+) -> None:
+    """Decide how much of the fine-tuning to keep; writes `judgement.json`.
+
+    Without exploration there are no virtual views, and real views alone are judged.
+    """
+    from extrags.exploration import Exploration
+    from extrags.finetuning_judge import judge_finetuning
+    from extrags.restoration.backends import load_enhancer
+    from extrags.scene import Scene
+    from extrags.sequence import EndoscopicSequence
+
+    judgement = judge_finetuning(
+        slot.load(Scene, scene),
+        slot.load(EndoscopicSequence, sequence),
+        () if explore is None else slot.load(Exploration, explore).trajectories,
+        None if restorer is None else load_enhancer(slot.open(restorer) / RESTORER),
+        config,
+        enhance,
+        coarse,
+        measure=weights.perceptual_difference(),
+    )
+    slot.save(judgement)
+    slot.counts["amount"] = judgement.amount
+
+
+@stage("finetune", version=5)
 def finetune(
     slot: Slot,
     scene: Ref,

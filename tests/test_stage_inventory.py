@@ -19,13 +19,15 @@ from tasks import (
     poses,
     report,
     surface,
+    uc_nerf,
 )
 from tasks.stage import stage_versions
 from tests import stage_inventory
 from tests.stage_inventory import NATIVE, changed_modules, inventory, reached, recorded, stages
 
 TASKS = (
-    assess, benchmark, coarse, enhance, evaluate, explore, finetune, freespace, ingest, poses, report, surface
+    assess, benchmark, coarse, enhance, evaluate, explore, finetune, freespace, ingest, poses, report, surface,
+    uc_nerf,
 )  # fmt: skip
 
 
@@ -42,7 +44,7 @@ def test_versions_follow_the_code() -> None:
 
 
 def test_the_inventory_reads_versions_as_the_decorator_does() -> None:
-    assert len(TASKS) == 12
+    assert len(TASKS) == 13
     real = {name: version for name, version in stage_versions().items() if not name.startswith("toy")}
     found = {name: version for name, (_, version) in stages().items()}
     assert {name: real[name] for name in found} == found

@@ -90,6 +90,9 @@ class Setting:
     def _words(self, kind: Any) -> list[str]:
         if get_origin(kind) is Literal or (kind is str and self.choices):
             return self.choices
+        if get_origin(kind) is tuple and get_origin(get_args(kind)[0]) is Literal:
+            names = ", ".join(map(str, get_args(get_args(kind)[0])))
+            return [f"one or more of {names}, with commas between"]
         if get_origin(kind) is tuple:
             return [f"{len(get_args(kind))} whole numbers with commas between"]
         if kind in (int, float):

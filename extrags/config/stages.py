@@ -28,6 +28,7 @@ __all__ = [
     "FinetuneConfig",
     "FreespaceConfig",
     "IngestConfig",
+    "JudgeConfig",
     "LightConfig",
     "LpipsNet",
     "OptimiserConfig",
@@ -237,6 +238,13 @@ class CoarseConfig(StageConfig):
         le=1,
         description="starting Gaussians are discs on the surface, so thick against their radius; 1: round",
     )
+    min_footprint_px: float = Field(
+        0.4,
+        ge=0,
+        le=4,
+        description="standard deviation, in pixels of the training view that resolves it best, below which "
+        "the two larger axes of a Gaussian do not shrink; 0: no bound, as in 3DGS",
+    )
     optimiser: OptimiserConfig = OptimiserConfig()
     densify: DensifyConfig = DensifyConfig()
     light: LightConfig = LightConfig()
@@ -412,6 +420,23 @@ class ExploreConfig(StageConfig):
         )
 
 
+class JudgeConfig(StageConfig):
+    """Leave-out test of the fine-tuning: how much of it to keep."""
+
+    enabled: bool = Field(True, description="False: fine-tuning is kept whatever it does to real views")
+    leave_out_every: int = Field(
+        5, ge=2, description="one in so many training frames is left out of the trial scene, in short runs"
+    )
+    iterations_share: float = Field(
+        0.4, gt=0, le=1, description="share of the iterations of both stages that a trial has"
+    )
+    views: int = Field(32, ge=1, description="virtual views restored for the trials")
+    max_width: int = Field(160, ge=16, description="wider frames are downscaled for the trials")
+    max_loss_db: float = Field(
+        0.1, ge=0, description="mean PSNR that left-out frames may lose against the coarse scene"
+    )
+
+
 class FinetuneConfig(StageConfig):
     """Fine-tuning on real and restored views."""
 
@@ -463,6 +488,7 @@ class FinetuneConfig(StageConfig):
     confidence_floor: float = Field(
         0.1, ge=0, le=1, description="smallest pixel-level weight, so that no pixel drifts freely"
     )
+    judge: JudgeConfig = JudgeConfig()
     seed: int = Field(0, ge=0, description="seed of all random sampling")
 
 

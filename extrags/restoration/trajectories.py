@@ -27,6 +27,7 @@ def restore(
     coarse: CoarseConfig | None = None,
     *,
     measure: PerceptualDifference | None = None,
+    enhancer: Enhancer | None = None,
 ) -> PseudoViews:
     """Restore the views of virtual trajectories: prepare the scene's restorer, then all batches of clips.
 
@@ -38,13 +39,15 @@ def restore(
         config: backend and budgets; None takes the defaults.
         coarse: settings the scene was reconstructed with; None takes the defaults.
         measure: behind the pixel-level confidence; None takes LPIPS where its weights can be found.
+        enhancer: the scene's restorer (`train_enhancer`); None prepares it.
 
     Raises:
         ShapeError: when there is no view at all.
         ExtragsError: as `extrags.restoration.backends.train_enhancer`.
     """
     config = EnhanceConfig() if config is None else config
-    enhancer = train_enhancer(scene, sequence, config, CoarseConfig() if coarse is None else coarse)
+    if enhancer is None:
+        enhancer = train_enhancer(scene, sequence, config, CoarseConfig() if coarse is None else coarse)
     measure = PerceptualDifference.available() if measure is None else measure
     trajectories = [cameras for cameras in trajectories if len(cameras) > 1]
     parts = [

@@ -17,7 +17,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.thresholds import HOLE_ALPHA
 from extrags.training.optimise import TrainingResult, optimise
-from extrags.training.reconstruction import coarse_schedule, scene_extent
+from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
 from extrags.training.starting import median_depth, surface_normals, thin_out
 from extrags.training.views import View, epochs, real_views
 
@@ -28,6 +28,15 @@ UNKNOWN = 0.5
 
 CARVED_MARGIN = 0.05
 """A new Gaussian nearer than a real view's surface by this share of its depth would hide it."""
+
+KNOWN_BELOW = 0.5
+"""Below this uncertainty a solid pixel of a virtual view shows surface the scene knows."""
+
+GUESSED_NEARER = 0.25
+"""A new Gaussian this much nearer than another virtual view's completed depth stands in that view's way."""
+
+MAX_GUESS_DISTANCE = 0.5
+"""Farther from known surface, in median depths, completed depth is too wrong to place a Gaussian by."""
 
 MIN_POINTS = 8
 """Fewer hole points have neither neighbours nor normals."""
@@ -45,6 +54,8 @@ def finetune(
     pseudo_views: PseudoViews | None,
     config: FinetuneConfig | None = None,
     coarse: CoarseConfig | None = None,
+    *,
+    stage: str = "finetune",
 ) -> TrainingResult:
     r"""Fine-tune a scene on real and virtual views together.
 
@@ -75,6 +86,7 @@ def finetune(
         pseudo_views: restored virtual views with confidences, or None.
         config: budgets and shares; None takes the defaults.
         coarse: rates and weights, those the coarse scene was made with; None takes the defaults.
+        stage: named in progress events.
 
     Raises:
         DivergedError: when the optimisation does not stay finite.
@@ -90,7 +102,14 @@ def finetune(
     max_gaussians = round(config.growth * coarse.densify.max_gaussians)
     if pseudo_views is not None and config.seed_holes:
         room = max_gaussians - len(scene.gaussians)
-        new_gaussians = hole_gaussians(scene, sequence, pseudo_views, room, thickness=coarse.thickness)
+        new_gaussians = hole_gaussians(
+            scene,
+            sequence,
+            pseudo_views,
+            room,
+            thickness=coarse.thickness,
+            max_distance=MAX_GUESS_DISTANCE * depth,
+        )
         if new_gaussians is not None:
             start = Scene(Gaussians.concatenated(scene.gaussians, new_gaussians), scene.light)
     real = real_views(sequence, frames)
@@ -107,13 +126,14 @@ def finetune(
         _with_loss_weights(coarse, config),
         scene_extent(sequence, frames),
         depth,
-        "finetune",
+        stage,
         iterations=config.iterations,
         densify=coarse.densify.model_copy(update=densify),
     )
     schedule = replace(schedule, photometric_weight=config.photometric_weight)
     # All harmonics are active from the first step: the scene is optimised already.
-    return optimise(start, draw, schedule.resumed(seed=config.seed))
+    footprint = smallest_footprint(coarse, sequence.cameras[frames])
+    return optimise(start, draw, schedule.resumed(seed=config.seed), footprint=footprint)
 
 
 def _with_loss_weights(coarse: CoarseConfig, config: FinetuneConfig) -> CoarseConfig:
@@ -177,12 +197,15 @@ def hole_gaussians(
     room: int,
     *,
     thickness: float = 1.0,
+    max_distance: float = np.inf,
 ) -> Gaussians | None:
     """New Gaussians where a restored virtual view shows surface and the scene has none.
 
     Points come from the completed depth of hole pixels, their albedo from the restored colour with the
     light divided out; like the scene's first Gaussians they lie flat on the surface, which the light's
-    cosine asks for. Points that would stand in front of what a real view saw are dropped.
+    cosine asks for. A guess must not hide what is known: dropped are points in front of what a real view saw,
+    of what a virtual view shows of known surface, or of the depth another virtual view completes there, and
+    points far from all known surface.
 
     Args:
         scene: the coarse scene.
@@ -190,6 +213,7 @@ def hole_gaussians(
         pseudo_views: restored virtual views.
         room: at most so many new Gaussians.
         thickness: along the surface's normal, as a share of the radius.
+        max_distance: points farther than this from all Gaussians of the scene are dropped, in world units.
 
     Returns:
         The new Gaussians, or None where there is nothing to fill.
@@ -213,8 +237,10 @@ def hole_gaussians(
         normals = np.einsum("nji,nj->ni", into_camera, surface_normals(points))
         lit = torch.from_numpy(rgb), torch.from_numpy(local), torch.from_numpy(normals)
         rgb = scene.light.albedo(*lit, min_gain=MIN_GAIN).detach().numpy()
-    unseen = ~_in_front_of_real_surface(points, scene, sequence)
-    points, rgb = points[unseen], rgb[unseen]
+    placed = _near_known_surface(points, scene, max_distance)
+    placed &= ~_in_front_of_real_surface(points, scene, sequence)
+    placed &= ~_in_front_of_virtual_surface(points, pseudo_views)
+    points, rgb = points[placed], rgb[placed]
     if len(points) < MIN_POINTS:
         return None
     spacing = _typical_spacing(scene.gaussians)
@@ -271,6 +297,31 @@ def _in_front_of_real_surface(
         seen = depth[row, column]
         hides[inside] |= (seen > 0) & (z[inside] < (1 - CARVED_MARGIN) * seen)
     return hides
+
+
+def _in_front_of_virtual_surface(
+    points: Float[np.ndarray, "n 3"], pseudo_views: PseudoViews
+) -> Bool[np.ndarray, "n"]:
+    """Points that stand between a virtual camera and the surface it shows, known or completed."""
+    hides = np.zeros(len(points), dtype=bool)
+    cameras = pseudo_views.cameras
+    for index in range(len(cameras)):
+        (pixels,), (z,) = cameras[index].project(points)
+        inside = cameras.contains(pixels)
+        column, row = pixels[inside].astype(np.int64).T
+        solid = pseudo_views.alpha[index][row, column] >= HOLE_ALPHA
+        known = solid & (pseudo_views.uncertainty[index][row, column] < KNOWN_BELOW)
+        # Completed depths of two views hardly ever agree closely; surface between both is uncertain.
+        margin = np.where(known, CARVED_MARGIN, np.where(solid, 1.0, GUESSED_NEARER))
+        hides[inside] |= z[inside] < (1 - margin) * pseudo_views.depth_mm[index][row, column]
+    return hides
+
+
+def _near_known_surface(
+    points: Float[np.ndarray, "n 3"], scene: Scene, distance: float
+) -> Bool[np.ndarray, "n"]:
+    found, _ = cKDTree(scene.gaussians.means.numpy()).query(points, distance_upper_bound=distance)
+    return np.asarray(np.isfinite(found))
 
 
 def _real_depth(scene: Scene, sequence: EndoscopicSequence, frame: int) -> Float[np.ndarray, "h w"]:

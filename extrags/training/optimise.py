@@ -15,6 +15,7 @@ from extrags.errors import DivergedError
 from extrags.events import Progress, emit
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
+from extrags.training.footprint import APPLIED_EVERY, SmallestFootprint
 from extrags.training.pose_refinement import PoseRefinement, RefinedPoses
 from extrags.training.schedule import Schedule
 from extrags.training.step import Observation, TrainingStep, training_step
@@ -52,6 +53,7 @@ def optimise(
     *,
     make_step: Callable[[Scene, Schedule], TrainingStep] = training_step,
     poses: PoseRefinement | None = None,
+    footprint: SmallestFootprint | None = None,
 ) -> TrainingResult:
     """Fit a scene to views, one per iteration.
 
@@ -61,6 +63,7 @@ def optimise(
         schedule: rates, weights and budgets.
         make_step: which implementation of a step; default: the fastest that can take the scene.
         poses: corrects the poses of real views during the optimisation.
+        footprint: lower bound on the size of Gaussians.
 
     Raises:
         DivergedError: when loss or parameters stop being finite; names iteration and parameter group.
@@ -83,9 +86,12 @@ def optimise(
                 raise DivergedError(_account(schedule, iteration, adam.parameters), last_good)
             step.update(observation)
             density.step(adam, observation.rendering, iteration)
+            last = iteration == schedule.iterations - 1
+            if footprint is not None and (last or (iteration + 1) % APPLIED_EVERY == 0):
+                footprint.apply(adam.parameters)
             if poses is not None and frame is not None and observation.viewmat_gradient is not None:
                 poses.step(frame, observation.viewmat_gradient, iteration)
-            if iteration % HISTORY_EVERY == 0 or iteration == schedule.iterations - 1:
+            if iteration % HISTORY_EVERY == 0 or last:
                 entry = {
                     "iteration": float(iteration),
                     "loss": observation.loss,

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Int
 
+from extrags.cameras import Cameras
 from extrags.config import CoarseConfig, DensifyConfig
 from extrags.errors import CaptureError
 from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.training.footprint import SmallestFootprint
 from extrags.training.normal_term import NormalTerm
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.pose_refinement import PoseRefinement
@@ -19,7 +21,7 @@ from extrags.training.schedule import Schedule
 from extrags.training.starting import median_depth, starting_gaussians
 from extrags.training.views import epochs, real_views
 
-__all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent"]
+__all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent", "smallest_footprint"]
 
 
 def reconstruct(
@@ -76,7 +78,19 @@ def reconstruct(
     if refines_poses(sequence, config):
         settings = config.pose_refinement
         poses = PoseRefinement(sequence.cameras[chosen], settings, depth, config.iterations)
-    return optimise(Scene(gaussians, light), lambda _: views[next(order)], schedule, poses=poses)
+    return optimise(
+        Scene(gaussians, light),
+        lambda _: views[next(order)],
+        schedule,
+        poses=poses,
+        footprint=smallest_footprint(config, sequence.cameras[chosen]),
+    )
+
+
+def smallest_footprint(config: CoarseConfig, cameras: Cameras) -> SmallestFootprint | None:
+    """The lower bound on the size of Gaussians; None where the settings have none."""
+    pixels = config.min_footprint_px
+    return SmallestFootprint(cameras, pixels) if pixels > 0 else None
 
 
 def refines_poses(sequence: EndoscopicSequence, config: CoarseConfig) -> bool:

@@ -132,6 +132,9 @@ class TestSettings:
             assume(math.isfinite(value))
         if isinstance(value, str):
             assume(value.strip().lower() not in ("none", "null"))
+        if isinstance(value, tuple):
+            # No setting takes an empty list or the same name twice.
+            assume(value and (isinstance(value[0], int) or len(set(value)) == len(value)))
         found = setting.parse(setting.text(value))
         assert found == value
         assert type(found) is type(value)

@@ -31,6 +31,34 @@ def small_sequence(frames: int = 4) -> EndoscopicSequence:
     )
 
 
+class TestAtMostWidth:
+    def test_halved_frames(self) -> None:
+        sequence = replace(small_sequence(), specular=np.random.default_rng(1).random((4, 6, 8)) > 0.8)
+        small = sequence.at_most_width(4)
+        assert (small.width, small.height, len(small)) == (4, 3, 4)
+        blocks = sequence.rgb.reshape(4, 3, 2, 4, 2, 3).astype(np.float64)
+        np.testing.assert_allclose(small.rgb, blocks.mean(axis=(2, 4)), atol=0.5 + 1e-6)
+
+        def pairs(stack: np.ndarray) -> np.ndarray:
+            return stack.reshape(4, 3, 2, 4, 2)
+
+        assert sequence.observed is not None
+        assert sequence.specular is not None
+        np.testing.assert_array_equal(small.mask, pairs(sequence.mask).all(axis=(2, 4)))
+        np.testing.assert_array_equal(small.observed, pairs(sequence.observed).all(axis=(2, 4)))
+        # One highlight in the area is enough.
+        np.testing.assert_array_equal(small.specular, pairs(sequence.specular).any(axis=(2, 4)))
+        assert small.depth_mm is not None
+        assert sequence.depth_mm is not None
+        assert np.isin(small.depth_mm, sequence.depth_mm).all()
+        np.testing.assert_allclose(small.K[:, :2], sequence.K[:, :2] / 2)
+        assert (small.split, small.world_from_camera is sequence.world_from_camera) == (sequence.split, True)
+
+    def test_narrow_ones_stay(self) -> None:
+        sequence = small_sequence()
+        assert sequence.at_most_width(8) is sequence
+
+
 class TestSequence:
     def test_round_trip_through_zarr(self, tmp_path: Path) -> None:
         sequence = small_sequence()

@@ -107,7 +107,7 @@ class TestUsage:
             ([SEQUENCE, "--reruns", "2"], "unknown argument --reruns"),
             ([SEQUENCE, "--sed", "2"], "did you mean --seed"),
             ([SEQUENCE, "--coarse.iteration", "2"], "did you mean --coarse.iterations"),
-            ([SEQUENCE, "--iterations=2"], "did you mean --coarse.iterations or --finetune.iterations"),
+            ([SEQUENCE, "--iterations=2"], "did you mean --coarse.iterations or --uc_nerf.iterations"),
             ([SEQUENCE, "--coarse.light", "no"], "--coarse.light is a group of settings; name one of"),
             ([SEQUENCE, "--coarse.iterations", "-1"], "is -1; expected a whole number of at least 1"),
             ([SEQUENCE, "--coarse.iterations", "1.5"], "is 1.5; expected a whole number of at least 1"),

@@ -97,6 +97,7 @@ def test_tables_have_the_backbones_that_were_asked_for() -> None:
         "seconds": 1.0,
         "peak_mib": None,
         "error": "",
+        "held_out_trained_on": False,
     }
     runs = [{**case, "method": "3dgs", "metrics": both}, {**case, "method": "coarse", "metrics": both}]
     assert "| lpips_vgg |" in benchmark_markdown(runs, "3dgs")

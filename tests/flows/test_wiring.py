@@ -203,9 +203,8 @@ def test_a_process_that_lacks_a_metric_says_so(finished: tuple[str, SequenceOutc
             store=store,
             renders=found["renders_final"],
             sequence=found["sequence"],
-            net="alex",
-            weights_digest=None,
-            weights=Weights(net="alex"),
+            lpips_digests={"alex": None},
+            weights=[Weights(net="alex")],
             added=["toy_error@1"],
         )
 

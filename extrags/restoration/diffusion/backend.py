@@ -18,9 +18,10 @@ from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.diffusion.validation import validation_scores
 from extrags.restoration.diffusion.weights import find_weights, weights_digest
 from extrags.restoration.protocol import Enhancer
-from extrags.restoration.training_data.pairs import MIN_FRAMES, Pairs, make_pairs
+from extrags.restoration.training_data.pairs import Pairs, make_pairs
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.training.leave_out import MIN_FRAMES
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import LightTransfer

@@ -22,20 +22,14 @@ from extrags.events import Progress, emit
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, saturated_mask
-from extrags.training.optimise import optimise
-from extrags.training.reconstruction import coarse_schedule, scene_extent
-from extrags.training.starting import median_depth, starting_gaussians, surface_normals
-from extrags.training.views import epochs, real_views
+from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, log_exposures, partial_scene
+from extrags.training.starting import surface_normals
 from extrags.view_synthesis.conditioning import Layers, observe_views
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import ReferenceViews
 
-__all__ = ["Pairs", "fold_pairs", "leave_out_folds", "make_pairs", "pair_views", "synthetic_pairs"]
+__all__ = ["Pairs", "fold_pairs", "make_pairs", "pair_views", "synthetic_pairs"]
 
-MIN_FRAMES = 4
-"""With fewer training frames none can be left out."""
-BLOCKS_PER_FOLD = 3
-"""Runs of neighbouring frames that a fold leaves out, so that gaps are like those of a new trajectory."""
 VALIDATION_EVERY = 5
 """Every n-th training frame is a target of the validation only."""
 TARGETS_PER_SUBSET = 4
@@ -133,27 +127,6 @@ def make_pairs(
     return Pairs.concatenated(parts)
 
 
-def leave_out_folds(
-    frames: Int[np.ndarray, "n"], folds: int
-) -> list[tuple[Int[np.ndarray, "kept"], Int[np.ndarray, "left"]]]:
-    """Kept and left-out frames of each fold; every frame is left out exactly once, in runs.
-
-    With one fold a third of the frames is left out.
-
-    Raises:
-        CaptureError: with fewer than four frames.
-    """
-    if len(frames) < MIN_FRAMES:
-        raise CaptureError(
-            f"{len(frames)} training frames are too few to train a restorer on (at least {MIN_FRAMES} "
-            "are needed); set enhance.backend to classical"
-        )
-    parts = max(folds, 2) if folds != 1 else 3
-    blocks = min(BLOCKS_PER_FOLD * parts, len(frames))
-    owner = np.arange(len(frames)) * blocks // len(frames) % parts
-    return [(frames[owner != fold], frames[owner == fold]) for fold in range(folds)]
-
-
 def fold_pairs(
     scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig, fold: int
 ) -> Pairs:
@@ -171,10 +144,18 @@ def fold_pairs(
     """
     train = np.asarray(sequence.train, dtype=np.int64)
     kept, left = leave_out_folds(train, config.folds)[fold]
-    partial = _partial_scene(scene, sequence, config, coarse, kept, fold)
+    partial = partial_scene(
+        scene,
+        sequence,
+        coarse,
+        kept,
+        iterations=config.fold_iterations,
+        seed=config.seed + fold,
+        stage="enhance-pairs",
+    )
     references = gather_references(partial, sequence, kept)
     # In the partial scene the mean over the kept frames is one.
-    gain = (_log_exposures(scene, sequence, left) - _log_exposures(scene, sequence, kept).mean()).exp()
+    gain = (log_exposures(scene, sequence, left) - log_exposures(scene, sequence, kept).mean()).exp()
     generator = np.random.default_rng([config.seed, 4, fold])
     perturbed = _perturbed(partial, generator)
     parts = []
@@ -189,46 +170,6 @@ def fold_pairs(
         )
         parts.append(pair_views(sequence, observation.layers, left, synthetic=degraded is perturbed))
     return Pairs.concatenated(parts)
-
-
-def _partial_scene(
-    scene: Scene,
-    sequence: EndoscopicSequence,
-    config: EnhanceConfig,
-    coarse: CoarseConfig,
-    kept: Int[np.ndarray, "k"],
-    fold: int,
-) -> Scene:
-    """A brief reconstruction from the kept frames, under the coarse scene's light.
-
-    A fold is too short to learn the light: with a new one, the pairs would have errors of brightness that the
-    coarse scene does not have.
-    """
-    light = scene.light
-    if light is not None:
-        light = replace(light, log_exposure=_log_exposures(scene, sequence, kept))
-    brief = coarse.model_copy(
-        update={
-            "iterations": config.fold_iterations,
-            "sh_every": max(1, config.fold_iterations // 3),
-            "seed": config.seed + fold,
-        }
-    )
-    start = starting_gaussians(
-        sequence,
-        kept,
-        brief.max_points,
-        light=light,
-        sh_degree=brief.sh_degree,
-        seed=brief.seed,
-        thickness=brief.thickness,
-    )
-    views = real_views(sequence, kept)
-    order = epochs(len(views), np.random.default_rng(brief.seed))
-    schedule = coarse_schedule(
-        brief, scene_extent(sequence, kept), median_depth(sequence, kept), "enhance-pairs"
-    )
-    return optimise(Scene(start, light), lambda _: views[next(order)], schedule).scene
 
 
 def _perturbed(scene: Scene, generator: np.random.Generator) -> Scene:
@@ -259,16 +200,6 @@ def _outside_random_balls(
         center = points[generator.integers(len(points))]
         outside &= np.linalg.norm(points - center, axis=1) > generator.uniform(0.05, 0.35) * scale
     return outside if outside.any() else np.ones(len(points), dtype=bool)
-
-
-def _log_exposures(
-    scene: Scene, sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]
-) -> Float[Tensor, "m"]:
-    """Log-exposures of training frames in the coarse scene."""
-    if scene.light is None:
-        return torch.zeros(len(frames))
-    position = {int(frame): index for index, frame in enumerate(sequence.train)}
-    return scene.light.log_exposure[torch.tensor([position[int(frame)] for frame in frames])]
 
 
 def synthetic_pairs(scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig) -> Pairs:

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from extrags.config import CoarseConfig, DensifyConfig, FinetuneConfig
@@ -151,7 +152,7 @@ def prepared(
     """`finetune` up to its first step."""
     runs: list[Run] = []
 
-    def taken(start: Scene, draw: Callable[[int], View], schedule: Schedule) -> TrainingResult:
+    def taken(start: Scene, draw: Callable[[int], View], schedule: Schedule, **_: Any) -> TrainingResult:
         runs.append(Run(start, draw, schedule))
         return TrainingResult(start, [])
 
@@ -736,9 +737,18 @@ def projected(points: np.ndarray, camera: Any, index: int) -> tuple[np.ndarray, 
     return pixels, z
 
 
+@pytest.fixture
+def real_views_carve_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the rule on virtual views, which has a test of its own."""
+    monkeypatch.setattr(
+        finetuning, "_in_front_of_virtual_surface", lambda points, _: np.zeros(len(points), dtype=bool)
+    )
+
+
 class TestHoleGaussians:
     ROOM = 10_000
 
+    @pytest.mark.usefixtures("real_views_carve_alone")
     def test_lie_at_the_restored_depth_along_their_rays(
         self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
     ) -> None:
@@ -765,6 +775,7 @@ class TestHoleGaussians:
         assert got == wanted
         assert len(new) == len(wanted)
 
+    @pytest.mark.usefixtures("real_views_carve_alone")
     def test_none_in_front_of_a_real_surface(
         self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
     ) -> None:
@@ -793,6 +804,7 @@ class TestHoleGaussians:
         assert 20 < hides.sum() < len(every) - 20
         assert len(new) == len(every) - hides.sum()
 
+    @pytest.mark.usefixtures("real_views_carve_alone")
     def test_albedo_times_light_is_the_target(
         self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
     ) -> None:
@@ -828,8 +840,8 @@ class TestHoleGaussians:
         tolerance = 100 * np.finfo(np.float32).eps
         np.testing.assert_allclose(image, pseudo.target[0][row, column], rtol=tolerance, atol=tolerance)
 
-    @settings(max_examples=20)
-    @given(room=st.integers(-3, 300))
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    @pytest.mark.parametrize("room", [-3, 0, 5, 50, 99, 100, 101, 173, 300])
     def test_at_most_room(self, sequence: EndoscopicSequence, pseudo: PseudoViews, room: int) -> None:
         blind = replace(sequence, mask=np.zeros_like(sequence.mask))
         everywhere = np.ones((3, HEIGHT, WIDTH), dtype=bool)
@@ -842,6 +854,55 @@ class TestHoleGaussians:
             assert room / 2 < len(new) <= room
         else:
             assert new is None or len(new) <= room
+
+    def test_none_in_front_of_surface_that_a_virtual_view_shows(
+        self,
+        sequence: EndoscopicSequence,
+        pseudo: PseudoViews,
+        holes: np.ndarray,
+    ) -> None:
+        """A guess must hide neither known surface nor what another virtual view completes far behind it."""
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        holes[1:] = False
+        near = np.full(holes.shape, 6.0)
+        every = hole_gaussians(wall_scene(None), blind, wall_views(pseudo, near, holes), self.ROOM)
+        assert every is not None
+        means = every.means.double().numpy()
+        (pixels,), (z,) = pseudo.cameras[1].project(means)
+        seen = pseudo.cameras[1].contains(pixels)
+        assert 0 < seen.sum() < len(seen)
+        nearest, farthest = z[seen].min(), z[seen].max()
+        for alpha, uncertainty, shown_mm, hidden in (
+            (1.0, 0.0, 1.2 * farthest, True),  # known surface behind the guesses
+            (1.0, 1.0, 1.2 * farthest, False),  # solid, but nothing is known of it
+            (0.0, 1.0, 1.5 * farthest, True),  # completed far behind
+            (0.0, 1.0, 1.2 * nearest, False),  # completed a little behind: they may be the same surface
+        ):
+            views = wall_views(pseudo, near, holes)
+            second = np.full(holes.shape[1:], shown_mm)
+            views = replace(views, uncertainty=pseudo.uncertainty.copy())
+            views.depth_mm[1], views.alpha[1], views.uncertainty[1] = second, alpha, uncertainty
+            found = hole_gaussians(wall_scene(None), blind, views, self.ROOM)
+            # The second view may bring points of its own.
+            apart = np.inf if found is None else cKDTree(found.means.numpy()).query(every.means.numpy())[0]
+            kept = bool(np.all(apart < 1e-3))
+            assert kept != hidden, (alpha, uncertainty, shown_mm)
+
+    def test_none_far_from_all_known_surface(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        scene = Scene(tube_gaussians(N_GAUSSIANS), None)
+        depth = np.random.default_rng(0).uniform(2, 300, holes.shape)
+        views = wall_views(pseudo, depth, holes)
+        every = hole_gaussians(scene, blind, views, self.ROOM)
+        new = hole_gaussians(scene, blind, views, self.ROOM, max_distance=6.0)
+        assert every is not None
+        assert new is not None
+        assert 0 < len(new) < len(every)
+        apart = torch.cdist(new.means, scene.gaussians.means).min(dim=1).values
+        # Points of a cell are averaged, which may move them by its edge.
+        assert apart.max() <= 6.0 + finetuning._typical_spacing(scene.gaussians)
 
     def test_nothing_to_fill(self, sequence: EndoscopicSequence, pseudo: PseudoViews) -> None:
         none = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), 20.0), np.zeros((3, HEIGHT, WIDTH), dtype=bool))

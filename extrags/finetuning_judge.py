@@ -1,0 +1,256 @@
+"""How much of the fine-tuning to keep: a trial on training frames that its scene has never seen.
+
+Virtual views are guesses. Where they are good they fill what was never observed; where they are not (a torn
+surface, a restorer outside its training data) they spoil what was. The scene's own frames tell which: some
+are left out, the whole chain runs briefly without them, and the trial's coarse and fine-tuned scenes are
+compared on them. Held-out frames are never used.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Int
+
+from extrags.cameras import Cameras
+from extrags.confidence import PerceptualDifference
+from extrags.config import CoarseConfig, EnhanceConfig, FinetuneConfig
+from extrags.evaluation import render
+from extrags.events import MetricRecorded, Progress, emit
+from extrags.metrics.image import psnr_per_image
+from extrags.pseudo_views import PseudoViews
+from extrags.restoration.protocol import Enhancer
+from extrags.restoration.trajectories import restore_batch
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence, Split
+from extrags.store.storable import Storable
+from extrags.training.finetuning import finetune
+from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene
+
+__all__ = ["AMOUNTS", "Judgement", "Trial", "judge_finetuning"]
+
+logger = logging.getLogger(__name__)
+
+AMOUNTS = (1.0, 0.3)
+"""What is tried, as a factor of `finetune.pseudo_weight`, until one holds."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One way to fine-tune, tried on left-out frames.
+
+    Args:
+        amount: factor of `finetune.pseudo_weight`.
+        coarse_psnr_db: mean PSNR of the trial's coarse scene on the left-out frames.
+        final_psnr_db: the same after its fine-tuning.
+        gain_db: mean difference of the two, frame by frame.
+        standard_error_db: of that mean.
+    """
+
+    amount: float
+    coarse_psnr_db: float
+    final_psnr_db: float
+    gain_db: float
+    standard_error_db: float
+
+
+@dataclass(frozen=True)
+class Judgement(Storable):
+    """How much of the fine-tuning is kept, and why.
+
+    Args:
+        amount: factor of `finetune.pseudo_weight`; 0 fine-tunes on real views alone; None keeps the coarse
+            scene.
+        reason: in words, with the number it rests on.
+        trials: in the order they were made.
+        left_out: positions, among the training frames, of the frames left out.
+    """
+
+    stored_as: ClassVar[str] = "judgement.json"
+
+    amount: float | None
+    reason: str
+    trials: tuple[Trial, ...] = ()
+    left_out: tuple[int, ...] = ()
+
+    def applied_to(self, config: FinetuneConfig) -> FinetuneConfig:
+        """The settings with the weight of virtual views that is kept; for amounts above zero."""
+        if not self.amount:
+            return config
+        return config.model_copy(update={"pseudo_weight": self.amount * config.pseudo_weight})
+
+    def save(self, path: Path) -> None:
+        """Write as JSON."""
+        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> Judgement:
+        """Read what `save` wrote."""
+        values = json.loads(path.read_bytes())
+        trials = tuple(Trial(**trial) for trial in values["trials"])
+        return cls(values["amount"], values["reason"], trials, tuple(values["left_out"]))
+
+
+def judge_finetuning(
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    trajectories: Sequence[Cameras],
+    enhancer: Enhancer | None,
+    config: FinetuneConfig | None = None,
+    enhance: EnhanceConfig | None = None,
+    coarse: CoarseConfig | None = None,
+    *,
+    measure: PerceptualDifference | None = None,
+) -> Judgement:
+    """Try the fine-tuning on left-out training frames, and decide how much of it to keep.
+
+    One in `finetune.judge.leave_out_every` training frames is left out, in short runs. Without them the scene
+    is reconstructed briefly under its own light, some of its virtual views are rendered from that scene and
+    restored with references among the kept frames, and it is fine-tuned as the whole scene would be. The
+    control is fine-tuning on the kept frames alone: a brief reconstruction gains by any further step. The
+    largest of `AMOUNTS` is kept with which the left-out frames come within `finetune.judge.max_loss_db` of
+    both the control and the coarse scene; else the control, if it holds against the coarse scene; else
+    nothing.
+
+    Args:
+        scene: the coarse scene, trained on `sequence.train`.
+        sequence: posed frames; only training frames are used.
+        trajectories: virtual views of each trajectory, its real start first.
+        enhancer: the scene's restorer; None where there are no virtual views.
+        config: settings of the fine-tuning; None takes the defaults.
+        enhance: settings of the restoration; None takes the defaults.
+        coarse: settings the scene was reconstructed with; None takes the defaults.
+        measure: behind the pixel-level confidence; None takes LPIPS where its weights can be found.
+
+    Returns:
+        The judgement; with fewer than four training frames, or the judge switched off, everything is kept.
+
+    Raises:
+        DivergedError: when an optimisation does not stay finite.
+    """
+    config = FinetuneConfig() if config is None else config
+    enhance = EnhanceConfig() if enhance is None else enhance
+    coarse = CoarseConfig() if coarse is None else coarse
+    settings = config.judge
+    frames = np.asarray(sequence.train, dtype=np.int64)
+    if not settings.enabled:
+        return Judgement(1.0, "not judged: finetune.judge.enabled is off")
+    if len(frames) < MIN_FRAMES:
+        return Judgement(
+            1.0, f"not judged: of {len(frames)} training frames none can be left out (at least {MIN_FRAMES})"
+        )
+    part, left = _without_some_frames(sequence.at_most_width(settings.max_width), frames, config)
+    trial_coarse = coarse.model_copy(
+        update={"iterations": max(1, round(settings.iterations_share * coarse.iterations))}
+    )
+    start = partial_scene(
+        scene,
+        replace(part, split=sequence.split),
+        trial_coarse,
+        part.train,
+        iterations=trial_coarse.iterations,
+        seed=config.seed,
+        stage="finetune-judge",
+    )
+    views = None
+    if enhancer is not None:
+        small = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
+        views = _restored(start, part, small, enhancer, enhance, settings.views, measure)
+    brief = config.model_copy(
+        update={"iterations": max(1, round(settings.iterations_share * config.iterations))}
+    )
+    before = _psnr_db(start, part)
+
+    def trial(amount: float) -> Trial:
+        weight = {"pseudo_weight": amount * config.pseudo_weight} if amount > 0 else {}
+        pseudo_views = views if amount > 0 else None
+        found = finetune(
+            start, part, pseudo_views, brief.model_copy(update=weight), trial_coarse, stage="finetune-judge"
+        )
+        result = _trial(amount, before, _psnr_db(found.scene, part))
+        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{amount:g}", result.gain_db))
+        return result
+
+    control = trial(0.0)
+    trials = [control]
+    if views is not None:
+        for amount in AMOUNTS:
+            trials.append(trial(amount))
+            if trials[-1].gain_db >= max(control.gain_db, 0.0) - settings.max_loss_db:
+                break
+    judgement = _decided(trials, settings.max_loss_db, left)
+    logger.info("finetune: %s", judgement.reason)
+    return judgement
+
+
+def _without_some_frames(
+    sequence: EndoscopicSequence, frames: Int[np.ndarray, "n"], config: FinetuneConfig
+) -> tuple[EndoscopicSequence, Int[np.ndarray, "m"]]:
+    """The sequence with a split that holds out some training frames, and their positions among these."""
+    folds = leave_out_folds(frames, config.judge.leave_out_every)
+    # A fold from the middle: the first one would leave out the ends of the path, which nothing surrounds.
+    kept, left = folds[len(folds) // 2]
+    return replace(sequence, split=Split("leave-out", kept, left)), np.flatnonzero(np.isin(frames, left))
+
+
+def _restored(
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    trajectories: Sequence[Cameras],
+    enhancer: Enhancer,
+    enhance: EnhanceConfig,
+    max_views: int,
+    measure: PerceptualDifference | None,
+) -> PseudoViews:
+    fewer = enhance.model_copy(update={"max_views": max(max_views, len(trajectories))})
+    measure = PerceptualDifference.available() if measure is None else measure
+    batches = fewer.batches(len(trajectories))
+    parts = []
+    for batch in range(batches):
+        parts.append(restore_batch(scene, sequence, trajectories, enhancer, fewer, batch, measure))
+        emit(Progress("finetune-judge", batch + 1, batches))
+    return PseudoViews.concatenated(parts).quantised()
+
+
+def _psnr_db(scene: Scene, sequence: EndoscopicSequence) -> list[float]:
+    """PSNR of each held-out frame of a sequence inside its mask; frames without valid pixels are omitted."""
+    renders = render(scene, sequence)
+    truth = torch.from_numpy(sequence.rgb[sequence.test].astype(np.float32) / 255)
+    mask = torch.from_numpy(sequence.mask[sequence.test])
+    values = psnr_per_image(torch.from_numpy(renders.rgb).clamp(0, 1), truth, mask)
+    return [value for value in values if value is not None]
+
+
+def _trial(amount: float, before: list[float], after: list[float]) -> Trial:
+    gains = np.array(after) - np.array(before)
+    error = gains.std(ddof=1) / np.sqrt(len(gains)) if len(gains) > 1 else 0.0
+    return Trial(amount, float(np.mean(before)), float(np.mean(after)), float(gains.mean()), float(error))
+
+
+def _decided(trials: Sequence[Trial], max_loss_db: float, left: Int[np.ndarray, "m"]) -> Judgement:
+    """The judgement on trials: the control first, then falling amounts, of which the last alone may hold."""
+    control, last = trials[0], trials[-1]
+    names = ["real views alone", *(f"weight x {trial.amount:g}" for trial in trials[1:])]
+    changes = ", ".join(
+        f"{trial.gain_db:+.2f} dB ({name})" for name, trial in zip(names, trials, strict=True)
+    )
+    frames = f"on {len(left)} training frames left out of a trial, fine-tuning changes PSNR by {changes}"
+    amount: float | None = None
+    if last.amount > 0 and last.gain_db >= max(control.gain_db, 0.0) - max_loss_db:
+        amount = last.amount
+        outcome = "virtual views are kept"
+        if amount < 1:
+            outcome = f"virtual views weigh {amount:g} of finetune.pseudo_weight"
+    elif control.gain_db >= -max_loss_db:
+        amount = 0.0
+        outcome = "fine-tuning is on real views alone"
+    else:
+        outcome = f"all lose more than {max_loss_db:g} dB: the coarse scene is kept"
+    return Judgement(amount, f"{frames}; {outcome}", tuple(trials), tuple(left.tolist()))

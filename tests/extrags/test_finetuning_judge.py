@@ -1,0 +1,134 @@
+"""The judge of the fine-tuning: what it tries, what it keeps, and that it sees no held-out frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from extrags.cameras import Cameras
+from extrags.confidence import PerceptualDifference
+from extrags.config import CoarseConfig, DensifyConfig, EnhanceConfig, FinetuneConfig
+from extrags.config.stages import JudgeConfig
+from extrags.finetuning_judge import Judgement, Trial, _decided, judge_finetuning
+from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.protocol import Clip, Restoration
+from tests.extrags.lit_tube import Tube, tube_cameras
+
+COARSE = CoarseConfig(iterations=60, max_points=300, densify=DensifyConfig(max_gaussians=500))
+FINETUNE = FinetuneConfig(
+    iterations=60, judge=JudgeConfig(iterations_share=1.0, views=4, leave_out_every=3, max_width=64)
+)
+ENHANCE = EnhanceConfig(backend="classical")
+WITHOUT_WEIGHTS = PerceptualDifference(None, "not in this test")
+
+
+class Destroyer(ClassicalEnhancer):
+    """A restorer that turns everything green, and is sure of it."""
+
+    def restore(self, clip: Clip) -> Restoration:
+        found = super().restore(clip)
+        return replace(found, rgb=np.broadcast_to(np.float32([0, 1, 0]), found.rgb.shape).copy())
+
+
+def trajectories() -> list[Cameras]:
+    return [tube_cameras(3, offset_mm=3.0, start_mm=start, turn=0.4) for start in (0.0, 4.0)]
+
+
+def judged(tube: Tube, enhancer: ClassicalEnhancer | None, config: FinetuneConfig = FINETUNE) -> Judgement:
+    return judge_finetuning(
+        tube.scene,
+        tube.sequence,
+        trajectories() if enhancer is not None else (),
+        enhancer,
+        config,
+        ENHANCE,
+        COARSE,
+        measure=WITHOUT_WEIGHTS,
+    )
+
+
+def trial(amount: float, gain_db: float) -> Trial:
+    return Trial(amount, 30.0, 30.0 + gain_db, gain_db, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("control_db", "gains_db", "amount", "words"),
+    [
+        (0.5, {1.0: 1.2}, 1.0, "virtual views are kept"),
+        # No better than real views alone, but within the tolerance.
+        (0.5, {1.0: 0.41}, 1.0, "virtual views are kept"),
+        (0.5, {1.0: 0.3, 0.3: 0.45}, 0.3, "weigh 0.3"),
+        (0.5, {1.0: -2.0, 0.3: 0.1}, 0.0, "real views alone"),
+        # The control harms: virtual views have to hold against the coarse scene, which they do.
+        (-1.0, {1.0: -0.05}, 1.0, "virtual views are kept"),
+        (-1.0, {1.0: -0.2, 0.3: -0.2}, None, "coarse scene is kept"),
+        (-0.05, {1.0: -0.2, 0.3: -0.2}, 0.0, "real views alone"),
+    ],
+)
+def test_what_is_kept(
+    control_db: float, gains_db: dict[float, float], amount: float | None, words: str
+) -> None:
+    trials = [trial(0.0, control_db), *(trial(key, value) for key, value in gains_db.items())]
+    found = _decided(trials, 0.1, np.array([3, 4]))
+    assert found.amount == amount
+    assert words in found.reason
+    assert f"{control_db:+.2f} dB" in found.reason
+    assert found.left_out == (3, 4)
+
+
+def test_a_restorer_that_destroys_is_left_out_and_a_sound_one_is_not(tube: Tube) -> None:
+    config = FINETUNE.model_copy(update={"keep_known": False})
+    destroyed = judged(tube, Destroyer(""), config)
+    assert destroyed.amount == 0.0 or destroyed.amount is None
+    assert [trial.amount for trial in destroyed.trials] == [0.0, 1.0, 0.3]
+    control, full, _ = destroyed.trials
+    assert full.gain_db < control.gain_db - 0.1
+    sound = judged(tube, ClassicalEnhancer(""), config)
+    assert sound.trials[1].gain_db > full.gain_db
+    # The same control, whatever restores.
+    assert sound.trials[0] == control
+
+
+def test_held_out_frames_are_not_looked_at(tube: Tube) -> None:
+    sequence = tube.sequence
+    test = np.setdiff1d(np.arange(len(sequence)), sequence.train)
+    if len(test) == 0:
+        pytest.fail("the fixture has no held-out frames")
+    rgb = sequence.rgb.copy()
+    rgb[test] = 255 - rgb[test]
+    other = replace(tube, sequence=replace(sequence, rgb=rgb))
+    assert judged(other, None) == judged(tube, None)
+
+
+def test_left_out_frames_are_training_frames_in_the_middle(tube: Tube) -> None:
+    found = judged(tube, None)
+    assert [trial.amount for trial in found.trials] == [0.0]
+    assert 0 < len(found.left_out) < len(tube.sequence.train)
+    assert 0 not in found.left_out
+
+
+def test_off_or_too_few_frames_keep_everything(tube: Tube) -> None:
+    off = judged(tube, None, FINETUNE.model_copy(update={"judge": JudgeConfig(enabled=False)}))
+    assert (off.amount, off.trials) == (1.0, ())
+    assert "finetune.judge.enabled" in off.reason
+    split = replace(tube.sequence.split, train=tube.sequence.train[:3])
+    few = judged(replace(tube, sequence=replace(tube.sequence, split=split)), None)
+    assert few.amount == 1.0
+    assert "3 training frames" in few.reason
+
+
+def test_the_weight_of_virtual_views_follows() -> None:
+    config = FinetuneConfig(pseudo_weight=2.0)
+    assert Judgement(0.3, "").applied_to(config).pseudo_weight == pytest.approx(0.6)
+    assert Judgement(1.0, "").applied_to(config) == config
+    assert Judgement(0.0, "").applied_to(config) == config
+
+
+def test_storage(tmp_path: Path) -> None:
+    for amount in (None, 0.0, 1.0):
+        found = Judgement(amount, "why", (trial(0.0, 0.5), trial(1.0, -0.25)), (2, 5))
+        found.save(tmp_path / "judgement.json")
+        assert Judgement.load(tmp_path / "judgement.json") == found
