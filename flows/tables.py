@@ -99,7 +99,7 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
 
 def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
     """Paired differences of each dataset, spread of each sequence, and one row per run."""
-    from extrags.metrics.comparison import compare_runs
+    from extrags.metrics.comparison import CEILING, compare_runs
 
     comparison = compare_runs(cases, baseline)
     trees = [case["metrics"] for case in cases]
@@ -148,10 +148,30 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
             for case in cases
         ],
     )
+    ceiling = markdown_table(
+        ["dataset", "profile", "method", "sequences", *differences],
+        [
+            [
+                row["dataset"],
+                row["profile"],
+                row["method"],
+                row["n_sequences"],
+                *(share_text(row["figures"].get(name)) for name in differences),
+            ]
+            for row in comparison["ceiling_datasets"]
+        ],
+    )
+    shares = (
+        f"## Share of the way from {baseline} to {CEILING}\n\nMean over sequences, smallest and largest.\n\n"
+        f"{ceiling}\n\n"
+        if comparison["ceiling_datasets"]
+        else ""
+    )
     seen = sorted({case["method"] for case in cases if case["held_out_trained_on"]})
     warning = f"{HELD_OUT_TRAINED_ON} in {', '.join(seen)}.\n\n" if seen else ""
     return (
         f"{warning}## Differences to {baseline}\n\nMean over sequences and its 95 % interval.\n\n{paired}\n\n"
+        f"{shares}"
         f"## Spread over seeds\n\n{spread}\n\n## Runs\n\n{runs}\n"
     )
 
@@ -165,6 +185,16 @@ def difference_text(name: str, found: dict[str, Any] | None) -> str:
     return (
         text if found["low"] is None else f"{text} [{found['low']:+.{digits}f}, {found['high']:+.{digits}f}]"
     )
+
+
+def share_text(found: dict[str, Any] | None) -> str:
+    """A share in per cent, and its range over sequences if there are several."""
+    if found is None:
+        return figure("share", None)
+    text = f"{100 * found['mean']:.0f} %"
+    if found["n"] == 1:
+        return text
+    return f"{text} ({100 * found['smallest']:.0f} to {100 * found['largest']:.0f})"
 
 
 def spread_text(name: str, found: dict[str, Any] | None) -> str:

@@ -18,9 +18,12 @@ import numpy as np
 from extrags.errors import ConfigError
 from extrags.metrics.registry import Figure, figures
 
-__all__ = ["Spread", "compare_runs", "dataset_of", "figure_of", "paired", "spread"]
+__all__ = ["CEILING", "Spread", "compare_runs", "dataset_of", "figure_of", "paired", "spread"]
 
 Run = Mapping[str, Any]
+
+CEILING = "oracle"
+"""The method that trains on the held-out frames as well: the ceiling of the representation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,10 +117,12 @@ def compare_runs(runs: Sequence[Run], baseline: str) -> dict[str, Any]:
         baseline: method the others are compared with.
 
     Returns:
-        `{baseline, sequences, datasets, paired_sequences, paired_datasets}`: lists of rows with what they
-        are about (`sequence` and `setting`, or `dataset`; `profile`, `method`, `n_seeds` or
-        `n_sequences`) and `figures`, by name a `Spread`. Paired rows hold differences method - baseline
-        and, per figure, in how many of the `n` pairs the method is better.
+        `{baseline, sequences, datasets, paired_sequences, paired_datasets, ceiling_sequences,
+        ceiling_datasets}`: lists of rows with what they are about (`sequence` and `setting`, or `dataset`;
+        `profile`, `method`, `n_seeds` or `n_sequences`) and `figures`, by name a `Spread`. Paired rows hold
+        differences method - baseline and, per figure, in how many of the `n` pairs the method is better.
+        Ceiling rows hold the share of the way from the baseline to the method `oracle` (`CEILING`), and are
+        there where it was run; a sequence on which the oracle is not better than the baseline is left out.
 
     Raises:
         ConfigError: when there is no run of the baseline, or a run occurs twice.
@@ -144,6 +149,8 @@ def compare_runs(runs: Sequence[Run], baseline: str) -> dict[str, Any]:
         "datasets": _grouped(measured, known, _by_dataset),
         "paired_sequences": _paired(measured, known, rivals, baseline, _by_sequence),
         "paired_datasets": _paired(measured, known, rivals, baseline, _by_dataset),
+        "ceiling_sequences": _ceiling(measured, known, rivals, baseline, _by_sequence),
+        "ceiling_datasets": _ceiling(measured, known, rivals, baseline, _by_dataset),
     }
 
 
@@ -202,6 +209,40 @@ def _paired(
                     found[figure.name] = {**asdict(spread(sample)), "better": better}
             if found:
                 sizes = _sizes(list(partners.values()))
+                rows.append({**group, "method": method, "baseline": baseline, **sizes, "figures": found})
+    return rows
+
+
+def _ceiling(
+    runs: Sequence[Run],
+    known: Sequence[Figure],
+    methods: Sequence[str],
+    baseline: str,
+    about: Callable[[Run], dict[str, Any]],
+) -> list[dict[str, Any]]:
+    """Share of the way from the baseline to the oracle: a ratio of means over seeds, one per sequence."""
+
+    def gain_by_sequence(members: Sequence[Run], method: str, figure: Figure) -> dict[Any, float]:
+        sign = 1 if figure.higher_is_better else -1
+        by_sequence: dict[Any, list[float]] = {}
+        for run, value in paired(members, method, baseline, figure.name):
+            by_sequence.setdefault((run["sequence"], run["setting"]), []).append(sign * value)
+        return {sequence: float(np.mean(values)) for sequence, values in by_sequence.items()}
+
+    rows = []
+    for method in methods:
+        if method == CEILING:
+            continue
+        for group, members in _groups(runs, about):
+            found = {}
+            for figure in known:
+                ceiling = gain_by_sequence(members, CEILING, figure)
+                gains = gain_by_sequence(members, method, figure)
+                shares = [gains[key] / ceiling[key] for key in gains if ceiling.get(key, 0.0) > 0]
+                if shares:
+                    found[figure.name] = asdict(spread(shares))
+            if found:
+                sizes = _sizes([run for run in members if run["method"] == method])
                 rows.append({**group, "method": method, "baseline": baseline, **sizes, "figures": found})
     return rows
 

@@ -125,3 +125,34 @@ class TestTables:
         assert figure_of({"a": {"b": 2}}, "a.b") == 2.0
         assert figure_of({"a": {"b": None}}, "a.b") is None
         assert figure_of(None, "a") is None
+
+
+class TestCeiling:
+    def test_share_of_the_way_to_the_oracle(self) -> None:
+        runs = [
+            # Ratios of means over seeds: (2 + 4) / (8 + 4) on the first sequence.
+            *(run("3dgs", "phantom/0", seed, 20.0) for seed in (0, 1)),
+            run("coarse", "phantom/0", 0, 22.0),
+            run("coarse", "phantom/0", 1, 24.0),
+            run("oracle", "phantom/0", 0, 28.0),
+            run("oracle", "phantom/0", 1, 24.0),
+            run("3dgs", "phantom/1", 0, 20.0),
+            run("coarse", "phantom/1", 0, 27.0),
+            run("oracle", "phantom/1", 0, 30.0),
+            # An oracle below the baseline is no ceiling.
+            run("3dgs", "phantom/2", 0, 20.0),
+            run("coarse", "phantom/2", 0, 25.0),
+            run("oracle", "phantom/2", 0, 19.0),
+        ]
+        comparison = compare_runs(runs, "3dgs")
+        shares = {row["sequence"]: row["figures"]["psnr"]["mean"] for row in comparison["ceiling_sequences"]}
+        assert shares == pytest.approx({"phantom/0": 0.5, "phantom/1": 0.7})
+        (row,) = comparison["ceiling_datasets"]
+        assert (row["method"], row["baseline"], row["figures"]["psnr"]["n"]) == ("coarse", "3dgs", 2)
+        assert row["figures"]["psnr"]["mean"] == pytest.approx(0.6)
+        # Lower is better: the same share of the way down.
+        assert row["figures"]["lpips_alex"]["mean"] == pytest.approx(0.6)
+
+    def test_without_an_oracle_there_is_none(self) -> None:
+        comparison = compare_runs(both("phantom/0", 0, 20.0, 1.0), "3dgs")
+        assert comparison["ceiling_sequences"] == comparison["ceiling_datasets"] == []
