@@ -888,6 +888,7 @@ class TestHoleGaussians:
             kept = bool(np.all(apart < 1e-3))
             assert kept != hidden, (alpha, uncertainty, shown_mm)
 
+    @pytest.mark.usefixtures("real_views_carve_alone")
     def test_none_far_from_all_known_surface(
         self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
     ) -> None:
