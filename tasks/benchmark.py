@@ -18,7 +18,7 @@ PER_VIEW_FILE = "per_view.json"
 
 
 # `rows` holds times and memory of the runs. The page shows them, but they are not part of its cache key.
-@stage("benchmark-report", version=1, ignore=("rows",))
+@stage("benchmark-report", version=2, ignore=("rows",))
 def benchmark_report(
     slot: Slot,
     name: str,
