@@ -81,11 +81,18 @@ class PerceptualDifference:
         reason: why LPIPS is not used; empty when it is.
         raw: U_pixel is as in the paper: LPIPS itself, without an upper bound, of the rendering and the whole
             restored image instead of the blend of both that `keep_known` makes.
+
+    Raises:
+        WeightsError: when it is raw, and there is no LPIPS.
     """
 
     lpips: Lpips | None
     reason: str = ""
     raw: bool = False
+
+    def __post_init__(self) -> None:
+        if self.raw and self.lpips is None:
+            raise WeightsError(f"enhance.pixel_confidence=raw is LPIPS itself: {self.reason}")
 
     @classmethod
     def available(cls, config: EvaluateConfig | None = None) -> PerceptualDifference:

@@ -34,7 +34,7 @@ from extrags.store.storable import Storable
 from extrags.training.finetuning import finetune
 from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene
 
-__all__ = ["AMOUNTS", "Judgement", "Trial", "judge_finetuning"]
+__all__ = ["AMOUNTS", "Judgement", "Trial", "decide", "judge_finetuning"]
 
 logger = logging.getLogger(__name__)
 
@@ -147,15 +147,12 @@ def judge_finetuning(
             1.0, f"not judged: of {len(frames)} training frames none can be left out (at least {MIN_FRAMES})"
         )
     part, left = _without_some_frames(sequence.at_most_width(settings.max_width), frames, config)
-    trial_coarse = coarse.model_copy(
-        update={"iterations": max(1, round(settings.iterations_share * coarse.iterations))}
-    )
     start = partial_scene(
         scene,
         replace(part, split=sequence.split),
-        trial_coarse,
+        coarse,
         part.train,
-        iterations=trial_coarse.iterations,
+        iterations=max(1, round(settings.iterations_share * coarse.iterations)),
         seed=config.seed,
         stage="finetune-judge",
     )
@@ -172,7 +169,7 @@ def judge_finetuning(
         weight = {"pseudo_weight": amount * config.pseudo_weight} if amount > 0 else {}
         pseudo_views = views if amount > 0 else None
         found = finetune(
-            start, part, pseudo_views, brief.model_copy(update=weight), trial_coarse, stage="finetune-judge"
+            start, part, pseudo_views, brief.model_copy(update=weight), coarse, stage="finetune-judge"
         )
         result = _trial(amount, before, _psnr_db(found.scene, part))
         emit(MetricRecorded("finetune", f"left_out_gain_db_at_{amount:g}", result.gain_db))
@@ -185,7 +182,7 @@ def judge_finetuning(
             trials.append(trial(amount))
             if trials[-1].gain_db >= max(control.gain_db, 0.0) - settings.max_loss_db:
                 break
-    judgement = _decided(trials, settings.max_loss_db, left)
+    judgement = decide(trials, settings.max_loss_db, left)
     logger.info("finetune: %s", judgement.reason)
     return judgement
 
@@ -209,7 +206,7 @@ def _restored(
     max_views: int,
     measure: PerceptualDifference | None,
 ) -> PseudoViews:
-    fewer = enhance.model_copy(update={"max_views": max(max_views, len(trajectories))})
+    fewer = enhance.model_copy(update={"max_views": max_views})
     measure = PerceptualDifference.available() if measure is None else measure
     batches = fewer.batches(len(trajectories))
     parts = []
@@ -234,8 +231,14 @@ def _trial(amount: float, before: list[float], after: list[float]) -> Trial:
     return Trial(amount, float(np.mean(before)), float(np.mean(after)), float(gains.mean()), float(error))
 
 
-def _decided(trials: Sequence[Trial], max_loss_db: float, left: Int[np.ndarray, "m"]) -> Judgement:
-    """The judgement on trials: the control first, then falling amounts, of which the last alone may hold."""
+def decide(trials: Sequence[Trial], max_loss_db: float, left: Int[np.ndarray, "m"]) -> Judgement:
+    """The judgement on trials.
+
+    Args:
+        trials: the control first, then falling amounts, of which the last alone may hold.
+        max_loss_db: mean PSNR that left-out frames may lose.
+        left: positions, among the training frames, of the frames left out.
+    """
     control, last = trials[0], trials[-1]
     names = ["real views alone", *(f"weight x {trial.amount:g}" for trial in trials[1:])]
     changes = ", ".join(

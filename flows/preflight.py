@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from extrags.config import PipelineConfig
+from extrags.errors import WeightsError
 from extrags.pipeline import STAGES
 
 __all__ = ["preflight"]
@@ -29,8 +30,10 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
     # Here, because they load torch, which looking up a deployment must not.
     from tasks.weights import lpips_weights
 
-    lpips_weights(config.evaluate)
+    first, *_ = lpips_weights(config.evaluate)
     if "enhance" not in leave_out:
+        if config.enhance.pixel_confidence == "raw" and first.digest is None:
+            raise WeightsError(f"enhance.pixel_confidence=raw is LPIPS itself: {first.reason}")
         from extrags.restoration import check_restorer
 
         check_restorer(config.enhance)

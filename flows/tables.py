@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from extrags.metrics.registry import Figure, figures, metric_named
@@ -104,19 +104,23 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
     comparison = compare_runs(cases, baseline)
     trees = [case["metrics"] for case in cases]
     columns, differences = table_figures(*trees), difference_figures(*trees)
-    paired = markdown_table(
-        ["dataset", "profile", "method", "sequences", *differences],
-        [
+
+    def by_dataset(rows: str, text: Callable[[str, dict[str, Any] | None], str]) -> str:
+        return markdown_table(
+            ["dataset", "profile", "method", "sequences", *differences],
             [
-                row["dataset"],
-                row["profile"],
-                row["method"],
-                row["n_sequences"],
-                *(difference_text(name, row["figures"].get(name)) for name in differences),
-            ]
-            for row in comparison["paired_datasets"]
-        ],
-    )
+                [
+                    row["dataset"],
+                    row["profile"],
+                    row["method"],
+                    row["n_sequences"],
+                    *(text(name, row["figures"].get(name)) for name in differences),
+                ]
+                for row in comparison[rows]
+            ],
+        )
+
+    paired = by_dataset("paired_datasets", difference_text)
     spread = markdown_table(
         ["sequence", "setting", "profile", "method", "seeds", *columns],
         [
@@ -148,19 +152,7 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
             for case in cases
         ],
     )
-    ceiling = markdown_table(
-        ["dataset", "profile", "method", "sequences", *differences],
-        [
-            [
-                row["dataset"],
-                row["profile"],
-                row["method"],
-                row["n_sequences"],
-                *(share_text(row["figures"].get(name)) for name in differences),
-            ]
-            for row in comparison["ceiling_datasets"]
-        ],
-    )
+    ceiling = by_dataset("ceiling_datasets", share_text)
     shares = (
         f"## Share of the way from {baseline} to {CEILING}\n\nMean over sequences, smallest and largest.\n\n"
         f"{ceiling}\n\n"
@@ -187,10 +179,10 @@ def difference_text(name: str, found: dict[str, Any] | None) -> str:
     )
 
 
-def share_text(found: dict[str, Any] | None) -> str:
+def share_text(name: str, found: dict[str, Any] | None) -> str:
     """A share in per cent, and its range over sequences if there are several."""
     if found is None:
-        return figure("share", None)
+        return figure(name, None)
     text = f"{100 * found['mean']:.0f} %"
     if found["n"] == 1:
         return text

@@ -89,6 +89,10 @@ class TestPixelConfidence:
         mapped = pixel_confidence(rendered, restored, bounded)
         np.testing.assert_allclose(1 - np.exp(-confidence / 0.25), mapped, rtol=1e-5, atol=1e-6)
 
+    def test_raw_lpips_without_weights_is_refused(self) -> None:
+        with pytest.raises(WeightsError, match=r"pixel_confidence=raw is LPIPS itself: no weights"):
+            PerceptualDifference(None, "no weights", raw=True)
+
     def test_a_named_file_must_work(self, tmp_path: Path) -> None:
         with pytest.raises(WeightsError):
             PerceptualDifference.available(EvaluateConfig(lpips_weights=str(tmp_path / "none.npz")))

@@ -12,7 +12,7 @@ from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, DensifyConfig, EnhanceConfig, FinetuneConfig
 from extrags.config.stages import JudgeConfig
-from extrags.finetuning_judge import Judgement, Trial, _decided, judge_finetuning
+from extrags.finetuning_judge import Judgement, Trial, decide, judge_finetuning
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.protocol import Clip, Restoration
 from tests.extrags.lit_tube import Tube, tube_cameras
@@ -72,7 +72,7 @@ def test_what_is_kept(
     control_db: float, gains_db: dict[float, float], amount: float | None, words: str
 ) -> None:
     trials = [trial(0.0, control_db), *(trial(key, value) for key, value in gains_db.items())]
-    found = _decided(trials, 0.1, np.array([3, 4]))
+    found = decide(trials, 0.1, np.array([3, 4]))
     assert found.amount == amount
     assert words in found.reason
     assert f"{control_db:+.2f} dB" in found.reason
