@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from extrags.metrics.comparison import compare_runs, figure_of
+from extrags.metrics.comparison import CEILING, compare_runs, figure_of
 from extrags.metrics.registry import Figure, figures
 from extrags.report.charts import method_colors, methods_chart, pairs_chart
 from extrags.report.comparison import RenderedMethod, compared_rows
 from extrags.report.encode import DataImage
 from extrags.report.page import rendered_page
-from extrags.report.wording import count, described_metrics, duration, number
+from extrags.report.wording import count, described_metrics, duration, number, percent
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["BenchmarkInputs", "ComparedViews", "build_benchmark_report"]
+
+NO_CELL = {"value": "–", "verdict": "", "note": "", "better": ""}  # noqa: RUF001
+"""A figure that was not measured."""
 
 LARGEST_PAGE_BYTES = 5_000_000
 """The share of the pictures; numbers and charts come on top."""
@@ -96,10 +99,13 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
             if run["metrics"] is None
         ],
         columns=columns,
-        paired_datasets=_rows(comparison["paired_datasets"], columns, signed=True),
-        paired_sequences=_rows(comparison["paired_sequences"], columns, signed=True),
-        datasets=_rows(comparison["datasets"], columns),
-        sequences=_rows(comparison["sequences"], columns),
+        paired_datasets=_rows(comparison["paired_datasets"], columns, cell=_difference_cell),
+        paired_sequences=_rows(comparison["paired_sequences"], columns, cell=_difference_cell),
+        datasets=_rows(comparison["datasets"], columns, cell=_mean_cell),
+        sequences=_rows(comparison["sequences"], columns, cell=_mean_cell),
+        ceiling=CEILING,
+        ceiling_datasets=_rows(comparison["ceiling_datasets"], columns, cell=_share_cell),
+        ceiling_sequences=_rows(comparison["ceiling_sequences"], columns, cell=_share_cell),
         difference_chart=_difference_chart(comparison["paired_sequences"], columns, inputs.baseline),
         figure_charts=_figure_charts(measured, columns, inputs),
         pictures=[
@@ -116,6 +122,8 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
 def _summary(comparison: Mapping[str, Any], inputs: BenchmarkInputs) -> str:
     said = []
     for row in comparison["paired_datasets"]:
+        if row["method"] == CEILING:
+            continue
         name = next((name for name in ("observed.psnr", "psnr") if name in row["figures"]), None)
         if name is None:
             continue
@@ -132,7 +140,10 @@ def _summary(comparison: Mapping[str, Any], inputs: BenchmarkInputs) -> str:
 
 
 def _rows(
-    rows: Sequence[Mapping[str, Any]], columns: Sequence[Figure], *, signed: bool = False
+    rows: Sequence[Mapping[str, Any]],
+    columns: Sequence[Figure],
+    *,
+    cell: Callable[[Mapping[str, Any], Figure], dict[str, str]],
 ) -> list[dict[str, Any]]:
     return [
         {
@@ -140,34 +151,38 @@ def _rows(
             "profile": row["profile"],
             "method": row["method"],
             "sizes": _sizes(row),
-            "cells": [_cell(row["figures"].get(column.name), column, signed) for column in columns],
+            "cells": [
+                cell(row["figures"][column.name], column) if column.name in row["figures"] else NO_CELL
+                for column in columns
+            ],
         }
         for row in rows
     ]
 
 
-def _cell(figure: Mapping[str, Any] | None, column: Figure, signed: bool) -> dict[str, str]:
-    if figure is None:
-        return {"value": "–", "verdict": "", "note": "", "better": ""}  # noqa: RUF001
-    value = number(figure["mean"], column.digits, signed=signed)
-    if not signed:
-        deviation = figure["deviation"]
-        return {
-            "value": value,
-            "verdict": "",
-            "note": "" if deviation is None else f"± {number(deviation, column.digits)}",
-            "better": "",
-        }
+def _mean_cell(figure: Mapping[str, Any], column: Figure) -> dict[str, str]:
+    deviation = figure["deviation"]
+    note = "" if deviation is None else f"± {number(deviation, column.digits)}"
+    return {**NO_CELL, "value": number(figure["mean"], column.digits), "note": note}
+
+
+def _difference_cell(figure: Mapping[str, Any], column: Figure) -> dict[str, str]:
     if round(figure["mean"], column.digits) == 0:
         verdict = "equal"
     else:
         verdict = "better" if (figure["mean"] > 0) == column.higher_is_better else "worse"
     return {
-        "value": value,
+        "value": number(figure["mean"], column.digits, signed=True),
         "verdict": verdict,
         "note": _interval(figure, column.digits),
         "better": f"better in {figure['better']} of {figure['n']}",
     }
+
+
+def _share_cell(figure: Mapping[str, Any], column: Figure) -> dict[str, str]:
+    smallest, largest = (percent(figure[end]) for end in ("smallest", "largest"))
+    note = "" if figure["n"] == 1 else f"{smallest} to {largest}"
+    return {**NO_CELL, "value": percent(figure["mean"]), "note": note}
 
 
 def _interval(figure: Mapping[str, Any], digits: int) -> str:

@@ -17,6 +17,7 @@ __all__ = [
     "duration",
     "metric_of",
     "number",
+    "percent",
     "shown_metrics",
 ]
 
@@ -45,6 +46,12 @@ def number(value: float | int | None, digits: int, *, signed: bool = False) -> s
     if float(text) == 0:
         text = f"{'±' if signed else ''}{0:.{digits}f}"
     return text.replace("-", MINUS)
+
+
+def percent(share: float | None) -> str:
+    """A share as whole per cent with a real minus sign; an en dash for none."""
+    text = number(None if share is None else 100 * share, 0)
+    return text if text == MISSING else f"{text}\N{NARROW NO-BREAK SPACE}%"
 
 
 def count(value: float | int | None) -> str:

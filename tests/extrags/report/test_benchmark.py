@@ -149,6 +149,18 @@ def test_a_baseline_that_was_not_run_is_refused() -> None:
         build_benchmark_report(BenchmarkInputs("x", runs_of({"phantom/0": 1.0}), "extrags", METHODS))
 
 
+def test_share_of_the_way_to_the_oracle(html: str) -> None:
+    runs = runs_of({"phantom/0": 4.0, "phantom/1": -1.0})
+    runs += [run("oracle", item["sequence"], item["seed"], 30.0) for item in runs if item["method"] == "3dgs"]
+    page = Page(build_benchmark_report(BenchmarkInputs("oracle", runs, "3dgs", METHODS)))
+    assert "ceiling" in page.ids
+    assert "Share of the way from 3dgs to oracle" in page.text
+    # 3dgs is at 20.25 dB on average, so that the oracle is 9.75 dB better: 41 % and -10 %, 15 % on average.
+    assert "15 % −10 % to 41 %" in page.text  # noqa: RUF001
+    assert "oracle against 3dgs" not in page.text
+    assert "ceiling" not in Page(html).ids
+
+
 def test_colours_of_methods() -> None:
     colors = method_colors(["a", "base", "b"], "base")
     assert list(colors) == ["base", "a", "b"]

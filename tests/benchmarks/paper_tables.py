@@ -1,0 +1,158 @@
+"""The tables of docs/results.md from results of `extrags benchmark --json`, as Markdown on standard output.
+
+`python tests/benchmarks/paper_tables.py methods|ablation|budget FILE...`
+
+* `methods`: every method by dataset, setting and region, plain and aligned, with the share of the way to the
+  oracle and the differences of `extrags` to `3dgs`.
+* `ablation`: each variant less `extrags`, paired, with 95 % intervals.
+* `budget`: the coarse and the final scene by variant, in the order of the runs.
+
+Runs of several files are put together; a run that two files hold has to be the same in both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from extrags.metrics.comparison import CEILING, compare_runs, dataset_of
+from extrags.metrics.registry import metric_named
+from flows.tables import difference_text, markdown_table, share_text, spread_text
+
+METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "flip", "depth_absrel")
+REGIONS = ("whole", "observed", "unobserved")
+ABLATED = ("psnr", "observed.psnr", "unobserved.psnr", "lpips_alex", "observed.depth_absrel")
+
+
+def cases_of(files: Iterable[Path]) -> list[dict[str, Any]]:
+    """Runs of all files, each once.
+
+    Raises:
+        SystemExit: where two files disagree about a run, or a run failed.
+    """
+    found: dict[tuple[Any, ...], dict[str, Any]] = {}
+    for file in files:
+        for case in json.loads(file.read_text())["cases"]:
+            key = tuple(case[name] for name in ("profile", "sequence", "setting", "seed", "method"))
+            if case["metrics"] is None:
+                raise SystemExit(f"{file}: {key} failed: {case['error']}")
+            if found.setdefault(key, case)["metrics"] != case["metrics"]:
+                raise SystemExit(f"{file}: {key} has other figures in another file")
+    return list(found.values())
+
+
+def path_of(metric: str, region: str, *, aligned: bool) -> str:
+    """Where a figure is in the tree of metrics: `observed.aligned.psnr`."""
+    parts = [] if region == "whole" else [region]
+    return ".".join([*parts, *(["aligned"] if aligned else []), metric])
+
+
+def methods_tables(cases: Sequence[dict[str, Any]]) -> str:
+    """All methods of all datasets."""
+    comparison = compare_runs(cases, "3dgs")
+    order = list(dict.fromkeys(case["method"] for case in cases))
+    texts = []
+    for dataset in dict.fromkeys(dataset_of(case) for case in cases):
+        runs = [case for case in cases if dataset_of(case) == dataset]
+        several = len({case["sequence"] for case in runs}) > 1
+        rows = comparison["datasets" if several else "sequences"]
+        by_method = {row["method"]: row for row in rows if _about(row) == dataset}
+        shares = {row["method"]: row for row in comparison["ceiling_datasets"] if row["dataset"] == dataset}
+        seeds = ", ".join(str(seed) for seed in sorted({case["seed"] for case in runs}))
+        named = ", ".join(dict.fromkeys(case["sequence"] for case in runs))
+        texts.append(
+            f"### {dataset}\n\n{named}; seeds {seeds}. Mean ± standard deviation over "
+            f"{'scenes' if several else 'seeds'}.\n"
+        )
+        seconds = {
+            method: sum(times) / len(times)
+            for method in order
+            if (times := [case["seconds"] for case in runs if case["method"] == method])
+        }
+        for aligned in (False, True):
+            shown = METRICS[:5] if aligned else METRICS
+            table = []
+            for region in REGIONS:
+                for method in [method for method in order if method in by_method]:
+                    names = [path_of(metric, region, aligned=aligned) for metric in shown]
+                    figures = by_method[method]["figures"]
+                    if names[0] not in figures:
+                        continue
+                    share = shares.get(method, {"figures": {}})["figures"].get(names[0])
+                    table.append(
+                        [
+                            region,
+                            f"**{method}**" if method == "extrags" else method,
+                            *(spread_text(name, figures.get(name)) for name in names),
+                            share_text(names[0], share),
+                            f"{seconds[method]:.0f}",
+                        ]
+                    )
+            labels = [metric_named(metric).label for metric in shown]
+            head = ["region", "method", *labels, f"share of the way to {CEILING}, PSNR", "seconds"]
+            title = "Aligned by one gain for each view:" if aligned else "As rendered:"
+            texts.append(f"{title}\n\n{markdown_table(head, table)}\n")
+    paired = [row for row in comparison["paired_datasets"] if row["method"] == "extrags"]
+    names = ["psnr", "observed.psnr", "unobserved.psnr", "lpips_alex", "lpips_vgg", "depth_absrel"]
+    table = [
+        [row["dataset"], row["n_sequences"], row["n_seeds"]]
+        + [difference_text(name, row["figures"].get(name)) for name in names]
+        for row in paired
+    ]
+    differences = markdown_table(["dataset", "scenes", "seeds", *names], table)
+    texts.append(f"### `extrags` less `3dgs`\n\nMean over scenes and its 95 % interval.\n\n{differences}\n")
+    return "\n".join(texts)
+
+
+def ablation_tables(cases: Sequence[dict[str, Any]]) -> str:
+    """Each variant less the whole method, by dataset."""
+    comparison = compare_runs(cases, "extrags")
+    rows = [row for row in comparison["paired_datasets"] if row["method"] != "3dgs"]
+    table = [
+        [row["dataset"], row["method"], row["n_sequences"], row["n_seeds"]]
+        + [difference_text(name, row["figures"].get(name)) for name in ABLATED]
+        for row in rows
+    ]
+    return markdown_table(["dataset", "without", "scenes", "seeds", *ABLATED], table)
+
+
+def budget_tables(cases: Sequence[dict[str, Any]]) -> str:
+    """Every variant's figures by dataset, in the order of the runs."""
+    comparison = compare_runs(cases, cases[0]["method"])
+    several = len({case["sequence"] for case in cases}) > 1
+    names = [
+        "psnr",
+        "aligned.psnr",
+        "observed.psnr",
+        "unobserved.psnr",
+        "lpips_alex",
+        "observed.depth_absrel",
+    ]
+    table = []
+    for row in comparison["datasets" if several else "sequences"]:
+        runs = [case for case in cases if case["method"] == row["method"] and dataset_of(case) == _about(row)]
+        seconds = sum(case["seconds"] for case in runs) / len(runs)
+        figures = [spread_text(name, row["figures"].get(name)) for name in names]
+        table.append([_about(row), row["method"], row["n_sequences"], *figures, f"{seconds:.0f}"])
+    return markdown_table(["dataset", "budget", "scenes", *names, "seconds"], table)
+
+
+def _about(row: dict[str, Any]) -> str:
+    return row["dataset"] if "dataset" in row else dataset_of(row)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    tables = {"methods": methods_tables, "ablation": ablation_tables, "budget": budget_tables}
+    parser.add_argument("table", choices=tables)
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    arguments = parser.parse_args()
+    sys.stdout.write(tables[arguments.table](cases_of(arguments.files)) + "\n")
+
+
+if __name__ == "__main__":
+    main()
