@@ -7,6 +7,9 @@ STORE ?= .extrags/demo
 # Actively waiting OpenMP threads slow each other down on machines with few cores.
 export OMP_WAIT_POLICY := passive
 
+# One process per core, each with one thread: most tests are too small for more.
+PARALLEL := --numprocesses auto --dist loadgroup
+
 .PHONY: help setup system demo test test-slow lint same-results bench clean
 
 help: ## Show this list
@@ -36,10 +39,10 @@ demo: setup ## Reconstruct, explore, restore and evaluate the phantom, both sett
 	$(BIN)/extrags run phantom/0@sparse phantom/0@distanced --profile quick --store $(STORE)
 
 test: setup ## The default test suite
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PARALLEL)
 
 test-slow: setup ## The default suite and everything marked slow
-	$(BIN)/python -m pytest --runslow
+	$(BIN)/python -m pytest $(PARALLEL) --runslow
 
 lint: setup ## Format, lint, types, import layers, spelling
 	$(BIN)/ruff format --check .

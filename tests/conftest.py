@@ -11,6 +11,9 @@ import pytest
 
 # Before torch is loaded: OpenMP threads that spin while they wait starve each other on small machines.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# Of several processes of tests each has one thread, and so have the programs that it starts.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ["OMP_NUM_THREADS"] = "1"
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 # The library itself never looks beside a checkout.
@@ -24,6 +27,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    for item in items:
+        # Fixtures of a module, and the server of all tests of flows, are made in one process only.
+        folder = item.path.parent
+        item.add_marker(pytest.mark.xdist_group(folder.name if folder.name == "flows" else str(item.path)))
     if not config.getoption("--runslow"):
         skip = pytest.mark.skip(reason="slow; run with --runslow")
         for item in items:

@@ -1,0 +1,247 @@
+"""Gaussians placed where restored virtual views show surface and the scene has none."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from extrags.gaussians import Gaussians
+from extrags.illumination import NearFieldLight
+from extrags.pseudo_views import PseudoViews
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
+from extrags.training import finetuning
+from extrags.training.finetuning import hole_gaussians
+from tests.extrags.training.conftest import HEIGHT, WIDTH, tube_gaussians, tube_light
+from tests.extrags.training.plain_finetuning import (
+    N_GAUSSIANS,
+    coarse_scene,
+    masked,
+    pseudo_views,
+)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return coarse_scene()
+
+
+@pytest.fixture(scope="module")
+def pseudo(scene: Scene) -> PseudoViews:
+    return pseudo_views(scene)
+
+
+@pytest.fixture(scope="module")
+def sequence(tube_sequence: EndoscopicSequence) -> EndoscopicSequence:
+    return masked(tube_sequence)
+
+
+def wall_scene(light: NearFieldLight | None) -> Scene:
+    """Gaussians so close together that no two hole points share a cell of their spacing."""
+    points = np.random.default_rng(1).normal(0, 1e-3, (50, 3)) - 50.0
+    return Scene(Gaussians.from_points(points, np.full((50, 3), 0.5), np.full(50, 1e-3)), light)
+
+
+def wall_views(pseudo: PseudoViews, depth_mm: np.ndarray, holes: np.ndarray) -> PseudoViews:
+    return replace(
+        pseudo,
+        depth_mm=depth_mm.astype(np.float32),
+        alpha=np.where(holes, 0.1, 0.9).astype(np.float32),
+    )
+
+
+@pytest.fixture
+def holes() -> np.ndarray:
+    found = np.zeros((3, HEIGHT, WIDTH), dtype=bool)
+    found[0, 3:30, 5:41] = True
+    found[2, 10:20, 20:30] = True
+    return found
+
+
+def projected(points: np.ndarray, camera: Any, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pixel coordinates and z-depth, with the pinhole model written out."""
+    pose = camera.world_from_camera[index]
+    local = (points - pose[:3, 3]) @ pose[:3, :3]
+    K = camera.K[index]
+    z = local[:, 2]
+    pixels = np.stack([K[0, 0] * local[:, 0] / z + K[0, 2], K[1, 1] * local[:, 1] / z + K[1, 2]], axis=1)
+    return pixels, z
+
+
+@pytest.fixture
+def real_views_carve_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the rule on virtual views, which has a test of its own."""
+    monkeypatch.setattr(
+        finetuning, "_in_front_of_virtual_surface", lambda points, _: np.zeros(len(points), dtype=bool)
+    )
+
+
+class TestHoleGaussians:
+    ROOM = 10_000
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    def test_lie_at_the_restored_depth_along_their_rays(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        # Nothing real was seen: nothing carves.
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        depth = np.random.default_rng(0).uniform(5, 40, holes.shape)
+        depth[0, 4:8] = 0
+        views = wall_views(pseudo, depth, holes)
+        new = hole_gaussians(wall_scene(None), blind, views, self.ROOM)
+        assert new is not None
+        means = new.means.double().numpy()
+        on_grid = np.zeros_like(holes)
+        on_grid[:, ::2, ::2] = True
+        wanted = {tuple(x) for x in np.argwhere(holes & on_grid & (depth > 0)).tolist()}
+        got = set()
+        for index in range(3):
+            pixels, z = projected(means, views.cameras, index)
+            column, row = np.floor(pixels).astype(int).T
+            inside = (z > 0) & (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
+            for i in np.flatnonzero(inside):
+                centred = np.abs(pixels[i] - np.floor(pixels[i]) - 0.5).max() < 1e-3
+                if centred and abs(z[i] / views.depth_mm[index, row[i], column[i]] - 1) < 1e-5:
+                    got.add((index, row[i], column[i]))
+        assert got == wanted
+        assert len(new) == len(wanted)
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    def test_none_in_front_of_a_real_surface(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        depth = np.random.default_rng(0).uniform(2, 60, holes.shape)
+        views = wall_views(pseudo, depth, holes)
+        new = hole_gaussians(wall_scene(None), sequence, views, self.ROOM)
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        every = hole_gaussians(wall_scene(None), blind, views, self.ROOM)
+        assert new is not None
+        assert every is not None
+        assert sequence.depth_mm is not None
+
+        def hiding(points: np.ndarray) -> np.ndarray:
+            found = np.zeros(len(points), dtype=bool)
+            for frame in sequence.train:
+                pixels, z = projected(points, sequence.cameras, frame)
+                for i, (u, v) in enumerate(pixels):
+                    if z[i] > 0 and 0 <= u < WIDTH and 0 <= v < HEIGHT:
+                        row, column = int(v), int(u)
+                        seen = sequence.depth_mm[frame, row, column] * sequence.mask[frame, row, column]
+                        found[i] |= seen > 0 and z[i] < 0.95 * seen
+            return found
+
+        assert not hiding(new.means.double().numpy()).any()
+        hides = hiding(every.means.double().numpy())
+        assert 20 < hides.sum() < len(every) - 20
+        assert len(new) == len(every) - hides.sum()
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    def test_albedo_times_light_is_the_target(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        holes[2] = False
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        light = replace(
+            tube_light(), spread=torch.tensor(0.4), cosine=torch.tensor(0.7), log_shoulder=torch.tensor(-0.3)
+        )
+        # A slanted plane n x = d before the first camera: normals and depths are known.
+        n, d = np.array([0.3, -0.2, 0.9]) / math.sqrt(0.94), 14.0
+        K = pseudo.cameras.K[0]
+        v, u = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+        rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
+        depth = np.repeat((d / (rays @ n))[None], 3, axis=0)
+        new = hole_gaussians(
+            wall_scene(light), blind, wall_views(pseudo, depth, holes), self.ROOM, thickness=0.1
+        )
+        assert new is not None
+        means = new.means.double().numpy()
+        pixels, z = projected(means, pseudo.cameras, 0)
+        column, row = np.floor(pixels).astype(int).T
+        albedo = 0.28209479177387814 * new.sh0[:, 0].double().numpy() + 0.5
+        # The light's formula, in float64, at points in the camera frame
+        points = rays[row, column] * z[:, None] / 15.0
+        square = (points**2).sum(1)
+        c, e, shoulder = math.exp(-2.0), 0.9, math.exp(-0.3)
+        facing = ((points @ n) ** 2 / square + 0.04) / 1.04
+        axis = np.maximum(points[:, 2] / np.sqrt(square), 0.1)
+        gain = ((1 + c) / (square + c)) ** e * axis**0.4 * facing**0.35
+        assert gain.min() > finetuning.MIN_GAIN
+        signal = albedo * gain[:, None]
+        image = (1 + shoulder) * signal / (1 + shoulder * signal)
+        tolerance = 100 * np.finfo(np.float32).eps
+        np.testing.assert_allclose(image, pseudo.target[0][row, column], rtol=tolerance, atol=tolerance)
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    @pytest.mark.parametrize("room", [-3, 0, 5, 50, 99, 100, 101, 173, 300])
+    def test_at_most_room(self, sequence: EndoscopicSequence, pseudo: PseudoViews, room: int) -> None:
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        everywhere = np.ones((3, HEIGHT, WIDTH), dtype=bool)
+        views = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), 20.0), everywhere)
+        new = hole_gaussians(wall_scene(None), blind, views, room)
+        if room <= 0:
+            assert new is None
+        elif room >= 100:
+            assert new is not None
+            assert room / 2 < len(new) <= room
+        else:
+            assert new is None or len(new) <= room
+
+    def test_none_in_front_of_surface_that_a_virtual_view_shows(
+        self,
+        sequence: EndoscopicSequence,
+        pseudo: PseudoViews,
+        holes: np.ndarray,
+    ) -> None:
+        """A guess must hide neither known surface nor what another virtual view completes far behind it."""
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        holes[1:] = False
+        near = np.full(holes.shape, 6.0)
+        every = hole_gaussians(wall_scene(None), blind, wall_views(pseudo, near, holes), self.ROOM)
+        assert every is not None
+        means = every.means.double().numpy()
+        (pixels,), (z,) = pseudo.cameras[1].project(means)
+        seen = pseudo.cameras[1].contains(pixels)
+        assert 0 < seen.sum() < len(seen)
+        nearest, farthest = z[seen].min(), z[seen].max()
+        for alpha, uncertainty, shown_mm, hidden in (
+            (1.0, 0.0, 1.2 * farthest, True),  # known surface behind the guesses
+            (1.0, 1.0, 1.2 * farthest, False),  # solid, but nothing is known of it
+            (0.0, 1.0, 1.5 * farthest, True),  # completed far behind
+            (0.0, 1.0, 1.2 * nearest, False),  # completed a little behind: they may be the same surface
+        ):
+            views = wall_views(pseudo, near, holes)
+            second = np.full(holes.shape[1:], shown_mm)
+            views = replace(views, uncertainty=pseudo.uncertainty.copy())
+            views.depth_mm[1], views.alpha[1], views.uncertainty[1] = second, alpha, uncertainty
+            found = hole_gaussians(wall_scene(None), blind, views, self.ROOM)
+            # The second view may bring points of its own.
+            apart = np.inf if found is None else cKDTree(found.means.numpy()).query(every.means.numpy())[0]
+            kept = bool(np.all(apart < 1e-3))
+            assert kept != hidden, (alpha, uncertainty, shown_mm)
+
+    @pytest.mark.usefixtures("real_views_carve_alone")
+    def test_none_far_from_all_known_surface(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        blind = replace(sequence, mask=np.zeros_like(sequence.mask))
+        scene = Scene(tube_gaussians(N_GAUSSIANS), None)
+        depth = np.random.default_rng(0).uniform(2, 300, holes.shape)
+        views = wall_views(pseudo, depth, holes)
+        every = hole_gaussians(scene, blind, views, self.ROOM)
+        new = hole_gaussians(scene, blind, views, self.ROOM, max_distance=6.0)
+        assert every is not None
+        assert new is not None
+        assert 0 < len(new) < len(every)
+        apart = torch.cdist(new.means, scene.gaussians.means).min(dim=1).values
+        # Points of a cell are averaged, which may move them by its edge.
+        assert apart.max() <= 6.0 + finetuning._typical_spacing(scene.gaussians)
+
+    def test_nothing_to_fill(self, sequence: EndoscopicSequence, pseudo: PseudoViews) -> None:
+        none = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), 20.0), np.zeros((3, HEIGHT, WIDTH), dtype=bool))
+        assert hole_gaussians(wall_scene(None), sequence, none, self.ROOM) is None
