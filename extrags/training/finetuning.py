@@ -38,6 +38,12 @@ GUESSED_NEARER = 0.25
 MAX_GUESS_DISTANCE = 0.5
 """Farther from known surface, in median depths, completed depth is too wrong to place a Gaussian by."""
 
+NEAREST_QUANTILE = 0.01
+"""Of the depths of training frames: the nearest surface they show, without outliers."""
+
+CLEAR_OF_CAMERAS = 0.7
+"""No new Gaussian is nearer to a camera than this share of the nearest surface: cameras fly in free space."""
+
 MIN_POINTS = 8
 """Fewer hole points have neither neighbours nor normals."""
 
@@ -203,9 +209,12 @@ def hole_gaussians(
 
     Points come from the completed depth of hole pixels, their albedo from the restored colour with the
     light divided out; like the scene's first Gaussians they lie flat on the surface, which the light's
-    cosine asks for. A guess must not hide what is known: dropped are points in front of what a real view saw,
-    of what a virtual view shows of known surface, or of the depth another virtual view completes there, and
-    points far from all known surface.
+    cosine asks for. A guess must not hide what is known: dropped are points
+
+    * in front of what a real view saw, of what a virtual view shows of known surface, or of the depth that
+      another virtual view completes there,
+    * much nearer to a camera, real or virtual, than the nearest surface that training frames show,
+    * far from all known surface.
 
     Args:
         scene: the coarse scene.
@@ -238,7 +247,10 @@ def hole_gaussians(
         lit = torch.from_numpy(rgb), torch.from_numpy(local), torch.from_numpy(normals)
         rgb = scene.light.albedo(*lit, min_gain=MIN_GAIN).detach().numpy()
     placed = _near_known_surface(points, scene, max_distance)
-    placed &= ~_in_front_of_real_surface(points, scene, sequence)
+    seen = [_real_depth(scene, sequence, int(frame)) for frame in sequence.train]
+    placed &= ~_in_front_of_real_surface(points, sequence, seen)
+    every_camera = np.concatenate([sequence.cameras[sequence.train].centers, cameras.centers])
+    placed &= _clear_of_cameras(points, every_camera, seen)
     placed &= ~_in_front_of_virtual_surface(points, pseudo_views)
     points, rgb = points[placed], rgb[placed]
     if len(points) < MIN_POINTS:
@@ -284,19 +296,31 @@ def _one_per_cell(
 
 
 def _in_front_of_real_surface(
-    points: Float[np.ndarray, "n 3"], scene: Scene, sequence: EndoscopicSequence
+    points: Float[np.ndarray, "n 3"], sequence: EndoscopicSequence, seen: list[Float[np.ndarray, "h w"]]
 ) -> Bool[np.ndarray, "n"]:
     """Points that stand between a training camera and the surface it saw."""
     hides = np.zeros(len(points), dtype=bool)
     cameras = sequence.cameras[sequence.train]
-    for index, frame in enumerate(sequence.train):
-        depth = _real_depth(scene, sequence, int(frame))
+    for index, depth in enumerate(seen):
         (pixels,), (z,) = cameras[index].project(points)
         inside = cameras.contains(pixels)
         column, row = pixels[inside].astype(np.int64).T
-        seen = depth[row, column]
-        hides[inside] |= (seen > 0) & (z[inside] < (1 - CARVED_MARGIN) * seen)
+        surface = depth[row, column]
+        hides[inside] |= (surface > 0) & (z[inside] < (1 - CARVED_MARGIN) * surface)
     return hides
+
+
+def _clear_of_cameras(
+    points: Float[np.ndarray, "n 3"],
+    centers: Float[np.ndarray, "c 3"],
+    seen: list[Float[np.ndarray, "h w"]],
+) -> Bool[np.ndarray, "n"]:
+    """Points that are not implausibly near to a camera, by the nearest surface that training frames show."""
+    known = np.concatenate([depth[depth > 0] for depth in seen])
+    if len(known) == 0:
+        return np.ones(len(points), dtype=bool)
+    distance, _ = cKDTree(centers).query(points)
+    return np.asarray(distance >= CLEAR_OF_CAMERAS * np.quantile(known, NEAREST_QUANTILE))
 
 
 def _in_front_of_virtual_surface(

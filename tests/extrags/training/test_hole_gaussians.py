@@ -76,10 +76,11 @@ def projected(points: np.ndarray, camera: Any, index: int) -> tuple[np.ndarray, 
 
 @pytest.fixture
 def real_views_carve_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without the rule on virtual views, which has a test of its own."""
+    """Without the rules on virtual views and on cameras, which have tests of their own."""
     monkeypatch.setattr(
         finetuning, "_in_front_of_virtual_surface", lambda points, _: np.zeros(len(points), dtype=bool)
     )
+    monkeypatch.setattr(finetuning, "_clear_of_cameras", lambda points, *_: np.ones(len(points), dtype=bool))
 
 
 class TestHoleGaussians:
@@ -241,6 +242,32 @@ class TestHoleGaussians:
         apart = torch.cdist(new.means, scene.gaussians.means).min(dim=1).values
         # Points of a cell are averaged, which may move them by its edge.
         assert apart.max() <= 6.0 + finetuning._typical_spacing(scene.gaussians)
+
+    def test_none_nearer_to_a_camera_than_any_surface_that_was_seen(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        # One near pixel in a thousand is no surface.
+        seen_mm = np.full(holes.shape[1:], 30.0, dtype=np.float32)
+        seen_mm[0, 0] = 0.5
+        depth = np.repeat(seen_mm[None], len(sequence.rgb), axis=0)
+        # Nothing carves: the real cameras stand where the first virtual one does, and look away from it.
+        turned = pseudo.cameras.world_from_camera[:1].repeat(len(depth), axis=0)
+        turned[:, :3, :3] = turned[:, :3, :3] @ np.diag([-1.0, 1.0, -1.0])
+        first = replace(sequence, depth_mm=depth, mask=np.ones_like(sequence.mask), world_from_camera=turned)
+        names = ("rendered", "restored", "target", "alpha", "depth_mm", "uncertainty", "pixel_confidence")
+        names += ("image_confidence", "reference", "clip", "cameras")
+        alone = replace(pseudo, **{name: getattr(pseudo, name)[:1] for name in names})
+        every = np.count_nonzero(holes[0, ::2, ::2])
+        # 0.7 * 30 mm = 21 mm along the ray: at 20 mm depth the corners alone are that far.
+        for z, some, left_out in ((10.0, False, True), (20.0, True, True), (22.0, True, False)):
+            views = wall_views(alone, np.full((1, *holes.shape[1:]), z), holes[:1])
+            new = hole_gaussians(wall_scene(None), first, views, self.ROOM)
+            assert (new is not None) == some
+            if new is None:
+                continue
+            assert (len(new) < every) == left_out
+            distance = np.linalg.norm(new.means.double().numpy() - alone.cameras.centers[0], axis=1)
+            assert distance.min() >= 21 * (1 - 1e-5)
 
     def test_nothing_to_fill(self, sequence: EndoscopicSequence, pseudo: PseudoViews) -> None:
         none = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), 20.0), np.zeros((3, HEIGHT, WIDTH), dtype=bool))
