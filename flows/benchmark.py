@@ -125,8 +125,8 @@ def check_methods(
     """Check the names of methods, variants and baseline; returns the baseline.
 
     Raises:
-        ConfigError: for unknown methods, duplicate names, a variant that would train on held-out frames, or
-            a baseline that is not among the methods.
+        ConfigError: for unknown methods, duplicate names, a variant that would train on held-out frames or
+            changes a stage that its method leaves out, or a baseline that is not among the methods.
     """
     for method in methods:
         if method not in METHODS:
@@ -143,6 +143,13 @@ def check_methods(
             raise ConfigError(f"variant {name}: no method {base!r}; known: {', '.join(METHODS)}")
         if "coarse.train_on" in changed:
             raise ConfigError(f"variant {name}: coarse.train_on cannot be changed; see the method oracle")
+        for setting in changed:
+            stage = setting.partition(".")[0]
+            if stage in METHODS[base].leave_out:
+                raise ConfigError(
+                    f"variant {name}: {setting} has no effect on the method {base}, which leaves out the "
+                    f"stage {stage}; name another method, as in --variant {name} extrags {setting}=VALUE"
+                )
     if baseline is None:
         return PREFERRED_BASELINE if PREFERRED_BASELINE in wanted else wanted[0]
     if baseline not in wanted:

@@ -137,6 +137,13 @@ class TestNames:
             (["coarse"], {}, "3dgs", "'3dgs' is not among the methods: coarse"),
             (["coarse"], {"3dgs": {}}, None, "cannot have a method's name: 3dgs"),
             (["coarse"], {"x": {"method": "nerf"}}, None, "variant x: no method 'nerf'"),
+            (["coarse"], {"x": {"explore.hole_weight": 0}}, None, "no effect on the method coarse"),
+            (
+                ["3dgs"],
+                {"x": {"method": "real-only", "enhance.steps": 1}},
+                None,
+                "leaves out the stage enhance",
+            ),
         ],
     )
     def test_wrong_names(
