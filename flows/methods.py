@@ -228,6 +228,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "finetune.seed_holes": False,
         "finetune.keep_known": False,
         "finetune.confidence_floor": 0.0,
+        "finetune.image_confidence": True,
         "finetune.judge.enabled": False,
     }
 

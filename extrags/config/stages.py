@@ -488,6 +488,9 @@ class FinetuneConfig(StageConfig):
     confidence_floor: float = Field(
         0.1, ge=0, le=1, description="smallest pixel-level weight, so that no pixel drifts freely"
     )
+    image_confidence: bool = Field(
+        True, description="weight virtual views by U_img; without it all have the same, the mean"
+    )
     judge: JudgeConfig = JudgeConfig()
     seed: int = Field(0, ge=0, description="seed of all random sampling")
 

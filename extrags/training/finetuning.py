@@ -176,10 +176,11 @@ def virtual_views(pseudo_views: PseudoViews, config: FinetuneConfig) -> list[Vie
     ssim_weight = torch.ones(cameras.height, cameras.width) if config.loss == "paper" else None
     # Completed depth supervises only where the scene has no reliable surface.
     depth = np.where(pseudo_views.uncertainty > UNKNOWN, pseudo_views.depth_mm, 0).astype(np.float32)
-    for index in range(len(cameras)):
-        weight = config.pseudo_weight * float(pseudo_views.image_confidence[index])
-        if weight <= 0:
-            continue
+    weights = config.pseudo_weight * pseudo_views.image_confidence
+    used = np.flatnonzero(weights > 0)
+    if not config.image_confidence:
+        weights = np.full_like(weights, weights[used].mean() if len(used) else 0)
+    for index in used.tolist():
         target = pseudo_views.target[index] if config.keep_known else pseudo_views.restored[index]
         views.append(
             View(
@@ -188,7 +189,7 @@ def virtual_views(pseudo_views: PseudoViews, config: FinetuneConfig) -> list[Vie
                 weight=torch.from_numpy(confidence[index].astype(np.float32)),
                 depth_mm=torch.from_numpy(depth[index]) if config.pseudo_depth else None,
                 frame=None,
-                loss_weight=weight,
+                loss_weight=float(weights[index]),
                 ssim_weight=ssim_weight,
                 normalisation=normalisation,
             )

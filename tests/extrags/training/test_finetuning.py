@@ -266,6 +266,13 @@ class TestConfidences:
         none = replace(pseudo, image_confidence=np.zeros(3, dtype=np.float32))
         assert virtual_views(none, config_of(form)) == []
 
+    def test_without_image_confidence_all_views_have_the_mean_weight(self, pseudo: PseudoViews) -> None:
+        views = virtual_views(pseudo, config_of("weighted_mean", image_confidence=False, pseudo_weight=2.0))
+        assert [virtual_index(view, pseudo) for view in views] == [0, 2]
+        assert [view.loss_weight for view in views] == pytest.approx([2 * (0.3 + 0.8) / 2] * 2)
+        each = virtual_views(pseudo, config_of("weighted_mean", pseudo_weight=2.0))
+        assert [view.loss_weight for view in each] == pytest.approx([0.6, 1.6])
+
     def test_the_floor_may_be_zero(self, pseudo: PseudoViews) -> None:
         floors = [0.0, 0.1]
         found = [virtual_views(pseudo, config_of("paper", confidence_floor=f))[0].weight for f in floors]
