@@ -1,11 +1,12 @@
 """The tables of docs/results.md from results of `extrags benchmark --json`, as Markdown on standard output.
 
-`python tests/benchmarks/paper_tables.py methods|ablation|budget FILE...`
+`python tests/benchmarks/paper_tables.py methods|ablation|budget FILE...` and `... judge STORE`
 
 * `methods`: every method by dataset, setting and region, plain and aligned, with the share of the way to the
   oracle and the differences of `extrags` to `3dgs`.
 * `ablation`: each variant less `extrags`, paired, with 95 % intervals.
 * `budget`: the coarse and the final scene by variant, in the order of the runs.
+* `judge`: what fine-tuning changed on training frames left out of a trial, of every run in a store.
 
 Runs of several files are put together; a run that two files hold has to be the same in both.
 """
@@ -26,6 +27,8 @@ from flows.tables import difference_text, markdown_table, share_text, spread_tex
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "flip", "depth_absrel")
 REGIONS = ("whole", "observed", "unobserved")
 ABLATED = ("psnr", "observed.psnr", "unobserved.psnr", "lpips_alex", "observed.depth_absrel")
+
+KEPT = {None: "the coarse scene", 0.0: "real views alone"}
 
 
 def cases_of(files: Iterable[Path]) -> list[dict[str, Any]]:
@@ -141,6 +144,31 @@ def budget_tables(cases: Sequence[dict[str, Any]]) -> str:
     return markdown_table(["dataset", "budget", "scenes", *names, "seconds"], table)
 
 
+def judge_table(store: Path) -> str:
+    """The trials of all judgements in a store, by sequence and seed."""
+    rows = []
+    for manifest in sorted((store / "artefacts").glob("finetune-judge-v*/manifest.json")):
+        judged = json.loads((manifest.parent / "judgement.json").read_text())
+        made = json.loads(manifest.read_text())
+        gains = {trial["amount"]: trial for trial in judged["trials"]}
+        rows.append(
+            [
+                made["label"],
+                made["config"]["config"]["seed"],
+                len(judged["left_out"]),
+                *(
+                    "–"  # noqa: RUF001
+                    if amount not in gains
+                    else "{gain_db:+.2f} ± {standard_error_db:.2f}".format(**gains[amount])
+                    for amount in (0.0, 0.3, 1.0)
+                ),
+                KEPT.get(judged["amount"], f"weight x {judged['amount']}"),
+            ]
+        )
+    head = ["sequence", "seed", "frames left out", "real views alone", "weight x 0.3", "weight x 1", "kept"]
+    return markdown_table(head, sorted(rows))
+
+
 def _about(row: dict[str, Any]) -> str:
     return row["dataset"] if "dataset" in row else dataset_of(row)
 
@@ -148,10 +176,14 @@ def _about(row: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     tables = {"methods": methods_tables, "ablation": ablation_tables, "budget": budget_tables}
-    parser.add_argument("table", choices=tables)
+    parser.add_argument("table", choices=[*tables, "judge"])
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     arguments = parser.parse_args()
-    sys.stdout.write(tables[arguments.table](cases_of(arguments.files)) + "\n")
+    if arguments.table == "judge":
+        text = "\n\n".join(judge_table(store) for store in arguments.files)
+    else:
+        text = tables[arguments.table](cases_of(arguments.files))
+    sys.stdout.write(text + "\n")
 
 
 if __name__ == "__main__":
