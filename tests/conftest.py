@@ -26,11 +26,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--runslow", action="store_true", help="run tests marked slow")
 
 
+# Before xdist's own hook, which puts the groups into the names of tests.
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
-        # Fixtures of a module, and the server of all tests of flows, are made in one process only.
-        folder = item.path.parent
-        item.add_marker(pytest.mark.xdist_group(folder.name if folder.name == "flows" else str(item.path)))
+        # Fixtures of a module are made in one process only.
+        item.add_marker(pytest.mark.xdist_group(str(item.path)))
     if not config.getoption("--runslow"):
         skip = pytest.mark.skip(reason="slow; run with --runslow")
         for item in items:
