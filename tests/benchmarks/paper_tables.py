@@ -65,12 +65,12 @@ def methods_tables(cases: Sequence[dict[str, Any]]) -> str:
         rows = comparison["datasets" if several else "sequences"]
         by_method = {row["method"]: row for row in rows if _about(row) == dataset}
         shares = {row["method"]: row for row in comparison["ceiling_datasets"] if row["dataset"] == dataset}
-        seeds = ", ".join(str(seed) for seed in sorted({case["seed"] for case in runs}))
+        each = sorted({case["seed"] for case in runs})
+        seeds = f"seed{'s' * (len(each) > 1)} {', '.join(str(seed) for seed in each)}"
+        over = "scenes" if several else "seeds"
+        spread = f" Mean ± standard deviation over {over}." if several or len(each) > 1 else ""
         named = ", ".join(dict.fromkeys(case["sequence"] for case in runs))
-        texts.append(
-            f"### {dataset}\n\n{named}; seeds {seeds}. Mean ± standard deviation over "
-            f"{'scenes' if several else 'seeds'}.\n"
-        )
+        texts.append(f"### {dataset}\n\n{named}; {seeds}.{spread}\n")
         seconds = {
             method: sum(times) / len(times)
             for method in order
