@@ -5,7 +5,7 @@
 * `methods`: every method by dataset, setting and region, plain and aligned, with the share of the way to the
   oracle and the differences of `extrags` to `3dgs`.
 * `ablation`: each variant less `extrags`, paired, with 95 % intervals.
-* `budget`: the coarse and the final scene by variant, in the order of the runs.
+* `budget`: the coarse and the final scene by budget.
 * `judge`: what fine-tuning changed on training frames left out of a trial, of every run in a store.
 
 Runs of several files are put together; a run that two files hold has to be the same in both.
@@ -22,7 +22,7 @@ from typing import Any
 
 from extrags.metrics.comparison import CEILING, compare_runs, dataset_of
 from extrags.metrics.registry import metric_named
-from flows.tables import difference_text, markdown_table, share_text, spread_text
+from flows.tables import difference_text, figure, markdown_table, share_text, spread_text
 
 METRICS = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "flip", "depth_absrel")
 REGIONS = ("whole", "observed", "unobserved")
@@ -124,9 +124,8 @@ def ablation_tables(cases: Sequence[dict[str, Any]]) -> str:
 
 
 def budget_tables(cases: Sequence[dict[str, Any]]) -> str:
-    """Every variant's figures by dataset, in the order of the runs."""
+    """Figures of `coarse` and `extrags`, and of their variants `coarse-2x`, `final-2x`, ..., by dataset."""
     comparison = compare_runs(cases, cases[0]["method"])
-    several = len({case["sequence"] for case in cases}) > 1
     names = [
         "psnr",
         "aligned.psnr",
@@ -135,13 +134,18 @@ def budget_tables(cases: Sequence[dict[str, Any]]) -> str:
         "lpips_alex",
         "observed.depth_absrel",
     ]
-    table = []
-    for row in comparison["datasets" if several else "sequences"]:
-        runs = [case for case in cases if case["method"] == row["method"] and dataset_of(case) == _about(row)]
+    rows = []
+    for row in comparison["datasets"]:
+        runs = [
+            case for case in cases if case["method"] == row["method"] and dataset_of(case) == row["dataset"]
+        ]
+        stage, _, factor = row["method"].replace("extrags", "final").partition("-")
         seconds = sum(case["seconds"] for case in runs) / len(runs)
-        figures = [spread_text(name, row["figures"].get(name)) for name in names]
-        table.append([_about(row), row["method"], row["n_sequences"], *figures, f"{seconds:.0f}"])
-    return markdown_table(["dataset", "budget", "scenes", *names, "seconds"], table)
+        figures = [figure(name, row["figures"][name]["mean"]) for name in names]
+        budget = float(factor.rstrip("x") or 1)
+        rows.append([row["dataset"], stage, budget, *figures, f"{seconds:.0f}"])
+    head = ["dataset", "scene", "budget", *names, "seconds"]
+    return markdown_table(head, [[*row[:2], f"{row[2]:g}x", *row[3:]] for row in sorted(rows)])
 
 
 def judge_table(store: Path) -> str:
