@@ -149,7 +149,7 @@ def budget_tables(cases: Sequence[dict[str, Any]]) -> str:
 
 
 def judge_table(store: Path) -> str:
-    """The trials of all judgements in a store, by sequence and seed."""
+    """The trials of all judgements in a store; sequences that train on the same frames share one."""
     rows = []
     for manifest in sorted((store / "artefacts").glob("finetune-judge-v*/manifest.json")):
         judged = json.loads((manifest.parent / "judgement.json").read_text())
@@ -158,6 +158,7 @@ def judge_table(store: Path) -> str:
         rows.append(
             [
                 made["label"],
+                made["config"]["config"]["iterations"],
                 made["config"]["config"]["seed"],
                 len(judged["left_out"]),
                 *(
@@ -169,7 +170,8 @@ def judge_table(store: Path) -> str:
                 KEPT.get(judged["amount"], f"weight x {judged['amount']}"),
             ]
         )
-    head = ["sequence", "seed", "frames left out", "real views alone", "weight x 0.3", "weight x 1", "kept"]
+    head = ["sequence", "iterations", "seed", "frames left out"]
+    head += ["real views alone", "weight x 0.3", "weight x 1", "kept"]
     return markdown_table(head, sorted(rows))
 
 

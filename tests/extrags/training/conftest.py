@@ -11,6 +11,7 @@ import torch
 from extrags.cameras import Cameras, look_at
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
+from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 
@@ -68,3 +69,28 @@ def tube_sequence() -> EndoscopicSequence:
         world_from_camera=cameras.world_from_camera,
         depth_mm=depth.numpy(),
     )
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """The tube, shaken."""
+    # Here, because that module takes the tube from this one.
+    from tests.extrags.training.plain_finetuning import coarse_scene
+
+    return coarse_scene()
+
+
+@pytest.fixture(scope="module")
+def pseudo(scene: Scene) -> PseudoViews:
+    """Virtual views of the shaken tube."""
+    from tests.extrags.training.plain_finetuning import pseudo_views
+
+    return pseudo_views(scene)
+
+
+@pytest.fixture(scope="module")
+def sequence(tube_sequence: EndoscopicSequence) -> EndoscopicSequence:
+    """The tube's frames with a mask, a highlight and pixels without depth."""
+    from tests.extrags.training.plain_finetuning import masked
+
+    return masked(tube_sequence)

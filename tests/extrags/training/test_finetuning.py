@@ -32,33 +32,15 @@ from tests.extrags.training.plain_finetuning import (
     Images,
     MakeStep,
     Plain,
-    coarse_scene,
     config_of,
     double,
     drawn,
-    masked,
     plain_loss,
     plain_ssim,
     prepared,
-    pseudo_views,
     stepped,
     virtual_index,
 )
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return coarse_scene()
-
-
-@pytest.fixture(scope="module")
-def pseudo(scene: Scene) -> PseudoViews:
-    return pseudo_views(scene)
-
-
-@pytest.fixture(scope="module")
-def sequence(tube_sequence: EndoscopicSequence) -> EndoscopicSequence:
-    return masked(tube_sequence)
 
 
 class TestLoss:

@@ -21,25 +21,7 @@ from extrags.training.finetuning import hole_gaussians
 from tests.extrags.training.conftest import HEIGHT, WIDTH, tube_gaussians, tube_light
 from tests.extrags.training.plain_finetuning import (
     N_GAUSSIANS,
-    coarse_scene,
-    masked,
-    pseudo_views,
 )
-
-
-@pytest.fixture(scope="module")
-def scene() -> Scene:
-    return coarse_scene()
-
-
-@pytest.fixture(scope="module")
-def pseudo(scene: Scene) -> PseudoViews:
-    return pseudo_views(scene)
-
-
-@pytest.fixture(scope="module")
-def sequence(tube_sequence: EndoscopicSequence) -> EndoscopicSequence:
-    return masked(tube_sequence)
 
 
 def wall_scene(light: NearFieldLight | None) -> Scene:
