@@ -110,6 +110,7 @@ def three_dgs(config: PipelineConfig) -> dict[str, Any]:
         "coarse.optimiser.opacities": 0.05,
         "coarse.optimiser.scales": 5e-3,
         "coarse.optimiser.quats": 1e-3,
+        "coarse.optimiser.decay_after": None,
         "coarse.densify.enabled": True,
         "coarse.densify.strategy": "default",
         "coarse.densify.absgrad": False,

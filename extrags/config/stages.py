@@ -131,6 +131,12 @@ class OptimiserConfig(StageConfig):
     opacities: float = Field(0.05, gt=0, description="opacities, as logits")
     scales: float = Field(5e-3, gt=0, description="axis lengths, as logarithms")
     quats: float = Field(1e-3, gt=0, description="rotations, as quaternions")
+    decay_after: int | None = Field(
+        1500,
+        ge=1,
+        description="from this iteration on, all rates but those of positions fall as 1 / iteration; null: "
+        "they stay, as in 3DGS",
+    )
 
 
 class DensifyConfig(StageConfig):

@@ -34,17 +34,23 @@ class Schedule:
     normals: NormalTerm | None = None
 
     def learning_rates(self, iteration: int) -> dict[str, float]:
-        """Rates at an iteration; positions fall log-linearly."""
+        """Rates at an iteration: positions fall log-linearly, the others as 1 / iteration after a while.
+
+        Adam's steps keep their length where the gradient is all noise, so that parameters which no view
+        determines drift as long as the rates stay: held-out views then get worse with every iteration.
+        """
         rates = self.optimiser
+        after = rates.decay_after
+        share = 1.0 if after is None else after / max(after, iteration)
         t = iteration / max(1, self.iterations)
         means = math.exp((1 - t) * math.log(rates.means) + t * math.log(rates.means_final))
         return {
             "means": means * self.extent,
-            "quats": rates.quats,
-            "scales": rates.scales,
-            "opacities": rates.opacities,
-            "sh0": rates.sh0,
-            "shN": rates.shN,
+            "quats": share * rates.quats,
+            "scales": share * rates.scales,
+            "opacities": share * rates.opacities,
+            "sh0": share * rates.sh0,
+            "shN": share * rates.shN,
         }
 
     def resumed(self, *, seed: int) -> Schedule:

@@ -1,0 +1,70 @@
+"""Learning rates and weights over an optimisation."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from extrags.config import CoarseConfig, OptimiserConfig, profile_config
+from extrags.training.reconstruction import coarse_schedule
+from extrags.training.schedule import Schedule
+
+SETTLING = ("quats", "scales", "opacities", "sh0", "shN")
+EXTENT = 7.0
+
+
+def schedule_with(decay_after: int | None, iterations: int = 1000) -> Schedule:
+    config = CoarseConfig(iterations=iterations, optimiser=OptimiserConfig(decay_after=decay_after))
+    return coarse_schedule(config, EXTENT, 20.0, "coarse")
+
+
+class TestLearningRates:
+    def test_start_at_the_settings(self) -> None:
+        schedule = schedule_with(100)
+        expected = {name: getattr(schedule.optimiser, name) for name in SETTLING}
+        rates = schedule.learning_rates(0)
+        assert {name: rates[name] for name in SETTLING} == expected
+        assert rates["means"] == pytest.approx(EXTENT * schedule.optimiser.means)
+
+    @pytest.mark.parametrize("name", SETTLING)
+    def test_fall_with_the_inverse_of_the_iteration(self, name: str) -> None:
+        schedule = schedule_with(100)
+        start = getattr(schedule.optimiser, name)
+        for iteration, share in ((0, 1), (99, 1), (100, 1), (200, 1 / 2), (400, 1 / 4), (999, 100 / 999)):
+            assert schedule.learning_rates(iteration)[name] == pytest.approx(share * start)
+
+    @pytest.mark.parametrize("name", SETTLING)
+    def test_their_steps_add_up_to_the_logarithm_of_the_length(self, name: str) -> None:
+        # Twice as long may move a parameter that nothing determines by a constant more, not twice as far.
+        def path(iterations: int) -> float:
+            schedule = schedule_with(100, iterations)
+            return sum(schedule.learning_rates(i)[name] for i in range(iterations))
+
+        start = getattr(OptimiserConfig(), name)
+        assert path(2000) - path(1000) == pytest.approx(100 * start * np.log(2), rel=1e-2)
+        assert path(4000) - path(2000) == pytest.approx(100 * start * np.log(2), rel=1e-2)
+
+    def test_none_leaves_them(self) -> None:
+        schedule = schedule_with(None)
+        assert all(
+            schedule.learning_rates(999)[name] == schedule.learning_rates(0)[name] for name in SETTLING
+        )
+
+    def test_positions_fall_log_linearly_whatever_the_others_do(self) -> None:
+        for schedule in (schedule_with(100), schedule_with(None)):
+            rates = [schedule.learning_rates(iteration)["means"] for iteration in (0, 500, 1000)]
+            assert rates[1] == pytest.approx(np.sqrt(rates[0] * rates[2]))
+            assert rates[2] == pytest.approx(EXTENT * schedule.optimiser.means_final)
+
+    def test_the_shortest_profile_ends_before_they_fall(self) -> None:
+        coarse = profile_config("quick").coarse
+        assert coarse.optimiser.decay_after is not None
+        assert coarse.iterations <= coarse.optimiser.decay_after
+
+
+class TestDepthWeight:
+    def test_falls_log_linearly_to_its_share(self) -> None:
+        config = CoarseConfig(iterations=1000, depth_weight=0.2, depth_weight_final_share=0.25)
+        schedule = coarse_schedule(config, EXTENT, 20.0, "coarse")
+        weights = [schedule.depth_weight_at(iteration) for iteration in (0, 500, 1000)]
+        assert weights == pytest.approx([0.2, 0.1, 0.05])
