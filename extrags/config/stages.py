@@ -134,8 +134,8 @@ class OptimiserConfig(StageConfig):
     decay_after: int | None = Field(
         1500,
         ge=1,
-        description="from this iteration on, all rates but those of positions fall as 1 / iteration; null: "
-        "they stay, as in 3DGS",
+        description="from this iteration on all rates but those of positions, the light's too, fall as "
+        "1 / iteration^1.5; null: they stay, as in 3DGS",
     )
 
 

@@ -49,15 +49,15 @@ class DenseAdam:
         self._first, self._second = np.zeros_like(values), np.zeros_like(values)
         self._steps = 0
 
-    def step(self, gradient: Float[np.ndarray, "n"]) -> None:
-        """One step; entries whose gradient is always zero stay what they are."""
+    def step(self, gradient: Float[np.ndarray, "n"], rate_share: float = 1.0) -> None:
+        """One step at a share of the learning rate; entries whose gradient is always zero stay."""
         beta1, beta2 = self.BETAS
         self._steps += 1
         self._first += (1 - beta1) * (gradient - self._first)
         self._second *= beta2
         self._second += (1 - beta2) * gradient * gradient
         root = np.sqrt(self._second) / math.sqrt(1 - beta2**self._steps) + self.EPS
-        self.values -= self.learning_rate / (1 - beta1**self._steps) * self._first / root
+        self.values -= rate_share * self.learning_rate / (1 - beta1**self._steps) * self._first / root
 
 
 @dataclass(frozen=True)
@@ -142,16 +142,17 @@ class LightFit:
         exposures = self._log_exposure
         return self._config.exposure_prior * float(exposures @ exposures) / len(exposures)
 
-    def step(self, gradient: Float[np.ndarray, "12"]) -> None:
+    def step(self, gradient: Float[np.ndarray, "12"], rate_share: float = 1.0) -> None:
         """Step what is learned.
 
         Args:
             gradient: of the loss without the prior, with respect to the last `row`.
+            rate_share: of the settings' learning rates.
         """
         if self._any_free:
-            self._adam.step(self.common_gradient(gradient))
+            self._adam.step(self.common_gradient(gradient), rate_share)
         if self._config.exposure and self._frame is not None:
-            self._exposure_adam.step(self.exposure_gradient(gradient))
+            self._exposure_adam.step(self.exposure_gradient(gradient), rate_share)
 
     def common_gradient(self, gradient: Float[np.ndarray, "12"]) -> Float[np.ndarray, "8"]:
         """Gradient of the parameters all cameras share, in the order of a row; zero where not learned."""

@@ -84,7 +84,7 @@ def optimise(
             observation = step.differentiate(view, iteration, density, viewmat)
             if not math.isfinite(observation.loss):
                 raise DivergedError(_account(schedule, iteration, adam.parameters), last_good)
-            step.update(observation)
+            step.update(observation, iteration)
             density.step(adam, observation.rendering, iteration)
             last = iteration == schedule.iterations - 1
             if footprint is not None and (last or (iteration + 1) % APPLIED_EVERY == 0):

@@ -8,7 +8,10 @@ from dataclasses import dataclass, replace
 from extrags.config import DensifyConfig, LightConfig, OptimiserConfig
 from extrags.training.normal_term import NormalTerm
 
-__all__ = ["Schedule"]
+__all__ = ["DECAY_EXPONENT", "Schedule"]
+
+DECAY_EXPONENT = 1.5
+"""Of the iteration, in the decay of rates: above 1, so that their sum stays finite."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +37,9 @@ class Schedule:
     normals: NormalTerm | None = None
 
     def learning_rates(self, iteration: int) -> dict[str, float]:
-        """Rates at an iteration: positions fall log-linearly, the others as 1 / iteration after a while.
-
-        Adam's steps keep their length where the gradient is all noise, so that parameters which no view
-        determines drift as long as the rates stay: held-out views then get worse with every iteration.
-        """
+        """Rates at an iteration: positions fall log-linearly, the others as `rate_share` says."""
         rates = self.optimiser
-        after = rates.decay_after
-        share = 1.0 if after is None else after / max(after, iteration)
+        share = self.rate_share(iteration)
         t = iteration / max(1, self.iterations)
         means = math.exp((1 - t) * math.log(rates.means) + t * math.log(rates.means_final))
         return {
@@ -52,6 +50,16 @@ class Schedule:
             "sh0": share * rates.sh0,
             "shN": share * rates.shN,
         }
+
+    def rate_share(self, iteration: int) -> float:
+        """Share of their first value that rates still have; those of positions follow a law of their own.
+
+        Adam's steps keep their length where the gradient is all noise, so that what no view determines drifts
+        as long as the rates stay: held-out views then get worse with every iteration. Shares of this form
+        have a finite sum: however long a run is, it drifts no farther.
+        """
+        after = self.optimiser.decay_after
+        return 1.0 if after is None else float((after / max(after, iteration)) ** DECAY_EXPONENT)
 
     def resumed(self, *, seed: int) -> Schedule:
         """The schedule for a scene that exists already: all harmonics are active from the first step."""

@@ -67,8 +67,13 @@ class TrainingStep(Protocol):
             viewmat: camera from world instead of the view's own, [4, 4]; its gradient is asked for.
         """
 
-    def update(self, observation: Observation) -> None:
-        """Move the parameters along the gradients of the last `differentiate`."""
+    def update(self, observation: Observation, iteration: int) -> None:
+        """Move the parameters along the gradients of the last `differentiate`.
+
+        Args:
+            observation: what that returned.
+            iteration: sets the light's learning rates; those of the Gaussians are `adam.learning_rates`.
+        """
 
 
 def training_step(scene: Scene, schedule: Schedule) -> TrainingStep:
@@ -135,11 +140,14 @@ class AutogradStep:
         gradient = None if pose is None or pose.grad is None else pose.grad.numpy()
         return Observation(float(loss.detach()), rendering, rendering.visible[0], gradient)
 
-    def update(self, observation: Observation) -> None:
+    def update(self, observation: Observation, iteration: int) -> None:
         """See `TrainingStep.update`."""
         self.adam.step(visible=observation.visible)
         self.adam.zero_grad()
         if self._light_adam is not None:
+            share = self._schedule.rate_share(iteration)
+            for group in self._light_adam.param_groups:
+                group["lr"] = share * group["initial_lr"]
             self._light_adam.step()
             self._light_adam.zero_grad(set_to_none=True)
 
@@ -200,13 +208,13 @@ class NativeStep:
         gradient = None if viewmat is None else direct.viewmat_gradient
         return Observation(loss, direct.rendering(target), direct.visible, gradient)
 
-    def update(self, observation: Observation) -> None:
+    def update(self, observation: Observation, iteration: int) -> None:
         """See `TrainingStep.update`."""
         if self.direct is None:
             raise RuntimeError("update before the first differentiate")
         self.adam.step(visible=observation.visible, gradients=self.direct.gradients)
         if self.light_fit is not None:
-            self.light_fit.step(self.direct.light_gradient)
+            self.light_fit.step(self.direct.light_gradient, self._schedule.rate_share(iteration))
 
     def _bound_step(self, density: DensityStrategy) -> DirectStep:
         """The kernels' arrays, made anew where densification has replaced the parameters."""
@@ -282,7 +290,7 @@ def _trainable_light(
         values["log_exposure"].requires_grad_()
     trainable = NearFieldLight(**values, reference_distance=light.reference_distance)
     groups: list[dict[str, Any]] = [
-        {"params": [values[name] for name in learned], "lr": config.learning_rate},
-        {"params": [values["log_exposure"]], "lr": config.exposure_learning_rate},
+        {"params": [values[name] for name in learned], "initial_lr": config.learning_rate},
+        {"params": [values["log_exposure"]], "initial_lr": config.exposure_learning_rate},
     ]
     return trainable, torch.optim.Adam(groups, eps=1e-15)

@@ -125,17 +125,19 @@ class TestOneStep:
                 assert expected.light.log_exposure.grad is not None
                 assert _relative(exposure, expected.light.log_exposure.grad) < 1e-5
 
+    @pytest.mark.parametrize("iteration", [3, 4000])
     @pytest.mark.parametrize("degree", [0, 1, 3])
     def test_parameters_after_a_step_are_the_same(
-        self, tube_sequence: EndoscopicSequence, degree: int
+        self, tube_sequence: EndoscopicSequence, degree: int, iteration: int
     ) -> None:
         view = real_views(tube_sequence, tube_sequence.train)[0]
-        schedule = _schedule(sh_every=1)
+        schedule = _schedule(8000, sh_every=1)
         scene = _scene(degree)
         density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
         steps = [NativeStep(scene, schedule), AutogradStep(scene, schedule)]
         for step in steps:
-            step.update(step.differentiate(view, 3, density))
+            step.adam.learning_rates = schedule.learning_rates(iteration)
+            step.update(step.differentiate(view, iteration, density), iteration)
         own, other = (step.adam.parameters for step in steps)
         start = scene.gaussians.parameters()
         for name, value in other.items():
@@ -145,6 +147,14 @@ class TestOneStep:
                 assert _relative(moved, expected) < 0.02, name
                 assert float(expected.abs().max()) > 0
         for name, value in steps[1].light.parameters().items():  # type: ignore[union-attr]
+            rate = (
+                schedule.light.exposure_learning_rate
+                if name == "log_exposure"
+                else schedule.light.learning_rate
+            )
+            first = scene.light.parameters()[name]  # type: ignore[union-attr]
+            longest = float((value.detach() - first).nan_to_num().abs().max())  # a softening of 0
+            assert longest <= 1.001 * schedule.rate_share(iteration) * rate
             torch.testing.assert_close(
                 steps[0].light.parameters()[name], value.detach(), rtol=1e-4, atol=1e-6
             )  # type: ignore[union-attr]
