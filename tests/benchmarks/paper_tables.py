@@ -131,6 +131,7 @@ def budget_tables(cases: Sequence[dict[str, Any]]) -> str:
         "aligned.psnr",
         "observed.psnr",
         "unobserved.psnr",
+        "observed.ssim",
         "lpips_alex",
         "observed.depth_absrel",
     ]
