@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import jaxtyping
 import pytest
@@ -14,6 +15,16 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 # Of several processes of tests each has one thread, and so have the programs that it starts.
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
+
+SHARING = ("tests/flows",)
+"""Packages whose tests share a server and a finished run."""
+LONG = (
+    "tests/flows",
+    "tests/extrags/restoration/test_backends.py",
+    "tests/extrags/poses/test_estimate.py",
+    "tests/data_catalog/test_c3vd_scenes.py",
+)
+"""The groups that take longest."""
 
 SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 # The library itself never looks beside a checkout.
@@ -26,12 +37,36 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--runslow", action="store_true", help="run tests marked slow")
 
 
-# Before xdist's own hook, which puts the groups into the names of tests.
-@pytest.hookimpl(tryfirst=True)
+def group_of(nodeid: str) -> str:
+    """What one process runs: a file, whose fixtures are made once, or a package that shares dearer ones."""
+    file = nodeid.partition("::")[0]
+    return next((package for package in SHARING if file.startswith(f"{package}/")), file)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Schedule by `group_of`, in the order of the tests.
+
+    Not by marks of groups: xdist 3.8 writes them to where pytest from 9.2 on does not look, and every test
+    is then a group of its own, whose module's fixtures are made by every process.
+    """
+    if config.getvalue("dist") != "loadgroup":
+        return None
+    from xdist.scheduler import LoadScopeScheduling
+
+    class Groups(LoadScopeScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            return group_of(nodeid)
+
+    # By the number of tests, which says little of how long they take.
+    config.option.loadscopereorder = False
+    return Groups(config, log)
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    for item in items:
-        # Fixtures of a module are made in one process only.
-        item.add_marker(pytest.mark.xdist_group(str(item.path)))
+    # Long groups first: one that begins last keeps the other processes waiting for it.
+    rank = {group: place for place, group in enumerate(LONG)}
+    items.sort(key=lambda item: rank.get(group_of(item.nodeid), len(rank)))
     if not config.getoption("--runslow"):
         skip = pytest.mark.skip(reason="slow; run with --runslow")
         for item in items:
