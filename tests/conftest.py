@@ -16,6 +16,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 if "PYTEST_XDIST_WORKER" in os.environ:
     os.environ["OMP_NUM_THREADS"] = "1"
 
+HERE = Path(__file__).resolve().parent
 SHARING = ("tests/flows",)
 """Packages whose tests share a server and a finished run."""
 LONG = (
@@ -26,11 +27,13 @@ LONG = (
 )
 """The groups that take longest."""
 
-SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+SHARED_DATA = Path(os.environ.get("EXTRAGS_DATA") or HERE.parents[1] / "shared" / "data")
+"""A caller's choice, else the folder beside the checkout."""
+
 # The library itself never looks beside a checkout.
 if SHARED_DATA.is_dir():
     os.environ["EXTRAGS_DATA"] = str(SHARED_DATA)
-    os.environ["EXTRAGS_LPIPS_WEIGHTS"] = str(SHARED_DATA / "lpips_weights")
+    os.environ.setdefault("EXTRAGS_LPIPS_WEIGHTS", str(SHARED_DATA / "lpips_weights"))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -76,9 +79,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Third-party data beside the checkout."""
+    """Third-party data: `$EXTRAGS_DATA`, else beside the checkout."""
     if not SHARED_DATA.is_dir():
-        pytest.skip("no ../shared/data beside the checkout")
+        pytest.skip("no $EXTRAGS_DATA, and no ../shared/data beside the checkout")
     return SHARED_DATA
 
 
