@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
@@ -13,7 +14,7 @@ import extrags
 from extrags.events import Event, subscribed
 from extrags.metrics.registry import unregister_metric
 from extrags.restoration import backends
-from tests.flows.tiny import SEQUENCE, tiny_config
+from tests.flows.tiny import SEQUENCE, spared, tiny_config
 
 FAST = tiny_config(enhance__pretrained_weights="bundled", enhance__train_iterations=0, enhance__judge=False)
 """The bundled restorer as it is, neither trained nor judged on the scene."""
@@ -30,8 +31,14 @@ def example(name: str) -> ModuleType:
     return module
 
 
+@pytest.fixture(scope="module", autouse=True)
+def little_work() -> Iterator[None]:
+    with spared():
+        yield
+
+
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[extrags.Result, Path]:
+def finished(little_work: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[extrags.Result, Path]:
     """The whole job, once for all tests."""
     ply = tmp_path_factory.mktemp("examples") / "scene.ply"
     return example("whole_job").whole_job(SEQUENCE, ply, FAST), ply

@@ -10,6 +10,9 @@ import pytest
 from prefect.settings import (
     PREFECT_FLOWS_HEARTBEAT_FREQUENCY,
     PREFECT_LOGGING_TO_API_ENABLED,
+    PREFECT_SERVER_ANALYTICS_ENABLED,
+    PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED,
+    PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED,
     temporary_settings,
 )
 from prefect.testing.utilities import prefect_test_harness
@@ -17,9 +20,18 @@ from prefect.testing.utilities import prefect_test_harness
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
-from tests.flows.tiny import SEQUENCE, tiny_config
+from tests.flows.tiny import SEQUENCE, spared, tiny_config
 
 HERE = Path(__file__).parent
+# As `flows.environment` has it, the server calls nobody; and it keeps no events, which no test asks for.
+QUIET_SERVER = dict.fromkeys(
+    (
+        PREFECT_SERVER_ANALYTICS_ENABLED,
+        PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED,
+        PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED,
+    ),
+    False,
+)
 LEFT_TO_THE_COLLECTOR = "ignore:Exception ignored in. <socket:pytest.PytestUnraisableExceptionWarning"
 
 
@@ -33,6 +45,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 @pytest.fixture(scope="package")
 def prefect_server() -> Iterator[None]:
     with (
+        temporary_settings(QUIET_SERVER),
         prefect_test_harness(server_startup_timeout=120),
         # The heartbeat costs a second per flow run; it cannot be switched off by environment.
         temporary_settings({PREFECT_FLOWS_HEARTBEAT_FREQUENCY: None, PREFECT_LOGGING_TO_API_ENABLED: False}),
@@ -42,8 +55,15 @@ def prefect_server() -> Iterator[None]:
     gc.collect()
 
 
-@pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, SequenceOutcome]:
+@pytest.fixture(scope="package", autouse=True)
+def little_work() -> Iterator[None]:
+    """Runs of this package are about stages and their order, not about what a phantom looks like."""
+    with spared():
+        yield
+
+
+@pytest.fixture(scope="package")
+def finished(little_work: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, SequenceOutcome]:
     """A store in which the tiny sequence has gone through all stages."""
     store = str(tmp_path_factory.mktemp("finished") / "store")
     outcome = run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), profile="quick")

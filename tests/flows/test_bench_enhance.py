@@ -41,12 +41,12 @@ def test_a_table_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert [case["method"] for case in found["cases"]] == ["none", "classical", "classical/no-references"]
     for case in found["cases"]:
         assert {"psnr", "ssim", "lpips_alex", "steps", "seconds_per_frame", "kept", "flicker"} <= set(case)
-        assert (case["sequence"], case["seed"], case["views"]) == (SEQUENCE, 2, 28)
+        assert (case["sequence"], case["seed"], case["views"]) == (SEQUENCE, 2, 14)
         for part in ("well", "hole", "observed", "unobserved"):
             assert {"psnr", "ssim", "lpips_alex"} <= set(case[part])
     assert found["cases"][0]["changed_share"] == 0
     said = capsys.readouterr().out
-    assert f"{SEQUENCE}: 28 held-out views" in said
+    assert f"{SEQUENCE}: 14 held-out views" in said
     assert "classical/no-references" in said
 
 
@@ -86,6 +86,6 @@ def test_no_prediction_no_figure(tmp_path: Path, capsys: pytest.CaptureFixture[s
     arguments = [SEQUENCE, *SETTINGS, "--methods", "none", "--figure", str(figure)]
     assert main(["bench", "enhance", *arguments]) == 2
     said = capsys.readouterr()
-    assert "28 held-out views" in said.out
+    assert "14 held-out views" in said.out
     assert "no restorer here predicts its error" in said.err
     assert not figure.exists()

@@ -407,7 +407,7 @@ class TestCache:
 
 class TestData:
     def test_show(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert main(["data", "show", SEQUENCE, "--json", "-"]) == 0
+        assert main(["data", "show", SEQUENCE, "--ingest.max_frames", "4", "--json", "-"]) == 0
         assert json.loads(capsys.readouterr().out)["has_depth"] is True
 
     def test_show_unknown(self, capsys: pytest.CaptureFixture[str]) -> None:

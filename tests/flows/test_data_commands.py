@@ -15,6 +15,7 @@ from data_catalog.catalog import read
 from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.recording import record
 from data_catalog.readers.colmap_model import write_colmap
+from extrags.config import PipelineConfig
 from extrags.sequence import EndoscopicSequence
 from extrags.store import Store
 from flows.cli import main
@@ -35,6 +36,21 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> str:
     folder = tmp_path_factory.mktemp("scene") / "colon"
     write_colmap(record(config, "phantom/5"), folder)
     return str(folder)
+
+
+REFINING = {**TINY, "ingest.max_frames": 8, "coarse.refine_poses": True, "coarse.iterations": 60}
+REFINING_ARGUMENTS = ["--profile", "quick"]
+for name, value in REFINING.items():
+    REFINING_ARGUMENTS += ["--set", f"{name}={json.dumps(value)}"]
+
+
+@pytest.fixture(scope="module")
+def refined(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, PipelineConfig, EndoscopicSequence]:
+    """A store in which poses were refined, the settings of that run, and its frames."""
+    store = str(tmp_path_factory.mktemp("refined") / "store")
+    config = method_config("extrags", "quick", REFINING)
+    outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="coarse")
+    return store, config, Store(store).load(EndoscopicSequence, outcome.refs["sequence"])
 
 
 @pytest.fixture(autouse=True)
@@ -161,22 +177,25 @@ class TestExport:
 
     @pytest.mark.parametrize("to", ["colmap", "transforms"])
     def test_poses_are_those_the_scene_was_made_with(
-        self, to: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+        self,
+        to: str,
+        refined: tuple[str, PipelineConfig, EndoscopicSequence],
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
     ) -> None:
         """The source has poses; those that the run has refined are written, not the source's."""
-        store, target = str(tmp_path / "store"), tmp_path / "scene"
-        refining = {**TINY, "ingest.max_frames": 8, "coarse.refine_poses": True}
-        arguments = [
-            "export", SEQUENCE, "--to", to, "--out", str(target), "--profile", "quick", "--store", store,
-            *(part for name, value in refining.items() for part in ("--set", f"{name}={json.dumps(value)}")),
-        ]  # fmt: skip
-        assert main(arguments) == 1
+        store, config, used = refined
+        target = tmp_path / "scene"
+
+        def export(store: str) -> int:
+            return main(
+                ["export", SEQUENCE, "--to", to, "--out", str(target), "--store", store, *REFINING_ARGUMENTS]
+            )
+
+        assert export(str(tmp_path / "store")) == 1
         assert "run it first" in capsys.readouterr().err
-        config = method_config("extrags", "quick", refining)
-        outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="coarse")
-        assert main(arguments) == 0, capsys.readouterr().err
+        assert export(store) == 0, capsys.readouterr().err
         given = read(SEQUENCE, config.ingest)
-        used = Store(store).load(EndoscopicSequence, outcome.refs["sequence"])
         written = read(target)
         np.testing.assert_allclose(written.K, used.K, atol=1e-10)
 

@@ -70,13 +70,16 @@ class TestAgreement:
             assert json.loads(json.dumps(in_memory.evaluations[which].metrics)) == outcome.metrics[which]
 
 
+# Its renders take most of the time, and go by frames.
+UC_NERF = tiny_config(uc_nerf__enabled=True, ingest__max_frames=10)
+
+
 @pytest.fixture(scope="module")
 def uc_nerf(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, SequenceOutcome]:
     """A store in which the tiny sequence was reconstructed and evaluated with the baseline."""
     store = str(tmp_path_factory.mktemp("uc_nerf") / "store")
-    config = tiny_config(uc_nerf__enabled=True)
     outcome = run_sequence(
-        SEQUENCE, config, store, DirectRunner(store), leave_out=METHODS["uc-nerf"].leave_out
+        SEQUENCE, UC_NERF, store, DirectRunner(store), leave_out=METHODS["uc-nerf"].leave_out
     )
     assert outcome.status == "ok", outcome.error
     return store, outcome
@@ -87,10 +90,9 @@ class TestUcNerf:
 
     def test_in_memory_and_cached(self, uc_nerf: tuple[str, SequenceOutcome]) -> None:
         _, cached = uc_nerf
-        config = tiny_config(uc_nerf__enabled=True)
-        sequence = extrags.read(SEQUENCE, config.ingest)
+        sequence = extrags.read(SEQUENCE, UC_NERF.ingest)
         # Without `leave_out`: the pipeline knows by itself what needs Gaussians.
-        result = extrags.run_pipeline(sequence, config, true_surface=true_surface(sequence))
+        result = extrags.run_pipeline(sequence, UC_NERF, true_surface=true_surface(sequence))
         reasons = {row.stage: row.reason for row in cached.stages if row.state == "skipped"}
         assert reasons == result.skipped
         assert set(reasons) == {"poses", *NEED_GAUSSIANS}
@@ -102,7 +104,7 @@ class TestUcNerf:
 
     def test_settings_of_gaussians_do_not_concern_it(self, uc_nerf: tuple[str, SequenceOutcome]) -> None:
         store, cached = uc_nerf
-        config = tiny_config(uc_nerf__enabled=True, coarse__iterations=7)
+        config = UC_NERF.with_overrides({"coarse.iterations": 7})
         again = run_sequence(SEQUENCE, config, store, StoreRunner(store), until="evaluate")
         assert {row.state for row in again.stages} == {"cached", "skipped"}
         assert again.digests["coarse"] == cached.digests["coarse"]
