@@ -52,6 +52,7 @@ class Module:
     imports: dict[str, Symbol] = field(default_factory=dict)
 
 
+@cache
 def file_of(module: str) -> Path | None:
     """Source of one of this project's modules, or None."""
     if module.split(".")[0] not in ROOTS:
@@ -96,6 +97,7 @@ def _defined(node: ast.stmt) -> Iterator[str]:
                 yield part.id
 
 
+@cache
 def resolved(module: str, name: str) -> Symbol | None:
     """Where a name that is used in a module is defined; None outside this project."""
     seen = set()
@@ -156,6 +158,12 @@ def examined(symbol: Symbol) -> tuple[str, tuple[Symbol, ...]]:
     # A module that is only what an attribute is taken from does not count whole: the attribute does.
     named = {one for node in nodes for one in used(node, module) if one[1] or not _is_owner(one, node)}
     return _digest("".join(_code(node) for node in nodes)), tuple(sorted(named))
+
+
+def forget() -> None:
+    """Read every source anew."""
+    for remembered in (file_of, parsed, resolved, examined, _kernels):
+        remembered.cache_clear()
 
 
 def _is_owner(symbol: Symbol, node: ast.AST) -> bool:

@@ -79,8 +79,7 @@ class TestReached:
                 "from extrags.two import LIMIT\ndef f(x):\n    return x < LIMIT\n"
             )
             (package / "two.py").write_text(code)
-            stage_inventory.parsed.cache_clear()
-            stage_inventory.examined.cache_clear()
+            stage_inventory.forget()
             return reached(("extrags.one", "f"))
 
         try:
@@ -89,5 +88,4 @@ class TestReached:
             assert digest(f"{edit}\nLIMIT = 3\nOTHER = 5\n") == plain
             assert digest("LIMIT = 2\nOTHER = 4\n") != plain
         finally:
-            stage_inventory.parsed.cache_clear()
-            stage_inventory.examined.cache_clear()
+            stage_inventory.forget()

@@ -56,7 +56,8 @@ def test_every_image_shows_something_and_says_what(page: Page) -> None:
         if isinstance(content, str):
             assert content.count("<path") > 10
         else:
-            assert len(np.unique(np.asarray(content.convert("RGB")).reshape(-1, 3), axis=0)) > 1
+            pixels = np.asarray(content.convert("RGB"))
+            assert (pixels != pixels[0, 0]).any()
     alts = [str(image["alt"]) for image in page.images]
     assert sum(alt.startswith("Frame b_") and "render, mean" in alt for alt in alts) == 2 * 3
     assert sum(alt.startswith("Uncertainty of virtual view") for alt in alts) == 4
