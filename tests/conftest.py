@@ -12,11 +12,7 @@ import pytest
 
 # Before torch is loaded: OpenMP threads that spin while they wait starve each other on small machines.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-# Of several processes of tests each has one thread, and so have the programs that it starts.
-if "PYTEST_XDIST_WORKER" in os.environ:
-    os.environ["OMP_NUM_THREADS"] = "1"
 
-HERE = Path(__file__).resolve().parent
 SHARING = ("tests/flows",)
 """Packages whose tests share a server and a finished run."""
 LONG = (
@@ -27,7 +23,7 @@ LONG = (
 )
 """The groups that take longest."""
 
-SHARED_DATA = Path(os.environ.get("EXTRAGS_DATA") or HERE.parents[1] / "shared" / "data")
+SHARED_DATA = Path(os.environ.get("EXTRAGS_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
 """A caller's choice, else the folder beside the checkout."""
 
 # The library itself never looks beside a checkout.
@@ -38,6 +34,13 @@ if SHARED_DATA.is_dir():
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--runslow", action="store_true", help="run tests marked slow")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Of several processes of tests each has one thread, and so have the programs that it starts. It is said
+    # before they begin: their plugins load numpy, which makes its threads then.
+    if config.getoption("numprocesses", None):
+        os.environ["OMP_NUM_THREADS"] = "1"
 
 
 def group_of(nodeid: str) -> str:
