@@ -31,7 +31,7 @@ from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
 from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
-from data_catalog.readers.frame_list import split_by_name
+from data_catalog.readers.frame_list import present_frames, split_by_name
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
@@ -111,15 +111,19 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     if place is None:
         raise SourceNotFoundError("no COLMAP model in this folder", file=folder)
     model = read_model(place)
-    images = sorted(model.images, key=lambda image: natural_key(image.name))
-    root = _image_root(folder, [image.name for image in images])
-    _tell_about_unposed(root, {image.name for image in images})
+    pose_file = next(file for file in (place / "images.bin", place / "images.txt") if file.is_file())
+    listed = sorted(model.images, key=lambda image: natural_key(image.name))
+    root = _image_root(folder, [image.name for image in listed])
+    _tell_about_unposed(root, {image.name for image in listed})
+    files = {image.name: root / image.name for image in listed}
+    present = set(present_frames(files, config.max_absent_share, listing=pose_file))
+    images = [image for image in listed if image.name in present]
     recordings = sorted({str(Path(image.name).parent) for image in images}, key=natural_key)
-    splits = _splits(folder, images)
+    splits = _splits(folder, listed)
     frames = [
         PosedFrame(
             name=image.name,
-            file=root / image.name,
+            file=files[image.name],
             lens=model.lenses[image.camera],
             world_from_camera=image.world_from_camera,
             mask_file=_mask_file(folder, image.name),
@@ -129,15 +133,6 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         )
         for image in images
     ]
-    for frame in frames:
-        if not frame.file.is_file():
-            raise SourceNotFoundError(
-                f"the model in {place.name}/ names this image, but there is no such file",
-                file=frame.file,
-                frame=frame.name,
-                field="name",
-            )
-    pose_file = next(file for file in (place / "images.bin", place / "images.txt") if file.is_file())
     return SourceFrames(
         frames,
         pose_file=pose_file,

@@ -1,9 +1,10 @@
-"""What readers of listed frames share: the JSON file that lists them, matrices in it, splits by name."""
+"""What readers of listed frames share: the list itself, frames it has and disk has not, matrices, splits."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
+import logging
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,9 +12,14 @@ import numpy as np
 from jaxtyping import Float
 
 from data_catalog.images import natural_key
-from extrags.errors import SourceError
+from extrags.errors import SourceError, SourceNotFoundError
 
-__all__ = ["load_frame_list", "matrix_of", "split_by_name"]
+__all__ = ["load_frame_list", "matrix_of", "present_frames", "split_by_name"]
+
+logger = logging.getLogger(__name__)
+
+NAMED_ABSENT = 5
+"""A warning names so many absent frames."""
 
 
 def load_frame_list(file: Path, key: str) -> dict[str, Any]:
@@ -42,6 +48,44 @@ def load_frame_list(file: Path, key: str) -> dict[str, Any]:
             raise SourceError("the frame is listed twice", file=file, frame=entry[key], field=key)
         seen.add(entry[key])
     return content
+
+
+def present_frames(files: Mapping[str, Path], max_absent_share: float, *, listing: Path) -> list[str]:
+    """The listed frames that are there, in order; the others are left out with a warning that names them.
+
+    Published scenes list frames they do not ship (instant-ngp's fox: 67 and 50).
+
+    Args:
+        files: the image of each listed frame, by the frame's name.
+        max_absent_share: with more absent, the scene is refused.
+        listing: the file that lists them, named in messages.
+
+    Raises:
+        SourceNotFoundError: no frame is there, or too many are absent; names the first absent file.
+    """
+    present = [name for name, file in files.items() if file.is_file()]
+    absent = [name for name in files if name not in set(present)]
+    if not absent:
+        return present
+    if not present or len(absent) > max_absent_share * len(files):
+        raise SourceNotFoundError(
+            f"{listing.name} lists {len(files)} frames, and {len(absent)} of them are absent, this one first; at "
+            f"most {max_absent_share:.0%} may be (ingest.max_absent_share)",
+            file=files[absent[0]],
+            frame=absent[0],
+            field="file",
+        )
+    named = ", ".join(absent[:NAMED_ABSENT])
+    more = f" and {len(absent) - NAMED_ABSENT} more" if len(absent) > NAMED_ABSENT else ""
+    logger.warning(
+        "%s lists %d frames; %d of them are absent and left out: %s%s",
+        listing,
+        len(files),
+        len(absent),
+        named,
+        more,
+    )
+    return present
 
 
 def matrix_of(

@@ -3,8 +3,9 @@
 Read: `transform_matrix` (camera to world, OpenGL axes: y up, z backward; turned to OpenCV's on reading and
 nothing else), `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`, `cx`, `cy`, `w`, `h`, `k1` to `k4`, `p1`,
 `p2`, `camera_model` or `is_fisheye`, each for all frames or in a frame of its own; `file_path` (its suffix
-may be missing), `mask_path` (white is tissue), `depth_file_path`; `train_filenames`, `test_filenames` and
-`val_filenames`; `ply_file_path`. Images of distorted cameras are resampled to a pinhole.
+may be missing; frames without a file are left out, with a warning), `mask_path` (white is tissue),
+`depth_file_path`; `train_filenames`, `test_filenames` and `val_filenames`; `ply_file_path`. Images of
+distorted cameras are resampled to a pinhole.
 
 Depth is z-depth; a value times `depth_unit_scale_factor` is in the unit of the poses. Where the file does not
 say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). 0 is unknown.
@@ -29,7 +30,7 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, image_size, natural_key, read_depth, save_images
 from data_catalog.lens import LENS_PARAMETERS, Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
-from data_catalog.readers.frame_list import load_frame_list, matrix_of, split_by_name
+from data_catalog.readers.frame_list import load_frame_list, matrix_of, present_frames, split_by_name
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.sequence import EndoscopicSequence
@@ -70,20 +71,16 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             field="length_unit",
         )
     scale = _MM_PER_UNIT[unit]
-    entries = sorted(content["frames"], key=lambda entry: natural_key(entry["file_path"]))
+    listed = sorted(content["frames"], key=lambda entry: natural_key(entry["file_path"]))
+    files = {entry["file_path"]: _with_suffix(folder / entry["file_path"]) for entry in listed}
+    present = set(present_frames(files, config.max_absent_share, listing=file))
+    entries = [entry for entry in listed if entry["file_path"] in present]
     splits = _splits(content, file)
     folders = sorted({str(Path(entry["file_path"]).parent) for entry in entries}, key=natural_key)
     frames = []
     for entry in entries:
         frame = entry["file_path"]
-        place = _with_suffix(folder / frame)
-        if not place.is_file():
-            raise SourceNotFoundError(
-                f"{TRANSFORMS_FILE} lists this frame, but there is no such file",
-                file=place,
-                frame=frame,
-                field="file_path",
-            )
+        place = files[frame]
         frames.append(
             PosedFrame(
                 name=str(Path(frame).relative_to("images")) if frame.startswith("images/") else frame,

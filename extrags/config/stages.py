@@ -59,6 +59,13 @@ class IngestConfig(StageConfig):
         8, ge=2, description="hold out every n-th frame where the source defines no split"
     )
     max_frames: int | None = Field(None, ge=2, description="read at most so many frames")
+    max_absent_share: float = Field(
+        0.5,
+        ge=0,
+        lt=1,
+        description="frames that a list of poses names and that are absent are left out with a warning; the "
+        "source is refused where more than this share is absent",
+    )
     field_of_view_deg: float | None = Field(
         None,
         ge=20,

@@ -316,12 +316,12 @@ DAMAGES = {
         None,
         "points3D.bin",
     ),
-    "an image of the model is missing": Damage(
+    "most images of the model are missing": Damage(
         "colmap",
-        removed("images/0003.png"),
-        "the model in 0/ names this image",
+        lambda folder: [removed(f"images/{index:04d}.png")(folder) for index in range(3, 10)],
+        r"images.bin lists 10 frames, and 7 of them are absent, this one first; at most 50% may be",
         "0003.png",
-        "name",
+        "file",
         "0003.png",
     ),
     "an unknown camera model": Damage(

@@ -10,8 +10,10 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read, resolve
+from data_catalog.readers.colmap_model import write_colmap
 from data_catalog.readers.transforms_json import write_transforms
 from extrags.config import IngestConfig
+from extrags.errors import SourceNotFoundError
 from extrags.sequence import Split
 from tests.data_catalog.layouts import carried_error_mm, same_frames
 
@@ -163,3 +165,44 @@ class TestReading:
     def test_validation_frames_are_held_out_too(self, folder, edit) -> None:
         edit(lambda content: content.update(val_filenames=["images/0005.png"], train_filenames=[]))
         assert read(folder).test.tolist() == [0, 5]
+
+
+class TestAbsentFrames:
+    """Published scenes list frames that they do not ship."""
+
+    @pytest.mark.parametrize("write", [write_transforms, write_colmap])
+    def test_are_left_out_and_named(self, write, clip, tmp_path, caplog) -> None:
+        folder = tmp_path / "scene"
+        write(clip, folder)
+        whole = read(folder)
+        absent = [2, 5]
+        images = sorted((folder / "images").iterdir())
+        for index in absent:
+            images[index].unlink()
+        with caplog.at_level("WARNING"):
+            found = read(folder)
+        kept = np.setdiff1d(np.arange(len(whole)), absent)
+        np.testing.assert_array_equal(found.rgb, whole.rgb[kept])
+        np.testing.assert_array_equal(found.cameras.world_from_camera, whole.cameras.world_from_camera[kept])
+        np.testing.assert_array_equal(found.depth_mm, whole.depth_mm[kept])
+        (said,) = [record.getMessage() for record in caplog.records if "absent" in record.getMessage()]
+        assert f"lists {len(whole)} frames; 2 of them are absent and left out:" in said
+        assert all(images[index].name in said for index in absent)
+
+    @pytest.mark.parametrize(("share", "refused"), [(0.1, True), (0.2, False)])
+    def test_share_that_may_be_absent(self, clip, folder, share, refused) -> None:
+        for entry in json.loads((folder / "transforms.json").read_text())["frames"][:2]:
+            (folder / entry["file_path"]).unlink()
+        config = IngestConfig(max_absent_share=share)
+        if not refused:
+            assert len(read(folder, config)) == len(clip) - 2
+            return
+        with pytest.raises(SourceNotFoundError, match="2 of them are absent, this one first") as caught:
+            read(folder, config)
+        assert caught.value.field == "file"
+
+    def test_none_there(self, folder) -> None:
+        for file in (folder / "images").iterdir():
+            file.unlink()
+        with pytest.raises(SourceNotFoundError, match="absent"):
+            read(folder, IngestConfig(max_absent_share=0.99))
