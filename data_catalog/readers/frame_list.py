@@ -69,8 +69,8 @@ def present_frames(files: Mapping[str, Path], max_absent_share: float, *, listin
         return present
     if not present or len(absent) > max_absent_share * len(files):
         raise SourceNotFoundError(
-            f"{listing.name} lists {len(files)} frames, and {len(absent)} of them are absent, this one first; at "
-            f"most {max_absent_share:.0%} may be (ingest.max_absent_share)",
+            f"{listing.name} lists {len(files)} frames, and {len(absent)} of them are absent, this one "
+            f"first; at most {max_absent_share:.0%} may be (ingest.max_absent_share)",
             file=files[absent[0]],
             frame=absent[0],
             field="file",
