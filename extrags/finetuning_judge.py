@@ -17,7 +17,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
@@ -38,7 +38,7 @@ __all__ = ["AMOUNTS", "Judgement", "Trial", "decide", "judge_finetuning"]
 
 logger = logging.getLogger(__name__)
 
-AMOUNTS = (1.0, 0.3)
+AMOUNTS = (1.0, 0.3, 0.1)
 """What is tried, as a factor of `finetune.pseudo_weight`, until one holds."""
 
 
@@ -52,6 +52,8 @@ class Trial:
         final_psnr_db: the same after its fine-tuning.
         gain_db: mean difference of the two, frame by frame.
         standard_error_db: of that mean.
+        over_control_db: mean difference to the control, frame by frame.
+        over_control_error_db: standard error of that mean.
     """
 
     amount: float
@@ -59,6 +61,18 @@ class Trial:
     final_psnr_db: float
     gain_db: float
     standard_error_db: float
+    over_control_db: float = 0.0
+    over_control_error_db: float = 0.0
+
+    def holds(self, max_loss_db: float) -> bool:
+        """Whether left-out frames keep their quality.
+
+        The mean may fall behind the coarse scene's by `max_loss_db`. Behind the control it may fall by its
+        standard error more: with few frames a difference that small is no evidence, and a scene that gives
+        its virtual views up has nothing where no real view looked.
+        """
+        behind_control_db = -(self.over_control_db + self.over_control_error_db)
+        return self.gain_db >= -max_loss_db and behind_control_db <= max_loss_db
 
 
 @dataclass(frozen=True)
@@ -116,8 +130,8 @@ def judge_finetuning(
     restored with references among the kept frames, and it is fine-tuned as the whole scene would be. The
     control is fine-tuning on the kept frames alone: a brief reconstruction gains by any further step. The
     largest of `AMOUNTS` is kept with which the left-out frames come within `finetune.judge.max_loss_db` of
-    both the control and the coarse scene; else the control, if it holds against the coarse scene; else
-    nothing.
+    the coarse scene and, within noise, of the control (`Trial.holds`); else the control, if it holds against
+    the coarse scene; else nothing.
 
     Args:
         scene: the coarse scene, trained on `sequence.train`.
@@ -165,23 +179,23 @@ def judge_finetuning(
     )
     before = _psnr_db(start, part)
 
-    def trial(amount: float) -> Trial:
+    def after_finetuning(amount: float) -> list[float]:
         weight = {"pseudo_weight": amount * config.pseudo_weight} if amount > 0 else {}
         pseudo_views = views if amount > 0 else None
         found = finetune(
             start, part, pseudo_views, brief.model_copy(update=weight), coarse, stage="finetune-judge"
         )
-        result = _trial(amount, before, _psnr_db(found.scene, part))
-        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{amount:g}", result.gain_db))
-        return result
+        return _psnr_db(found.scene, part)
 
-    control = trial(0.0)
-    trials = [control]
+    control = after_finetuning(0.0)
+    trials = [_trial(0.0, before, control, control)]
     if views is not None:
         for amount in AMOUNTS:
-            trials.append(trial(amount))
-            if trials[-1].gain_db >= max(control.gain_db, 0.0) - settings.max_loss_db:
+            trials.append(_trial(amount, before, after_finetuning(amount), control))
+            if trials[-1].holds(settings.max_loss_db):
                 break
+    for trial in trials:
+        emit(MetricRecorded("finetune", f"left_out_gain_db_at_{trial.amount:g}", trial.gain_db))
     judgement = decide(trials, settings.max_loss_db, left)
     logger.info("finetune: %s", judgement.reason)
     return judgement
@@ -225,10 +239,22 @@ def _psnr_db(scene: Scene, sequence: EndoscopicSequence) -> list[float]:
     return [value for value in values if value is not None]
 
 
-def _trial(amount: float, before: list[float], after: list[float]) -> Trial:
-    gains = np.array(after) - np.array(before)
-    error = gains.std(ddof=1) / np.sqrt(len(gains)) if len(gains) > 1 else 0.0
-    return Trial(amount, float(np.mean(before)), float(np.mean(after)), float(gains.mean()), float(error))
+def _trial(amount: float, before: list[float], after: list[float], control: list[float]) -> Trial:
+    """Of PSNR of each left-out frame: before the fine-tuning, after it, and after the control's."""
+    gain, error = _mean_and_error(np.array(after) - np.array(before))
+    return Trial(
+        amount,
+        float(np.mean(before)),
+        float(np.mean(after)),
+        gain,
+        error,
+        *_mean_and_error(np.array(after) - np.array(control)),
+    )
+
+
+def _mean_and_error(values: Float[np.ndarray, "n"]) -> tuple[float, float]:
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    return float(values.mean()), float(error)
 
 
 def decide(trials: Sequence[Trial], max_loss_db: float, left: Int[np.ndarray, "m"]) -> Judgement:
@@ -246,12 +272,12 @@ def decide(trials: Sequence[Trial], max_loss_db: float, left: Int[np.ndarray, "m
     )
     frames = f"on {len(left)} training frames left out of a trial, fine-tuning changes PSNR by {changes}"
     amount: float | None = None
-    if last.amount > 0 and last.gain_db >= max(control.gain_db, 0.0) - max_loss_db:
+    if last.amount > 0 and last.holds(max_loss_db):
         amount = last.amount
         outcome = "virtual views are kept"
         if amount < 1:
             outcome = f"virtual views weigh {amount:g} of finetune.pseudo_weight"
-    elif control.gain_db >= -max_loss_db:
+    elif control.holds(max_loss_db):
         amount = 0.0
         outcome = "fine-tuning is on real views alone"
     else:

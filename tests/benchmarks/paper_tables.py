@@ -20,6 +20,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from extrags.finetuning_judge import AMOUNTS
 from extrags.metrics.comparison import CEILING, compare_runs, dataset_of
 from extrags.metrics.registry import metric_named
 from flows.tables import difference_text, figure, markdown_table, share_text, spread_text
@@ -150,30 +151,36 @@ def budget_tables(cases: Sequence[dict[str, Any]]) -> str:
 
 
 def judge_table(store: Path) -> str:
-    """The trials of all judgements in a store; sequences that train on the same frames share one."""
-    rows = []
-    for manifest in sorted((store / "artefacts").glob("finetune-judge-v*/manifest.json")):
+    """The trials of all judgements in a store; sequences that train on the same frames share one.
+
+    Of judgements of the same run by several versions of the judge the newest counts.
+    """
+    rows: dict[tuple[Any, ...], list[Any]] = {}
+    manifests = [
+        (json.loads(manifest.read_text()), manifest)
+        for manifest in (store / "artefacts").glob("finetune-judge-v*/manifest.json")
+    ]
+    for made, manifest in sorted(manifests, key=lambda found: int(found[0]["version"])):
         judged = json.loads((manifest.parent / "judgement.json").read_text())
-        made = json.loads(manifest.read_text())
         gains = {trial["amount"]: trial for trial in judged["trials"]}
-        rows.append(
-            [
-                made["label"],
-                made["config"]["config"]["iterations"],
-                made["config"]["config"]["seed"],
-                len(judged["left_out"]),
-                *(
-                    "–"  # noqa: RUF001
-                    if amount not in gains
-                    else "{gain_db:+.2f} ± {standard_error_db:.2f}".format(**gains[amount])
-                    for amount in (0.0, 0.3, 1.0)
-                ),
-                KEPT.get(judged["amount"], f"weight x {judged['amount']}"),
-            ]
-        )
-    head = ["sequence", "iterations", "seed", "frames left out"]
-    head += ["real views alone", "weight x 0.3", "weight x 1", "kept"]
-    return markdown_table(head, sorted(rows))
+        if not gains:
+            continue
+        settings = made["config"]["config"]
+        run = (made["label"], settings["iterations"], settings["seed"])
+        rows[run] = [
+            *run,
+            len(judged["left_out"]),
+            *(
+                "–"  # noqa: RUF001
+                if amount not in gains
+                else "{gain_db:+.2f} ± {standard_error_db:.2f}".format(**gains[amount])
+                for amount in (0.0, *AMOUNTS)
+            ),
+            KEPT.get(judged["amount"], f"weight x {judged['amount']}"),
+        ]
+    head = ["sequence", "iterations", "seed", "frames left out", "real views alone"]
+    head += [*(f"weight x {amount:g}" for amount in AMOUNTS), "kept"]
+    return markdown_table(head, [rows[run] for run in sorted(rows)])
 
 
 def _about(row: dict[str, Any]) -> str:

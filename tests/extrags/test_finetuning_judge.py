@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from extrags import finetuning_judge
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, DensifyConfig, EnhanceConfig, FinetuneConfig
 from extrags.config.stages import JudgeConfig
-from extrags.finetuning_judge import Judgement, Trial, decide, judge_finetuning
+from extrags.finetuning_judge import AMOUNTS, Judgement, Trial, decide, judge_finetuning
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.protocol import Clip, Restoration
 from tests.extrags.lit_tube import Tube, tube_cameras
@@ -50,28 +51,34 @@ def judged(tube: Tube, enhancer: ClassicalEnhancer | None, config: FinetuneConfi
     )
 
 
-def trial(amount: float, gain_db: float) -> Trial:
-    return Trial(amount, 30.0, 30.0 + gain_db, gain_db, 0.1)
+def trial(amount: float, gain_db: float, control_db: float, paired_error_db: float = 0.0) -> Trial:
+    return Trial(amount, 30.0, 30.0 + gain_db, gain_db, 0.1, gain_db - control_db, paired_error_db)
 
 
 @pytest.mark.parametrize(
-    ("control_db", "gains_db", "amount", "words"),
+    ("control_db", "gains_db", "paired_error_db", "amount", "words"),
     [
-        (0.5, {1.0: 1.2}, 1.0, "virtual views are kept"),
+        (0.5, {1.0: 1.2}, 0.0, 1.0, "virtual views are kept"),
         # No better than real views alone, but within the tolerance.
-        (0.5, {1.0: 0.41}, 1.0, "virtual views are kept"),
-        (0.5, {1.0: 0.3, 0.3: 0.45}, 0.3, "weigh 0.3"),
-        (0.5, {1.0: -2.0, 0.3: 0.1}, 0.0, "real views alone"),
+        (0.5, {1.0: 0.41}, 0.0, 1.0, "virtual views are kept"),
+        (0.5, {1.0: 0.3, 0.3: 0.45}, 0.0, 0.3, "weigh 0.3"),
+        (0.5, {1.0: -2.0, 0.3: 0.1, 0.1: 0.3}, 0.0, 0.0, "real views alone"),
+        # Behind the control, but no farther than frames differ among each other.
+        (0.5, {1.0: 0.3}, 0.15, 1.0, "virtual views are kept"),
+        (1.3, {1.0: 0.2, 0.3: 0.15, 0.1: 1.1}, 0.15, 0.1, "weigh 0.1"),
+        # Noise excuses no loss against the coarse scene.
+        (0.5, {1.0: -0.2}, 2.0, 0.0, "real views alone"),
         # The control harms: virtual views have to hold against the coarse scene, which they do.
-        (-1.0, {1.0: -0.05}, 1.0, "virtual views are kept"),
-        (-1.0, {1.0: -0.2, 0.3: -0.2}, None, "coarse scene is kept"),
-        (-0.05, {1.0: -0.2, 0.3: -0.2}, 0.0, "real views alone"),
+        (-1.0, {1.0: -0.05}, 0.0, 1.0, "virtual views are kept"),
+        (-1.0, {1.0: -0.2, 0.3: -0.2}, 0.0, None, "coarse scene is kept"),
+        (-0.05, {1.0: -0.2, 0.3: -0.2}, 0.0, 0.0, "real views alone"),
     ],
 )
 def test_what_is_kept(
-    control_db: float, gains_db: dict[float, float], amount: float | None, words: str
+    control_db: float, gains_db: dict[float, float], paired_error_db: float, amount: float | None, words: str
 ) -> None:
-    trials = [trial(0.0, control_db), *(trial(key, value) for key, value in gains_db.items())]
+    tried = (trial(key, value, control_db, paired_error_db) for key, value in gains_db.items())
+    trials = [trial(0.0, control_db, control_db), *tried]
     found = decide(trials, 0.1, np.array([3, 4]))
     assert found.amount == amount
     assert words in found.reason
@@ -83,13 +90,37 @@ def test_a_restorer_that_destroys_is_left_out_and_a_sound_one_is_not(tube: Tube)
     config = FINETUNE.model_copy(update={"keep_known": False})
     destroyed = judged(tube, Destroyer(""), config)
     assert destroyed.amount == 0.0 or destroyed.amount is None
-    assert [trial.amount for trial in destroyed.trials] == [0.0, 1.0, 0.3]
-    control, full, _ = destroyed.trials
+    assert [trial.amount for trial in destroyed.trials] == [0.0, *AMOUNTS]
+    control, full, *_ = destroyed.trials
     assert full.gain_db < control.gain_db - 0.1
     sound = judged(tube, ClassicalEnhancer(""), config)
     assert sound.trials[1].gain_db > full.gain_db
     # The same control, whatever restores.
     assert sound.trials[0] == control
+
+
+def test_the_control_is_compared_frame_by_frame(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
+    """PSNR of four frames: trials that lose as much on average, on all frames or on one."""
+    measured = iter(
+        [
+            [30.0, 30.0, 30.0, 30.0],  # before
+            [31.0, 31.0, 31.0, 31.0],  # the control
+            [30.7, 30.7, 30.7, 30.7],
+            [29.8, 31.0, 31.0, 31.0],
+        ]
+    )
+    monkeypatch.setattr(finetuning_judge, "_psnr_db", lambda *_: next(measured))
+    found = judged(tube, ClassicalEnhancer(""))
+    control, evenly, once = found.trials
+    assert (control.over_control_db, control.over_control_error_db) == (0, 0)
+    assert (evenly.amount, once.amount) == (1.0, 0.3)
+    for lost in (evenly, once):
+        assert lost.gain_db == pytest.approx(0.7)
+        assert lost.over_control_db == pytest.approx(-0.3)
+    assert evenly.over_control_error_db == pytest.approx(0, abs=1e-9)
+    # The standard deviation of 0, 0, 0 and -1.2 is 0.6, over the root of four frames.
+    assert once.over_control_error_db == pytest.approx(0.3)
+    assert found.amount == 0.3
 
 
 def test_held_out_frames_are_not_looked_at(tube: Tube) -> None:
@@ -129,6 +160,6 @@ def test_the_weight_of_virtual_views_follows() -> None:
 
 def test_storage(tmp_path: Path) -> None:
     for amount in (None, 0.0, 1.0):
-        found = Judgement(amount, "why", (trial(0.0, 0.5), trial(1.0, -0.25)), (2, 5))
+        found = Judgement(amount, "why", (trial(0.0, 0.5, 0.5), trial(1.0, -0.25, 0.5, 0.2)), (2, 5))
         found.save(tmp_path / "judgement.json")
         assert Judgement.load(tmp_path / "judgement.json") == found
