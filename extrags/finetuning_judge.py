@@ -61,8 +61,8 @@ class Trial:
     final_psnr_db: float
     gain_db: float
     standard_error_db: float
-    over_control_db: float = 0.0
-    over_control_error_db: float = 0.0
+    over_control_db: float
+    over_control_error_db: float
 
     def holds(self, max_loss_db: float) -> bool:
         """Whether left-out frames keep their quality.

@@ -116,7 +116,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     root = _image_root(folder, [image.name for image in listed])
     _tell_about_unposed(root, {image.name for image in listed})
     files = {image.name: root / image.name for image in listed}
-    present = set(present_frames(files, config.max_absent_share, listing=pose_file))
+    present = present_frames(files, config.max_absent_share, listing=pose_file)
     images = [image for image in listed if image.name in present]
     recordings = sorted({str(Path(image.name).parent) for image in images}, key=natural_key)
     splits = _splits(folder, listed)

@@ -50,8 +50,8 @@ def load_frame_list(file: Path, key: str) -> dict[str, Any]:
     return content
 
 
-def present_frames(files: Mapping[str, Path], max_absent_share: float, *, listing: Path) -> list[str]:
-    """The listed frames that are there, in order; the others are left out with a warning that names them.
+def present_frames(files: Mapping[str, Path], max_absent_share: float, *, listing: Path) -> set[str]:
+    """Names of the listed frames that are there; the others are left out with a warning that names them.
 
     Published scenes list frames they do not ship (instant-ngp's fox: 67 and 50).
 
@@ -63,8 +63,8 @@ def present_frames(files: Mapping[str, Path], max_absent_share: float, *, listin
     Raises:
         SourceNotFoundError: no frame is there, or too many are absent; names the first absent file.
     """
-    present = [name for name, file in files.items() if file.is_file()]
-    absent = [name for name in files if name not in set(present)]
+    absent = [name for name, file in files.items() if not file.is_file()]
+    present = files.keys() - set(absent)
     if not absent:
         return present
     if not present or len(absent) > max_absent_share * len(files):

@@ -73,7 +73,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     scale = _MM_PER_UNIT[unit]
     listed = sorted(content["frames"], key=lambda entry: natural_key(entry["file_path"]))
     files = {entry["file_path"]: _with_suffix(folder / entry["file_path"]) for entry in listed}
-    present = set(present_frames(files, config.max_absent_share, listing=file))
+    present = present_frames(files, config.max_absent_share, listing=file)
     entries = [entry for entry in listed if entry["file_path"] in present]
     splits = _splits(content, file)
     folders = sorted({str(Path(entry["file_path"]).parent) for entry in entries}, key=natural_key)

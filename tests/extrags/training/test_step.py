@@ -139,7 +139,8 @@ class TestOneStep:
             step.adam.learning_rates = schedule.learning_rates(iteration)
             step.update(step.differentiate(view, iteration, density), iteration)
         own, other = (step.adam.parameters for step in steps)
-        start = scene.gaussians.parameters()
+        assert scene.light is not None
+        start, start_light = scene.gaussians.parameters(), scene.light.parameters()
         for name, value in other.items():
             if value.numel():
                 moved, expected = own[name].detach() - start[name], value.detach() - start[name]
@@ -152,7 +153,7 @@ class TestOneStep:
                 if name == "log_exposure"
                 else schedule.light.learning_rate
             )
-            first = scene.light.parameters()[name]  # type: ignore[union-attr]
+            first = start_light[name]
             longest = float((value.detach() - first).nan_to_num().abs().max())  # a softening of 0
             assert longest <= 1.001 * schedule.rate_share(iteration) * rate
             torch.testing.assert_close(
