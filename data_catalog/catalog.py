@@ -79,9 +79,12 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
         ConfigError: settings that this source cannot be read with.
     """
     source = source if isinstance(source, Source) else resolve(source)
-    sequence = _dataset(source).read(source, config or IngestConfig())
+    config = config or IngestConfig()
+    sequence = _dataset(source).read(source, config)
     check_sequence(sequence, file=source.path or source.name)
-    return with_specular(sequence)
+    # After the checks, which hold poses against all depth there is; what was observed is known by now.
+    shown = sequence.without_training_depth() if config.withhold_depth else sequence
+    return with_specular(shown)
 
 
 def source_fingerprint(source: Source | str | Path, config: IngestConfig | None = None) -> dict[str, Any]:

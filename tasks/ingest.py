@@ -29,7 +29,7 @@ def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: Inge
         width=sequence.width,
         height=sequence.height,
         has_poses=int(sequence.world_from_camera is not None),
-        has_depth=int(sequence.depth_mm is not None),
+        has_depth=int(sequence.training_depth_known),
         masked_share=float(1 - sequence.mask.mean()),
         specular_share=0.0 if sequence.specular is None else float(sequence.specular.sum() / inside),
         saturated_share=float((saturated_mask(sequence.rgb) & sequence.mask).sum() / inside),

@@ -66,6 +66,11 @@ class IngestConfig(StageConfig):
         description="frames that a list of poses names and that are absent are left out with a warning; the "
         "source is refused where more than this share is absent",
     )
+    withhold_depth: bool = Field(
+        False,
+        description="training frames keep no depth; held-out frames keep theirs for the evaluation alone. "
+        "Points of a source that has depth go with it",
+    )
     field_of_view_deg: float | None = Field(
         None,
         ge=20,

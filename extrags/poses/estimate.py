@@ -49,6 +49,9 @@ class PoseEstimate:
         mean_reprojection_px: over the observations in training frames; None without such.
         metric: true when the unit is the millimetre, from known depth.
         report: counts of features, matches and registrations, ready for JSON.
+        truth_per_unit: length of one unit of the poses in the unit of withheld true depth; None where no
+            depth is withheld or the poses are metric. The evaluation compares with the truth by it; no
+            pose and no point depends on it.
     """
 
     method: Literal["colmap", "rgbd"]
@@ -59,6 +62,7 @@ class PoseEstimate:
     mean_reprojection_px: float | None
     metric: bool
     report: dict[str, Any]
+    truth_per_unit: float | None = None
 
     @property
     def summary(self) -> str:
@@ -87,6 +91,7 @@ class PoseEstimate:
             "summary": self.summary,
             "registered": [bool(found) for found in self.registered],
             "mean_reprojection_px": self.mean_reprojection_px,
+            "truth_per_unit": self.truth_per_unit,
             "against_given": errors,
             **self.report,
         }
@@ -120,6 +125,9 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
     """
     config = PosesConfig() if config is None else config
+    if not sequence.training_depth_known:
+        # Held-out frames may have depth for the evaluation alone.
+        sequence = replace(sequence, depth_mm=None)
     if len(sequence.train) < MIN_TRAINING_FRAMES:
         raise CaptureError(
             f"{sequence.name}: poses need at least {MIN_TRAINING_FRAMES} training frames, "
@@ -165,17 +173,12 @@ def _from_colmap(
     sequence: EndoscopicSequence, result: PoseJobResult, registered: np.ndarray, report: dict[str, Any]
 ) -> PoseEstimate:
     poses, points = _cleaned(result.world_from_camera, registered), result.points
-    scale = None
+    seen = (result.observed_frame, result.observed_point, result.observed_px)
+    scale = truth = None
     if sequence.depth_mm is not None and sequence.metric:
-        scale = depth_scale(
-            poses,
-            points,
-            result.observed_frame,
-            result.observed_point,
-            result.observed_px,
-            sequence.depth_mm,
-            sequence.mask,
-        )
+        scale = depth_scale(poses, points, *seen, sequence.depth_mm, sequence.mask)
+    elif sequence.true_depth_mm is not None:
+        truth = depth_scale(poses, points, *seen, sequence.true_depth_mm, sequence.mask)
     if scale is not None:
         poses[:, :3, 3] *= scale.mm_per_unit
         points = points * scale.mm_per_unit
@@ -189,6 +192,7 @@ def _from_colmap(
         mean_reprojection_px=float(report["mean_reprojection_px"]),
         metric=scale is not None,
         report=report,
+        truth_per_unit=None if truth is None else truth.mm_per_unit,
     )
 
 
@@ -234,7 +238,8 @@ def _by_depth(
 def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -> EndoscopicSequence:
     """The sequence with poses and points, without the frames that did not register.
 
-    Frames keep their names; the split is renumbered. `truth` is kept as it is.
+    Frames keep their names; the split is renumbered. `truth` is kept and told that the world is another
+    (`world`). Where true depth was withheld, it is brought to the unit of the poses, for the evaluation.
 
     Raises:
         ShapeError: when the estimate is of another sequence.
@@ -252,13 +257,22 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
     def of_kept(stack: np.ndarray | None) -> Any:
         return None if stack is None else stack[kept]
 
+    def of_truth(depth: np.ndarray | None) -> Any:
+        if depth is None or estimate.metric:
+            return of_kept(depth)
+        if estimate.truth_per_unit is None:
+            return None  # its unit is not that of the poses, so that nothing could be compared with it
+        return (depth[kept] / estimate.truth_per_unit).astype(depth.dtype)
+
     split = sequence.split
+    hidden = not sequence.training_depth_known
     return replace(
         sequence,
         rgb=sequence.rgb[kept],
         K=sequence.K[kept],
         mask=sequence.mask[kept],
-        depth_mm=of_kept(sequence.depth_mm),
+        depth_mm=of_truth(sequence.depth_mm) if hidden else of_kept(sequence.depth_mm),
+        withheld_depth_mm=of_truth(sequence.withheld_depth_mm),
         recording=of_kept(sequence.recording),
         observed=of_kept(sequence.observed),
         specular=of_kept(sequence.specular),
@@ -269,6 +283,7 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         points=estimate.points,
         points_rgb=estimate.points_rgb,
         pose_source="estimated" if estimate.method == "colmap" else "aligned",
+        truth={**sequence.truth, "world": "estimated"} if sequence.truth else {},
     )
 
 

@@ -180,6 +180,42 @@ def test_frames_in_the_middle_may_fail(run: Run) -> None:
         )
 
 
+def test_withheld_depth_changes_neither_poses_nor_points(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without training depth the unit is COLMAP's own; the truth follows it, for the evaluation alone."""
+    monkeypatch.setattr(estimate_module, "_run", lambda *_: run.raw)
+    hidden = run.sequence.without_training_depth()
+    found = estimate_poses(hidden, CONFIG)
+    blind = estimate_poses(replace(hidden, depth_mm=None, withheld_depth_mm=None), CONFIG)
+    assert not found.metric
+    np.testing.assert_array_equal(found.points, blind.points)
+    np.testing.assert_array_equal(found.world_from_camera, blind.world_from_camera)
+    assert found.report == blind.report
+    assert found.truth_per_unit == pytest.approx(run.estimate.report["scale"]["mm_per_unit"])
+    assert blind.truth_per_unit is None
+    posed = with_estimated_poses(hidden, found)
+    assert not posed.metric
+    assert posed.true_depth_mm is not None
+    assert run.sequence.depth_mm is not None
+    np.testing.assert_allclose(
+        posed.true_depth_mm * found.truth_per_unit, run.sequence.depth_mm[:8], rtol=1e-5
+    )
+    assert posed.training_part().depth_mm is None
+    unknown = with_estimated_poses(hidden, replace(found, truth_per_unit=None))
+    assert unknown.true_depth_mm is None
+
+
+def test_held_out_depth_is_none_to_fall_back_on(
+    turning: EndoscopicSequence, no_parallax: PoseJobResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimate_module, "_run", lambda *_: no_parallax)
+    split = replace(turning.split, train=np.array([0, 1, 2, 3]), test=np.array([4, 5]))
+    hidden = replace(turning, split=split).without_training_depth()
+    with pytest.raises(CaptureError, match="The source has no depth that frames could be aligned by"):
+        estimate_poses(hidden, CONFIG.model_copy(update={"fallback": "auto"}))
+    with pytest.raises(CaptureError, match="needs depth, and there is none"):
+        estimate_poses(hidden, CONFIG.model_copy(update={"fallback": "rgbd"}))
+
+
 def test_without_texture_the_account_says_so(sequence: EndoscopicSequence) -> None:
     flat = replace(sequence, rgb=np.full_like(sequence.rgb, 128))
     with pytest.raises(
