@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import subprocess
-import sys
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -18,8 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from extrags.cameras import as_rotation
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
-from extrags.events import Progress, emit
-from extrags.poses.job import PoseJob, PoseJobResult
+from extrags.poses.job import PoseJob, PoseJobResult, run_job
 from extrags.poses.registration_report import (
     colmap_report,
     errors_against_given,
@@ -288,37 +281,7 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
 
 
 def _run(job: PoseJob, name: str) -> PoseJobResult:
-    """Run the job in a process of its own and pass its progress on."""
-    with TemporaryDirectory(prefix="extrags-poses-") as scratch:
-        folder = Path(scratch)
-        job.save(folder)
-        log = folder / "colmap.log"
-        # The child must find this very package, installed or not.
-        root = str(Path(__file__).resolve().parents[2])
-        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
-        with (
-            log.open("wb") as log_file,
-            subprocess.Popen(
-                [sys.executable, "-m", "extrags.poses.colmap", scratch],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=log_file,
-                text=True,
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-            ) as process,
-        ):
-            try:
-                for line in process.stdout or ():
-                    told = json.loads(line)
-                    emit(Progress("poses", told["done"], told["total"], told["values"]))
-                code = process.wait()
-            except BaseException:
-                process.kill()
-                raise
-        if code != 0 or not (folder / "result.json").exists():
-            last = log.read_text(errors="replace").strip().splitlines()[-8:]
-            raise CaptureError(f"{name}: COLMAP's process ended with code {code}:\n" + "\n".join(last))
-        return PoseJobResult.load(folder)
+    return run_job("extrags.poses.colmap", job, name, stage="poses")
 
 
 def _cleaned(found: np.ndarray, registered: np.ndarray) -> np.ndarray:
