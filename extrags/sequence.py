@@ -17,7 +17,7 @@ from extrags.store.storable import Storable
 from extrags.thresholds import SATURATED
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["EndoscopicSequence", "PoseSource", "Split", "saturated_mask"]
+__all__ = ["EndoscopicSequence", "PoseSource", "ScaleSource", "Split", "saturated_mask"]
 
 ALL_OF_AREA = 0.999
 """A downscaled pixel is valid above this share of valid area; below one because of rounding."""
@@ -25,6 +25,18 @@ ALL_OF_AREA = 0.999
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
 """Origin of the poses. given: by the source; estimated: by COLMAP; aligned: by RGB-D alignment; refined:
 corrected during the reconstruction."""
+
+
+ScaleSource = Literal["source", "setting", "depth", "working_distance"]
+"""What the unit of length rests on. source: what the source says of it; setting: `ingest.scale_mm_per_unit`;
+depth: known depth that estimated poses were scaled by; working_distance: `poses.working_distance_mm`."""
+
+_SCALE_WORDS: dict[ScaleSource, str] = {
+    "source": "millimetres as the source has them",
+    "setting": "millimetres from the scale given",
+    "depth": "millimetres from known depth",
+    "working_distance": "millimetres from the working distance given",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +83,7 @@ class EndoscopicSequence(Storable):
         pose_source: origin of the poses; the reconstruction may refine estimated ones.
         withheld_depth_mm: true z-depth that the evaluation alone may use, 0 where unknown, [F, H, W]; None
             where `depth_mm` is the truth. See `true_depth_mm`.
+        scale_source: what the unit of length rests on; of no account where it is arbitrary.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -95,6 +108,7 @@ class EndoscopicSequence(Storable):
     specular: Bool[np.ndarray, "f h w"] | None = None
     pose_source: PoseSource = "given"
     withheld_depth_mm: Float[np.ndarray, "f h w"] | None = None
+    scale_source: ScaleSource = "source"
 
     def __post_init__(self) -> None:
         frames, height, width = self.rgb.shape[:3]
@@ -171,6 +185,37 @@ class EndoscopicSequence(Storable):
         if self.withheld_depth_mm is None:
             return self.depth_mm
         return self.withheld_depth_mm if bool((self.withheld_depth_mm > 0).any()) else None
+
+    @property
+    def scale_words(self) -> str:
+        """What lengths are, and what says so, for tables and reports."""
+        return _SCALE_WORDS[self.scale_source] if self.metric else "arbitrary scale"
+
+    def in_millimetres(self, mm_per_unit: float, source: ScaleSource) -> EndoscopicSequence:
+        """A copy of a posed sequence with all lengths multiplied, which makes it metric.
+
+        Args:
+            mm_per_unit: length of one unit of the poses.
+            source: what it rests on.
+
+        Raises:
+            ShapeError: while the poses are unknown.
+        """
+        poses = self.cameras.world_from_camera.copy()
+        poses[:, :3, 3] *= mm_per_unit
+
+        def longer(lengths: Any) -> Any:
+            return None if lengths is None else (lengths * mm_per_unit).astype(lengths.dtype)
+
+        return replace(
+            self,
+            world_from_camera=poses,
+            depth_mm=longer(self.depth_mm),
+            withheld_depth_mm=longer(self.withheld_depth_mm),
+            points=longer(self.points),
+            metric=True,
+            scale_source=source,
+        )
 
     def without_training_depth(self) -> EndoscopicSequence:
         """A copy whose training frames have no depth, so that only the evaluation knows any.
@@ -298,6 +343,8 @@ class EndoscopicSequence(Storable):
         # Written only where it differs from the default, so that older artefacts keep their digest.
         if self.pose_source != "given":
             group.attrs["pose_source"] = self.pose_source
+        if self.scale_source != "source":
+            group.attrs["scale_source"] = self.scale_source
 
     @classmethod
     def load(cls, path: Path) -> EndoscopicSequence:
@@ -335,6 +382,7 @@ class EndoscopicSequence(Storable):
             metric=bool(attributes["metric"]),
             truth=truth,
             pose_source=cast("PoseSource", attributes.get("pose_source", "given")),
+            scale_source=cast("ScaleSource", attributes.get("scale_source", "source")),
             **optional,
         )
 

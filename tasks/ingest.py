@@ -29,6 +29,7 @@ def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: Inge
         width=sequence.width,
         height=sequence.height,
         has_poses=int(sequence.world_from_camera is not None),
+        scale=sequence.scale_words if sequence.world_from_camera is not None else "",
         has_depth=int(sequence.training_depth_known),
         masked_share=float(1 - sequence.mask.mean()),
         specular_share=0.0 if sequence.specular is None else float(sequence.specular.sum() / inside),

@@ -30,6 +30,7 @@ def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
         test=len(posed.test),
         dropped=len(unposed) - len(posed),
         method=estimate.method,
+        scale=posed.scale_words,
         summary=estimate.summary,
         mean_reprojection_px=estimate.mean_reprojection_px,
     )

@@ -21,7 +21,7 @@ from extrags.poses.registration_report import (
 )
 from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import depth_scale
-from extrags.sequence import EndoscopicSequence, Split
+from extrags.sequence import EndoscopicSequence, ScaleSource, Split
 
 __all__ = ["PoseEstimate", "estimate_poses", "with_estimated_poses"]
 
@@ -40,11 +40,12 @@ class PoseEstimate:
         points: of the surface, [P, 3], float32, in the unit of the poses.
         points_rgb: their colours, [P, 3].
         mean_reprojection_px: over the observations in training frames; None without such.
-        metric: true when the unit is the millimetre, from known depth.
+        metric: true when the unit is the millimetre.
         report: counts of features, matches and registrations, ready for JSON.
         truth_per_unit: length of one unit of the poses in the unit of withheld true depth; None where no
             depth is withheld or the poses are metric. The evaluation compares with the truth by it; no
             pose and no point depends on it.
+        scale_source: what makes the estimate metric, if anything does.
     """
 
     method: Literal["colmap", "rgbd"]
@@ -56,6 +57,7 @@ class PoseEstimate:
     metric: bool
     report: dict[str, Any]
     truth_per_unit: float | None = None
+    scale_source: ScaleSource = "source"
 
     @property
     def summary(self) -> str:
@@ -68,8 +70,17 @@ class PoseEstimate:
             why = f" (COLMAP registered only {failed['registered_train']})"
         return (
             f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
-            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames"
+            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames; {self._scale}"
         )
+
+    @property
+    def _scale(self) -> str:
+        return {
+            "source": "scale as that of the depth" if self.method == "rgbd" else "arbitrary scale",
+            "setting": "scale from ingest.scale_mm_per_unit",
+            "depth": "scale from depth",
+            "working_distance": "scale from the working distance given",
+        }[self.scale_source]
 
     def to_json(self, given: EndoscopicSequence) -> dict[str, Any]:
         """Counts and errors as plain JSON.
@@ -96,7 +107,8 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     *COLMAP*: SIFT inside the validity mask, known intrinsics held fixed, incremental mapping on the training
     frames alone; the largest model counts. Held-out frames are registered afterwards against the finished
     map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the millimetre
-    (`extrags.poses.depth_scale`). COLMAP runs in a process of its own.
+    (`extrags.poses.depth_scale`); where it has none and `config.working_distance_mm` is given, the median
+    depth of the points in the frames that observe them becomes that. COLMAP runs in a process of its own.
 
     *Colour and depth* (`extrags.poses.rgbd`): where the sequence has depth and COLMAP registers too few
     training frames, unless `config.fallback` says `never`; or from the start if it says `rgbd`. Again
@@ -133,7 +145,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     report = colmap_report(sequence, result, registered)
     if _enough(report, config):
         _warn_of_missing(sequence, report)
-        return _from_colmap(sequence, result, registered, report)
+        return _from_colmap(sequence, result, registered, report, config)
     if config.fallback == "never":
         instead = "Alignment by colour and depth is switched off (poses.fallback)."
     elif sequence.depth_mm is None:
@@ -163,19 +175,30 @@ def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
 
 
 def _from_colmap(
-    sequence: EndoscopicSequence, result: PoseJobResult, registered: np.ndarray, report: dict[str, Any]
+    sequence: EndoscopicSequence,
+    result: PoseJobResult,
+    registered: np.ndarray,
+    report: dict[str, Any],
+    config: PosesConfig,
 ) -> PoseEstimate:
     poses, points = _cleaned(result.world_from_camera, registered), result.points
+    mm_per_unit: float | None = None
+    scale_source: ScaleSource = "source"
     seen = (result.observed_frame, result.observed_point, result.observed_px)
     scale = truth = None
     if sequence.depth_mm is not None and sequence.metric:
         scale = depth_scale(poses, points, *seen, sequence.depth_mm, sequence.mask)
-    elif sequence.true_depth_mm is not None:
+    elif sequence.true_depth_mm is not None and config.working_distance_mm is None:
         truth = depth_scale(poses, points, *seen, sequence.true_depth_mm, sequence.mask)
     if scale is not None:
-        poses[:, :3, 3] *= scale.mm_per_unit
-        points = points * scale.mm_per_unit
+        mm_per_unit, scale_source = scale.mm_per_unit, "depth"
         report["scale"] = asdict(scale)
+    elif config.working_distance_mm is not None:
+        mm_per_unit, scale_source = _told_scale(poses, result, config.working_distance_mm), "working_distance"
+        report["scale"] = {"mm_per_unit": mm_per_unit, "working_distance_mm": config.working_distance_mm}
+    if mm_per_unit is not None:
+        poses[:, :3, 3] *= mm_per_unit
+        points = points * mm_per_unit
     return PoseEstimate(
         method="colmap",
         world_from_camera=poses,
@@ -183,10 +206,18 @@ def _from_colmap(
         points=points.astype(np.float32),
         points_rgb=result.points_rgb,
         mean_reprojection_px=float(report["mean_reprojection_px"]),
-        metric=scale is not None,
+        metric=mm_per_unit is not None,
         report=report,
+        scale_source=scale_source,
         truth_per_unit=None if truth is None else truth.mm_per_unit,
     )
+
+
+def _told_scale(poses: np.ndarray, result: PoseJobResult, working_distance_mm: float) -> float:
+    """Millimetres per unit, so that points are so far from the frames that observe them, in the median."""
+    pose = poses[result.observed_frame]
+    z = np.einsum("oi,oi->o", pose[:, :3, 2], result.points[result.observed_point] - pose[:, :3, 3])
+    return working_distance_mm / float(np.median(z[z > 0]))
 
 
 def _by_depth(
@@ -225,6 +256,7 @@ def _by_depth(
         mean_reprojection_px=None,
         metric=sequence.metric,
         report=report,
+        scale_source="depth" if sequence.metric else "source",
     )
 
 
@@ -275,6 +307,7 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         metric=estimate.metric,
         points=estimate.points,
         points_rgb=estimate.points_rgb,
+        scale_source=estimate.scale_source,
         pose_source="estimated" if estimate.method == "colmap" else "aligned",
         truth={**sequence.truth, "world": "estimated"} if sequence.truth else {},
     )

@@ -91,7 +91,7 @@ def _facts(inputs: ReportInputs) -> list[tuple[str, str]]:
     recordings = 1 if sequence.recording is None else len(np.unique(sequence.recording))
     if recordings > 1:
         facts.append(("Recordings", count(recordings)))
-    facts.append(("Unit of length", "millimetres" if sequence.metric else "arbitrary"))
+    facts.append(("Scale", sequence.scale_words.removesuffix(" scale")))
     if (gaussians := metric_of(final, "n_gaussians")) is not None:
         facts.append(("Gaussians", count(gaussians)))
     if inputs.stages:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from data_catalog import read
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError
 from extrags.pipeline import run_pipeline
 from tests.extrags.object_capture import write_object_capture
 from tests.flows.tiny import tiny_config
@@ -46,3 +48,19 @@ def test_the_radiance_field_as_well(tmp_path: Path) -> None:
     )
     result = run_pipeline(read(folder, config.ingest), config)
     assert np.isfinite(result.evaluations["final"].metrics["psnr"])
+
+
+def test_a_scale_makes_it_metric(tmp_path: Path) -> None:
+    folder = tmp_path / "bricks"
+    write_object_capture(folder, views=4)
+    given, scaled = read(folder), read(folder, IngestConfig(scale_mm_per_unit=12.5))
+    assert (given.metric, given.scale_words) == (False, "arbitrary scale")
+    assert (scaled.metric, scaled.scale_words) == (True, "millimetres from the scale given")
+    np.testing.assert_allclose(scaled.cameras.centers, 12.5 * given.cameras.centers)
+    with pytest.raises(ConfigError, match="the source's lengths are millimetres"):
+        read("phantom/0@sparse", IngestConfig(width=16, height=16, max_frames=4, scale_mm_per_unit=2.0))
+    for image in (folder / "images").iterdir():
+        image.rename(folder / image.name)
+    (folder / "transforms.json").unlink()
+    with pytest.raises(ConfigError, match=r"poses\.working_distance_mm makes estimated poses metric"):
+        read(folder, IngestConfig(scale_mm_per_unit=2.0))

@@ -188,3 +188,31 @@ class TestWithoutTrainingDepth:
         bare = replace(hidden, depth_mm=None, withheld_depth_mm=None)
         assert not bare.training_depth_known
         assert bare.training_part().depth_mm is hidden.training_part().depth_mm is None
+
+
+class TestScale:
+    def test_all_lengths_are_multiplied(self, tmp_path: Path) -> None:
+        generator = np.random.default_rng(3)
+        poses = np.tile(np.eye(4), (4, 1, 1))
+        poses[:, :3, 3] = generator.random((4, 3))
+        arbitrary = replace(small_sequence(), world_from_camera=poses, metric=False)
+        assert arbitrary.scale_words == "arbitrary scale"
+        found = arbitrary.in_millimetres(25.0, "setting")
+        assert found.metric
+        assert found.scale_words == "millimetres from the scale given"
+        assert found.world_from_camera is not None
+        np.testing.assert_allclose(found.world_from_camera[:, :3, 3], 25 * poses[:, :3, 3])
+        np.testing.assert_array_equal(found.world_from_camera[:, :3, :3], poses[:, :3, :3])
+        assert arbitrary.points is not None
+        np.testing.assert_allclose(found.points, 25 * arbitrary.points)
+        assert arbitrary.depth_mm is not None
+        assert found.depth_mm is not None
+        assert found.depth_mm.dtype == np.float32
+        np.testing.assert_allclose(found.depth_mm, 25 * arbitrary.depth_mm, rtol=1e-6)
+        found.save(tmp_path / "sequence")
+        assert EndoscopicSequence.load(tmp_path / "sequence").scale_source == "setting"
+        assert found.training_part().scale_source == "setting"
+
+    def test_poses_are_needed(self) -> None:
+        with pytest.raises(ShapeError, match="no poses"):
+            replace(small_sequence(), world_from_camera=None).in_millimetres(2.0, "setting")

@@ -118,7 +118,9 @@ def test_a_frame_without_pose_is_named(run: Run) -> None:
     assert run.estimate.report["unregistered_train"] == []
     assert "no pose for held-out frames arc-8" in run.log
     assert run.estimate.report["registrations"]["arc-3"]["inliers"] > 50
-    assert run.estimate.summary == "by COLMAP: 7 of 7 training frames, 1 of 2 held-out frames"
+    assert run.estimate.summary == (
+        "by COLMAP: 7 of 7 training frames, 1 of 2 held-out frames; scale from depth"
+    )
     json.dumps(run.estimate.report, allow_nan=False)
 
 
@@ -202,6 +204,33 @@ def test_withheld_depth_changes_neither_poses_nor_points(run: Run, monkeypatch: 
     assert posed.training_part().depth_mm is None
     unknown = with_estimated_poses(hidden, replace(found, truth_per_unit=None))
     assert unknown.true_depth_mm is None
+
+
+def test_a_working_distance_makes_the_estimate_metric(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimate_module, "_run", lambda *_: run.raw)
+    told = CONFIG.model_copy(update={"working_distance_mm": 21.0})
+    hidden = run.sequence.without_training_depth()
+    found = estimate_poses(hidden, told)
+    assert found.metric
+    assert found.truth_per_unit is None
+    assert found.report["scale"]["working_distance_mm"] == 21.0
+    assert found.summary.endswith("scale from the working distance given")
+    posed = with_estimated_poses(hidden, found)
+    assert posed.scale_words == "millimetres from the working distance given"
+    # The truth stays in its own millimetres: how far what was told is off counts in the figures.
+    np.testing.assert_array_equal(posed.true_depth_mm, run.sequence.depth_mm[:8])  # type: ignore[index]
+    z = [
+        posed.cameras[int(frame)].project(
+            found.points[run.raw.observed_point[run.raw.observed_frame == frame]]
+        )[1]
+        for frame in posed.train
+    ]
+    assert float(np.median(np.concatenate(z, axis=1))) == pytest.approx(21.0, rel=1e-5)
+    # Where depth is known, it is measured and not told.
+    measured = estimate_poses(run.sequence, told)
+    np.testing.assert_array_equal(measured.points, run.estimate.points)
+    posed = with_estimated_poses(run.sequence, measured)
+    assert posed.scale_words == "millimetres from known depth"
 
 
 def test_held_out_depth_is_none_to_fall_back_on(
