@@ -79,9 +79,14 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
         ConfigError: settings that this source cannot be read with.
     """
     source = source if isinstance(source, Source) else resolve(source)
-    sequence = _dataset(source).read(source, config or IngestConfig())
+    config = config or IngestConfig()
+    sequence = _dataset(source).read(source, config)
     check_sequence(sequence, file=source.path or source.name)
-    return with_specular(sequence)
+    if config.scale_mm_per_unit is not None:
+        sequence = _scaled(sequence, config.scale_mm_per_unit)
+    # After the checks, which hold poses against all depth there is; what was observed is known by now.
+    shown = sequence.without_training_depth() if config.withhold_depth else sequence
+    return with_specular(shown)
 
 
 def source_fingerprint(source: Source | str | Path, config: IngestConfig | None = None) -> dict[str, Any]:
@@ -101,6 +106,20 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
     """
     source = source if isinstance(source, Source) else resolve(source)
     return _dataset(source).fingerprint(source, config or IngestConfig())
+
+
+def _scaled(sequence: EndoscopicSequence, mm_per_unit: float) -> EndoscopicSequence:
+    if sequence.world_from_camera is None:
+        raise ConfigError(
+            f"{sequence.name}: ingest.scale_mm_per_unit is the unit of the source's poses, and there are "
+            "none; poses.working_distance_mm makes estimated poses metric"
+        )
+    if sequence.metric:
+        raise ConfigError(
+            f"{sequence.name}: the source's lengths are millimetres; ingest.scale_mm_per_unit is for sources "
+            "whose unit is arbitrary"
+        )
+    return sequence.in_millimetres(mm_per_unit, "setting")
 
 
 def _dataset(source: Source) -> Dataset:

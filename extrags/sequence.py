@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
 
@@ -16,7 +17,7 @@ from extrags.store.storable import Storable
 from extrags.thresholds import SATURATED
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["EndoscopicSequence", "PoseSource", "Split", "saturated_mask"]
+__all__ = ["EndoscopicSequence", "PoseSource", "ScaleSource", "Split", "saturated_mask"]
 
 ALL_OF_AREA = 0.999
 """A downscaled pixel is valid above this share of valid area; below one because of rounding."""
@@ -24,6 +25,18 @@ ALL_OF_AREA = 0.999
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
 """Origin of the poses. given: by the source; estimated: by COLMAP; aligned: by RGB-D alignment; refined:
 corrected during the reconstruction."""
+
+
+ScaleSource = Literal["source", "setting", "depth", "working_distance"]
+"""What the unit of length rests on. source: what the source says of it; setting: `ingest.scale_mm_per_unit`;
+depth: known depth that estimated poses were scaled by; working_distance: `poses.working_distance_mm`."""
+
+_SCALE_WORDS: dict[ScaleSource, str] = {
+    "source": "millimetres as the source has them",
+    "setting": "millimetres from the scale given",
+    "depth": "millimetres from known depth",
+    "working_distance": "millimetres from the working distance given",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +81,9 @@ class EndoscopicSequence(Storable):
         specular: true on specular highlights, [F, H, W]; they have no weight in training, but count in the
             evaluation of held-out frames like any other pixel. None where they were not detected.
         pose_source: origin of the poses; the reconstruction may refine estimated ones.
+        withheld_depth_mm: true z-depth that the evaluation alone may use, 0 where unknown, [F, H, W]; None
+            where `depth_mm` is the truth. See `true_depth_mm`.
+        scale_source: what the unit of length rests on; of no account where it is arbitrary.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -91,6 +107,8 @@ class EndoscopicSequence(Storable):
     truth: dict[str, Any] = field(default_factory=dict)
     specular: Bool[np.ndarray, "f h w"] | None = None
     pose_source: PoseSource = "given"
+    withheld_depth_mm: Float[np.ndarray, "f h w"] | None = None
+    scale_source: ScaleSource = "source"
 
     def __post_init__(self) -> None:
         frames, height, width = self.rgb.shape[:3]
@@ -99,6 +117,7 @@ class EndoscopicSequence(Storable):
             ("K", self.K, (frames, 3, 3)),
             ("world_from_camera", self.world_from_camera, (frames, 4, 4)),
             ("depth_mm", self.depth_mm, (frames, height, width)),
+            ("withheld_depth_mm", self.withheld_depth_mm, (frames, height, width)),
             ("observed", self.observed, (frames, height, width)),
             ("specular", self.specular, (frames, height, width)),
             ("recording", self.recording, (frames,)),
@@ -151,6 +170,66 @@ class EndoscopicSequence(Storable):
         """
         return self.cameras[self.train]
 
+    @cached_property
+    def training_depth_known(self) -> bool:
+        """Whether any training frame has depth: held-out frames may have some for the evaluation alone."""
+        return self.depth_mm is not None and bool((self.depth_mm[self.train] > 0).any())
+
+    @cached_property
+    def true_depth_mm(self) -> Float[np.ndarray, "f h w"] | None:
+        """True z-depth of all frames, for the evaluation alone; 0 where unknown, None where none is known.
+
+        In the unit of the poses, as `depth_mm`, but of training frames as well where their depth was
+        withheld or was estimated from images.
+        """
+        if self.withheld_depth_mm is None:
+            return self.depth_mm
+        return self.withheld_depth_mm if bool((self.withheld_depth_mm > 0).any()) else None
+
+    @property
+    def scale_words(self) -> str:
+        """What lengths are, and what says so, for tables and reports."""
+        return _SCALE_WORDS[self.scale_source] if self.metric else "arbitrary scale"
+
+    def in_millimetres(self, mm_per_unit: float, source: ScaleSource) -> EndoscopicSequence:
+        """A copy of a posed sequence with all lengths multiplied, which makes it metric.
+
+        Args:
+            mm_per_unit: length of one unit of the poses.
+            source: what it rests on.
+
+        Raises:
+            ShapeError: while the poses are unknown.
+        """
+        poses = self.cameras.world_from_camera.copy()
+        poses[:, :3, 3] *= mm_per_unit
+
+        def longer(lengths: Any) -> Any:
+            return None if lengths is None else (lengths * mm_per_unit).astype(lengths.dtype)
+
+        return replace(
+            self,
+            world_from_camera=poses,
+            depth_mm=longer(self.depth_mm),
+            withheld_depth_mm=longer(self.withheld_depth_mm),
+            points=longer(self.points),
+            metric=True,
+            scale_source=source,
+        )
+
+    def without_training_depth(self) -> EndoscopicSequence:
+        """A copy whose training frames have no depth, so that only the evaluation knows any.
+
+        Held-out frames keep theirs. Points go too, since a source with depth may have made them from it. A
+        sequence without depth is returned as it is.
+        """
+        if self.depth_mm is None:
+            return self
+        shown = self.depth_mm.copy()
+        shown[self.train] = 0
+        true = self.depth_mm if self.withheld_depth_mm is None else self.withheld_depth_mm
+        return replace(self, depth_mm=shown, withheld_depth_mm=true, points=None, points_rgb=None)
+
     def supervised_mask(self, frames: int | Int[np.ndarray, "n"]) -> Bool[np.ndarray, "*n h w"]:
         """Mask of pixels used for supervision: the validity mask without detected specular highlights.
 
@@ -195,12 +274,14 @@ class EndoscopicSequence(Storable):
         K[:, 0] *= size[0] / self.width
         K[:, 1] *= size[1] / self.height
         depth, observed, specular = self.depth_mm, self.observed, self.specular
+        withheld = self.withheld_depth_mm
         return replace(
             self,
             rgb=resized(self.rgb, cv2.INTER_AREA),
             K=K,
             mask=share(self.mask) > ALL_OF_AREA,
             depth_mm=None if depth is None else resized(depth, cv2.INTER_NEAREST),
+            withheld_depth_mm=None if withheld is None else resized(withheld, cv2.INTER_NEAREST),
             observed=None if observed is None else share(observed) > ALL_OF_AREA,
             specular=None if specular is None else share(specular) > 0,
         )
@@ -225,7 +306,8 @@ class EndoscopicSequence(Storable):
             mask=self.mask[train],
             split=Split("training", np.arange(len(train)), np.arange(0), self.split.version),
             world_from_camera=of_train(self.world_from_camera),
-            depth_mm=of_train(self.depth_mm),
+            depth_mm=of_train(self.depth_mm) if self.training_depth_known else None,
+            withheld_depth_mm=None,
             recording=None if recording is None else np.unique(recording, return_inverse=True)[1],
             frame_names=tuple(self.frame_name(int(frame)) for frame in train),
             observed=None,
@@ -241,7 +323,7 @@ class EndoscopicSequence(Storable):
         write_array(group, "K", self.K)
         write_array(group, "split/train", self.split.train.astype(np.int64))
         write_array(group, "split/test", self.split.test.astype(np.int64))
-        for name in ("depth_mm", "observed", "specular"):
+        for name in ("depth_mm", "withheld_depth_mm", "observed", "specular"):
             stack = getattr(self, name)
             if stack is not None:
                 write_frames(group, name, stack)
@@ -261,6 +343,8 @@ class EndoscopicSequence(Storable):
         # Written only where it differs from the default, so that older artefacts keep their digest.
         if self.pose_source != "given":
             group.attrs["pose_source"] = self.pose_source
+        if self.scale_source != "source":
+            group.attrs["scale_source"] = self.scale_source
 
     @classmethod
     def load(cls, path: Path) -> EndoscopicSequence:
@@ -272,6 +356,7 @@ class EndoscopicSequence(Storable):
             name: read_array(group, name) if name in group else None
             for name in (
                 "depth_mm",
+                "withheld_depth_mm",
                 "observed",
                 "specular",
                 "world_from_camera",
@@ -297,6 +382,7 @@ class EndoscopicSequence(Storable):
             metric=bool(attributes["metric"]),
             truth=truth,
             pose_source=cast("PoseSource", attributes.get("pose_source", "given")),
+            scale_source=cast("ScaleSource", attributes.get("scale_source", "source")),
             **optional,
         )
 

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import subprocess
-import sys
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -18,8 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from extrags.cameras import as_rotation
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
-from extrags.events import Progress, emit
-from extrags.poses.job import PoseJob, PoseJobResult
+from extrags.poses.job import PoseJob, PoseJobResult, run_job
 from extrags.poses.registration_report import (
     colmap_report,
     errors_against_given,
@@ -28,7 +21,7 @@ from extrags.poses.registration_report import (
 )
 from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import depth_scale
-from extrags.sequence import EndoscopicSequence, Split
+from extrags.sequence import EndoscopicSequence, ScaleSource, Split
 
 __all__ = ["PoseEstimate", "estimate_poses", "with_estimated_poses"]
 
@@ -47,8 +40,12 @@ class PoseEstimate:
         points: of the surface, [P, 3], float32, in the unit of the poses.
         points_rgb: their colours, [P, 3].
         mean_reprojection_px: over the observations in training frames; None without such.
-        metric: true when the unit is the millimetre, from known depth.
+        metric: true when the unit is the millimetre.
         report: counts of features, matches and registrations, ready for JSON.
+        truth_per_unit: length of one unit of the poses in the unit of withheld true depth; None where no
+            depth is withheld or the poses are metric. The evaluation compares with the truth by it; no
+            pose and no point depends on it.
+        scale_source: what makes the estimate metric, if anything does.
     """
 
     method: Literal["colmap", "rgbd"]
@@ -59,6 +56,8 @@ class PoseEstimate:
     mean_reprojection_px: float | None
     metric: bool
     report: dict[str, Any]
+    truth_per_unit: float | None = None
+    scale_source: ScaleSource = "source"
 
     @property
     def summary(self) -> str:
@@ -71,8 +70,17 @@ class PoseEstimate:
             why = f" (COLMAP registered only {failed['registered_train']})"
         return (
             f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
-            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames"
+            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames; {self._scale}"
         )
+
+    @property
+    def _scale(self) -> str:
+        return {
+            "source": "scale as that of the depth" if self.method == "rgbd" else "arbitrary scale",
+            "setting": "scale from ingest.scale_mm_per_unit",
+            "depth": "scale from depth",
+            "working_distance": "scale from the working distance given",
+        }[self.scale_source]
 
     def to_json(self, given: EndoscopicSequence) -> dict[str, Any]:
         """Counts and errors as plain JSON.
@@ -87,6 +95,7 @@ class PoseEstimate:
             "summary": self.summary,
             "registered": [bool(found) for found in self.registered],
             "mean_reprojection_px": self.mean_reprojection_px,
+            "truth_per_unit": self.truth_per_unit,
             "against_given": errors,
             **self.report,
         }
@@ -98,7 +107,8 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     *COLMAP*: SIFT inside the validity mask, known intrinsics held fixed, incremental mapping on the training
     frames alone; the largest model counts. Held-out frames are registered afterwards against the finished
     map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the millimetre
-    (`extrags.poses.depth_scale`). COLMAP runs in a process of its own.
+    (`extrags.poses.depth_scale`); where it has none and `config.working_distance_mm` is given, the median
+    depth of the points in the frames that observe them becomes that. COLMAP runs in a process of its own.
 
     *Colour and depth* (`extrags.poses.rgbd`): where the sequence has depth and COLMAP registers too few
     training frames, unless `config.fallback` says `never`; or from the start if it says `rgbd`. Again
@@ -120,6 +130,9 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
     """
     config = PosesConfig() if config is None else config
+    if not sequence.training_depth_known:
+        # Held-out frames may have depth for the evaluation alone.
+        sequence = replace(sequence, depth_mm=None)
     if len(sequence.train) < MIN_TRAINING_FRAMES:
         raise CaptureError(
             f"{sequence.name}: poses need at least {MIN_TRAINING_FRAMES} training frames, "
@@ -132,7 +145,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     report = colmap_report(sequence, result, registered)
     if _enough(report, config):
         _warn_of_missing(sequence, report)
-        return _from_colmap(sequence, result, registered, report)
+        return _from_colmap(sequence, result, registered, report, config)
     if config.fallback == "never":
         instead = "Alignment by colour and depth is switched off (poses.fallback)."
     elif sequence.depth_mm is None:
@@ -162,24 +175,30 @@ def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
 
 
 def _from_colmap(
-    sequence: EndoscopicSequence, result: PoseJobResult, registered: np.ndarray, report: dict[str, Any]
+    sequence: EndoscopicSequence,
+    result: PoseJobResult,
+    registered: np.ndarray,
+    report: dict[str, Any],
+    config: PosesConfig,
 ) -> PoseEstimate:
     poses, points = _cleaned(result.world_from_camera, registered), result.points
-    scale = None
+    mm_per_unit: float | None = None
+    scale_source: ScaleSource = "source"
+    seen = (result.observed_frame, result.observed_point, result.observed_px)
+    scale = truth = None
     if sequence.depth_mm is not None and sequence.metric:
-        scale = depth_scale(
-            poses,
-            points,
-            result.observed_frame,
-            result.observed_point,
-            result.observed_px,
-            sequence.depth_mm,
-            sequence.mask,
-        )
+        scale = depth_scale(poses, points, *seen, sequence.depth_mm, sequence.mask)
+    elif sequence.true_depth_mm is not None and config.working_distance_mm is None:
+        truth = depth_scale(poses, points, *seen, sequence.true_depth_mm, sequence.mask)
     if scale is not None:
-        poses[:, :3, 3] *= scale.mm_per_unit
-        points = points * scale.mm_per_unit
+        mm_per_unit, scale_source = scale.mm_per_unit, "depth"
         report["scale"] = asdict(scale)
+    elif config.working_distance_mm is not None:
+        mm_per_unit, scale_source = _told_scale(poses, result, config.working_distance_mm), "working_distance"
+        report["scale"] = {"mm_per_unit": mm_per_unit, "working_distance_mm": config.working_distance_mm}
+    if mm_per_unit is not None:
+        poses[:, :3, 3] *= mm_per_unit
+        points = points * mm_per_unit
     return PoseEstimate(
         method="colmap",
         world_from_camera=poses,
@@ -187,9 +206,18 @@ def _from_colmap(
         points=points.astype(np.float32),
         points_rgb=result.points_rgb,
         mean_reprojection_px=float(report["mean_reprojection_px"]),
-        metric=scale is not None,
+        metric=mm_per_unit is not None,
         report=report,
+        scale_source=scale_source,
+        truth_per_unit=None if truth is None else truth.mm_per_unit,
     )
+
+
+def _told_scale(poses: np.ndarray, result: PoseJobResult, working_distance_mm: float) -> float:
+    """Millimetres per unit, so that points are so far from the frames that observe them, in the median."""
+    pose = poses[result.observed_frame]
+    z = np.einsum("oi,oi->o", pose[:, :3, 2], result.points[result.observed_point] - pose[:, :3, 3])
+    return working_distance_mm / float(np.median(z[z > 0]))
 
 
 def _by_depth(
@@ -228,13 +256,15 @@ def _by_depth(
         mean_reprojection_px=None,
         metric=sequence.metric,
         report=report,
+        scale_source="depth" if sequence.metric else "source",
     )
 
 
 def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -> EndoscopicSequence:
     """The sequence with poses and points, without the frames that did not register.
 
-    Frames keep their names; the split is renumbered. `truth` is kept as it is.
+    Frames keep their names; the split is renumbered. `truth` is kept and told that the world is another
+    (`world`). Where true depth was withheld, it is brought to the unit of the poses, for the evaluation.
 
     Raises:
         ShapeError: when the estimate is of another sequence.
@@ -252,13 +282,22 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
     def of_kept(stack: np.ndarray | None) -> Any:
         return None if stack is None else stack[kept]
 
+    def of_truth(depth: np.ndarray | None) -> Any:
+        if depth is None or estimate.metric:
+            return of_kept(depth)
+        if estimate.truth_per_unit is None:
+            return None  # its unit is not that of the poses, so that nothing could be compared with it
+        return (depth[kept] / estimate.truth_per_unit).astype(depth.dtype)
+
     split = sequence.split
+    hidden = not sequence.training_depth_known
     return replace(
         sequence,
         rgb=sequence.rgb[kept],
         K=sequence.K[kept],
         mask=sequence.mask[kept],
-        depth_mm=of_kept(sequence.depth_mm),
+        depth_mm=of_truth(sequence.depth_mm) if hidden else of_kept(sequence.depth_mm),
+        withheld_depth_mm=of_truth(sequence.withheld_depth_mm),
         recording=of_kept(sequence.recording),
         observed=of_kept(sequence.observed),
         specular=of_kept(sequence.specular),
@@ -268,42 +307,14 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         metric=estimate.metric,
         points=estimate.points,
         points_rgb=estimate.points_rgb,
+        scale_source=estimate.scale_source,
         pose_source="estimated" if estimate.method == "colmap" else "aligned",
+        truth={**sequence.truth, "world": "estimated"} if sequence.truth else {},
     )
 
 
 def _run(job: PoseJob, name: str) -> PoseJobResult:
-    """Run the job in a process of its own and pass its progress on."""
-    with TemporaryDirectory(prefix="extrags-poses-") as scratch:
-        folder = Path(scratch)
-        job.save(folder)
-        log = folder / "colmap.log"
-        # The child must find this very package, installed or not.
-        root = str(Path(__file__).resolve().parents[2])
-        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
-        with (
-            log.open("wb") as log_file,
-            subprocess.Popen(
-                [sys.executable, "-m", "extrags.poses.colmap", scratch],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=log_file,
-                text=True,
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-            ) as process,
-        ):
-            try:
-                for line in process.stdout or ():
-                    told = json.loads(line)
-                    emit(Progress("poses", told["done"], told["total"], told["values"]))
-                code = process.wait()
-            except BaseException:
-                process.kill()
-                raise
-        if code != 0 or not (folder / "result.json").exists():
-            last = log.read_text(errors="replace").strip().splitlines()[-8:]
-            raise CaptureError(f"{name}: COLMAP's process ended with code {code}:\n" + "\n".join(last))
-        return PoseJobResult.load(folder)
+    return run_job("extrags.poses.colmap", job, name, stage="poses")
 
 
 def _cleaned(found: np.ndarray, registered: np.ndarray) -> np.ndarray:
