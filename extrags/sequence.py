@@ -84,6 +84,8 @@ class EndoscopicSequence(Storable):
         withheld_depth_mm: true z-depth that the evaluation alone may use, 0 where unknown, [F, H, W]; None
             where `depth_mm` is the truth. See `true_depth_mm`.
         scale_source: what the unit of length rests on; of no account where it is arbitrary.
+        depth_error: expected relative error of an estimated `depth_mm`, [F, H, W]; None where the depth was
+            measured.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -109,6 +111,7 @@ class EndoscopicSequence(Storable):
     pose_source: PoseSource = "given"
     withheld_depth_mm: Float[np.ndarray, "f h w"] | None = None
     scale_source: ScaleSource = "source"
+    depth_error: Float[np.ndarray, "f h w"] | None = None
 
     def __post_init__(self) -> None:
         frames, height, width = self.rgb.shape[:3]
@@ -118,6 +121,7 @@ class EndoscopicSequence(Storable):
             ("world_from_camera", self.world_from_camera, (frames, 4, 4)),
             ("depth_mm", self.depth_mm, (frames, height, width)),
             ("withheld_depth_mm", self.withheld_depth_mm, (frames, height, width)),
+            ("depth_error", self.depth_error, (frames, height, width)),
             ("observed", self.observed, (frames, height, width)),
             ("specular", self.specular, (frames, height, width)),
             ("recording", self.recording, (frames,)),
@@ -284,6 +288,7 @@ class EndoscopicSequence(Storable):
             withheld_depth_mm=None if withheld is None else resized(withheld, cv2.INTER_NEAREST),
             observed=None if observed is None else share(observed) > ALL_OF_AREA,
             specular=None if specular is None else share(specular) > 0,
+            depth_error=None if self.depth_error is None else resized(self.depth_error, cv2.INTER_NEAREST),
         )
 
     def training_part(self) -> EndoscopicSequence:
@@ -313,6 +318,7 @@ class EndoscopicSequence(Storable):
             observed=None,
             truth={},
             specular=of_train(self.specular),
+            depth_error=of_train(self.depth_error),
         )
 
     def save(self, path: Path) -> None:
@@ -323,7 +329,7 @@ class EndoscopicSequence(Storable):
         write_array(group, "K", self.K)
         write_array(group, "split/train", self.split.train.astype(np.int64))
         write_array(group, "split/test", self.split.test.astype(np.int64))
-        for name in ("depth_mm", "withheld_depth_mm", "observed", "specular"):
+        for name in ("depth_mm", "withheld_depth_mm", "depth_error", "observed", "specular"):
             stack = getattr(self, name)
             if stack is not None:
                 write_frames(group, name, stack)
@@ -357,6 +363,7 @@ class EndoscopicSequence(Storable):
             for name in (
                 "depth_mm",
                 "withheld_depth_mm",
+                "depth_error",
                 "observed",
                 "specular",
                 "world_from_camera",

@@ -68,9 +68,7 @@ def completion_inputs(
     """
     mask = frames.mask
     sure = mask & (stereo.agrees * stereo.seen * stereo.n_sources[:, None, None] >= SURE_AGREEMENT)
-    log_scale = torch.stack(
-        [_median(log, s, m) for log, s, m in zip(stereo.fused, sure, mask, strict=True)]
-    )
+    log_scale = torch.stack([_median(log, s, m) for log, s, m in zip(stereo.fused, sure, mask, strict=True)])
     relative = (stereo.fused - log_scale[:, None, None]).clamp(-FARTHEST_LOG, FARTHEST_LOG)
     shading = (stereo.shading - log_scale[:, None, None]).clamp(-FARTHEST_LOG, FARTHEST_LOG)
     scatter = torch.tensor([min(fit.scatter, 1.0) for fit in stereo.fits], device=relative.device)

@@ -90,7 +90,9 @@ def fit_shading(
         One fit per group, in their order, each with the intercepts of its frames. A frame without sure
         pixels takes the mean intercept of its group.
     """
-    group = torch.zeros(len(brightness), dtype=torch.long, device=brightness.device) if group is None else group
+    group = (
+        torch.zeros(len(brightness), dtype=torch.long, device=brightness.device) if group is None else group
+    )
     return [
         _fit(brightness[group == g], log_depth[group == g], sure[group == g])
         for g in range(int(group.max()) + 1)

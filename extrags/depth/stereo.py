@@ -141,7 +141,9 @@ def multi_view_stereo(
         shading[recording == g] = fit.log_depth(brightness[recording == g])
     found, matched, margins = [], [], []
     for number, part in enumerate(parts):
-        cost = costs[number] + _prior(shading[part], fits, recording[part], log_base[part], offsets[part], settings)
+        cost = costs[number] + _prior(
+            shading[part], fits, recording[part], log_base[part], offsets[part], settings
+        )
         costs[number] = torch.empty(0)
         smoothed = semi_global(cost, grey[part], small_step=settings.small_step, jump=settings.jump)
         log_depth = _log_depth(smoothed, log_base[part][:, None, None], offsets[part])

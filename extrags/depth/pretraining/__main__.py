@@ -68,13 +68,23 @@ def main() -> None:
 
     def told(iteration: int, means: dict[str, float]) -> None:
         if iteration % 500 == 0:
-            log.info("%d %s %.0f s", iteration, {k: round(v, 4) for k, v in means.items()}, time.monotonic() - begun)
+            log.info(
+                "%d %s %.0f s",
+                iteration,
+                {k: round(v, 4) for k, v in means.items()},
+                time.monotonic() - begun,
+            )
 
     network = train_completion(bank, settings, network, told=told, half=device.type == "cuda")
     scores = score(network, held_out.all_of_size())
     log.info("%s", scores)
     torch.save({k: v.cpu().half() for k, v in network.state_dict().items()}, options.folder / "completion.pt")
-    record = {"settings": asdict(settings), "examples": len(bank), "seed": options.seed, "scores": asdict(scores)}
+    record = {
+        "settings": asdict(settings),
+        "examples": len(bank),
+        "seed": options.seed,
+        "scores": asdict(scores),
+    }
     (options.folder / "completion.json").write_text(json.dumps(record, indent=1))
 
 

@@ -189,7 +189,9 @@ class Cavities:
     def _field(self, points: Tensor) -> Tensor:
         flat = points * torch.tensor([1.0, 1.0, 0.0], device=points.device)
         height = self.distance + self.relief_height * self.relief(flat)
-        inside = self._with_lumps(0.8 * (height - points[:, :, 2]), points - torch.nn.functional.pad(height[:, :, None], (2, 0)))
+        inside = self._with_lumps(
+            0.8 * (height - points[:, :, 2]), points - torch.nn.functional.pad(height[:, :, None], (2, 0))
+        )
         return torch.minimum(inside, self.to_instruments(points))
 
     def to_instruments(self, points: Float[Tensor, "c n 3"]) -> Float[Tensor, "c n"]:
@@ -211,7 +213,9 @@ class Cavities:
         elif self.kind == "airways":
             center = torch.stack([direction[:, :, 0], direction[:, :, 1], 3 + 3 * self.lumps[:, :, 2]], dim=2)
         else:
-            center = torch.stack([2 * self.lumps[:, :, 0], 2 * self.lumps[:, :, 1], 0 * direction[:, :, 2]], dim=2)
+            center = torch.stack(
+                [2 * self.lumps[:, :, 0], 2 * self.lumps[:, :, 1], 0 * direction[:, :, 2]], dim=2
+            )
         distance = (local[:, :, None] - center[:, None]).norm(dim=3) - self.lump_radius[:, None]
         nearest = distance.min(dim=2).values
         # A smooth minimum, so that bumps have a foot.
@@ -227,8 +231,13 @@ class Cavities:
         wander = self.uniform(0.0, 0.10, c, 2) * (speed / 0.1).clamp(0.3, 1.5)
         phase = self.uniform(0, 2 * math.pi, c, 4)
         rate = self.uniform(0.2, 1.2, c, 4)
-        sway = torch.stack([wander[:, :1] * torch.sin(rate[:, :1] * t + phase[:, :1]),
-                            wander[:, 1:] * torch.sin(rate[:, 1:2] * t + phase[:, 1:2])], dim=2)
+        sway = torch.stack(
+            [
+                wander[:, :1] * torch.sin(rate[:, :1] * t + phase[:, :1]),
+                wander[:, 1:] * torch.sin(rate[:, 1:2] * t + phase[:, 1:2]),
+            ],
+            dim=2,
+        )
         if self.kind in ("colon", "airways"):
             sign = torch.where(self.uniform(0, 1, c, 1) < 0.5, -1.0, 1.0)
             start = self.uniform(-2, 2, c, 1) if self.kind == "colon" else self.uniform(-1.5, 1.5, c, 1)
@@ -242,19 +251,25 @@ class Cavities:
         elif self.kind == "sac":
             heading = self.uniform(-1, 1, c, 1, 3)
             heading = heading / heading.norm(dim=2, keepdim=True)
-            position = self.uniform(-0.35, 0.35, c, 1, 3) * self.axes + heading * speed[:, :, None] * t[:, :, None]
+            position = (
+                self.uniform(-0.35, 0.35, c, 1, 3) * self.axes + heading * speed[:, :, None] * t[:, :, None]
+            )
             position = position + torch.nn.functional.pad(sway, (0, 1))
             forward = self.uniform(-1, 1, c, 1, 3).expand(c, frames, 3)
             tilt = self.uniform(-0.2, 0.2, c, 1, 2)
         else:
             heading = self.uniform(-1, 1, c, 1, 3) * torch.tensor([1.0, 1.0, 0.5], device=device)
-            position = heading * speed[:, :, None] * (t - frames / 2)[:, :, None] + torch.nn.functional.pad(sway, (0, 1))
+            position = heading * speed[:, :, None] * (t - frames / 2)[:, :, None] + torch.nn.functional.pad(
+                sway, (0, 1)
+            )
             # Some look at one place from different sides.
             aim = torch.cat([self.uniform(-0.3, 0.3, c, 1, 2), self.distance[:, :, None]], dim=2)
             around = (self.uniform(0, 1, c, 1, 1) < 0.5).float()
             forward = aim - around * position
             tilt = self.uniform(-0.4, 0.4, c, 1, 2)
-        drift = torch.stack([torch.sin(rate[:, 2:3] * t + phase[:, 2:3]), torch.sin(rate[:, 3:] * t + phase[:, 3:])], 2)
+        drift = torch.stack(
+            [torch.sin(rate[:, 2:3] * t + phase[:, 2:3]), torch.sin(rate[:, 3:] * t + phase[:, 3:])], 2
+        )
         tilt = tilt + self.uniform(0.0, 0.12, c, 1, 1) * drift
         return _looking(position, forward, tilt, self.uniform(0, 2 * math.pi, c, 1))
 
@@ -273,9 +288,15 @@ def _looking(position: Tensor, forward: Tensor, tilt: Tensor, roll: Tensor) -> T
     base = torch.stack([right, down, forward], dim=3)
     a, b, r = tilt[..., 0], tilt[..., 1], roll.expand(tilt.shape[:2])
     zero, one = torch.zeros_like(a), torch.ones_like(a)
-    yaw = torch.stack([a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos()], 2).unflatten(2, (3, 3))
-    pitch = torch.stack([one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos()], 2).unflatten(2, (3, 3))
-    spin = torch.stack([r.cos(), -r.sin(), zero, r.sin(), r.cos(), zero, zero, zero, one], 2).unflatten(2, (3, 3))
+    yaw = torch.stack([a.cos(), zero, a.sin(), zero, one, zero, -a.sin(), zero, a.cos()], 2).unflatten(
+        2, (3, 3)
+    )
+    pitch = torch.stack([one, zero, zero, zero, b.cos(), -b.sin(), zero, b.sin(), b.cos()], 2).unflatten(
+        2, (3, 3)
+    )
+    spin = torch.stack([r.cos(), -r.sin(), zero, r.sin(), r.cos(), zero, zero, zero, one], 2).unflatten(
+        2, (3, 3)
+    )
     pose = torch.eye(4, device=position.device).repeat(*position.shape[:2], 1, 1)
     pose[:, :, :3, :3] = base @ yaw @ pitch @ spin
     pose[:, :, :3, 3] = position

@@ -70,9 +70,7 @@ def make_examples(
     inputs = completion_inputs(frames, stereo, points)
     truth = torch.log(clips.depth.clamp_min(1e-6)) - inputs.log_scale[:, None, None]
     known = frames.mask & (clips.depth > 0)
-    return Examples(
-        inputs.channels.half(), torch.where(known, truth, 0.0).clamp(-4, 4).half(), known.half()
-    )
+    return Examples(inputs.channels.half(), torch.where(known, truth, 0.0).clamp(-4, 4).half(), known.half())
 
 
 def _searched(clips: Clips, scene: Cavities) -> tuple[Tensor, Tensor, Tensor]:
@@ -87,7 +85,11 @@ def _searched(clips: Clips, scene: Cavities) -> tuple[Tensor, Tensor, Tensor]:
     for first in range(0, n, v):
         part = slice(first, first + v)
         found = select_sources(
-            poses[part].astype(np.float64), K[part].astype(np.float64), clips.frames.size, typical[part], SOURCES
+            poses[part].astype(np.float64),
+            K[part].astype(np.float64),
+            clips.frames.size,
+            typical[part],
+            SOURCES,
         )
         chosen[part] = np.where(found >= 0, found + first, -1)
     sources = torch.from_numpy(chosen).to(device)

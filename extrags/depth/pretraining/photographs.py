@@ -52,7 +52,10 @@ class _Mucosa:
         self.vessels = [Waves.random(generator, c, low, high, slope=0.6, waves=20) for low, high in sizes]
         self.vessel_width = [uniform(0.05, 0.22, c, 1) for _ in sizes]
         self.vessel_strength = [uniform(0.0, 0.6, c, 1) * uniform(0.0, 1.0, c, 1) for _ in sizes]
-        self.mottle = [Waves.random(generator, c, low, high, slope=0.3, waves=32) for low, high in ((8.0, 30.0), (25.0, 90.0))]
+        self.mottle = [
+            Waves.random(generator, c, low, high, slope=0.3, waves=32)
+            for low, high in ((8.0, 30.0), (25.0, 90.0))
+        ]
         self.mottle_strength = [uniform(0.0, 0.12, c, 1) * uniform(0, 1, c, 1) for _ in range(2)]
         self.relief = Waves.random(generator, c, 15.0, 60.0, slope=0.8, waves=24)
         self.relief_strength = uniform(0.0, 0.35, c, 1)
@@ -72,9 +75,7 @@ class _Mucosa:
         return colour.clamp(0.01, 1.5)
 
 
-def photograph(
-    scene: Cavities, generator: torch.Generator, size: tuple[int, int], views: int
-) -> Clips:
+def photograph(scene: Cavities, generator: torch.Generator, size: tuple[int, int], views: int) -> Clips:
     """Make one clip in each scene; clips whose camera touches a wall or looks into nothing are left out.
 
     Args:
@@ -167,7 +168,9 @@ def _pixel_depth(depth: Tensor, hit: Tensor) -> tuple[Tensor, Tensor]:
 
 def _field_of_view(scene: Cavities, height: int, width: int) -> Bool[Tensor, "c h w"]:
     rows, columns = torch.meshgrid(
-        torch.arange(height, device=scene.device) + 0.5, torch.arange(width, device=scene.device) + 0.5, indexing="ij"
+        torch.arange(height, device=scene.device) + 0.5,
+        torch.arange(width, device=scene.device) + 0.5,
+        indexing="ij",
     )
     radius = scene.uniform(0.42, 1.4, scene.scenes, 1, 1) * width
     return (columns - width / 2).square() + (rows - height / 2).square() < radius.square()
@@ -179,7 +182,9 @@ class _Lamps:
     def __init__(self, scene: Cavities) -> None:
         c, uniform = scene.scenes, scene.uniform
         self.offset = uniform(-0.2, 0.2, c, 3, 3) * torch.tensor([1.0, 1.0, 0.15], device=scene.device)
-        self.power = torch.cat([torch.ones(c, 1, device=scene.device), uniform(-1, 1, c, 2).clamp_min(0)], dim=1)
+        self.power = torch.cat(
+            [torch.ones(c, 1, device=scene.device), uniform(-1, 1, c, 2).clamp_min(0)], dim=1
+        )
         self.spread = uniform(0.0, 2.5, c, 1)
         self.around = uniform(0.0, 0.3, c, 1)
         self.shine = uniform(0.0, 0.6, c, 1) * uniform(0, 1, c, 1)
@@ -252,7 +257,9 @@ class _Sensor:
         brightness = radiance.mean(2).flatten(2)
         per_view = brightness.kthvalue(int(0.75 * brightness.shape[2]), dim=2).values.clamp_min(1e-6)
         common = per_view.mean(1, keepdim=True)
-        gain = self.target / (self.automatic * per_view + (1 - self.automatic) * common) * torch.exp(self.drift)
+        gain = (
+            self.target / (self.automatic * per_view + (1 - self.automatic) * common) * torch.exp(self.drift)
+        )
         y = ((torch.arange(height, device=radiance.device) + 0.5) / height * 2 - 1)[:, None]
         x = ((torch.arange(width, device=radiance.device) + 0.5) / width * 2 - 1)[None]
         shade = 1 - self.vignetting[:, None, None] * 0.5 * (x.square() + y.square())
@@ -273,6 +280,10 @@ def _blur(images: Tensor, sigma: Tensor) -> Tensor:
     kernel = torch.exp(-0.5 * (taps / sigma.clamp_min(0.05)[:, None]).square())
     kernel = kernel / kernel.sum(1, keepdim=True)
     flat = images.permute(1, 2, 0, 3, 4).reshape(views * channels, c, height, width)
-    flat = functional.conv2d(functional.pad(flat, (2, 2, 0, 0), mode="replicate"), kernel[:, None, None], groups=c)
-    flat = functional.conv2d(functional.pad(flat, (0, 0, 2, 2), mode="replicate"), kernel[:, None, :, None], groups=c)
+    flat = functional.conv2d(
+        functional.pad(flat, (2, 2, 0, 0), mode="replicate"), kernel[:, None, None], groups=c
+    )
+    flat = functional.conv2d(
+        functional.pad(flat, (0, 0, 2, 2), mode="replicate"), kernel[:, None, :, None], groups=c
+    )
     return flat.reshape(views, channels, c, height, width).permute(2, 0, 1, 3, 4)

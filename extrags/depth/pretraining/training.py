@@ -144,7 +144,9 @@ def train_completion(
         with torch.autocast(device.type, torch.bfloat16, enabled=half):
             log_depth, log_error = network(channels)
         terms = completion_loss(log_depth, log_error, truth, known)
-        loss = terms["depth"] + settings.slope_weight * terms["slope"] + settings.error_weight * terms["error"]
+        loss = (
+            terms["depth"] + settings.slope_weight * terms["slope"] + settings.error_weight * terms["error"]
+        )
         optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -207,5 +209,3 @@ def score(network: CompletionNetwork, examples: list[Examples], chunk: int = 32)
         float(correlation),
         float(error.mean() / told.mean()),
     )
-
-
