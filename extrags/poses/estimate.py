@@ -22,6 +22,7 @@ from extrags.poses.registration_report import (
 from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import depth_scale
 from extrags.sequence import EndoscopicSequence, ScaleSource, Split
+from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 
 __all__ = ["PoseEstimate", "estimate_poses", "with_estimated_poses"]
 
@@ -108,7 +109,8 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     frames alone; the largest model counts. Held-out frames are registered afterwards against the finished
     map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the millimetre
     (`extrags.poses.depth_scale`); where it has none and `config.working_distance_mm` is given, the median
-    depth of the points in the frames that observe them becomes that. COLMAP runs in a process of its own.
+    depth of the pixels, interpolated between the points that a frame observes, becomes that. COLMAP runs in
+    a process of its own.
 
     *Colour and depth* (`extrags.poses.rgbd`): where the sequence has depth and COLMAP registers too few
     training frames, unless `config.fallback` says `never`; or from the start if it says `rgbd`. Again
@@ -194,7 +196,10 @@ def _from_colmap(
         mm_per_unit, scale_source = scale.mm_per_unit, "depth"
         report["scale"] = asdict(scale)
     elif config.working_distance_mm is not None:
-        mm_per_unit, scale_source = _told_scale(poses, result, config.working_distance_mm), "working_distance"
+        mm_per_unit, scale_source = (
+            _told_scale(sequence, poses, result, config.working_distance_mm),
+            "working_distance",
+        )
         report["scale"] = {"mm_per_unit": mm_per_unit, "working_distance_mm": config.working_distance_mm}
     if mm_per_unit is not None:
         poses[:, :3, 3] *= mm_per_unit
@@ -213,11 +218,23 @@ def _from_colmap(
     )
 
 
-def _told_scale(poses: np.ndarray, result: PoseJobResult, working_distance_mm: float) -> float:
-    """Millimetres per unit, so that points are so far from the frames that observe them, in the median."""
+def _told_scale(
+    sequence: EndoscopicSequence, poses: np.ndarray, result: PoseJobResult, working_distance_mm: float
+) -> float:
+    """Millimetres per unit, so that surface is so far from the training frames, in the median over pixels.
+
+    Over pixels and not over points: points lie where features are, in a tube mostly far away. Depth is
+    interpolated between the points that each frame observes.
+    """
     pose = poses[result.observed_frame]
     z = np.einsum("oi,oi->o", pose[:, :3, 2], result.points[result.observed_point] - pose[:, :3, 3])
-    return working_distance_mm / float(np.median(z[z > 0]))
+    found = []
+    for frame in np.unique(result.observed_frame):
+        rows = (result.observed_frame == frame) & (z > 0)
+        if rows.sum() >= MIN_POINTS_PER_VIEW:
+            lattice = pixel_lattice(sequence.mask[frame])
+            found.append(interpolated_depth(result.observed_px[rows], z[rows], lattice))
+    return working_distance_mm / float(np.median(np.concatenate(found) if found else z[z > 0]))
 
 
 def _by_depth(

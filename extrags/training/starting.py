@@ -14,6 +14,7 @@ from extrags.errors import CaptureError
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.sequence import EndoscopicSequence
+from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 from extrags.training.random_start import depth_range, random_depth
 
 __all__ = [
@@ -30,8 +31,8 @@ _log = logging.getLogger(__name__)
 NORMAL_NEIGHBOURS = 12
 """Points beside a point whose plane gives its normal."""
 
-MIN_POINTS_PER_VIEW = 20
-"""A view with fewer visible sparse points gives no interpolated depth."""
+MEASURED_FRAMES = 40
+"""Frames at most whose interpolated depth gives the length scale of a scene of sparse points."""
 
 SURFACE_OPACITY, RANDOM_OPACITY = 0.5, 0.1
 """Opacity at the start: on a known surface, and at random points, which must not hide each other."""
@@ -40,7 +41,7 @@ SURFACE_OPACITY, RANDOM_OPACITY = 0.5, 0.1
 def median_depth(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> float:
     """Median distance from lens to surface over frames, in world units: the scene's length scale.
 
-    From depth, else from sparse points, else from where the cameras stand and look
+    From depth, else interpolated between sparse points, else from where the cameras stand and look
     (`extrags.training.random_start.depth_range`).
 
     Raises:
@@ -50,9 +51,16 @@ def median_depth(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> 
     if depth is not None:
         return float(np.median(depth[(depth > 0) & sequence.mask[frames]]))
     if sequence.points is not None and len(sequence.points) >= MIN_POINTS_PER_VIEW:
-        _, z = sequence.cameras[frames].project(sequence.points)
-        if (z > 0).any():
-            return float(np.median(z[z > 0]))
+        found = []
+        chosen = np.linspace(0, len(frames) - 1, min(len(frames), MEASURED_FRAMES)).round().astype(np.int64)
+        for frame in frames[chosen]:
+            pixels, z, inside = _seen(sequence, int(frame))
+            if inside.sum() >= MIN_POINTS_PER_VIEW:
+                # Not of the points themselves: they lie where features are, and mostly far down a tube.
+                lattice = pixel_lattice(sequence.mask[frame])
+                found.append(interpolated_depth(pixels[inside], z[inside], lattice))
+        if found:
+            return float(np.median(np.concatenate(found)))
     return depth_range(sequence.cameras[frames], sequence.name).typical
 
 
@@ -204,8 +212,6 @@ def depth_from_points(
     Raises:
         CaptureError: when no frame sees enough points.
     """
-    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-
     points = sequence.points
     if points is None or len(points) < MIN_POINTS_PER_VIEW:
         raise CaptureError(
@@ -213,18 +219,17 @@ def depth_from_points(
             f"at least {MIN_POINTS_PER_VIEW} are needed to start the reconstruction"
         )
     depth = np.zeros(sequence.rgb.shape[:3], np.float32)
-    u, v = np.meshgrid(np.arange(sequence.width) + 0.5, np.arange(sequence.height) + 0.5)
+    everywhere = np.stack(
+        np.meshgrid(np.arange(sequence.width) + 0.5, np.arange(sequence.height) + 0.5), axis=-1
+    )
     used = 0
     for frame in frames:
         pixels, z, inside = _seen(sequence, int(frame))
         if inside.sum() < MIN_POINTS_PER_VIEW:
             continue
         used += 1
-        # Inverse depth is linear across a plane in the image; depth is not.
-        linear = LinearNDInterpolator(pixels[inside], 1 / z[inside])(u, v)
-        nearest = NearestNDInterpolator(pixels[inside], 1 / z[inside])(u, v)
-        inverse = np.where(np.isfinite(linear), linear, nearest)
-        depth[frame] = np.where(sequence.mask[frame], 1 / inverse, 0)
+        found = interpolated_depth(pixels[inside], z[inside], everywhere)
+        depth[frame] = np.where(sequence.mask[frame], found, 0)
     if used == 0:
         raise CaptureError(
             f"{sequence.name}: no training frame sees {MIN_POINTS_PER_VIEW} of the "

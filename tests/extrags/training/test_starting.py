@@ -79,6 +79,11 @@ class TestStartingGaussians:
         points = np.stack([10 * np.cos(angle), 10 * np.sin(angle), along], axis=1)
         sparse = replace(tube_sequence, depth_mm=None, points=points)
         depth = depth_from_points(sparse, sparse.train)
+        assert not starts_at_random(sparse, sparse.train)
+        # Of the surface in view, not of the points, of which most are far down the tube.
+        assert median_depth(sparse, sparse.train) == pytest.approx(
+            float(np.median(depth[sparse.train][sparse.mask[sparse.train]])), rel=0.05
+        )
         truth = tube_sequence.depth_mm
         assert truth is not None
         both = (truth[sparse.train] > 0) & (truth[sparse.train] < 30)
