@@ -11,6 +11,7 @@ so that where stereo is right there is nothing to be learned but the weight one.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -131,10 +132,10 @@ class CompletionNetwork(nn.Module):
         self.down = nn.ModuleList(_Block(width, width) for width in widths)
         self.coarser = nn.ModuleList(
             nn.Conv2d(fine, coarse, 3, stride=2, padding=1)
-            for fine, coarse in zip(widths[:-1], widths[1:], strict=True)
+            for fine, coarse in itertools.pairwise(widths)
         )
         self.finer = nn.ModuleList(
-            nn.Conv2d(coarse, fine, 1) for fine, coarse in zip(widths[:-1], widths[1:], strict=True)
+            nn.Conv2d(coarse, fine, 1) for fine, coarse in itertools.pairwise(widths)
         )
         self.up = nn.ModuleList(_Block(2 * width, width) for width in widths[:-1])
         self.norm = nn.GroupNorm(NORM_GROUPS, widths[0])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
@@ -253,7 +252,7 @@ class _Sensor:
         self.blur = uniform(0.0, 0.8, c)
 
     def develop(self, radiance: Tensor, generator: torch.Generator) -> Tensor:
-        c, views, _, height, width = radiance.shape
+        _c, _views, _, height, width = radiance.shape
         brightness = radiance.mean(2).flatten(2)
         per_view = brightness.kthvalue(int(0.75 * brightness.shape[2]), dim=2).values.clamp_min(1e-6)
         common = per_view.mean(1, keepdim=True)

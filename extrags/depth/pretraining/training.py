@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from extrags.depth.completion import RAYS, RGB, STEREO, CompletionNetwork, completion_loss
@@ -159,7 +158,7 @@ def train_completion(
             sums[name] = sums.get(name, torch.zeros((), device=device)) + value.detach()
         if (iteration + 1) % 100 == 0:
             means = {name: float(value) / 100 for name, value in sums.items()}
-            if not all(map(lambda mean: mean == mean and abs(mean) < 1e6, means.values())):
+            if not all(mean == mean and abs(mean) < 1e6 for mean in means.values()):
                 raise DivergedError(f"pretraining of the depth completion: loss {means} at {iteration + 1}")
             sums = {}
             if told is not None:
