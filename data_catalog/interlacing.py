@@ -7,7 +7,8 @@ picture of one moment they never do, over more than a few pixels.
 A woven picture shows two camera poses at once. It is replaced by the half picture of one moment, its missing
 lines interpolated: half the vertical detail, but one pose.
 
-Source: the comb test of De Haan and Bellers, "Deinterlacing - an overview", Proceedings of the IEEE 1998.
+Source: De Haan and Bellers, "Deinterlacing - an overview", Proceedings of the IEEE 1998, on what
+interpolation inside one half picture keeps and loses.
 """
 
 from __future__ import annotations

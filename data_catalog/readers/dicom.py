@@ -13,7 +13,7 @@ Rate or Recommended Display Frame Rate. Pixels that are not square stay as they 
 Nothing of a file but its pixels, their format and their timing is looked at: names and dates of patients stay
 where they are. What is burnt into the picture is masked as in a video, not removed.
 
-Source: DICOM PS3.3 (C.7.6.3, C.7.6.5) and PS3.5 (annex A).
+Format: DICOM PS3.3 (C.7.6.3, C.7.6.5) and PS3.5 (annex A).
 """
 
 from __future__ import annotations

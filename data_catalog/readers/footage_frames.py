@@ -25,7 +25,7 @@ from data_catalog.readers.frames_folder import read_intrinsics
 from data_catalog.sampling import Sampling
 from data_catalog.survey import Shot, Survey, choose_frames, survey
 from extrags.config import IngestConfig
-from extrags.errors import SourceError
+from extrags.errors import ConfigError, SourceError
 
 __all__ = ["MAX_FRAMES", "footage_frames"]
 
@@ -48,9 +48,12 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
         config: number of frames, and the part in seconds.
 
     Raises:
+        ConfigError: a part that ends before it begins.
         SourceError: damaged, empty in that part, or a picture that hardly moves.
     """
     file = footage.file
+    if config.end_s is not None and config.end_s <= config.start_s:
+        raise ConfigError(f"ingest.end_s = {config.end_s:g} is not after ingest.start_s = {config.start_s:g}")
     span = TimeSpan(config.start_s, np.inf if config.end_s is None else config.end_s)
     found = survey(footage.frames(span), file=file, announced=footage.announced, span=span)
     shot = found.longest_shot()

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator
 
 from extrags.config.base import StageConfig
 from extrags.config.baselines import UcNerfConfig
@@ -79,12 +79,6 @@ class IngestConfig(StageConfig):
         description="horizontal field of view of the pinhole that distorted sources are resampled to; None: "
         "the source's usual one (C3VD and C3VDv2 100; others: that of their central resolution)",
     )
-
-    @model_validator(mode="after")
-    def _ends_after_its_start(self) -> IngestConfig:
-        if self.end_s is not None and self.end_s <= self.start_s:
-            raise ValueError(f"end_s = {self.end_s:g} is not after start_s = {self.start_s:g}")
-        return self
 
 
 class PosesConfig(StageConfig):
