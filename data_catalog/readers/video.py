@@ -5,9 +5,10 @@ optional: `intrinsics.json` and `mask.png`, as in `data_catalog.readers.frames_f
 field of view of 90 degrees is assumed and said so, without the second the picture's outline and burnt-in text
 are found. How frames are chosen: `data_catalog.readers.footage_frames`.
 
-Frames are decoded by OpenCV's FFmpeg: upright (a rotation in the container is applied), 8 bit a channel
+Frames are decoded by FFmpeg through PyAV: upright (a rotation in the container is applied), 8 bit a channel
 whatever the depth of the file, at the timestamps of the container, which may be uneven. Pixels that are not
-square (standard definition) stay as they are; the intrinsics say so.
+square (standard definition) stay as they are; the intrinsics say so. OpenCV's own FFmpeg would not do: of
+every video whose header says that it is interlaced, OpenCV 5.0 gives empty pictures, without an error.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".mxf", ".y4m")
 _MIN_DECODED = 0.9
-_QUARTER_TURNS = (90, 270)
+_USUAL_FRAMES_PER_S = 25.0
 
 
 class VideoFile:
@@ -50,20 +51,23 @@ class VideoFile:
     """
 
     def __init__(self, file: Path, *, named: Path | None = None) -> None:
-        import cv2
-
         self._stream = file
         self._file = named or file
-        with _opened(file, self._file) as video:
-            # Some containers say nothing, which reads as a negative number.
-            self._announced = max(0, int(video.get(cv2.CAP_PROP_FRAME_COUNT)))
-            self._frames_per_s = float(video.get(cv2.CAP_PROP_FPS))
-            across, down = video.get(cv2.CAP_PROP_SAR_NUM), video.get(cv2.CAP_PROP_SAR_DEN)
-            aspect = float(across / down) if across > 0 and down > 0 else 1.0
-            turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META)) % 360
-        self._pixel_aspect = 1 / aspect if turned in _QUARTER_TURNS else aspect
-        if turned:
-            logger.info("%s: turned by %d degrees, as the file says", self._file.name, turned)
+        with _opened(self._stream, self._file) as (container, stream):
+            self._frames_per_s = float(stream.average_rate or stream.guessed_rate or 0)
+            duration_s = container.duration / 1e6 if container.duration else 0.0
+            # Where the container does not count its frames, what a steady rate would give.
+            self._announced = stream.frames or round(duration_s * self._frames_per_s)
+            self._start_s = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
+            aspect = float(stream.sample_aspect_ratio or 1)
+            turned_deg = next((frame.rotation for frame in _decoded(container, stream)), 0)
+        # Counterclockwise, as numpy turns.
+        self._quarter_turns = round(turned_deg / 90) % 4
+        self._pixel_aspect = 1 / aspect if self._quarter_turns % 2 else aspect
+        if self._quarter_turns:
+            logger.info(
+                "%s: turned by %d degrees, as the file says", self._file.name, -90 * self._quarter_turns % 360
+            )
 
     @property
     def file(self) -> Path:
@@ -93,45 +97,41 @@ class VideoFile:
         Raises:
             SourceError: the video ends before its end.
         """
-        import cv2
-
         last = None if numbers is None else max(numbers, default=-1)
         count, time_s = 0, 0.0
-        with _opened(self._stream, self._file) as video:
-            while (last is None or count <= last) and video.grab():
+        with _opened(self._stream, self._file) as (container, stream):
+            for frame in _decoded(container, stream):
                 number, count = count, count + 1
-                time_s = self._time_s(number, video.get(cv2.CAP_PROP_POS_MSEC) / 1000)
-                if time_s >= span.end_s:
+                time_s = self._time_s(number, frame.time)
+                if time_s >= span.end_s or (last is not None and number > last):
                     return
-                if time_s not in span or (numbers is not None and number not in numbers):
-                    continue
-                there, image = video.retrieve()
-                if there:
-                    yield FootageFrame(number, time_s, np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)))
+                if time_s in span and (numbers is None or number in numbers):
+                    rgb = np.rot90(frame.to_ndarray(format="rgb24"), self._quarter_turns)
+                    yield FootageFrame(number, time_s, np.ascontiguousarray(rgb))
         if numbers is None:
             self._check_whole(count, time_s)
 
-    def _time_s(self, number: int, told_s: float) -> float:
+    def _time_s(self, number: int, told_s: float | None) -> float:
         """The container's timestamp; where it has none, frames follow evenly."""
-        if told_s > 0 or number == 0 or self._frames_per_s <= 0:
-            return told_s
-        return number / self._frames_per_s
+        if told_s is None:
+            return number / (self._frames_per_s or _USUAL_FRAMES_PER_S)
+        return told_s - self._start_s
 
     def _check_whole(self, count: int, time_s: float) -> None:
         """Compare with the header, in frames and in seconds.
 
-        Where the frame rate varies, some containers announce the frames that a steady rate would have.
+        Where the frame rate varies, the number of frames may be that of a steady rate.
         """
-        if count == 0 or self._announced == 0 or count >= _MIN_DECODED * self._announced:
+        if count == 0 or count >= _MIN_DECODED * self._announced:
             return
-        step_s = 1 / self._frames_per_s if self._frames_per_s > 0 else 0.0
-        if time_s + step_s < _MIN_DECODED * self._announced * step_s or step_s == 0:
+        step_s = 1 / self._frames_per_s if self._frames_per_s else 0.0
+        # Not the container's duration: of some truncated files it is estimated from what is left.
+        if step_s == 0 or time_s + step_s < _MIN_DECODED * self._announced * step_s:
             raise SourceError(
                 f"{self._announced} frames announced, {count} decoded: the video is truncated or damaged",
                 file=self._file,
                 frame=count,
             )
-        logger.info("%s: %d frames announced, %d found", self._file.name, self._announced, count)
 
 
 def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
@@ -184,19 +184,37 @@ READER = FolderReader(
 
 
 @contextmanager
-def _opened(file: Path, named: Path) -> Iterator[Any]:
-    import cv2
+def _opened(file: Path, named: Path) -> Iterator[tuple[Any, Any]]:
+    """A container and the first stream of pictures in it."""
+    import av
 
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=named)
-    video = cv2.VideoCapture(str(file), cv2.CAP_FFMPEG)
+    problem = f"cannot be opened as a video ({file.stat().st_size} bytes); is it whole?"
     try:
-        if not video.isOpened():
-            raise SourceError(
-                f"cannot be opened as a video ({file.stat().st_size} bytes); is it whole?", file=named
-            )
-        # As is usual; said here because sizes and masks rest on it.
-        video.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-        yield video
-    finally:
-        video.release()
+        container = av.open(str(file))
+    except av.error.FFmpegError as error:
+        raise SourceError(problem, file=named) from error
+    with container:
+        if not container.streams.video:
+            raise SourceError(problem, file=named)
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        yield container, stream
+
+
+def _decoded(container: Any, stream: Any) -> Iterator[Any]:
+    """Frames one after another; what is damaged is passed over, as players do."""
+    from av.error import FFmpegError
+
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets)
+        except (StopIteration, FFmpegError):
+            return
+        try:
+            frames = packet.decode()
+        except FFmpegError:
+            continue
+        yield from frames

@@ -24,6 +24,21 @@ def write_video(file: Path, frames: np.ndarray, code: str = "FFV1") -> Path:
     return file
 
 
+def write_flagged(file: Path, woven: np.ndarray) -> Path:
+    """MPEG-2 whose header says that it is interlaced, as recorders write it."""
+    import av
+
+    with av.open(str(file), "w") as container:
+        options = {"flags": "+ildct+ilme", "b": "8000000"}
+        stream = container.add_stream("mpeg2video", rate=25, options=options)
+        stream.height, stream.width = woven.shape[1:3]
+        stream.pix_fmt = "yuv420p"
+        for image in woven:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+        container.mux(stream.encode())
+    return file
+
+
 def write_ten_bit(file: Path, frames: np.ndarray, *, pixel_aspect: str = "1:1") -> Path:
     """YUV4MPEG2 with 10 bits a channel and halved chroma, limited range."""
     height, width = frames.shape[1:3]
