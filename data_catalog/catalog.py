@@ -1,7 +1,7 @@
 """The catalogue: names to sources, sources to sequences, and what a source is to a cache.
 
-A sequence is named `DATASET/SEQUENCE[@SETTING]` or is a path to a folder or a video. The datasets are asked
-in order; what each of them knows stands in its own module.
+A sequence is named `DATASET/SEQUENCE[@SETTING]` or is a path to a folder, a video or a DICOM file. The
+datasets are asked in order; what each of them knows stands in its own module.
 """
 
 from __future__ import annotations
@@ -49,8 +49,9 @@ def resolve(name_or_path: str | Path) -> Source:
 
     Args:
         name_or_path: `phantom/3@sparse` (without a setting: `sparse`), `sinus/hopkins`, `simcol3d/s1`,
-            `c3vdv2/c1_cecum_t1@sparse`, `FOLDER/c1_cecum_t1@sparse` for videos in a folder of their own, or
-            a path to a folder or a video. A path that exists wins over a name spelled the same.
+            `c3vdv2/c1_cecum_t1@sparse`, `FOLDER/SCENE@sparse` for videos in a folder of their own
+            (`SCENE_v1`, `SCENE_v2`; registered or not), or a path to a folder, a video or a DICOM file. A
+            path that exists wins over a name spelled the same.
 
     Raises:
         UnknownSequenceError: neither a known name nor an existing path; suggests the nearest name.

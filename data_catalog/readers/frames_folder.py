@@ -91,7 +91,7 @@ class _ContentMask:
 
 READER = FolderReader(
     name="frames",
-    version=2,
+    version=3,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
@@ -100,13 +100,16 @@ READER = FolderReader(
 )
 
 
-def read_intrinsics(folder: Path, width: int, height: int) -> Float[np.ndarray, "3 3"]:
+def read_intrinsics(
+    folder: Path, width: int, height: int, *, pixel_aspect: float = 1.0
+) -> Float[np.ndarray, "3 3"]:
     """K from `intrinsics.json` in a folder, or of the assumed field of view where there is none.
 
     Args:
         folder: where the file is looked for.
         width: of the images it belongs to, in pixels.
         height: of the images it belongs to, in pixels.
+        pixel_aspect: width of a pixel over its height, for intrinsics from a field of view.
 
     Raises:
         SourceError: the file is damaged or describes no pinhole.
@@ -118,7 +121,7 @@ def read_intrinsics(folder: Path, width: int, height: int) -> Float[np.ndarray, 
             folder.name,
             ASSUMED_FIELD_OF_VIEW_DEG,
         )
-        return _from_field_of_view(ASSUMED_FIELD_OF_VIEW_DEG, width, height)
+        return _from_field_of_view(ASSUMED_FIELD_OF_VIEW_DEG, width, height, pixel_aspect)
     try:
         content = json.loads(file.read_text())
         if "K" in content:
@@ -131,7 +134,7 @@ def read_intrinsics(folder: Path, width: int, height: int) -> Float[np.ndarray, 
                     file=file,
                     field="field_of_view_deg",
                 )
-            K = _from_field_of_view(angle, width, height)
+            K = _from_field_of_view(angle, width, height, pixel_aspect)
         else:
             fx, fy, cx, cy = (float(content[key]) for key in ("fx", "fy", "cx", "cy"))
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
@@ -145,6 +148,8 @@ def read_intrinsics(folder: Path, width: int, height: int) -> Float[np.ndarray, 
     return K
 
 
-def _from_field_of_view(angle_deg: float, width: int, height: int) -> Float[np.ndarray, "3 3"]:
+def _from_field_of_view(
+    angle_deg: float, width: int, height: int, pixel_aspect: float
+) -> Float[np.ndarray, "3 3"]:
     focal = width / 2 / np.tan(np.radians(angle_deg) / 2)
-    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return np.array([[focal, 0, width / 2], [0, focal * pixel_aspect, height / 2], [0, 0, 1.0]])

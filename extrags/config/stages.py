@@ -78,6 +78,12 @@ class IngestConfig(StageConfig):
         description="millimetres per unit of the source's poses, where their unit is arbitrary; None: it "
         "stays arbitrary",
     )
+    start_s: float = Field(
+        0.0, ge=0, description="of a video or DICOM file: read from here on, in seconds by its timestamps"
+    )
+    end_s: float | None = Field(
+        None, gt=0, description="of a video or DICOM file: read up to here, in seconds; None: to its end"
+    )
     field_of_view_deg: float | None = Field(
         None,
         ge=20,
