@@ -131,12 +131,9 @@ class CompletionNetwork(nn.Module):
         self.entrance = nn.Conv2d(INPUT_CHANNELS, widths[0], 3, padding=1)
         self.down = nn.ModuleList(_Block(width, width) for width in widths)
         self.coarser = nn.ModuleList(
-            nn.Conv2d(fine, coarse, 3, stride=2, padding=1)
-            for fine, coarse in itertools.pairwise(widths)
+            nn.Conv2d(fine, coarse, 3, stride=2, padding=1) for fine, coarse in itertools.pairwise(widths)
         )
-        self.finer = nn.ModuleList(
-            nn.Conv2d(coarse, fine, 1) for fine, coarse in itertools.pairwise(widths)
-        )
+        self.finer = nn.ModuleList(nn.Conv2d(coarse, fine, 1) for fine, coarse in itertools.pairwise(widths))
         self.up = nn.ModuleList(_Block(2 * width, width) for width in widths[:-1])
         self.norm = nn.GroupNorm(NORM_GROUPS, widths[0])
         self.exit = nn.Conv2d(widths[0], 6, 3, padding=1)

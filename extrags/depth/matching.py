@@ -9,19 +9,22 @@ be finer.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
 from extrags.depth.frames import PosedFrames, source_from_reference
 
-__all__ = ["matching_cost", "semi_global", "sub_step"]
+__all__ = ["best_steps", "centred_brightness", "kept_sources", "matching_cost", "semi_global", "sub_step"]
 
 VARIANCE_FLOOR = 2e-4
 """Added to variances of log-brightness: noise of a few grey levels correlates with nothing."""
 
 NEUTRAL_COST = 1.0
 """Of a hypothesis that a source does not see: that of no correlation at all."""
+
+ABSENT_COST = 9.0
+"""Above any cost there is."""
 
 MIN_WINDOW_SHARE = 0.5
 """A window counts when at least so much of it is valid in both frames."""
@@ -55,12 +58,12 @@ def matching_cost(
     height, width = frames.size
     grey = frames.grey()
     mask = frames.mask.float()
-    reference, own = grey[references], mask[references]
-    centred = (reference - _box(reference * own, radius_px) / _box(own, radius_px).clamp_min(1e-6)) * own
+    own = mask[references]
+    centred = centred_brightness(grey, frames.mask, references, radius_px)
     rays = frames.rays()[references]
     costs = torch.empty(len(references), offsets.shape[1], height, width, device=grey.device)
     present = sources >= 0
-    kept = torch.clamp(torch.ceil(best_share * present.sum(1)), min=1).long()
+    kept = kept_sources(sources, best_share)
     motions = [
         source_from_reference(frames, references, sources[:, s].clamp_min(0)) for s in range(sources.shape[1])
     ]
@@ -82,12 +85,28 @@ def matching_cost(
             )
             both = own * (inside & (sampled[:, 1] > 0.99)) * present[:, s, None, None]
             other = sampled[:, 0]
-            per_source.append(_one_minus_zncc(centred, other, both, radius_px))
+            cost = _one_minus_zncc(centred, other, both, radius_px)
+            # An absent source is sorted last, where it is never kept.
+            per_source.append(torch.where(present[:, s, None, None], cost, ABSENT_COST))
         stacked = torch.stack(per_source, dim=1).sort(dim=1).values
         ranks = torch.arange(sources.shape[1], device=grey.device)
         weight = (ranks[None] < kept[:, None]).float() / kept[:, None]
         costs[:, step] = torch.einsum("bshw,bs->bhw", stacked, weight)
     return costs
+
+
+def centred_brightness(
+    grey: Float[Tensor, "f h w"], mask: Bool[Tensor, "f h w"], references: Int[Tensor, "b"], radius_px: int
+) -> Float[Tensor, "b h w"]:
+    """Brightness less its local mean, zero outside the mask: products of it lose no digits."""
+    reference, own = grey[references], mask[references].float()
+    mean = _box(reference * own, radius_px) / _box(own, radius_px).clamp_min(1e-6)
+    return (reference - mean) * own
+
+
+def kept_sources(sources: Int[Tensor, "b s"], best_share: float) -> Int[Tensor, "b"]:
+    """How many of a reference's sources are averaged."""
+    return torch.clamp(torch.ceil(best_share * (sources >= 0).sum(1)), min=1).long()
 
 
 def _one_minus_zncc(a: Tensor, b: Tensor, both: Tensor, radius_px: int) -> Tensor:
@@ -172,6 +191,18 @@ def semi_global(
             summed[:, :, line] += path
             previous = path
     return total / len(_DIRECTIONS)
+
+
+def best_steps(
+    cost: Float[Tensor, "b d h w"],
+    grey: Float[Tensor, "b h w"],
+    *,
+    small_step: float,
+    jump: float,
+    edge: float = 0.15,
+) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w"], Float[Tensor, "b h w"]]:
+    """`sub_step` of what `semi_global` makes of the costs; arguments and results are theirs."""
+    return sub_step(semi_global(cost, grey, small_step=small_step, jump=jump, edge=edge))
 
 
 def sub_step(

@@ -12,13 +12,16 @@ from torch.nn import functional
 
 from extrags.depth.consistency import agreement
 from extrags.depth.frames import PosedFrames
-from extrags.depth.matching import matching_cost, semi_global, sub_step
+from extrags.depth import matching, native
 from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
 
 __all__ = ["StereoDepth", "StereoSettings", "multi_view_stereo"]
 
 SATURATED = 0.97
 """Brightness above which a pixel says nothing about its distance."""
+
+COST_LEVELS = 127.5
+"""Levels per unit of the costs that are kept as bytes."""
 
 SURE_AGREEMENT = 1.5
 """Sources that must agree with a depth for the fit of the shading, together with the frame's own."""
@@ -121,13 +124,17 @@ def multi_view_stereo(
     log_base = 0.5 * (near.log() + far.log())
     offsets = 0.5 * (far.log() - near.log())[:, None] * steps[None]
     parts = torch.arange(n, device=device).split(chunk)
+    kernels = native if device.type == "cpu" else matching
     costs, first = [], []
     for part in parts:
         base = log_base[part].exp()[:, None, None].expand(-1, *frames.size)
         cost = _cost(frames, part, sources, base, offsets[part], settings)
-        costs.append(cost)
-        smoothed = semi_global(cost, grey[part], small_step=settings.small_step, jump=settings.jump)
-        first.append(_log_depth(smoothed, log_base[part][:, None, None], offsets[part]))
+        # A byte is fine enough for what is only ranked again, and many frames are kept.
+        costs.append((cost * COST_LEVELS).round().clamp(0, 255).to(torch.uint8))
+        position, _, _ = kernels.best_steps(
+            cost, grey[part], small_step=settings.small_step, jump=settings.jump
+        )
+        first.append(_log_depth(position, log_base[part][:, None, None], offsets[part]))
         if told is not None:
             told(len(part))
     depth = torch.cat(first).exp()
@@ -141,24 +148,25 @@ def multi_view_stereo(
         shading[recording == g] = fit.log_depth(brightness[recording == g])
     found, matched, margins = [], [], []
     for number, part in enumerate(parts):
-        cost = costs[number] + _prior(
-            shading[part], fits, recording[part], log_base[part], offsets[part], settings
-        )
+        cost = costs[number].float() / COST_LEVELS
+        cost += _prior(shading[part], fits, recording[part], log_base[part], offsets[part], settings)
         costs[number] = torch.empty(0)
-        smoothed = semi_global(cost, grey[part], small_step=settings.small_step, jump=settings.jump)
-        log_depth = _log_depth(smoothed, log_base[part][:, None, None], offsets[part])
-        margins.append(sub_step(smoothed)[2])
+        position, _, margin = kernels.best_steps(
+            cost, grey[part], small_step=settings.small_step, jump=settings.jump
+        )
+        margins.append(margin)
+        log_depth = _log_depth(position, log_base[part][:, None, None], offsets[part])
         surface = _median(log_depth, frames.mask[part])
         step = offsets[part][:, 1] - offsets[part][:, 0]
         finer = torch.linspace(-1, 1, settings.refinement_hypotheses, device=device)[None]
         finer = finer * (settings.refinement_extent * step)[:, None]
         cost = _cost(frames, part, sources, surface.exp(), finer, settings)
-        smoothed = semi_global(
+        position, _, _ = kernels.best_steps(
             cost, grey[part], small_step=settings.refinement_small_step, jump=settings.refinement_jump
         )
-        found.append(_log_depth(smoothed, surface, finer))
-        position = sub_step(smoothed)[0].round().long().clamp(0, finer.shape[1] - 1)
-        matched.append(cost.gather(1, position[:, None])[:, 0])
+        found.append(_log_depth(position, surface, finer))
+        nearest = position.round().long().clamp(0, finer.shape[1] - 1)
+        matched.append(cost.gather(1, nearest[:, None])[:, 0])
         if told is not None:
             told(len(part))
     log_depth = torch.cat(found)
@@ -192,7 +200,8 @@ def _cost(
     offsets: Tensor,
     settings: StereoSettings,
 ) -> Tensor:
-    return matching_cost(
+    kernels = native if base.device.type == "cpu" else matching
+    return kernels.matching_cost(
         frames,
         part,
         sources[part],
@@ -203,8 +212,7 @@ def _cost(
     )
 
 
-def _log_depth(cost: Tensor, log_base: Tensor, offsets: Tensor) -> Tensor:
-    position = sub_step(cost)[0]
+def _log_depth(position: Tensor, log_base: Tensor, offsets: Tensor) -> Tensor:
     step = (offsets[:, 1] - offsets[:, 0])[:, None, None]
     return log_base + offsets[:, 0, None, None] + position * step
 
