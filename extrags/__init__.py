@@ -10,9 +10,9 @@ The front door of the library: what most programs need is here, and loaded when 
     print(result.evaluations["final"].metrics["psnr"])
     result.scene.gaussians.write_ply("scene.ply")
 
-The stages can be called one by one: `read`, `estimate_poses`, `reconstruct`, `assess`, `fuse_surface`,
-`carve`, `explore`, `restore`, `finetune`, `evaluate`; `extrags.pipeline` says how they follow each other.
-All names are listed in `extrags.api`.
+The stages can be called one by one: `read`, `estimate_poses`, `estimate_depth`, `reconstruct`, `assess`,
+`fuse_surface`, `carve`, `explore`, `restore`, `finetune`, `evaluate`; `extrags.pipeline` says how they
+follow each other. All names are listed in `extrags.api`.
 """
 
 from __future__ import annotations

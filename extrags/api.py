@@ -12,6 +12,7 @@ from extrags.config import (
     PROFILES,
     AssessConfig,
     CoarseConfig,
+    DepthConfig,
     EnhanceConfig,
     EvaluateConfig,
     ExploreConfig,
@@ -24,6 +25,7 @@ from extrags.config import (
     SurfaceConfig,
     profile_config,
 )
+from extrags.depth.estimate import DepthEstimate, estimate_depth, with_estimated_depth
 from extrags.evaluation import evaluate, render
 from extrags.exploration import Exploration, explore
 from extrags.freespace import FreeSpace, carve
@@ -49,6 +51,8 @@ __all__ = [
     "AssessConfig",
     "Cameras",
     "CoarseConfig",
+    "DepthConfig",
+    "DepthEstimate",
     "EndoscopicSequence",
     "EnhanceConfig",
     "EvaluateConfig",
@@ -77,6 +81,7 @@ __all__ = [
     "TrainingResult",
     "assess",
     "carve",
+    "estimate_depth",
     "estimate_poses",
     "evaluate",
     "explore",
@@ -93,5 +98,6 @@ __all__ = [
     "render",
     "restore",
     "run_pipeline",
+    "with_estimated_depth",
     "with_estimated_poses",
 ]

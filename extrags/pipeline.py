@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from extrags.assessment import Decision, ScenePlan
     from extrags.baselines.uc_nerf.training import UcNerfResult
     from extrags.confidence import PerceptualDifference
+    from extrags.depth.estimate import DepthEstimate
     from extrags.exploration import Exploration
     from extrags.finetuning_judge import Judgement
     from extrags.freespace import FreeSpace
@@ -57,6 +58,7 @@ T = TypeVar("T")
 StageName = Literal[
     "ingest",
     "poses",
+    "depth",
     "coarse",
     "assess",
     "surface",
@@ -160,10 +162,23 @@ class Pipeline(ABC):
             return f"it needs the stage {NEEDS[stage]}, which was skipped"
         if stage == "poses" and self.has_poses() and not self.config.poses.replace_given:
             return "the source has poses"
+        if stage == "depth":
+            return self._reason_to_skip_depth()
         if stage == "enhance" and self.virtual_views() == 0:
             return "exploration found no view that adds anything"
         if stage == "evaluate" and self.held_out_frames() == 0:
             return "the sequence has no held-out frames"
+        return None
+
+    def _reason_to_skip_depth(self) -> str | None:
+        if self.has_depth():
+            return "the source has depth"
+        if self.config.uc_nerf.enabled:
+            return "the radiance field has a stereo of its own"
+        if not self.config.depth.enabled:
+            return "the settings do without it (depth.enabled)"
+        if self.training_frame_count() < 2:
+            return "a single training frame has no other to be matched with"
         return None
 
     def planned(self, stage: str) -> Decision | None:
@@ -180,6 +195,14 @@ class Pipeline(ABC):
         """Whether the sequence has camera poses."""
 
     @abstractmethod
+    def has_depth(self) -> bool:
+        """Whether any training frame of the source has depth."""
+
+    @abstractmethod
+    def training_frame_count(self) -> int:
+        """Number of training frames."""
+
+    @abstractmethod
     def held_out_frames(self) -> int:
         """Number of held-out frames."""
 
@@ -194,6 +217,10 @@ class Pipeline(ABC):
     @abstractmethod
     def poses(self) -> None:
         """Estimate camera poses."""
+
+    @abstractmethod
+    def depth(self) -> None:
+        """Estimate depth of the training frames from these alone."""
 
     @abstractmethod
     def coarse(self) -> None:
@@ -256,7 +283,9 @@ class Result:
     """Results of `run_pipeline` for a sequence; None for the results of skipped stages.
 
     Args:
-        sequence: all frames, with the poses the scene belongs to.
+        sequence: all frames, with the poses the scene belongs to; without estimated depth, since the
+            evaluation would take it for the truth.
+        depth: estimated depth of the training frames, where the source has none.
         reconstruction: the coarse scene and its training history.
         uc_nerf: the radiance field and its training history, instead of `reconstruction`, where
             `uc_nerf.enabled` is set.
@@ -274,6 +303,7 @@ class Result:
     """
 
     sequence: EndoscopicSequence
+    depth: DepthEstimate | None = None
     reconstruction: TrainingResult | None = None
     uc_nerf: UcNerfResult | None = None
     plan: ScenePlan | None = None
@@ -346,6 +376,14 @@ class InMemoryPipeline(Pipeline):
         """Whether the sequence has camera poses."""
         return self.result.sequence.world_from_camera is not None
 
+    def has_depth(self) -> bool:
+        """Whether any training frame of the source has depth."""
+        return self.result.sequence.training_depth_known
+
+    def training_frame_count(self) -> int:
+        """Number of training frames."""
+        return len(self.result.sequence.train)
+
     def held_out_frames(self) -> int:
         """Number of held-out frames."""
         return len(self.result.sequence.test)
@@ -366,23 +404,33 @@ class InMemoryPipeline(Pipeline):
             estimate = estimate_poses(sequence, self.config.poses)
             self.result.sequence = with_estimated_poses(sequence, estimate)
 
+    def depth(self) -> None:
+        """`extrags.depth.estimate.estimate_depth` of the training frames alone."""
+        from extrags.depth.estimate import estimate_depth
+
+        with self._timed("depth"):
+            frames = self.result.sequence.training_part()
+            self.result.depth = estimate_depth(frames, self.config.depth, self.config.poses)
+
     def coarse(self) -> None:
         """`extrags.training.reconstruct` on the training frames alone."""
         from extrags.training import reconstruct
         from extrags.training.pose_refinement import with_refined_poses
 
         with self._timed("coarse"):
-            self._training = self.result.sequence.training_part()
+            self._training = self._with_depth(self.result.sequence.training_part())
             if self.config.uc_nerf.enabled:
                 self.result.uc_nerf = self._train_uc_nerf()
                 return
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
-            found = reconstruct(self.result.sequence if oracle else self._training, self.config.coarse)
+            frames = self._with_depth(self.result.sequence) if oracle else self._training
+            found = reconstruct(frames, self.config.coarse)
             if found.refined is not None:
                 # The scene was optimised with the corrected poses: later stages need them.
                 refined = with_refined_poses(self.result.sequence, found.refined.world_from_camera)
-                self.result.sequence, self._training = refined, refined.training_part()
+                self.result.sequence = refined
+                self._training = self._with_depth(refined.training_part())
             self.result.reconstruction = found
 
     def assess(self) -> None:
@@ -503,6 +551,12 @@ class InMemoryPipeline(Pipeline):
 
     def report(self) -> None:
         """Nothing: the HTML report is built from artefacts, which a run in memory does not have."""
+
+    def _with_depth(self, frames: EndoscopicSequence) -> EndoscopicSequence:
+        """The frames with the depth that was estimated of the training frames, if any was."""
+        from extrags.depth.training_depth import with_training_depth
+
+        return frames if self.result.depth is None else with_training_depth(frames, self.result.depth)
 
     def _train_uc_nerf(self) -> UcNerfResult:
         from extrags.baselines.uc_nerf.training import train

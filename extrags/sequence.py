@@ -184,10 +184,10 @@ class EndoscopicSequence(Storable):
         """True z-depth of all frames, for the evaluation alone; 0 where unknown, None where none is known.
 
         In the unit of the poses, as `depth_mm`, but of training frames as well where their depth was
-        withheld or was estimated from images.
+        withheld. Depth that was estimated from images (`depth_error`) is no truth.
         """
         if self.withheld_depth_mm is None:
-            return self.depth_mm
+            return self.depth_mm if self.depth_error is None else None
         return self.withheld_depth_mm if bool((self.withheld_depth_mm > 0).any()) else None
 
     @property

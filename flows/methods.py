@@ -127,6 +127,11 @@ def three_dgs(config: PipelineConfig) -> dict[str, Any]:
     }
 
 
+def _three_dgs_method(config: PipelineConfig) -> dict[str, Any]:
+    """Plain 3DGS starts from sparse points, or at random, where a source has no depth: none is estimated."""
+    return {**three_dgs(config), "depth.enabled": False}
+
+
 def gaussian_pancakes(config: PipelineConfig) -> dict[str, Any]:
     """Settings that make the coarse stage Gaussian Pancakes: plain 3DGS held to depth and surface normals.
 
@@ -138,7 +143,8 @@ def gaussian_pancakes(config: PipelineConfig) -> dict[str, Any]:
     What differs from the published system, and why:
 
     * The published one takes depth, poses and points from a SLAM system that is not available. Here
-      they are the sequence's, as for every method.
+      they are the sequence's, as for every method; the stage `depth` stands for the SLAM system's depth
+      where a source has none.
     * Its Huber delta of 0.2 is in that system's units. Here it is 0.2 median depths
       (`extrags.raster.loss.huber_depth_loss`), so that scenes in millimetres and in arbitrary units are
       treated alike: an interpretation. Pixels without known depth or without a rendered surface are left out.
@@ -188,6 +194,8 @@ either listed here or pinned."""
 def paper(config: PipelineConfig) -> dict[str, Any]:
     """Settings that make the pipeline the paper's; docs/paper.md lists where it still differs, and why.
 
+    It estimates no depth: the paper starts from the points of structure from motion.
+
     Numbers that the paper does not give are those of its published code. Budgets are the profile's:
     those of profile `paper` are the paper's own.
 
@@ -196,6 +204,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
     """
     return {
         **three_dgs(config),
+        "depth.enabled": False,
         "freespace.top_views": 3,
         "freespace.occupied_below": 0.5,
         "explore.directions": 32,
@@ -314,7 +323,7 @@ METHODS: dict[str, Method] = {
     ),
     "3dgs": Method(
         "plain 3D Gaussian Splatting: standard loss and schedule, SH 3, no light, no enhancement",
-        three_dgs,
+        _three_dgs_method,
         dict.fromkeys([*EXPLORING, "finetune"], "plain 3DGS has no such stage"),
     ),
     "gaussian-pancakes": Method(

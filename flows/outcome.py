@@ -13,6 +13,7 @@ __all__ = ["DatasetOutcome", "Part", "SequenceFailedError", "SequenceOutcome", "
 Part = Literal[
     "ingest",
     "poses",
+    "depth",
     "sequence",
     "training",
     "coarse",
@@ -32,7 +33,8 @@ Part = Literal[
     "metrics_final",
     "report",
 ]
-"""Artefacts of a run. `sequence` has all frames with the latest poses, `training` the training frames alone,
+"""Artefacts of a run. `sequence` has all frames with the latest poses, `depth` the estimated depth of the
+training frames, `training` the training frames alone, with that depth where it was estimated,
 `waves` the state of the exploration, `restorer` the restorer prepared for this scene, `judgement` how much of
 the fine-tuning is kept."""
 

@@ -25,6 +25,10 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         ConfigError: when settings of the restorer do not fit each other, the model or the machine.
         ExtragsError: when the code a checkpoint needs does not start.
     """
+    if STAGES.index(until) >= STAGES.index("depth") and config.depth.enabled and "depth" not in leave_out:
+        from tasks.weights import depth_completion_digest
+
+        depth_completion_digest(config.depth)
     if STAGES.index(until) < STAGES.index("enhance"):
         return
     # Here, because they load torch, which looking up a deployment must not.

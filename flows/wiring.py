@@ -18,6 +18,7 @@ from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner
 from tasks.assess import assess, plan
 from tasks.coarse import coarse, refined_frames
+from tasks.depth import depth, depth_frames, triangulation_settings
 from tasks.enhance import assemble, restore, train
 from tasks.evaluate import METRICS_FILE, measure, render
 from tasks.explore import NEXT, branch, explore, merge, start
@@ -29,7 +30,7 @@ from tasks.progress import StageProgress, notify
 from tasks.report import PAGE, REPORT_PARTS, report
 from tasks.surface import surface
 from tasks.uc_nerf import render_uc_nerf, uc_nerf
-from tasks.weights import Weights, lpips_weights, restorer_digest
+from tasks.weights import Weights, depth_completion_digest, lpips_weights, restorer_digest
 
 __all__ = ["SequenceRun", "run_sequence"]
 
@@ -129,6 +130,14 @@ class SequenceRun(Pipeline):
         """Whether the source has camera poses."""
         return bool(self._manifest("sequence").counts["has_poses"])
 
+    def has_depth(self) -> bool:
+        """Whether any training frame of the source has depth."""
+        return bool(self._manifest("ingest").counts["has_depth"])
+
+    def training_frame_count(self) -> int:
+        """Number of training frames."""
+        return int(self._manifest("sequence").counts["train"] or 0)
+
     def held_out_frames(self) -> int:
         """Number of held-out frames."""
         return int(self._manifest("sequence").counts["test"] or 0)
@@ -154,21 +163,32 @@ class SequenceRun(Pipeline):
             self.refs["poses"] = self.refs["sequence"] = self._run_task(row, Call(poses, inputs))
             row.reason = str(self._manifest("poses").counts["summary"])
 
+    def depth(self) -> None:
+        """Depth of the training frames."""
+        with self._stage("depth") as row:
+            settings = self.config.depth
+            inputs = {
+                "sequence": self._run_uncounted(Call(training_frames, {"sequence": self.refs["sequence"]})),
+                "config": settings,
+                "features": triangulation_settings(self.config.poses),
+                "weights_digest": depth_completion_digest(settings),
+            }
+            self.refs["depth"] = self._run_task(row, Call(depth, inputs))
+            row.reason = str(self._manifest("depth").counts["summary"])
+
     def coarse(self) -> None:
         """The coarse scene from the training frames; where it refined poses, the frames with these."""
         with self._stage("coarse") as row:
             # Later stages get the training frames alone. Extracting them takes no time, and does not affect
             # whether the stage counts as cached.
-            self.refs["training"] = self._run_uncounted(
-                Call(training_frames, {"sequence": self.refs["sequence"]})
-            )
+            self.refs["training"] = self._training_frames()
             if self.config.uc_nerf.enabled:
                 inputs = {"sequence": self.refs["training"], "config": self.config.uc_nerf}
                 self.refs["coarse"] = self._run_task(row, Call(uc_nerf, inputs))
                 return
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
-            frames = self.refs["sequence" if oracle else "training"]
+            frames = self._with_depth(self.refs["sequence"]) if oracle else self.refs["training"]
             self.refs["coarse"] = self._run_task(
                 row, Call(coarse, {"sequence": frames, "config": self.config.coarse})
             )
@@ -179,8 +199,7 @@ class SequenceRun(Pipeline):
                 # The scene was optimised with the corrected poses: later stages need them.
                 inputs = {"sequence": self.refs["sequence"], "coarse": self.refs["coarse"]}
                 self.refs["sequence"] = self._run_uncounted(Call(refined_frames, inputs))
-                whole = {"sequence": self.refs["sequence"]}
-                self.refs["training"] = self._run_uncounted(Call(training_frames, whole))
+                self.refs["training"] = self._training_frames()
                 row.reason = f"poses refined, by {counts['refined_mean_turn_deg']:.2f} degrees on average"
 
     def assess(self) -> None:
@@ -328,6 +347,16 @@ class SequenceRun(Pipeline):
 
     def _scene_inputs(self) -> dict[str, Any]:
         return {"scene": self.refs["coarse"], "sequence": self.refs["training"]}
+
+    def _training_frames(self) -> Ref:
+        """The training frames alone, with their estimated depth if the source has none."""
+        frames = self._run_uncounted(Call(training_frames, {"sequence": self.refs["sequence"]}))
+        return self._with_depth(frames)
+
+    def _with_depth(self, frames: Ref) -> Ref:
+        if "depth" not in self.refs:
+            return frames
+        return self._run_uncounted(Call(depth_frames, {"sequence": frames, "depth": self.refs["depth"]}))
 
     def _weights(self) -> list[Weights]:
         return lpips_weights(self.config.evaluate)

@@ -20,6 +20,7 @@ S = TypeVar("S", bound=Storable)
 
 ReportPart = Literal[
     "sequence",
+    "depth",
     "coarse",
     "plan",
     "surface",
@@ -58,6 +59,7 @@ def report(
         rows: `{stage, state, seconds, reason, made_seconds}` of each stage.
     """
     from extrags.assessment import ScenePlan
+    from extrags.depth.estimate import DepthEstimate
     from extrags.exploration import Exploration
     from extrags.freespace import FreeSpace
     from extrags.metrics.protocol import RenderedViews
@@ -84,6 +86,7 @@ def report(
         final=part(RenderedViews, "renders_final"),
         coarse_metrics=figures("metrics_coarse", METRICS_FILE),
         final_metrics=figures("metrics_final", METRICS_FILE),
+        depth=part(DepthEstimate, "depth"),
         pseudo=part(PseudoViews, "enhance"),
         trajectories=[cameras.world_from_camera for cameras in trajectories],
         exploration=None if exploration is None else exploration.summary(),

@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
-from extrags.config import EnhanceConfig, EvaluateConfig, LpipsNet
+from extrags.config import DepthConfig, EnhanceConfig, EvaluateConfig, LpipsNet
 from extrags.errors import WeightsError
 
 if TYPE_CHECKING:
     from extrags.confidence import PerceptualDifference
     from extrags.metrics.lpips import Lpips
 
-__all__ = ["Weights", "lpips_by_net", "lpips_weights", "restorer_digest"]
+__all__ = ["Weights", "depth_completion_digest", "lpips_by_net", "lpips_weights", "restorer_digest"]
 
 
 class Weights(BaseModel):
@@ -89,3 +89,14 @@ def restorer_digest(config: EnhanceConfig) -> str | None:
     from extrags.restoration import backends
 
     return backends.restorer_digest(config)
+
+
+def depth_completion_digest(config: DepthConfig) -> str | None:
+    """Digest of the network that completes estimated depth; None where the settings do without.
+
+    Raises:
+        WeightsError: when the settings name a file that is not there.
+    """
+    from extrags.depth.weights import completion_digest
+
+    return completion_digest(config.completion)

@@ -5,6 +5,8 @@ Every public name of the modules below is here: a new model is listed in its own
 
 from extrags.config.base import *  # noqa: F403
 from extrags.config.baselines import *  # noqa: F403
+from extrags.config.depth import *  # noqa: F403
+from extrags.config.poses import *  # noqa: F403
 from extrags.config.profiles import *  # noqa: F403
 from extrags.config.restorer import *  # noqa: F403
 from extrags.config.stages import *  # noqa: F403

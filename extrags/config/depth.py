@@ -12,6 +12,7 @@ __all__ = ["DepthConfig"]
 class DepthConfig(StageConfig):
     """Dense depth of the training frames, for sources without it."""
 
+    enabled: bool = Field(True, description="False: sources without depth stay without it")
     sources: int = Field(6, ge=1, le=16, description="frames each frame is matched with")
     hypotheses: int = Field(96, ge=8, le=512, description="depths tried per pixel in the first sweep")
     window_radius_px: int = Field(3, ge=1, le=8, description="windows have sides of 2 radius + 1 pixels")

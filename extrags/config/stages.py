@@ -14,6 +14,8 @@ from pydantic import Field, ValidationError, field_validator
 
 from extrags.config.base import StageConfig
 from extrags.config.baselines import UcNerfConfig
+from extrags.config.depth import DepthConfig
+from extrags.config.poses import PosesConfig
 from extrags.config.restorer import EnhanceConfig
 from extrags.config.settings import settings_of, unknown_setting
 from extrags.thresholds import HOLE_ALPHA
@@ -34,7 +36,6 @@ __all__ = [
     "OptimiserConfig",
     "PipelineConfig",
     "PoseRefinementConfig",
-    "PosesConfig",
     "ReportConfig",
     "SurfaceConfig",
     "Visibility",
@@ -91,42 +92,6 @@ class IngestConfig(StageConfig):
         description="horizontal field of view of the pinhole that distorted sources are resampled to; None: "
         "the source's usual one (C3VD and C3VDv2 100; others: that of their central resolution)",
     )
-
-
-class PosesConfig(StageConfig):
-    """Camera poses, for sources without them."""
-
-    n_features: int = Field(6000, ge=100, description="SIFT features per image")
-    peak_threshold: float = Field(
-        0.001, gt=0, description="SIFT peak threshold; COLMAP's default is too high for mucosa"
-    )
-    edge_threshold: float = Field(20.0, gt=0, description="SIFT edge threshold")
-    sequential_overlap: int = Field(12, ge=1, description="frames matched to each side")
-    exhaustive_below: int = Field(
-        60, ge=2, description="match all pairs when there are at most so many frames"
-    )
-    min_tri_angle_deg: float = Field(4.0, gt=0, description="smallest initial triangulation angle")
-    min_registered_share: float = Field(
-        0.5, gt=0, le=1, description="fewer registered training frames are an error"
-    )
-    fallback: Literal["auto", "never", "rgbd"] = Field(
-        "auto",
-        description="auto: where COLMAP fails and depth is there, frames are aligned by colour and depth; "
-        "never: COLMAP alone; rgbd: alignment by colour and depth from the start",
-    )
-    replace_given: bool = Field(
-        False, description="estimate poses even if the source has them; the source's serve as reference"
-    )
-    working_distance_mm: float | None = Field(
-        None,
-        gt=0,
-        le=1000,
-        description="median distance from lens to tissue; makes an estimate by COLMAP metric where no depth "
-        "does. None: its scale is arbitrary",
-    )
-    rgbd_width: int = Field(192, ge=32, description="alignment by colour and depth works at most so wide")
-    rgbd_neighbours: int = Field(6, ge=1, description="frames each frame is aligned with")
-    seed: int = Field(0, ge=0, description="seed of all random sampling")
 
 
 class LightConfig(StageConfig):
@@ -572,6 +537,7 @@ class PipelineConfig(StageConfig):
 
     ingest: IngestConfig = IngestConfig()
     poses: PosesConfig = PosesConfig()
+    depth: DepthConfig = DepthConfig()
     coarse: CoarseConfig = CoarseConfig()
     uc_nerf: UcNerfConfig = UcNerfConfig()
     assess: AssessConfig = AssessConfig()

@@ -11,6 +11,7 @@ from pydantic import BaseModel
 from extrags.config import PipelineConfig, ReportConfig
 from extrags.metrics.registry import metrics
 from extrags.report.charts import gain_chart, history_chart, views_chart
+from extrags.report.estimated_depth import estimated_depth
 from extrags.report.inputs import ReportInputs
 from extrags.report.page import rendered_page
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
@@ -197,7 +198,8 @@ def _views(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:
     held_out = min(config.held_out_views, len(inputs.frames)) if inputs.coarse or inputs.final else 0
     virtual = 0 if inputs.pseudo is None else min(config.virtual_views, len(inputs.pseudo.rendered))
     has_depth = held_out > 0 and inputs.sequence.true_depth_mm is not None
-    images = 5 * (held_out + virtual + (held_out if has_depth else 0))
+    estimated = 0 if inputs.depth is None else min(config.held_out_views, len(inputs.sequence.train))
+    images = 5 * (held_out + virtual + (held_out if has_depth else 0) + estimated)
     largest = IMAGE_BYTES // max(1, images)
     coarse, final = _per_view_psnr(inputs.coarse_metrics), _per_view_psnr(inputs.final_metrics)
     chart = None if coarse is None else views_chart(coarse, final, _unobserved_shares(inputs))
@@ -207,6 +209,9 @@ def _views(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:
         "final_absent": None if inputs.final is not None else inputs.why_absent("final", "finetune"),
         "views_chart": chart,
         "depth": depth_rows(inputs, held_out, largest) if has_depth else None,
+        "estimated": None
+        if inputs.depth is None
+        else estimated_depth(inputs.sequence, inputs.depth, estimated, largest),
         "depth_absent": inputs.absent.get("depth", "there is no true depth to compare with"),
         "virtual": virtual_rows(inputs.pseudo, inputs.sequence, virtual, largest)
         if inputs.pseudo is not None and virtual

@@ -13,7 +13,7 @@ from extrags.config import PipelineConfig
 from extrags.errors import ShapeError
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["GridLike", "MeshLike", "PseudoLike", "RendersLike", "ReportInputs"]
+__all__ = ["DepthLike", "GridLike", "MeshLike", "PseudoLike", "RendersLike", "ReportInputs"]
 
 
 @runtime_checkable
@@ -33,6 +33,26 @@ class RendersLike(Protocol):
     @property
     def alpha(self) -> np.ndarray:
         """Opacity, [T, H, W]."""
+        ...
+
+
+@runtime_checkable
+class DepthLike(Protocol):
+    """Estimated depth of the training frames: `extrags.depth.estimate.DepthEstimate`."""
+
+    @property
+    def depth(self) -> np.ndarray:
+        """z-depth, 0 outside the mask, [M, H, W]."""
+        ...
+
+    @property
+    def expected_error(self) -> np.ndarray:
+        """Expected relative error of it, [M, H, W]."""
+        ...
+
+    @property
+    def report(self) -> Mapping[str, Any]:
+        """Facts on each cue."""
         ...
 
 
@@ -134,6 +154,7 @@ class ReportInputs:
         coarse_metrics: `EvaluationResult.to_json()` of the coarse scene: `metrics`, `per_view`,
             `reasons`, `protocol`.
         final_metrics: the same of the fine-tuned scene.
+        depth: depth of the training frames that was estimated from images.
         pseudo: virtual views before and after restoration.
         trajectories: camera-to-world poses of each virtual trajectory, its real start first, [L, 4, 4].
         exploration: `Exploration.summary()`.
@@ -161,6 +182,7 @@ class ReportInputs:
     final: RendersLike | None = None
     coarse_metrics: Mapping[str, Any] | None = None
     final_metrics: Mapping[str, Any] | None = None
+    depth: DepthLike | None = None
     pseudo: PseudoLike | None = None
     trajectories: Sequence[Float[np.ndarray, "_ 4 4"]] = ()
     exploration: Mapping[str, Any] | None = None
@@ -184,6 +206,12 @@ class ReportInputs:
                     f"{self.name}: {name} renders have shape {renders.rgb.shape}, expected {expected} "
                     f"for {len(frames)} held-out frames"
                 )
+        shape = (len(self.sequence.train), self.sequence.height, self.sequence.width)
+        if self.depth is not None and self.depth.depth.shape != shape:
+            raise ShapeError(
+                f"{self.name}: estimated depth has shape {self.depth.depth.shape}, expected {shape} for "
+                f"{shape[0]} training frames"
+            )
         for name, metrics in (("coarse", self.coarse_metrics), ("final", self.final_metrics)):
             if metrics is not None and len(metrics["per_view"]) != len(frames):
                 raise ShapeError(

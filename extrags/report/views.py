@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from extrags.report.encode import as_uint8, color_bar, color_mapped, fitted_image
+from extrags.report.estimated_depth import DEPTH_COLORMAP
 from extrags.report.image_table import (
     ERROR_COLORMAP,
     SCALE_QUANTILE,
@@ -29,7 +30,6 @@ from extrags.thresholds import HOLE_ALPHA
 
 __all__ = ["depth_rows", "held_out_rows", "virtual_rows"]
 
-DEPTH_COLORMAP = "viridis"
 UNCERTAINTY_COLORMAP = "cividis"
 CHANGED_LEVELS = 8
 """A pixel counts as changed when a channel differs by more than this, of 255."""

@@ -17,7 +17,7 @@ from flows.dataset import reconstruct_dataset
 from flows.outcome import SequenceFailedError, SequenceOutcome
 from flows.sequence import artifact_key, reconstruct_sequence
 from flows.settings import pipeline_config, task_runner
-from tests.flows.tiny import SEQUENCE, TINY, without_report
+from tests.flows.tiny import GIVEN, SEQUENCE, TINY, without_report
 
 REPOSITORY = Path(__file__).parents[2]
 
@@ -31,7 +31,7 @@ class TestSequence:
     def test_finds_what_other_runners_made(self, finished: tuple[str, SequenceOutcome]) -> None:
         store, first = finished
         outcome = reconstruct_sequence(sequence=SEQUENCE, profile="quick", settings=TINY, store=store)
-        assert states(outcome) == {**dict.fromkeys(STAGES, "cached"), "poses": "skipped"}
+        assert states(outcome) == {**dict.fromkeys(STAGES, "cached"), **dict.fromkeys(GIVEN, "skipped")}
         assert without_report(outcome.digests) == without_report(first.digests)
         artifact: Any = Artifact.get(artifact_key("sequence", SEQUENCE))
         assert "| finetune | cached |" in artifact.data

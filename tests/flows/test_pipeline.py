@@ -25,7 +25,7 @@ from flows.methods import METHODS
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.wiring import run_sequence
-from tests.flows.tiny import SEQUENCE, tiny_config
+from tests.flows.tiny import GIVEN, SEQUENCE, tiny_config
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ class TestUcNerf:
         result = extrags.run_pipeline(sequence, UC_NERF, true_surface=true_surface(sequence))
         reasons = {row.stage: row.reason for row in cached.stages if row.state == "skipped"}
         assert reasons == result.skipped
-        assert set(reasons) == {"poses", *NEED_GAUSSIANS}
+        assert set(reasons) == {*GIVEN, *NEED_GAUSSIANS}
         assert json.loads(json.dumps(result.evaluations["final"].metrics)) == cached.metrics["final"]
         assert cached.metrics["final"]["psnr"] > 10
         assert cached.metrics["final"]["surface"]["recall"] is not None
@@ -135,7 +135,7 @@ class TestRules:
 
     def test_what_rests_on_a_left_out_stage_is_skipped_too(self, tmp_path: Path) -> None:
         assert self.reasons(tmp_path, {"freespace": "not wanted"}) == {
-            "poses": "the source has poses",
+            **GIVEN,
             "assess": NO_PLAN,
             "freespace": "not wanted",
             "explore": "it needs the stage freespace, which was skipped",
@@ -146,7 +146,7 @@ class TestRules:
     def test_without_enhance_fine_tuning_is_a_control(self, tmp_path: Path) -> None:
         left_out = dict.fromkeys(("surface", "freespace", "explore", "enhance"), "a control")
         reasons = self.reasons(tmp_path, left_out)
-        assert set(reasons) == {"poses", "assess", *left_out}
+        assert set(reasons) == {*GIVEN, "assess", *left_out}
         assert reasons["assess"] == NO_PLAN
 
     def test_who_pays_for_the_assessment(self) -> None:

@@ -23,7 +23,9 @@ from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.wiring import run_sequence
 from tasks.evaluate import measure
 from tasks.weights import Weights
-from tests.flows.tiny import SEQUENCE, tiny_config, without_report
+from tests.flows.tiny import GIVEN, SEQUENCE, tiny_config, without_report
+
+SKIPPED = dict.fromkeys(GIVEN, "skipped")
 
 
 def states(outcome: SequenceOutcome) -> dict[str, str]:
@@ -34,10 +36,8 @@ def test_every_stage_runs(finished: tuple[str, SequenceOutcome]) -> None:
     store, outcome = finished
     assert outcome.status == "ok"
     assert list(states(outcome)) == list(STAGES)
-    assert states(outcome) == {**dict.fromkeys(STAGES, "ran"), "poses": "skipped"}
-    poses = outcome.row("poses")
-    assert poses is not None
-    assert poses.reason == "the source has poses"
+    assert states(outcome) == {**dict.fromkeys(STAGES, "ran"), **SKIPPED}
+    assert {row.stage: row.reason for row in outcome.stages if row.state == "skipped"} == GIVEN
     for which in ("coarse", "final"):
         assert {"psnr", "ssim", "lpips_alex", "flip", "depth_absrel", "n_gaussians"} <= set(
             outcome.metrics[which]
@@ -69,7 +69,7 @@ def test_lineage_leads_back_to_the_source(finished: tuple[str, SequenceOutcome])
 def test_second_run_is_all_cached_and_the_same(finished: tuple[str, SequenceOutcome]) -> None:
     store, first = finished
     second = run_sequence(SEQUENCE, tiny_config(), store, StoreRunner(store), profile="quick")
-    assert states(second) == {**dict.fromkeys(STAGES, "cached"), "poses": "skipped"}
+    assert states(second) == {**dict.fromkeys(STAGES, "cached"), **SKIPPED}
     assert without_report(second.digests) == without_report(first.digests)
     assert second.metrics == first.metrics
 
@@ -89,7 +89,7 @@ def test_exploration_settings_leave_everything_before_cached(finished: tuple[str
     before = STAGES[: STAGES.index("explore")]
     assert {stage: states(outcome)[stage] for stage in before} == {
         **dict.fromkeys(before, "cached"),
-        "poses": "skipped",
+        **SKIPPED,
     }
     assert states(outcome)["explore"] == "ran"
 

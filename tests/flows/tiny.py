@@ -20,6 +20,9 @@ from flows.wiring import run_sequence
 
 SEQUENCE = "phantom/0@sparse"
 
+GIVEN = {"poses": "the source has poses", "depth": "the source has depth"}
+"""Stages that its runs skip, with the reason."""
+
 TINY: dict[str, Any] = {
     "ingest.width": 48,
     "ingest.height": 40,

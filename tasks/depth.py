@@ -1,0 +1,69 @@
+"""depth: depth of the training frames from these alone, for sources without it."""
+
+from __future__ import annotations
+
+from extrags.config import DepthConfig, PosesConfig
+from extrags.store import Ref, Slot
+from tasks.stage import stage
+
+__all__ = ["depth", "depth_frames", "triangulation_settings"]
+
+TRIANGULATION = frozenset(
+    {
+        "n_features",
+        "peak_threshold",
+        "edge_threshold",
+        "sequential_overlap",
+        "exhaustive_below",
+        "seed",
+    }
+)
+"""Settings of the poses stage that triangulation with known poses uses."""
+
+
+def triangulation_settings(config: PosesConfig) -> PosesConfig:
+    """The settings that triangulation uses, all others at their defaults: these are not part of the key."""
+    return PosesConfig(**config.model_dump(include=set(TRIANGULATION)))
+
+
+# The digest stands for the content of the weights; the task finds them by the settings again.
+@stage("depth", version=1)
+def depth(
+    slot: Slot, sequence: Ref, config: DepthConfig, features: PosesConfig, weights_digest: str | None
+) -> None:
+    """Estimate the depth of the training frames; writes `depth/`.
+
+    Args:
+        slot: the artefact to write.
+        sequence: the training frames alone, with poses.
+        config: what to use.
+        features: settings of features and matching, from `triangulation_settings`.
+        weights_digest: content of the network's weights, for the key alone.
+    """
+    from extrags.depth.estimate import estimate_depth
+    from extrags.sequence import EndoscopicSequence
+
+    frames = slot.load(EndoscopicSequence, sequence)
+    estimate = estimate_depth(frames, config, features)
+    slot.save(estimate)
+    slot.counts.update(
+        frames=len(frames),
+        summary=estimate.summary,
+        n_points=estimate.report["n_points"],
+        points_from=estimate.report["points_from"],
+        median_expected_error=estimate.report["median_expected_error"],
+        agreeing_share=estimate.report["agreeing_share"],
+    )
+
+
+@stage("depth-frames", version=1)
+def depth_frames(slot: Slot, sequence: Ref, depth: Ref) -> None:
+    """Frames with the estimated depth of the training frames; writes `sequence/`."""
+    from extrags.depth.estimate import DepthEstimate
+    from extrags.depth.training_depth import with_training_depth
+    from extrags.sequence import EndoscopicSequence
+
+    frames = slot.load(EndoscopicSequence, sequence)
+    found = with_training_depth(frames, slot.load(DepthEstimate, depth))
+    slot.save(found)
+    slot.counts.update(frames=len(found), train=len(found.train), test=len(found.test))
