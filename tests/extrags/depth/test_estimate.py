@@ -1,0 +1,115 @@
+"""Depth of a phantom's frames from the frames alone, beside what was withheld."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from extrags.config import DepthConfig
+from extrags.depth.estimate import DepthEstimate, estimate_depth
+from extrags.errors import CaptureError
+from extrags.events import Progress, subscribed
+from extrags.sequence import EndoscopicSequence, Split
+from tests.extrags.depth.withheld import true_training_depth, with_points, withheld_phantom
+
+SETTINGS = {"hypotheses": 48, "sources": 4}
+
+
+@pytest.fixture(scope="module")
+def withheld() -> EndoscopicSequence:
+    return with_points(withheld_phantom())
+
+
+@pytest.fixture(scope="module")
+def estimate(withheld: EndoscopicSequence) -> DepthEstimate:
+    return estimate_depth(withheld.training_part(), DepthConfig(**SETTINGS))
+
+
+def relative_error(sequence: EndoscopicSequence, estimate: DepthEstimate) -> np.ndarray:
+    """Of the pixels whose truth is known."""
+    truth, mask = true_training_depth(sequence), sequence.mask[sequence.train]
+    known = (truth > 0) & mask
+    return np.abs(estimate.depth - truth)[known] / truth[known]
+
+
+def test_it_is_near_the_truth(withheld: EndoscopicSequence, estimate: DepthEstimate) -> None:
+    error = relative_error(withheld, estimate)
+    assert error.mean() < 0.09
+    assert np.median(error) < 0.04
+    assert not (estimate.depth[~withheld.mask[withheld.train]]).any()
+    assert estimate.report["points_from"] == "the source or the poses stage"
+    assert f"{estimate.report['n_points']} points" in estimate.summary
+
+
+def test_it_knows_where_it_is_wrong(withheld: EndoscopicSequence, estimate: DepthEstimate) -> None:
+    error = relative_error(withheld, estimate)
+    known = (true_training_depth(withheld) > 0) & withheld.mask[withheld.train]
+    expected = estimate.expected_error[known]
+    assert 0 < expected.min() <= expected.max() <= 1
+    surer = expected <= np.median(expected)
+    assert error[surer].mean() < 0.4 * error[~surer].mean()
+    assert estimate.report["median_expected_error"] == pytest.approx(np.median(expected), rel=0.05)
+
+
+def test_stereo_alone_is_farther_off(withheld: EndoscopicSequence, estimate: DepthEstimate) -> None:
+    plain = estimate_depth(withheld.training_part(), DepthConfig(completion="none", **SETTINGS))
+    completed, alone = relative_error(withheld, estimate), relative_error(withheld, plain)
+    assert np.median(alone) < 0.1
+    assert completed.mean() < 0.5 * alone.mean()
+    assert plain.report["completion"] == "none"
+
+
+def test_without_points_they_are_triangulated() -> None:
+    sequence = withheld_phantom()
+    found = estimate_depth(sequence.training_part(), DepthConfig(**SETTINGS))
+    assert found.report["points_from"] == "triangulation with the given poses"
+    assert len(found.points) == len(found.points_rgb) == found.report["n_points"] > 50
+    assert np.median(relative_error(sequence, found)) < 0.1
+
+
+def test_without_any_points_the_cameras_tell_the_range(caplog: pytest.LogCaptureFixture) -> None:
+    part = withheld_phantom(4, width=48, height=40).training_part()
+    with caplog.at_level("WARNING"):
+        found = estimate_depth(part, DepthConfig(triangulate=False, hypotheses=16, completion="none"))
+    assert "guessed from the cameras' motion" in caplog.text
+    assert len(found.points) == 0
+    assert (found.depth[part.mask] > 0).all()
+
+
+def test_wide_frames_are_matched_small(withheld: EndoscopicSequence) -> None:
+    part = withheld.training_part()
+    small = replace(part.at_most_width(48), split=part.split)
+    settings = DepthConfig(max_width=48, completion="none", **SETTINGS)
+    found = estimate_depth(part, settings)
+    assert found.depth.shape == part.mask.shape
+    expected = estimate_depth(small, settings)
+    assert np.median(found.depth[part.mask]) == pytest.approx(np.median(expected.depth[small.mask]), rel=0.02)
+
+
+def test_progress_and_the_same_result_again(withheld: EndoscopicSequence) -> None:
+    part = withheld.training_part().at_most_width(48)
+    seen: list[Progress] = []
+    with subscribed(lambda event: seen.append(event) if isinstance(event, Progress) else None):
+        first = estimate_depth(part, DepthConfig(**SETTINGS))
+    assert {event.stage for event in seen} == {"depth"}
+    assert seen[-1].done == seen[-1].total == 3 * len(part)
+    again = estimate_depth(part, DepthConfig(**SETTINGS))
+    np.testing.assert_array_equal(first.depth, again.depth)
+    np.testing.assert_array_equal(first.expected_error, again.expected_error)
+
+
+def test_on_disk_and_back(estimate: DepthEstimate, tmp_path: Path) -> None:
+    estimate.save(tmp_path / "depth")
+    loaded = DepthEstimate.load(tmp_path / "depth")
+    for name in ("depth", "expected_error", "points", "points_rgb"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(estimate, name))
+    assert loaded.summary == estimate.summary
+
+
+def test_a_single_frame_is_refused(withheld: EndoscopicSequence) -> None:
+    one = replace(withheld, split=Split("one", withheld.train[:1], withheld.train[1:])).training_part()
+    with pytest.raises(CaptureError, match="needs at least two"):
+        estimate_depth(one)

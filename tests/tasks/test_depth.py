@@ -1,0 +1,64 @@
+"""The keys of the depth stage: what another depth would come from is in them, and nothing else."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import extrags.poses
+from extrags.config import DepthConfig, PosesConfig
+from extrags.store import Ref
+from tasks.depth import TRIANGULATION, depth, triangulation_settings
+from tasks.stage import stage_key
+
+OTHER: dict[str, Any] = {
+    "n_features": 500,
+    "peak_threshold": 0.01,
+    "edge_threshold": 8.0,
+    "sequential_overlap": 3,
+    "exhaustive_below": 9,
+    "seed": 4,
+}
+
+
+def key(digest: str = "frames", weights: str | None = "weights", **settings: Any) -> str:
+    poses = PosesConfig(**settings.pop("poses", {}))
+    return stage_key(
+        depth,
+        {
+            "sequence": Ref(uri="somewhere/frames", digest=digest),
+            "config": DepthConfig(**settings),
+            "features": triangulation_settings(poses),
+            "weights_digest": weights,
+        },
+    )
+
+
+def test_frames_settings_and_weights_are_in_it() -> None:
+    keys = [key(), key("others"), key(weights="others"), key(weights=None), key(hypotheses=32)]
+    assert len(set(keys)) == len(keys)
+    assert key() == key()
+
+
+@pytest.mark.parametrize("name", sorted(TRIANGULATION))
+def test_features_are_in_it(name: str) -> None:
+    assert key(poses={name: OTHER[name]}) != key()
+
+
+def test_what_only_estimates_poses_is_not() -> None:
+    others = {"fallback": "never", "working_distance_mm": 30.0, "min_registered_share": 0.7}
+    assert key(poses=others) == key()
+
+
+def test_triangulation_reads_no_other_setting() -> None:
+    (folder,) = extrags.poses.__path__
+    read = set()
+    for module in ("colmap_triangulation", "features"):
+        source = (Path(folder) / f"{module}.py").read_text(encoding="utf-8")
+        read |= set(re.findall(r'settings\["(\w+)"\]', source))
+        for names in re.findall(r"settings\[key\] for key in \(([^)]*)\)", source):
+            read |= set(re.findall(r'"(\w+)"', names))
+    assert read == TRIANGULATION
