@@ -19,8 +19,8 @@ from extrags.config import PosesConfig
 from extrags.config.depth import DepthConfig
 from extrags.depth.completion import CompletionNetwork, completion_inputs
 from extrags.depth.frames import PosedFrames, select_sources
-from extrags.depth.stereo import StereoDepth, StereoSettings, multi_view_stereo
-from extrags.depth.weights import load_completion
+from extrags.depth.stereo import StereoDepth, StereoSettings, multi_view_stereo, sweep_around
+from extrags.depth.weights import NONE, load_completion
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
 from extrags.poses.triangulation import triangulate_points
@@ -36,8 +36,17 @@ _LOG = logging.getLogger(__name__)
 MIN_POINTS = 12
 """Fewer points in a view say nothing about the range of its depths."""
 
-CERTAIN, HOPELESS = 0.02, 1.0
+CERTAIN, HOPELESS = 0.005, 1.0
 """Bounds of the expected relative error."""
+
+STEREO_TRUST_SOURCES = 2.0
+"""Sources that must agree with stereo for it to be taken where the network has another opinion."""
+
+STEREO_TRUST_ERRORS = 1.5
+"""How far, in expected errors of the network, stereo may be from it."""
+
+STEREO_GAIN = 0.4
+"""Share of the network's expected error that agreeing stereo removes."""
 
 STEREO_ERRORS = (0.03, 0.5)
 """Expected relative error of stereo without completion: where all sources agree, and where none does."""
@@ -123,28 +132,21 @@ def estimate_depth(
     small = sequence.at_most_width(config.max_width)
     near, typical, far = _ranges(small, points, config)
     frames = posed_frames(small)
-    sources = torch.from_numpy(
-        select_sources(
-            small.cameras.world_from_camera.astype(np.float64),
-            small.K.astype(np.float64),
-            frames.size,
-            typical,
-            config.sources,
-        )
-    )
+    sources = _sources(small, typical, config)
     recording = small.recording
-    told = _Told(stage, 3 * len(sequence))
+    told = _Told(stage, (2 if config.completion == NONE else 6) * len(sequence))
+    settings = StereoSettings(
+        hypotheses=config.hypotheses,
+        radius_px=config.window_radius_px,
+        shading_weight=StereoSettings.shading_weight if config.shading else 0.0,
+    )
     begun = time.monotonic()
     stereo = multi_view_stereo(
         frames,
         sources,
         torch.from_numpy(near).float(),
         torch.from_numpy(far).float(),
-        StereoSettings(
-            hypotheses=config.hypotheses,
-            radius_px=config.window_radius_px,
-            shading_weight=StereoSettings.shading_weight if config.shading else 0.0,
-        ),
+        settings,
         recording=None if recording is None else torch.from_numpy(recording),
         told=told.step,
     )
@@ -153,9 +155,8 @@ def estimate_depth(
     network = load_completion(config.completion)
     if network is None:
         log_depth, error = stereo.fused, _stereo_error(stereo)
-        told.step(len(sequence))
     else:
-        log_depth, error = _completed(network, frames, stereo, _point_depths(small, points), told)
+        log_depth, error, stereo = _completed(network, frames, small, stereo, config, settings, told)
     seconds["completion"] = time.monotonic() - begun
     log_depth, error = (_enlarged(part, sequence.height, sequence.width) for part in (log_depth, error))
     depth = np.where(sequence.mask, np.exp(log_depth), 0).astype(np.float32)
@@ -262,24 +263,63 @@ def _inside(sequence: EndoscopicSequence, frame: int, pixels: np.ndarray, z: np.
     return np.asarray(inside)
 
 
-def _point_depths(sequence: EndoscopicSequence, points: np.ndarray) -> Tensor:
-    """z-depth of points at the pixels they fall on, the nearest one first; 0 elsewhere."""
-    depth = np.zeros(sequence.rgb.shape[:3], np.float32)
-    if len(points):
-        pixels, z = sequence.cameras.project(points)
-        for frame in range(len(sequence)):
-            inside = np.flatnonzero(_inside(sequence, frame, pixels[frame], z[frame]))
-            inside = inside[np.argsort(-z[frame][inside])]
-            column, row = np.floor(pixels[frame][inside]).astype(np.int64).T
-            depth[frame, row, column] = z[frame][inside]
-    return torch.from_numpy(depth)
+def _completed(
+    network: CompletionNetwork,
+    frames: PosedFrames,
+    sequence: EndoscopicSequence,
+    stereo: StereoDepth,
+    config: DepthConfig,
+    settings: StereoSettings,
+    told: _Told,
+) -> tuple[Tensor, Tensor, StereoDepth]:
+    """Completion and stereo around what it gives, twice, and a mixture of both: stereo where views agree."""
+    log_depth, error = _run_network(network, frames, stereo, told)
+    # The typical depths are known now; those of few points were not.
+    typical = np.array(
+        [float(image[mask].exp().median()) for image, mask in zip(log_depth, frames.mask, strict=True)]
+    )
+    sources = _sources(sequence, typical, config)
+    stereo = sweep_around(
+        frames,
+        sources,
+        stereo,
+        log_depth,
+        half_width=0.2,
+        hypotheses=17,
+        small_step=0.1,
+        jump=0.5,
+        settings=settings,
+        told=told.step,
+    )
+    log_depth, error = _run_network(network, frames, stereo, told)
+    stereo = sweep_around(
+        frames,
+        sources,
+        stereo,
+        log_depth,
+        half_width=0.1,
+        hypotheses=13,
+        small_step=0.2,
+        jump=1.0,
+        settings=settings,
+        told=told.step,
+    )
+    agreeing = stereo.agrees * stereo.seen * stereo.n_sources[:, None, None]
+    away = (stereo.fused - log_depth) / (STEREO_TRUST_ERRORS * error)
+    weight = (agreeing / STEREO_TRUST_SOURCES).clamp(max=1) * (1 - stereo.violates)
+    weight = weight * torch.exp(-0.5 * away.square())
+    mixed = log_depth + weight * (stereo.fused - log_depth)
+    return mixed, error * (1 - STEREO_GAIN * weight), stereo
 
 
 @torch.no_grad()
-def _completed(
-    network: CompletionNetwork, frames: PosedFrames, stereo: StereoDepth, points: Tensor, told: _Told
+def _run_network(
+    network: CompletionNetwork, frames: PosedFrames, stereo: StereoDepth, told: _Told
 ) -> tuple[Tensor, Tensor]:
-    inputs = completion_inputs(frames, stereo, points)
+    """Log-depth, and the expected absolute error of it."""
+    # Without sparse points: those of two views are wrong by several percent, which the network, that was
+    # shown better ones, believes too much (AbsRel .046 with them and .037 without on phantom/11).
+    inputs = completion_inputs(frames, stereo)
     log_depth, log_error = [], []
     for frame in range(len(frames)):
         found, expected = network(inputs.channels[frame : frame + 1])
@@ -287,6 +327,18 @@ def _completed(
         log_error.append(expected)
         told.step(1)
     return torch.cat(log_depth), torch.cat(log_error).exp()
+
+
+def _sources(sequence: EndoscopicSequence, typical: np.ndarray, config: DepthConfig) -> Tensor:
+    return torch.from_numpy(
+        select_sources(
+            sequence.cameras.world_from_camera.astype(np.float64),
+            sequence.K.astype(np.float64),
+            (sequence.height, sequence.width),
+            typical,
+            config.sources,
+        )
+    )
 
 
 def _stereo_error(stereo: StereoDepth) -> Tensor:

@@ -1,4 +1,4 @@
-"""The native kernels of stereo; `extrags.depth.matching` is their specification, and what other devices use."""
+"""The native kernels of stereo; `extrags.depth.matching` is their specification, and serves other devices."""
 
 from __future__ import annotations
 

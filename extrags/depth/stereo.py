@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from extrags.depth import matching, native
 from extrags.depth.consistency import agreement
 from extrags.depth.frames import PosedFrames
-from extrags.depth import matching, native
 from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
 
-__all__ = ["StereoDepth", "StereoSettings", "multi_view_stereo"]
+__all__ = ["StereoDepth", "StereoSettings", "multi_view_stereo", "sweep_around"]
 
 SATURATED = 0.97
 """Brightness above which a pixel says nothing about its distance."""
@@ -189,6 +189,65 @@ def multi_view_stereo(
         fits=fits,
         recording=recording,
         n_sources=count,
+    )
+
+
+def sweep_around(
+    frames: PosedFrames,
+    sources: Int[Tensor, "f s"],
+    stereo: StereoDepth,
+    log_depth: Float[Tensor, "f h w"],
+    *,
+    half_width: float,
+    hypotheses: int,
+    small_step: float,
+    jump: float,
+    settings: StereoSettings | None = None,
+    told: Callable[[int], None] | None = None,
+) -> StereoDepth:
+    """Stereo again in a narrow range around surfaces that are nearly right.
+
+    Where the first search went astray for want of texture or of a neighbour, windows that follow the
+    completed surface match better than any plane did.
+
+    Args:
+        frames: frames with poses.
+        sources: what each is matched with.
+        stereo: result of `multi_view_stereo`, whose margin and shading are kept.
+        log_depth: logarithm of the surfaces' z-depth.
+        half_width: of the range, in log-depth.
+        hypotheses: depths tried in it.
+        small_step: semi-global penalty of a change by one hypothesis.
+        jump: semi-global penalty of larger changes.
+        settings: windows, sources and tolerance; None takes the defaults.
+        told: called with the number of frames done.
+    """
+    settings = StereoSettings() if settings is None else settings
+    kernels = native if log_depth.device.type == "cpu" else matching
+    grey, n = frames.grey(), len(frames)
+    offsets = torch.linspace(-half_width, half_width, hypotheses, device=log_depth.device)[None]
+    found, matched = [], []
+    parts = torch.arange(n, device=log_depth.device).split(1)
+    for part in parts:
+        cost = _cost(frames, part, sources, log_depth[part].exp(), offsets, settings)
+        position, _, _ = kernels.best_steps(cost, grey[part], small_step=small_step, jump=jump)
+        found.append(_log_depth(position, log_depth[part], offsets))
+        nearest = position.round().long().clamp(0, hypotheses - 1)
+        matched.append(cost.gather(1, nearest[:, None])[:, 0])
+        if told is not None:
+            told(1)
+    new = torch.cat(found)
+    depth = torch.where(frames.mask, new.exp(), 0.0)
+    agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
+    return replace(
+        stereo,
+        log_depth=new,
+        cost=torch.cat(matched),
+        n_sources=(sources >= 0).sum(1),
+        **{
+            name: torch.cat([getattr(a, name) for a in agreed])
+            for name in ("seen", "agrees", "violates", "difference", "fused")
+        },
     )
 
 

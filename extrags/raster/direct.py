@@ -35,6 +35,7 @@ class Target:
         ssim_weight: weight of its SSIM term where that is another, [H, W]; None takes `weight`.
         normalisation: pixels that the weighted sums are divided by; None is the sum of `weight`.
         depth: z-depth in world units, 0 where there is none, [H, W].
+        depth_confidence: weight of the depth term per pixel, in [0, 1], [H, W]; None weights all equally.
 
     Raises:
         ShapeError: when sizes do not fit together.
@@ -51,6 +52,7 @@ class Target:
         ssim_weight: Float[Tensor, "h w"] | None = None,
         normalisation: float | None = None,
         depth: Float[Tensor, "h w"] | None = None,
+        depth_confidence: Float[Tensor, "h w"] | None = None,
     ) -> None:
         if rgb.ndim != 3 or rgb.shape[2] != 3:
             raise ShapeError(f"rgb has shape {tuple(rgb.shape)}, expected (H, W, 3)")
@@ -59,7 +61,13 @@ class Target:
         self.weight = None if weight is None else _contiguous_array(weight)
         self.ssim_weight = None if ssim_weight is None else _contiguous_array(ssim_weight)
         self.depth = None if depth is None else _contiguous_array(depth)
-        images = {"weight": self.weight, "ssim_weight": self.ssim_weight, "depth": self.depth}
+        self.depth_confidence = None if depth_confidence is None else _contiguous_array(depth_confidence)
+        images = {
+            "weight": self.weight,
+            "ssim_weight": self.ssim_weight,
+            "depth": self.depth,
+            "depth_confidence": self.depth_confidence,
+        }
         for name, image in images.items():
             if image is not None and image.shape != (self.height, self.width):
                 raise ShapeError(f"{name} has shape {image.shape}, expected {(self.height, self.width)}")
@@ -124,10 +132,16 @@ class _Images:
         if target.depth is not None and depth_weight > 0:
             images = image["depth"], image["alpha"], target.depth, image["v_depth"]
             if depth_huber_delta is None:
-                depth_loss, compared = kernels.inverse_depth(*images, depth_scale, depth_weight)
+                depth_loss, compared = kernels.inverse_depth(
+                    *images, depth_scale, depth_weight, confidence=target.depth_confidence
+                )
             else:
                 depth_loss, compared = huber_depth_gradient(
-                    *images, scale=depth_scale, delta=depth_huber_delta, weight=depth_weight
+                    *images,
+                    scale=depth_scale,
+                    delta=depth_huber_delta,
+                    weight=depth_weight,
+                    confidence=target.depth_confidence,
                 )
             loss += depth_loss
             if compared:

@@ -116,6 +116,7 @@ def inverse_depth_loss(
     target: Float[Tensor, "*c h w"],
     *,
     scale: float,
+    confidence: Float[Tensor, "*c h w"] | None = None,
 ) -> Float[Tensor, ""]:
     """Mean absolute difference of inverse depths, in units of the inverse of a typical depth.
 
@@ -127,6 +128,8 @@ def inverse_depth_loss(
         alpha: rendered opacity; pixels at `HOLE_ALPHA` or below are ignored.
         target: z-depth of the ground truth in world units, 0 where unknown.
         scale: the typical depth, in world units.
+        confidence: factor of each pixel's difference, in [0, 1]; None is one. The mean stays one over pixels,
+            so that an image of which little is sure has little weight.
 
     Returns:
         The loss; zero if no pixel can be compared.
@@ -134,8 +137,8 @@ def inverse_depth_loss(
     valid = (target > 0) & (alpha.detach() > HOLE_ALPHA) & (depth.detach() > 1e-3 * scale)
     if not bool(valid.any()):
         return depth.sum() * 0
-    difference = scale / depth[valid] - scale / target.detach()[valid]
-    return difference.abs().mean()
+    difference = (scale / depth[valid] - scale / target.detach()[valid]).abs()
+    return (difference if confidence is None else difference * confidence[valid]).mean()
 
 
 def huber_depth_loss(
@@ -145,6 +148,7 @@ def huber_depth_loss(
     *,
     scale: float,
     delta: float,
+    confidence: Float[Tensor, "*c h w"] | None = None,
 ) -> Float[Tensor, ""]:
     r"""Mean Huber loss of depth differences in units of a typical depth.
 
@@ -157,6 +161,7 @@ def huber_depth_loss(
         target: z-depth of the ground truth in world units, 0 where unknown.
         scale: the typical depth, in world units.
         delta: where the loss becomes linear, in typical depths.
+        confidence: factor of each pixel's loss, in [0, 1]; None is one.
 
     Returns:
         The loss; zero if no pixel can be compared.
@@ -168,7 +173,10 @@ def huber_depth_loss(
     valid = (target > 0) & (alpha.detach() > HOLE_ALPHA)
     if not bool(valid.any()):
         return depth.sum() * 0
-    return huber_loss(depth[valid] / scale, target.detach()[valid] / scale, delta=delta)
+    compared = depth[valid] / scale, target.detach()[valid] / scale
+    if confidence is None:
+        return huber_loss(*compared, delta=delta)
+    return (huber_loss(*compared, delta=delta, reduction="none") * confidence[valid]).mean()
 
 
 def huber_depth_gradient(
@@ -180,6 +188,7 @@ def huber_depth_gradient(
     scale: float,
     delta: float,
     weight: float,
+    confidence: Float[np.ndarray, "h w"] | None = None,
 ) -> tuple[float, int]:
     """`huber_depth_loss` times a weight, with its gradient, without autograd.
 
@@ -191,6 +200,7 @@ def huber_depth_gradient(
         scale: the typical depth.
         delta: where the loss becomes linear.
         weight: of the loss.
+        confidence: factor of each pixel's loss; None is one.
 
     Returns:
         The weighted loss, and the number of pixels compared.
@@ -203,7 +213,10 @@ def huber_depth_gradient(
     difference = np.where(valid, depth - target, 0) / np.float32(scale)
     slope = np.clip(difference, -delta, delta)
     # slope * (difference - slope / 2) is x^2 / 2 where nothing is clipped, delta (|x| - delta / 2) elsewhere.
-    loss = float((slope * (difference - slope / 2)).sum(dtype=np.float64)) / count
+    per_pixel = slope * (difference - slope / 2)
+    if confidence is not None:
+        per_pixel, slope = per_pixel * confidence, slope * confidence
+    loss = float(per_pixel.sum(dtype=np.float64)) / count
     np.multiply(slope, np.float32(weight / (count * scale)), out=gradient)
     return weight * loss, count
 
@@ -215,11 +228,12 @@ def depth_loss(
     *,
     scale: float,
     huber_delta: float | None,
+    confidence: Float[Tensor, "*c h w"] | None = None,
 ) -> Float[Tensor, ""]:
     """`huber_depth_loss`, or `inverse_depth_loss` where `huber_delta` is None; see there."""
     if huber_delta is None:
-        return inverse_depth_loss(depth, alpha, target, scale=scale)
-    return huber_depth_loss(depth, alpha, target, scale=scale, delta=huber_delta)
+        return inverse_depth_loss(depth, alpha, target, scale=scale, confidence=confidence)
+    return huber_depth_loss(depth, alpha, target, scale=scale, delta=huber_delta, confidence=confidence)
 
 
 def _ssim_map(x: Tensor, y: Tensor) -> Tensor:

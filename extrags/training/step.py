@@ -130,6 +130,7 @@ class AutogradStep:
                 view.depth_mm,
                 scale=schedule.depth_scale,
                 huber_delta=schedule.depth_huber_delta,
+                confidence=view.depth_confidence,
             )
         loss = loss * view.loss_weight
         if scene.light is not None and view.frame is not None:
@@ -252,6 +253,7 @@ class NativeStep:
             ssim_weight=view.ssim_weight,
             normalisation=view.normalisation,
             depth=view.depth_mm if self._schedule.depth_weight > 0 else None,
+            depth_confidence=view.depth_confidence,
         )
         targets = self.targets
         # An identity may be given again once its view is gone.

@@ -13,7 +13,7 @@ from torch import Tensor
 from extrags.cameras import Cameras
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
-__all__ = ["View", "epochs", "real_views"]
+__all__ = ["View", "depth_confidence", "epochs", "real_views"]
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class View:
         ssim_weight: per-pixel weight of the SSIM term where that is another, [H, W]; None takes `weight`.
         normalisation: pixels that the weighted sums of the colour terms are divided by; None is the sum of
             `weight`, which makes them weighted means.
+        depth_confidence: weight of the depth term per pixel, in [0, 1], [H, W]; None is one.
     """
 
     camera: Cameras
@@ -40,6 +41,20 @@ class View:
     loss_weight: float = 1.0
     ssim_weight: Float[Tensor, "h w"] | None = None
     normalisation: float | None = None
+    depth_confidence: Float[Tensor, "h w"] | None = None
+
+
+CONFIDENT_ERROR = 0.05
+"""Expected relative error of an estimated depth that has half the weight of a measured one."""
+
+
+def depth_confidence(expected_error: Float[np.ndarray, "*f h w"]) -> Float[np.ndarray, "*f h w"]:
+    """Weight of estimated depth in the loss: one where it is sure, falling as the inverse square of its error.
+
+    Args:
+        expected_error: relative, as in `EndoscopicSequence.depth_error`.
+    """
+    return np.asarray(1 / (1 + np.square(expected_error / CONFIDENT_ERROR)), dtype=np.float32)
 
 
 def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> list[View]:
@@ -61,6 +76,9 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
                 weight=torch.from_numpy(weight.astype(np.float32)),
                 depth_mm=depth,
                 frame=position,
+                depth_confidence=None
+                if sequence.depth_error is None
+                else torch.from_numpy(depth_confidence(sequence.depth_error[index])),
             )
         )
     return views

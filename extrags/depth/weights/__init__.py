@@ -34,7 +34,7 @@ def find_completion(setting: str) -> Path | None:
     file = Path(str(files(__name__))) / "completion.safetensors" if bundled else Path(setting).expanduser()
     if not file.is_file() or file.suffix != ".safetensors":
         raise WeightsError(
-            f"depth.completion={setting}: there is no .safetensors file {file}; {BUNDLED} takes the weights of "
+            f"depth.completion={setting}: there is no .safetensors file {file}; {BUNDLED} takes those of "
             f"the package, {NONE} leaves stereo as it is"
         )
     return file

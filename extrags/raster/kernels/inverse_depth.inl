@@ -9,6 +9,10 @@ struct DepthContext {
   float factor;     // of the gradient
 };
 
+EXTRAGS_INLINE Vec confidence_at(const DepthImages& d, int64_t i, int lanes) {
+  return d.confidence == nullptr ? Vec(1.f) : load_first(d.confidence + i, lanes);
+}
+
 struct DepthVector {
   Mask valid;
   Vec difference, slope;  // of scale over depths, and its derivative
@@ -32,8 +36,9 @@ static void sum_depths(void* data, int task, int) {
   Vec total(0.f);
   int64_t count = 0;
   for (int64_t i = begin; i < end; i += 16) {
-    const DepthVector v = compare_depths(*c.images, i, end - i < 16 ? static_cast<int>(end - i) : 16);
-    total = total + abs(v.difference);
+    const int lanes = end - i < 16 ? static_cast<int>(end - i) : 16;
+    const DepthVector v = compare_depths(*c.images, i, lanes);
+    total = total + abs(v.difference) * confidence_at(*c.images, i, lanes);
     count += __builtin_popcount(to_bits(v.valid));
   }
   c.sums[task] = static_cast<double>(sum(total));
@@ -49,7 +54,7 @@ static void carry_depths(void* data, int task, int) {
     const int lanes = end - i < 16 ? static_cast<int>(end - i) : 16;
     const DepthVector v = compare_depths(*c.images, i, lanes);
     const Vec sign = keep(gt(v.difference, zero), up) + keep(gt(zero, v.difference), down);
-    store_first(c.images->gradient + i, keep(v.valid, sign * v.slope), lanes);
+    store_first(c.images->gradient + i, keep(v.valid, sign * v.slope * confidence_at(*c.images, i, lanes)), lanes);
   }
 }
 

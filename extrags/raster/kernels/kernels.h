@@ -182,6 +182,7 @@ struct DepthImages {
   const float* depth;   // rendered
   const float* alpha;   // rendered
   const float* target;  // 0 where there is none
+  const float* confidence;  // in [0, 1], or null: one everywhere
   float* gradient;      // of weight times the mean
   float scale, weight;
 };

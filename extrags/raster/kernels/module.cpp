@@ -351,11 +351,12 @@ double l1_ssim(const In& image, const In& target, std::optional<In> mask, Out gr
 }
 
 std::tuple<double, int64_t> inverse_depth(const In& depth, const In& alpha, const In& target, Out gradient,
-                                          float scale, float weight) {
+                                          float scale, float weight, std::optional<In> confidence) {
   const size_t pixels = depth.size();
+  expect(!confidence || confidence->size() == pixels, "a confidence image");
   expect(alpha.size() == pixels && target.size() == pixels && gradient.size() == pixels, "a depth image");
-  const DepthImages images{static_cast<int64_t>(pixels), depth.data(),    alpha.data(), target.data(),
-                           gradient.data(),              scale,           weight};
+  const DepthImages images{static_cast<int64_t>(pixels), depth.data(), alpha.data(), target.data(),
+                           confidence ? confidence->data() : nullptr, gradient.data(), scale, weight};
   nb::gil_scoped_release release_gil;
   int64_t compared = 0;
   const double loss = active()->inverse_depth(&images, thread_working(), &compared);
@@ -524,7 +525,8 @@ NB_MODULE(_native, m) {
         nb::arg("gradient").noconvert(), nb::arg("dssim_weight"), nb::arg("scale"),
         nb::arg("ssim_mask").none() = nb::none());
   m.def("inverse_depth", &inverse_depth, nb::arg("depth"), nb::arg("alpha"), nb::arg("target"),
-        nb::arg("gradient").noconvert(), nb::arg("scale"), nb::arg("weight"));
+        nb::arg("gradient").noconvert(), nb::arg("scale"), nb::arg("weight"),
+        nb::arg("confidence").none() = nb::none());
   m.def("sweep", &sweep, nb::arg("reference"), nb::arg("mask"), nb::arg("base"), nb::arg("ratios"),
         nb::arg("sources"), nb::arg("kept"), nb::arg("radius"), nb::arg("cost").noconvert());
   m.def("semi_global", &semi_global, nb::arg("cost"), nb::arg("grey"), nb::arg("small_step"), nb::arg("jump"),
