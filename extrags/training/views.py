@@ -44,7 +44,7 @@ class View:
     depth_confidence: Float[Tensor, "h w"] | None = None
 
 
-CONFIDENT_ERROR = 0.05
+CONFIDENT_ERROR = 0.15
 """Expected relative error of an estimated depth that has half the weight of a measured one."""
 
 
