@@ -140,7 +140,7 @@ class CompletionNetwork(nn.Module):
         nn.init.zeros_(self.exit.weight)
         with torch.no_grad():
             # It starts by believing stereo, with an expected error of five percent.
-            self.exit.bias.copy_(torch.tensor([2.0, 0.0, -2.0, 0.0, 0.0, -3.0]))
+            self.exit.bias[:] = torch.tensor([2.0, 0.0, -2.0, 0.0, 0.0, -3.0])  # type: ignore[index]
 
     def forward(
         self, channels: Float[Tensor, "f 19 h w"]

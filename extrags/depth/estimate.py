@@ -97,7 +97,8 @@ class DepthEstimate(Storable):
         group = zarr.open_group(str(path), mode="r")
         names = ("depth", "expected_error", "points", "points_rgb")
         report: Any = group.attrs["report"]
-        return cls(*(read_array(group, name) for name in names), report=report)
+        depth, expected_error, points, points_rgb = (read_array(group, name) for name in names)
+        return cls(depth, expected_error, points, points_rgb, report)
 
 
 def estimate_depth(
@@ -158,9 +159,10 @@ def estimate_depth(
     else:
         log_depth, error, stereo = _completed(network, frames, small, stereo, config, settings, told)
     seconds["completion"] = time.monotonic() - begun
-    log_depth, error = (_enlarged(part, sequence.height, sequence.width) for part in (log_depth, error))
-    depth = np.where(sequence.mask, np.exp(log_depth), 0).astype(np.float32)
-    error = np.where(sequence.mask, np.clip(error, CERTAIN, HOPELESS), 0).astype(np.float32)
+    full = sequence.height, sequence.width
+    depth = np.where(sequence.mask, np.exp(_enlarged(log_depth, *full)), 0).astype(np.float32)
+    expected = np.clip(_enlarged(error, *full), CERTAIN, HOPELESS)
+    expected = np.where(sequence.mask, expected, 0).astype(np.float32)
     confirmed = (stereo.agrees * stereo.seen > 0) & frames.mask
     report: dict[str, Any] = {
         "points_from": origin,
@@ -177,20 +179,22 @@ def estimate_depth(
             for fit in stereo.fits
         ],
         "completion": config.completion,
-        "median_expected_error": float(np.median(error[sequence.mask])) if sequence.mask.any() else 1.0,
+        "median_expected_error": float(np.median(expected[sequence.mask])) if sequence.mask.any() else 1.0,
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
     }
-    return DepthEstimate(depth, error, points.astype(np.float64), points_rgb, report)
+    return DepthEstimate(depth, expected, points.astype(np.float64), points_rgb, report)
 
 
 def with_estimated_depth(sequence: EndoscopicSequence, estimate: DepthEstimate) -> EndoscopicSequence:
     """The training part of a sequence with its estimated depth, the expected error of it, and the points."""
-    points = (
-        {}
-        if sequence.points is not None or not len(estimate.points)
-        else {"points": estimate.points, "points_rgb": estimate.points_rgb}
+    known = sequence.points is not None or not len(estimate.points)
+    return replace(
+        sequence,
+        depth_mm=estimate.depth,
+        depth_error=estimate.expected_error,
+        points=sequence.points if known else estimate.points,
+        points_rgb=sequence.points_rgb if known else estimate.points_rgb,
     )
-    return replace(sequence, depth_mm=estimate.depth, depth_error=estimate.expected_error, **points)
 
 
 class _Told:

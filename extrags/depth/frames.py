@@ -72,7 +72,8 @@ def source_from_reference(
     """Rigid motions from camera coordinates of `reference` to those of `source`."""
     to_world = frames.world_from_camera[reference]
     from_world = torch.linalg.inv(frames.world_from_camera[source])
-    return (from_world @ to_world)[:, :3]
+    motion: Tensor = (from_world @ to_world)[:, :3]
+    return motion
 
 
 def select_sources(

@@ -244,10 +244,11 @@ def sweep_around(
         log_depth=new,
         cost=torch.cat(matched),
         n_sources=(sources >= 0).sum(1),
-        **{
-            name: torch.cat([getattr(a, name) for a in agreed])
-            for name in ("seen", "agrees", "violates", "difference", "fused")
-        },
+        seen=torch.cat([a.seen for a in agreed]),
+        agrees=torch.cat([a.agrees for a in agreed]),
+        violates=torch.cat([a.violates for a in agreed]),
+        difference=torch.cat([a.difference for a in agreed]),
+        fused=torch.cat([a.fused for a in agreed]),
     )
 
 
@@ -260,7 +261,7 @@ def _cost(
     settings: StereoSettings,
 ) -> Tensor:
     kernels = native if base.device.type == "cpu" else matching
-    return kernels.matching_cost(
+    cost: Tensor = kernels.matching_cost(
         frames,
         part,
         sources[part],
@@ -269,6 +270,7 @@ def _cost(
         radius_px=settings.radius_px,
         best_share=settings.best_share,
     )
+    return cost
 
 
 def _log_depth(position: Tensor, log_base: Tensor, offsets: Tensor) -> Tensor:

@@ -221,7 +221,8 @@ class Cavities:
         # A smooth minimum, so that bumps have a foot.
         k = 0.12
         blend = (0.5 + 0.5 * (nearest - inside) / k).clamp(0, 1)
-        return nearest * (1 - blend) + inside * blend - k * blend * (1 - blend)
+        joined: Tensor = nearest * (1 - blend) + inside * blend - k * blend * (1 - blend)
+        return joined
 
     def camera_paths(self, frames: int) -> Float[Tensor, "c v 4 4"]:
         """Poses of a short clip in each scene, smooth, looking where the kind of organ lets one look."""

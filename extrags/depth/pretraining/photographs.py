@@ -224,7 +224,8 @@ class _Lamps:
             total = total + (incident * self.shine * lobe * (cosine > 0))[:, :, None]
         sun = self.sun / self.sun.norm(dim=1, keepdim=True)
         steady = (0.6 + 0.4 * (normal * sun[:, None]).sum(2))[:, :, None] * albedo
-        return total * (1 - self.fixed[:, :, None]) + self.fixed[:, :, None] * steady
+        mixed: Tensor = total * (1 - self.fixed[:, :, None]) + self.fixed[:, :, None] * steady
+        return mixed
 
 
 def _normal(scene: Cavities, points: Tensor) -> Tensor:
@@ -234,7 +235,8 @@ def _normal(scene: Cavities, points: Tensor) -> Tensor:
         (corner * scene.clearance(points + step * corner)[:, :, None] for corner in corners),
         start=torch.zeros_like(points),
     )
-    return gradient / gradient.norm(dim=2, keepdim=True).clamp_min(1e-9)
+    unit: Tensor = gradient / gradient.norm(dim=2, keepdim=True).clamp_min(1e-9)
+    return unit
 
 
 class _Sensor:
