@@ -51,7 +51,7 @@ class TestConfig:
             ("coars.iterations", "did you mean coarse"),
             ("coarse", "group of settings"),
             ("iterations", "did you mean coarse.iterations or uc_nerf.iterations or finetune.iterations"),
-            ("qqq", "settings begin with ingest, poses, coarse"),
+            ("qqq", "settings begin with ingest, poses, depth, coarse"),
             ("coarse.iterations.more", "no setting"),
         ],
     )
