@@ -174,3 +174,21 @@ def test_inverse_depth_with_nothing_to_compare(isa: str) -> None:
     assert float(nothing.detach()) == 0
     assert leaf.grad is not None
     assert not leaf.grad.any()
+
+
+def test_depth_confidence_scales_each_pixel(isa: str) -> None:
+    generator = torch.Generator().manual_seed(2)
+    shape = (19, 23)
+    depth = (1 + 10 * torch.rand(shape, generator=generator)).requires_grad_()
+    target, confidence = 1 + torch.rand(shape, generator=generator), torch.rand(shape, generator=generator)
+    alpha = torch.ones(shape)
+    expected = inverse_depth_loss(depth, alpha, target, scale=3.0, confidence=confidence)
+    (0.4 * expected).backward()
+    arrays = [value.detach().numpy() for value in (depth, alpha, target)]
+    gradient = np.empty(shape, dtype=np.float32)
+    loss, compared = native.compiled_kernels().inverse_depth(
+        *arrays, gradient, 3.0, 0.4, confidence=confidence.numpy()
+    )
+    assert compared == depth.numel()
+    assert loss == pytest.approx(0.4 * float(expected.detach()), rel=1e-6)
+    assert relative_l2(torch.from_numpy(gradient), depth.grad.double()) < 1e-6  # type: ignore[union-attr]

@@ -1,0 +1,94 @@
+"""The completion network, its loss, and its pretraining on a tiny scale."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from extrags.depth.completion import INPUT_CHANNELS, STEREO, CompletionNetwork, completion_loss
+from extrags.depth.pretraining.cavities import KINDS, Cavities, Kind
+from extrags.depth.pretraining.examples import make_examples
+from extrags.depth.pretraining.photographs import photograph
+from extrags.depth.pretraining.training import CompletionTraining, ExampleBank, score, train_completion
+from extrags.depth.stereo import StereoSettings
+from extrags.depth.weights import load_completion
+
+
+def test_an_untrained_network_believes_stereo() -> None:
+    channels = torch.zeros(1, INPUT_CHANNELS, 21, 34)
+    channels[:, STEREO] = 0.7
+    log_depth, log_error = CompletionNetwork()(channels)
+    assert log_depth.shape == log_error.shape == (1, 21, 34)
+    weights = torch.softmax(torch.tensor([2.0, 0.0, -2.0]), 0)
+    assert torch.allclose(log_depth, 0.7 * weights[0].expand_as(log_depth), atol=1e-5)
+
+
+def test_loss_of_a_constant_error() -> None:
+    truth, mask = torch.zeros(1, 8, 8), torch.ones(1, 8, 8)
+    terms = completion_loss(truth + 0.2, torch.full_like(truth, -1.0), truth, mask)
+    assert float(terms["depth"]) == pytest.approx(0.2)
+    assert float(terms["slope"]) == pytest.approx(0, abs=1e-6)
+    assert float(terms["error"]) == pytest.approx(0.2 * torch.e - 1, rel=1e-5)
+    hidden = completion_loss(truth + 0.2, truth, truth, torch.zeros_like(mask))
+    assert float(hidden["depth"]) == 0
+
+
+def test_expected_error_does_not_move_the_depth() -> None:
+    depth = torch.full((1, 4, 4), 0.3, requires_grad=True)
+    terms = completion_loss(depth, torch.zeros(1, 4, 4), torch.zeros(1, 4, 4), torch.ones(1, 4, 4))
+    assert not terms["error"].requires_grad
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_photographs_agree_with_the_surface(kind: Kind) -> None:
+    generator = torch.Generator().manual_seed(11)
+    scene = Cavities(kind, 4, generator)
+    clips = photograph(scene, generator, (16, 24), 2)
+    assert len(clips.depth) == 2 * len(clips.clip.unique())
+    assert len(clips.depth) >= 2
+    known = clips.frames.mask
+    assert ((clips.depth > 0) | ~known).all()
+    assert torch.isfinite(clips.frames.rgb).all()
+    # The same seed makes the same clips.
+    generator = torch.Generator().manual_seed(11)
+    again = photograph(Cavities(kind, 4, generator), generator, (16, 24), 2)
+    assert torch.equal(again.depth, clips.depth)
+    assert torch.equal(again.frames.rgb, clips.frames.rgb)
+
+
+def test_training_lowers_the_error_on_what_it_is_shown() -> None:
+    generator = torch.Generator().manual_seed(3)
+    settings = StereoSettings(hypotheses=24, radius_px=2, refinement_hypotheses=5)
+    examples = make_examples("sac", 2, generator, (32, 48), settings)
+    assert examples is not None
+    bank = ExampleBank(generator)
+    bank.add(examples)
+    before = score(CompletionNetwork(), [examples])
+    heard: list[int] = []
+    torch.manual_seed(0)
+    network = train_completion(
+        bank, CompletionTraining(iterations=100, batch=2), told=lambda done, means: heard.append(done)
+    )
+    after = score(network, [examples])
+    assert heard == [100]
+    assert after.absrel < 0.8 * before.absrel
+
+
+def test_bundled_weights_complete_unseen_cavities() -> None:
+    """Scenes drawn with another seed than any of the training."""
+    network = load_completion("bundled")
+    assert network is not None
+    generator = torch.Generator().manual_seed(990)
+    examples = make_examples("sac", 3, generator, (64, 80), StereoSettings(hypotheses=48))
+    assert examples is not None
+    found = score(network, [examples])
+    assert found.absrel < 0.6 * found.stereo_absrel
+    assert found.rank_correlation > 0.3
+    # Blind to stereo, it is worse, and expects to be.
+    channels = examples.channels.clone()
+    channels[:, STEREO] = 0
+    channels[:, 5:11] = 0
+    blind = score(network, [replace(examples, channels=channels)])
+    assert blind.absrel > found.absrel
