@@ -16,7 +16,7 @@ from extrags.store.storable import Storable
 from extrags.thresholds import SATURATED
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["EndoscopicSequence", "PoseSource", "Split", "saturated_mask"]
+__all__ = ["EndoscopicSequence", "IntrinsicsSource", "PoseSource", "Split", "saturated_mask"]
 
 ALL_OF_AREA = 0.999
 """A downscaled pixel is valid above this share of valid area; below one because of rounding."""
@@ -24,6 +24,10 @@ ALL_OF_AREA = 0.999
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
 """Origin of the poses. given: by the source; estimated: by COLMAP; aligned: by RGB-D alignment; refined:
 corrected during the reconstruction."""
+
+IntrinsicsSource = Literal["given", "guessed", "estimated"]
+"""Origin of the intrinsics. given: by the source or a calibration file; guessed: a usual field of view,
+because nothing states them; estimated: by bundle adjustment, with the poses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +72,8 @@ class EndoscopicSequence(Storable):
         specular: true on specular highlights, [F, H, W]; they have no weight in training, but count in the
             evaluation of held-out frames like any other pixel. None where they were not detected.
         pose_source: origin of the poses; the reconstruction may refine estimated ones.
+        intrinsics: origin of `K`; the poses stage estimates what was guessed.
+        focal_std_px: standard deviation of an estimated focal length, in pixels; None where it was not.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -91,6 +97,8 @@ class EndoscopicSequence(Storable):
     truth: dict[str, Any] = field(default_factory=dict)
     specular: Bool[np.ndarray, "f h w"] | None = None
     pose_source: PoseSource = "given"
+    intrinsics: IntrinsicsSource = "given"
+    focal_std_px: float | None = None
 
     def __post_init__(self) -> None:
         frames, height, width = self.rgb.shape[:3]
@@ -203,6 +211,7 @@ class EndoscopicSequence(Storable):
             depth_mm=None if depth is None else resized(depth, cv2.INTER_NEAREST),
             observed=None if observed is None else share(observed) > ALL_OF_AREA,
             specular=None if specular is None else share(specular) > 0,
+            focal_std_px=None if self.focal_std_px is None else self.focal_std_px * size[0] / self.width,
         )
 
     def training_part(self) -> EndoscopicSequence:
@@ -261,6 +270,10 @@ class EndoscopicSequence(Storable):
         # Written only where it differs from the default, so that older artefacts keep their digest.
         if self.pose_source != "given":
             group.attrs["pose_source"] = self.pose_source
+        if self.intrinsics != "given":
+            group.attrs["intrinsics"] = self.intrinsics
+        if self.focal_std_px is not None:
+            group.attrs["focal_std_px"] = self.focal_std_px
 
     @classmethod
     def load(cls, path: Path) -> EndoscopicSequence:
@@ -297,6 +310,8 @@ class EndoscopicSequence(Storable):
             metric=bool(attributes["metric"]),
             truth=truth,
             pose_source=cast("PoseSource", attributes.get("pose_source", "given")),
+            intrinsics=cast("IntrinsicsSource", attributes.get("intrinsics", "given")),
+            focal_std_px=cast("float | None", attributes.get("focal_std_px")),
             **optional,
         )
 

@@ -2,8 +2,8 @@
 
 A file with one of `VIDEO_SUFFIXES`, or a folder that holds one such file and no images. Beside the file, both
 optional: `intrinsics.json` and `mask.png`, as in `data_catalog.readers.frames_folder`; without the first a
-field of view of 90 degrees is assumed and said so, without the second the round picture, the dark frame and
-burnt-in text are found (`data_catalog.content`).
+field of view of 90 degrees is assumed and said so until the poses stage estimates it, without the second
+the round picture, the dark frame and burnt-in text are found (`data_catalog.content`).
 
 The video is decoded twice. First, all frames at a small size: how far the picture has moved (median of a
 dense optical flow from a reference frame, as a share of the image width; the reference follows only when the
@@ -33,13 +33,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from data_catalog.content import content_mask
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import colour_files
-from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
-from data_catalog.readers.frames_folder import read_intrinsics
+from data_catalog.readers.frames_folder import INTRINSICS_FILE, read_intrinsics
 from data_catalog.sampling import Sampling
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.events import Progress, emit
+from extrags.lens import Lens
 
 __all__ = ["MAX_FRAMES", "READER", "VIDEO_SUFFIXES", "VideoSurvey", "choose_frames", "survey", "video_file"]
 
@@ -99,7 +99,7 @@ def _files(place: Path) -> list[Path]:
     file = video_file(place)
     if file is None:
         return []
-    beside = [file.parent / name for name in ("intrinsics.json", "mask.png")]
+    beside = [file.parent / name for name in (INTRINSICS_FILE, "mask.png")]
     return sorted([file, *(other for other in beside if other.is_file())])
 
 
@@ -129,6 +129,7 @@ def _frames(place: Path, config: IngestConfig) -> SourceFrames:
         # No more frames were chosen than may be kept, so that each is asked for, in order.
         read_colour=lambda frame: _next_image(images, frame),
         masks=_SurveyedMask(found),
+        intrinsics="given" if (file.parent / INTRINSICS_FILE).is_file() else "guessed",
         looked_at=len(found.path),
     )
 
@@ -151,7 +152,7 @@ class _SurveyedMask:
 
 READER = FolderReader(
     name="video",
-    version=1,
+    version=2,
     summary="a video file (mp4, avi, mov, mkv, ...), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,
