@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from extrags.poses.calibration import LensCalibration, with_calibration
 from extrags.poses.estimate import PoseEstimate, estimate_poses, with_estimated_poses
 from extrags.poses.registration_report import errors_against_given
 from extrags.poses.rgbd import RgbdAlignment, align_by_depth
@@ -9,11 +10,13 @@ from extrags.poses.scale import DepthScale, depth_scale
 
 __all__ = [
     "DepthScale",
+    "LensCalibration",
     "PoseEstimate",
     "RgbdAlignment",
     "align_by_depth",
     "depth_scale",
     "errors_against_given",
     "estimate_poses",
+    "with_calibration",
     "with_estimated_poses",
 ]

@@ -19,6 +19,7 @@ from extrags.cameras import as_rotation
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
+from extrags.poses.calibration import LensCalibration, with_calibration
 from extrags.poses.job import PoseJob, PoseJobResult
 from extrags.poses.registration_report import (
     colmap_report,
@@ -49,6 +50,7 @@ class PoseEstimate:
         mean_reprojection_px: over the observations in training frames; None without such.
         metric: true when the unit is the millimetre, from known depth.
         report: counts of features, matches and registrations, ready for JSON.
+        calibration: of the lens, where the sequence's intrinsics were a guess; None where they were given.
     """
 
     method: Literal["colmap", "rgbd"]
@@ -59,6 +61,7 @@ class PoseEstimate:
     mean_reprojection_px: float | None
     metric: bool
     report: dict[str, Any]
+    calibration: LensCalibration | None = None
 
     @property
     def summary(self) -> str:
@@ -69,9 +72,10 @@ class PoseEstimate:
         if "colmap" in found:
             failed = found["colmap"]
             why = f" (COLMAP registered only {failed['registered_train']})"
+        lens = "" if self.calibration is None else f"; {self.calibration.summary}"
         return (
             f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
-            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames"
+            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames{lens}"
         )
 
     def to_json(self, given: EndoscopicSequence) -> dict[str, Any]:
@@ -99,6 +103,10 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     frames alone; the largest model counts. Held-out frames are registered afterwards against the finished
     map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the millimetre
     (`extrags.poses.depth_scale`). COLMAP runs in a process of its own.
+
+    *An unknown lens* (`sequence.intrinsics` is `guessed`, see `PosesConfig.refine_intrinsics`): focal
+    length and radial distortion are estimated with the map (`extrags.poses.self_calibration`), and the
+    guess is kept, with a warning, where the frames do not determine them.
 
     *Colour and depth* (`extrags.poses.rgbd`): where the sequence has depth and COLMAP registers too few
     training frames, unless `config.fallback` says `never`; or from the start if it says `rgbd`. Again
@@ -130,9 +138,14 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     result = _run(_job(sequence, config), sequence.name)
     registered = np.isfinite(result.world_from_camera).all((1, 2))
     report = colmap_report(sequence, result, registered)
+    calibration = None
+    if "calibration" in report:
+        calibration = LensCalibration.from_json(report["calibration"])
+        told = _LOG.info if calibration.determined else _LOG.warning
+        told("%s: %s", sequence.name, calibration.summary)
     if _enough(report, config):
         _warn_of_missing(sequence, report)
-        return _from_colmap(sequence, result, registered, report)
+        return replace(_from_colmap(sequence, result, registered, report), calibration=calibration)
     if config.fallback == "never":
         instead = "Alignment by colour and depth is switched off (poses.fallback)."
     elif sequence.depth_mm is None:
@@ -158,7 +171,19 @@ def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
         train=np.asarray(sequence.train, dtype=np.int64),
         test=np.asarray(sequence.test, dtype=np.int64),
         settings=config.model_dump(),
+        unknown_lens=_estimates_lens(sequence, config),
     )
+
+
+def _estimates_lens(sequence: EndoscopicSequence, config: PosesConfig) -> bool:
+    if config.refine_intrinsics == "never":
+        return False
+    if config.refine_intrinsics == "auto" and sequence.intrinsics != "guessed":
+        return False
+    if np.ptp(sequence.K, axis=0).any():
+        _LOG.warning("%s: the frames have several cameras; their intrinsics are kept", sequence.name)
+        return False
+    return True
 
 
 def _from_colmap(
@@ -234,7 +259,9 @@ def _by_depth(
 def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -> EndoscopicSequence:
     """The sequence with poses and points, without the frames that did not register.
 
-    Frames keep their names; the split is renumbered. `truth` is kept as it is.
+    Frames keep their names; the split is renumbered. `truth` is kept as it is. Where a lens was estimated,
+    `K` is that of its pinhole, and frames of a distorted lens are resampled to it
+    (`extrags.poses.with_calibration`).
 
     Raises:
         ShapeError: when the estimate is of another sequence.
@@ -253,7 +280,7 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         return None if stack is None else stack[kept]
 
     split = sequence.split
-    return replace(
+    posed = replace(
         sequence,
         rgb=sequence.rgb[kept],
         K=sequence.K[kept],
@@ -270,6 +297,7 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         points_rgb=estimate.points_rgb,
         pose_source="estimated" if estimate.method == "colmap" else "aligned",
     )
+    return posed if estimate.calibration is None else with_calibration(posed, estimate.calibration)
 
 
 def _run(job: PoseJob, name: str) -> PoseJobResult:

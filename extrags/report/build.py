@@ -20,6 +20,7 @@ from extrags.report.wording import (
     count,
     described_metrics,
     duration,
+    intrinsics_in_words,
     metric_of,
     number,
     shown_metrics,
@@ -92,6 +93,8 @@ def _facts(inputs: ReportInputs) -> list[tuple[str, str]]:
     if recordings > 1:
         facts.append(("Recordings", count(recordings)))
     facts.append(("Unit of length", "millimetres" if sequence.metric else "arbitrary"))
+    if sequence.intrinsics != "given":
+        facts.append(("Focal length", intrinsics_in_words(sequence)))
     if (gaussians := metric_of(final, "n_gaussians")) is not None:
         facts.append(("Gaussians", count(gaussians)))
     if inputs.stages:
