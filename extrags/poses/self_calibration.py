@@ -38,8 +38,11 @@ MIN_GAIN = 0.01
 """A model with more parameters must lower the sum of squared residuals by this share: thousands of
 observations make any gain significant, but what features and moving light do wrong is not what a lens
 does."""
-FURTHER_STARTS_DEG = (60.0, 120.0)
-"""Fields of view tried where the guess leads to no determined lens."""
+FURTHER_STARTS = (("SIMPLE_RADIAL_FISHEYE", 120.0), ("SIMPLE_PINHOLE", 60.0), ("SIMPLE_PINHOLE", 120.0))
+"""Where a free focal length leads to too small a map, or to no endoscope's lens, maps are made with lenses
+that are held: the guess, then these (family and field of view). The largest map is refined."""
+ENOUGH_SHARE = 0.75
+"""Of the training frames: a map with fewer is tried again from another start."""
 FIELDS_OF_VIEW_DEG = (30.0, 175.0)
 """An estimate outside is no endoscope's."""
 _FOCAL_RATIOS = (0.1, 2.0)
@@ -118,16 +121,20 @@ def map_with_unknown_lens(
         return largest_model(models), model_sizes(models)
 
     best: _Fit | None = None
-    for angle in (None, *FURTHER_STARTS_DEG):
-        start = guess if angle is None else _with_field_of_view(guess, angle)
-        model, _ = mapped(start, free=True)
+    for start, free in (
+        (guess, True),
+        (guess, False),
+        *((_with_field_of_view(guess, *family), False) for family in FURTHER_STARTS),
+    ):
+        model, _ = mapped(start, free=free)
         if model is None:
             continue
         found = _fitted(pycolmap, model, start, read_model)
-        if best is None or _size(found.model) > _size(best.model):
+        if best is None or _rank(found) > _rank(best):
             best = found
-        enough = best.model.num_reg_images() >= settings["min_registered_share"] * n_train
-        if enough and not _why_not(best, settings):
+        # Another start helps where this one went astray, not where the motion leaves the lens open.
+        enough = best.model.num_reg_images() >= ENOUGH_SHARE * n_train
+        if enough and not _implausible(best):
             break
     reason = "no map could be made" if best is None else _why_not(best, settings)
     if best is None or reason:
@@ -136,7 +143,9 @@ def map_with_unknown_lens(
     if not best.lens.is_pinhole:
         model, _ = mapped(best.lens, free=False)
         if model is not None and model.num_reg_images() >= best.model.num_reg_images():
-            again = _fitted(pycolmap, model, best.lens, read_model)
+            # Simpler families were ruled out; richer ones tell the uncertainty.
+            known = next(k for k, names in enumerate(LENS_MODELS) if best.lens.model in names)
+            again = _fitted(pycolmap, model, best.lens, read_model, LENS_MODELS[known:])
             # The lens that was held must come out again; else the first answer stands.
             best = best if _why_not(again, settings) else again
     std = {name: best.covariance.std(name) for name in best.free()} | {"f": best.focal_std_px}
@@ -163,18 +172,28 @@ def model_sizes(models: dict[int, Any]) -> list[int]:
     return sorted((model.num_reg_images() for model in models.values()), reverse=True)
 
 
+def _rank(fit: _Fit) -> tuple[int, int, int]:
+    return int(not _implausible(fit)), *_size(fit.model)
+
+
 def _size(model: Any) -> tuple[int, int]:
     return model.num_reg_images(), model.num_points3D()
 
 
-def _fitted(pycolmap: Any, model: Any, start: Lens, read_model: Callable[[Any], PoseJobResult]) -> _Fit:
+def _fitted(
+    pycolmap: Any,
+    model: Any,
+    start: Lens,
+    read_model: Callable[[Any], PoseJobResult],
+    families: tuple[tuple[str, ...], ...] = LENS_MODELS,
+) -> _Fit:
     """The simplest lens that explains the map, and how far its focal length may be off.
 
     That is taken from the model with one distortion parameter more: which of them are zero is itself only
     estimated, and what a little distortion can pass for, the focal length is uncertain by.
     """
     tried = []
-    for names in LENS_MODELS:
+    for names in families:
         adjusted = [_adjusted(pycolmap, model, name, start) for name in names]
         tried.append(min(adjusted, key=_squares))
     chosen = 0
@@ -199,6 +218,8 @@ def _adjusted(pycolmap: Any, model: Any, name: str, start: Lens) -> Any:
     options.refine_principal_point = False
     options.print_summary = False
     options.ceres.solver_options.num_threads = 1
+    # COLMAP's 0 goes on to the last of 100 iterations wherever the lens is poorly determined.
+    options.ceres.solver_options.function_tolerance = 1e-8
     pycolmap.bundle_adjustment(copy, options)
     return copy
 
@@ -244,20 +265,31 @@ def _free(model: str) -> tuple[str, ...]:
     return tuple(name for name in LENS_PARAMETERS[model] if name not in ("cx", "cy"))
 
 
-def _with_field_of_view(lens: Lens, angle_deg: float) -> Lens:
-    focal = lens.width / 2 / np.tan(np.radians(angle_deg) / 2)
-    return Lens("SIMPLE_PINHOLE", (float(focal), lens.value("cx"), lens.value("cy")), lens.width, lens.height)
+def _with_field_of_view(lens: Lens, model: str, angle_deg: float) -> Lens:
+    half = np.radians(angle_deg) / 2
+    focal = lens.width / 2 / (half if model.endswith("FISHEYE") else np.tan(half))
+    values = {"f": float(focal), "cx": lens.value("cx"), "cy": lens.value("cy")}
+    parameters = tuple(values.get(name, 0.0) for name in LENS_PARAMETERS[model])
+    return Lens(model, parameters, lens.width, lens.height)
 
 
 def _why_not(fit: _Fit, settings: dict[str, Any]) -> str:
     """Why an estimate cannot be taken; empty where it can."""
+    if problem := _implausible(fit):
+        return problem
+    focal = fit.lens.value("f")
+    share = fit.focal_std_px / focal
+    if share <= settings["max_focal_std_share"]:
+        return ""
+    spread = f" \N{PLUS-MINUS SIGN} {fit.focal_std_px:.0f}" if np.isfinite(share) else ""
+    return f"this motion does not determine it (estimate {focal:.0f}{spread} px)"
+
+
+def _implausible(fit: _Fit) -> str:
+    """Why an estimate is no endoscope's lens; empty where it may be."""
     focal = fit.lens.value("f")
     if not np.isfinite(focal) or focal <= 0:
         return "bundle adjustment found no focal length"
-    share = fit.focal_std_px / focal
-    if not share <= settings["max_focal_std_share"]:
-        spread = f" \N{PLUS-MINUS SIGN} {fit.focal_std_px:.0f}" if np.isfinite(share) else ""
-        return f"this motion does not determine it (estimate {focal:.0f}{spread} px)"
     angle = float(np.degrees(2 * np.arctan(fit.lens.width / 2 / focal)))
     lowest, highest = FIELDS_OF_VIEW_DEG
     if not lowest <= angle <= highest:
