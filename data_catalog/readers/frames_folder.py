@@ -61,7 +61,8 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     if not files:
         raise SourceNotFoundError("no image in this folder", file=folder)
     width, height = image_size(files[0], frame=files[0].name)
-    lens = Lens.pinhole(read_intrinsics(folder, width, height), width, height)
+    K = read_intrinsics(folder, width, height, guess_is_used=config.calibration is None)
+    lens = Lens.pinhole(K, width, height)
     mask_file = folder / "mask.png"
     return SourceFrames(
         frames=[
@@ -104,20 +105,24 @@ READER = FolderReader(
 )
 
 
-def read_intrinsics(folder: Path, width: int, height: int) -> Float[np.ndarray, "3 3"]:
+def read_intrinsics(
+    folder: Path, width: int, height: int, *, guess_is_used: bool = True
+) -> Float[np.ndarray, "3 3"]:
     """K from `intrinsics.json` in a folder, or of the assumed field of view where there is none.
 
     Args:
         folder: where the file is looked for.
         width: of the images it belongs to, in pixels.
         height: of the images it belongs to, in pixels.
+        guess_is_used: whether to warn of the assumed field of view; false where a calibration file follows.
 
     Raises:
         SourceError: the file is damaged or describes no pinhole.
     """
     file = folder / INTRINSICS_FILE
     if not file.is_file():
-        logger.warning(
+        logger.log(
+            logging.WARNING if guess_is_used else logging.DEBUG,
             "%s has no intrinsics.json: assuming a horizontal field of view of %g degrees, until the poses "
             "stage estimates it",
             folder.name,

@@ -110,7 +110,9 @@ def _frames(place: Path, config: IngestConfig) -> SourceFrames:
     found = survey(file)
     chosen = choose_frames(found.path, found.sharpness, config.max_frames or MAX_FRAMES, file=file)
     logger.info("%s: %d of %d frames chosen", file.name, len(chosen), len(found.path))
-    lens = Lens.pinhole(read_intrinsics(file.parent, found.width, found.height), found.width, found.height)
+    guess_is_used = config.calibration is None
+    K = read_intrinsics(file.parent, found.width, found.height, guess_is_used=guess_is_used)
+    lens = Lens.pinhole(K, found.width, found.height)
     mask_file = file.parent / "mask.png"
     images = _decoded(file, chosen)
     return SourceFrames(

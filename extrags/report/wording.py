@@ -80,7 +80,7 @@ def intrinsics_in_words(sequence: EndoscopicSequence) -> str:
     focal_px = float(sequence.K[0, 0, 0])
     angle_deg = math.degrees(2 * math.atan(sequence.width / 2 / focal_px))
     if sequence.intrinsics == "guessed":
-        return f"guessed: {focal_px:.1f} px ({angle_deg:.0f} degrees), not determined by this motion"
+        return f"guessed: {focal_px:.1f} px ({angle_deg:.0f} degrees), not determined"
     spread = "" if sequence.focal_std_px is None else f" \N{PLUS-MINUS SIGN} {sequence.focal_std_px:.1f}"
     return f"{focal_px:.1f} px{spread} (field of view {angle_deg:.0f} degrees), {sequence.intrinsics}"
 

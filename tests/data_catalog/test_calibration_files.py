@@ -193,10 +193,11 @@ class TestPlainFrames:
         assert sequence.intrinsics == "guessed"
         assert sequence.K[0, 0, 0] == pytest.approx(WIDTH / 2)
 
-    def test_with_it_they_are_given_and_straight(self, plain_frames, tmp_path) -> None:
+    def test_with_it_they_are_given_and_straight(self, plain_frames, tmp_path, caplog) -> None:
         file = opencv_file(tmp_path / "scope.yml", [-0.2, 0.03, 0.0, 0.0])
         sequence = read(plain_frames, IngestConfig(calibration=str(file)))
         assert sequence.intrinsics == "given"
+        assert "assuming a horizontal field of view" not in caplog.text
         assert sequence.K[0, 0, 0] == pytest.approx(np.sqrt(110.0 * 113.0))
         assert (sequence.rgb != read(plain_frames).rgb).any()
 

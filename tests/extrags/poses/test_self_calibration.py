@@ -11,12 +11,12 @@ import pytest
 
 from extrags.cameras import Cameras, look_at
 from extrags.config import PosesConfig
-from extrags.errors import ShapeError
+from extrags.errors import CaptureError, ShapeError
 from extrags.lens import Lens
 from extrags.poses import LensCalibration, estimate_poses, with_calibration, with_estimated_poses
 from extrags.poses.estimate import PoseEstimate
 from extrags.sequence import EndoscopicSequence
-from tests.extrags.poses.textured_room import render_room, room_sequence
+from tests.extrags.poses.textured_room import render_room, room_sequence, turning_room
 
 WIDTH, HEIGHT = 200, 150
 TRUE_FOCAL_PX = 0.7 * WIDTH
@@ -144,6 +144,12 @@ def test_straight_ahead_the_guess_stays(room: EndoscopicSequence) -> None:
     assert posed.intrinsics == "guessed"
     assert posed.focal_std_px is None
     assert posed.K[0, 0, 0] == WIDTH / 2
+
+
+def test_a_scope_that_only_turns_is_told_as_before() -> None:
+    turning = guessed(turning_room(5))
+    with pytest.raises(CaptureError, match="poses for 0 of 5 training frames.*too little parallax"):
+        estimate_poses(turning, PosesConfig(n_features=300, fallback="never"))
 
 
 class TestWithCalibration:

@@ -265,5 +265,5 @@ def test_intrinsics_that_nobody_stated_are_told(
     sequence = replace(inputs.sequence, intrinsics=intrinsics, focal_std_px=std)
     told = build_report(replace(inputs, sequence=sequence), CONFIG)
     assert said in told
-    assert ("not determined by this motion" in told) == (intrinsics == "guessed")
+    assert ("degrees), not determined" in told) == (intrinsics == "guessed")
     assert "Focal length" not in html
