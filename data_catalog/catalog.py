@@ -1,7 +1,7 @@
 """The catalogue: names to sources, sources to sequences, and what a source is to a cache.
 
-A sequence is named `DATASET/SEQUENCE[@SETTING]` or is a path to a folder or a video. The datasets are asked
-in order; what each of them knows stands in its own module.
+A sequence is named `DATASET/SEQUENCE[@SETTING]` or is a path to a folder, a video or a DICOM file. The
+datasets are asked in order; what each of them knows stands in its own module.
 """
 
 from __future__ import annotations
@@ -49,8 +49,9 @@ def resolve(name_or_path: str | Path) -> Source:
 
     Args:
         name_or_path: `phantom/3@sparse` (without a setting: `sparse`), `sinus/hopkins`, `simcol3d/s1`,
-            `c3vdv2/c1_cecum_t1@sparse`, `FOLDER/c1_cecum_t1@sparse` for videos in a folder of their own, or
-            a path to a folder or a video. A path that exists wins over a name spelled the same.
+            `c3vdv2/c1_cecum_t1@sparse`, `FOLDER/SCENE@sparse` for videos in a folder of their own
+            (`SCENE_v1`, `SCENE_v2`; registered or not), or a path to a folder, a video or a DICOM file. A
+            path that exists wins over a name spelled the same.
 
     Raises:
         UnknownSequenceError: neither a known name nor an existing path; suggests the nearest name.
@@ -87,7 +88,11 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
         )
     sequence = dataset.read(source, config)
     check_sequence(sequence, file=source.path or source.name)
-    return with_specular(sequence)
+    if config.scale_mm_per_unit is not None:
+        sequence = _scaled(sequence, config.scale_mm_per_unit)
+    # After the checks, which hold poses against all depth there is; what was observed is known by now.
+    shown = sequence.without_training_depth() if config.withhold_depth else sequence
+    return with_specular(shown)
 
 
 def source_fingerprint(source: Source | str | Path, config: IngestConfig | None = None) -> dict[str, Any]:
@@ -116,6 +121,20 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
     if not file.is_file():
         raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
     return found | {"calibration": file_digests([("calibration", file)])}
+
+
+def _scaled(sequence: EndoscopicSequence, mm_per_unit: float) -> EndoscopicSequence:
+    if sequence.world_from_camera is None:
+        raise ConfigError(
+            f"{sequence.name}: ingest.scale_mm_per_unit is the unit of the source's poses, and there are "
+            "none; poses.working_distance_mm makes estimated poses metric"
+        )
+    if sequence.metric:
+        raise ConfigError(
+            f"{sequence.name}: the source's lengths are millimetres; ingest.scale_mm_per_unit is for sources "
+            "whose unit is arbitrary"
+        )
+    return sequence.in_millimetres(mm_per_unit, "setting")
 
 
 def _dataset(source: Source) -> Dataset:

@@ -20,6 +20,7 @@ _DARK = 14
 """A pixel whose brightest channel stays below this belongs to the frame round the picture."""
 _MARGIN_SHARE = 0.006
 """The picture's rim is blurred: so much of the image width is cut off all round."""
+_LARGEST_DENT = 0.05
 _CIRCLE_TRIALS = 400
 _CIRCLE_TOLERANCE_SHARE = 0.006
 _CIRCLE_INLIERS = 0.75
@@ -174,12 +175,36 @@ def content_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
         small = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in rgb])
     circle = content_circle(small)
     margin = max(1.0, _MARGIN_SHARE * small.shape[2])
-    inside = view_mask(small) if circle is None else circle.mask(small.shape[2], small.shape[1], margin)
+    inside = (
+        _picture(view_mask(small), margin)
+        if circle is None
+        else circle.mask(small.shape[2], small.shape[1], margin)
+    )
     found = inside & ~overlay_mask(small, inside)
     if found.shape == (height, width):
         return np.asarray(found)
     share = cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(share > 0.999)
+
+
+def _picture(seen: Bool[np.ndarray, "h w"], margin_px: float) -> Bool[np.ndarray, "h w"]:
+    """The picture of any outline, such as an octagon, less its blurred rim and what is written beside it."""
+    import cv2
+
+    found = _largest(seen)
+    if not found.any():
+        return found
+    outline, _ = cv2.findContours(found.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    whole = np.zeros(found.shape, np.uint8)
+    cv2.fillConvexPoly(whole, cv2.convexHull(np.concatenate(outline)), 1)
+    # Pictures are convex: a dark corner of the lumen that made a dent belongs to them. What is far from
+    # convex is something else, and is left as it was found.
+    picture = whole if whole.sum() <= (1 + _LARGEST_DENT) * found.sum() else found.astype(np.uint8)
+    margin = int(np.ceil(margin_px))
+    kernel = np.ones((2 * margin + 1, 2 * margin + 1), np.uint8)
+    # The image border is no rim.
+    padded = np.pad(picture, margin, mode="edge")
+    return np.asarray(cv2.erode(padded, kernel)[margin:-margin, margin:-margin] > 0)
 
 
 def _largest(mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:

@@ -23,7 +23,8 @@ class FolderReader:
         name: identifier, part of cache keys.
         version: raised by hand when the same files are read into other arrays; part of cache keys.
         summary: one line for messages.
-        recognises: whether a path holds this layout, from file names only.
+        recognises: whether a path holds this layout, from file names (of a file without suffix, from its
+            first bytes).
         files: every file that `frames` and its result may look at, as a sorted list.
         frames: what there is, poses in OpenCV axes (x right, y down, z forward), camera to world. Thinning,
             split, masks, undistortion, resizing and checks are done behind it. Raises `SourceError` naming

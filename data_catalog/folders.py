@@ -1,4 +1,4 @@
-"""Folders and video files as a dataset: whatever a reader recognises, and the named sets that readers know.
+"""Folders, videos and DICOM files as a dataset: what a reader recognises, and the named sets readers know.
 
 To add a reader: one module in `data_catalog/readers` with a `READER`, and one line in `READERS`. A reader of
 another package is handed to `register_reader`.
@@ -18,6 +18,7 @@ from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.posed_frames import assembled
 from data_catalog.readers import (
     colmap_model,
+    dicom,
     endonerf,
     frames_folder,
     posed_folder,
@@ -41,6 +42,7 @@ READERS: tuple[FolderReader, ...] = (
     endonerf.READER,
     colmap_model.READER,
     video.READER,
+    dicom.READER,
     frames_folder.READER,
 )
 """The most specific first: a folder is read by the first that recognises it."""
@@ -72,7 +74,7 @@ def find_reader(name: str) -> FolderReader | None:
 
 
 class FolderDataset:
-    """Any folder or video file, and named sets below a data root."""
+    """Any folder, video or DICOM file, and named sets below a data root."""
 
     name = "folders"
 
@@ -135,8 +137,8 @@ def _recognised(path: Path) -> FolderReader:
             return reader
     if not path.is_dir():
         raise SourceError(
-            "this is a file; expected a folder that holds a sequence, or a video "
-            f"({', '.join(video.VIDEO_SUFFIXES)})",
+            "this is a file; expected a folder that holds a sequence, a video "
+            f"({', '.join(video.VIDEO_SUFFIXES)}) or a DICOM file ({', '.join(dicom.DICOM_SUFFIXES)})",
             file=path,
         )
     kinds = "; ".join(f"{reader.name}: {reader.summary}" for reader in readers())

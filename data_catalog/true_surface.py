@@ -12,10 +12,11 @@ __all__ = ["true_surface"]
 def true_surface(sequence: EndoscopicSequence) -> TrueSurface | None:
     """Ground truth that a reconstruction of the sequence is compared with; None where there is none.
 
-    The phantom's wall is made again from the settings that the sequence carries in `truth`.
+    The phantom's wall is made again from the settings that the sequence carries in `truth`; where poses were
+    estimated, the wall is in another world than they are, and depth takes its place.
     """
     phantom = sequence.truth.get("phantom")
-    if phantom is not None:
+    if phantom is not None and sequence.truth.get("world") != "estimated":
         from data_catalog.phantom.config import PhantomConfig
         from data_catalog.phantom.geometry import build_wall
 

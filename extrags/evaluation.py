@@ -88,7 +88,7 @@ def evaluate_renders(
         available_lpips() if lpips is None else lpips,
         surface=surface,
         surface_reason="the sequence has no true depth"
-        if sequence.depth_mm is None
+        if sequence.true_depth_mm is None
         else "no true surface given",
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
 
@@ -16,8 +17,17 @@ from extrags.store.storable import Storable
 from extrags.thresholds import SATURATED
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["EndoscopicSequence", "IntrinsicsSource", "PoseSource", "Split", "saturated_mask"]
+__all__ = [
+    "EndoscopicSequence",
+    "IntrinsicsSource",
+    "PoseSource",
+    "ScaleSource",
+    "Split",
+    "saturated_mask",
+]
 
+_SQUARE = 0.01
+"""Focal lengths across and down that differ by a smaller share are those of square pixels."""
 ALL_OF_AREA = 0.999
 """A downscaled pixel is valid above this share of valid area; below one because of rounding."""
 
@@ -28,6 +38,18 @@ corrected during the reconstruction."""
 IntrinsicsSource = Literal["given", "guessed", "estimated"]
 """Origin of the intrinsics. given: by the source or a calibration file; guessed: a usual field of view,
 because nothing states them; estimated: by bundle adjustment, with the poses."""
+
+
+ScaleSource = Literal["source", "setting", "depth", "working_distance"]
+"""What the unit of length rests on. source: what the source says of it; setting: `ingest.scale_mm_per_unit`;
+depth: known depth that estimated poses were scaled by; working_distance: `poses.working_distance_mm`."""
+
+_SCALE_WORDS: dict[ScaleSource, str] = {
+    "source": "millimetres as the source has them",
+    "setting": "millimetres from the scale given",
+    "depth": "millimetres from known depth",
+    "working_distance": "millimetres from the working distance given",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +96,11 @@ class EndoscopicSequence(Storable):
         pose_source: origin of the poses; the reconstruction may refine estimated ones.
         intrinsics: origin of `K`; the poses stage estimates what was guessed.
         focal_std_px: standard deviation of an estimated focal length, in pixels; None where it was not.
+        withheld_depth_mm: true z-depth that the evaluation alone may use, 0 where unknown, [F, H, W]; None
+            where `depth_mm` is the truth. See `true_depth_mm`.
+        scale_source: what the unit of length rests on; of no account where it is arbitrary.
+        depth_error: expected relative error of an estimated `depth_mm`, [F, H, W]; None where the depth was
+            measured.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -99,6 +126,9 @@ class EndoscopicSequence(Storable):
     pose_source: PoseSource = "given"
     intrinsics: IntrinsicsSource = "given"
     focal_std_px: float | None = None
+    withheld_depth_mm: Float[np.ndarray, "f h w"] | None = None
+    scale_source: ScaleSource = "source"
+    depth_error: Float[np.ndarray, "f h w"] | None = None
 
     def __post_init__(self) -> None:
         frames, height, width = self.rgb.shape[:3]
@@ -107,6 +137,8 @@ class EndoscopicSequence(Storable):
             ("K", self.K, (frames, 3, 3)),
             ("world_from_camera", self.world_from_camera, (frames, 4, 4)),
             ("depth_mm", self.depth_mm, (frames, height, width)),
+            ("withheld_depth_mm", self.withheld_depth_mm, (frames, height, width)),
+            ("depth_error", self.depth_error, (frames, height, width)),
             ("observed", self.observed, (frames, height, width)),
             ("specular", self.specular, (frames, height, width)),
             ("recording", self.recording, (frames,)),
@@ -159,6 +191,66 @@ class EndoscopicSequence(Storable):
         """
         return self.cameras[self.train]
 
+    @cached_property
+    def training_depth_known(self) -> bool:
+        """Whether any training frame has depth: held-out frames may have some for the evaluation alone."""
+        return self.depth_mm is not None and bool((self.depth_mm[self.train] > 0).any())
+
+    @cached_property
+    def true_depth_mm(self) -> Float[np.ndarray, "f h w"] | None:
+        """True z-depth of all frames, for the evaluation alone; 0 where unknown, None where none is known.
+
+        In the unit of the poses, as `depth_mm`, but of training frames as well where their depth was
+        withheld or was estimated from images.
+        """
+        if self.withheld_depth_mm is None:
+            return self.depth_mm
+        return self.withheld_depth_mm if bool((self.withheld_depth_mm > 0).any()) else None
+
+    @property
+    def scale_words(self) -> str:
+        """What lengths are, and what says so, for tables and reports."""
+        return _SCALE_WORDS[self.scale_source] if self.metric else "arbitrary scale"
+
+    def in_millimetres(self, mm_per_unit: float, source: ScaleSource) -> EndoscopicSequence:
+        """A copy of a posed sequence with all lengths multiplied, which makes it metric.
+
+        Args:
+            mm_per_unit: length of one unit of the poses.
+            source: what it rests on.
+
+        Raises:
+            ShapeError: while the poses are unknown.
+        """
+        poses = self.cameras.world_from_camera.copy()
+        poses[:, :3, 3] *= mm_per_unit
+
+        def longer(lengths: Any) -> Any:
+            return None if lengths is None else (lengths * mm_per_unit).astype(lengths.dtype)
+
+        return replace(
+            self,
+            world_from_camera=poses,
+            depth_mm=longer(self.depth_mm),
+            withheld_depth_mm=longer(self.withheld_depth_mm),
+            points=longer(self.points),
+            metric=True,
+            scale_source=source,
+        )
+
+    def without_training_depth(self) -> EndoscopicSequence:
+        """A copy whose training frames have no depth, so that only the evaluation knows any.
+
+        Held-out frames keep theirs. Points go too, since a source with depth may have made them from it. A
+        sequence without depth is returned as it is.
+        """
+        if self.depth_mm is None:
+            return self
+        shown = self.depth_mm.copy()
+        shown[self.train] = 0
+        true = self.depth_mm if self.withheld_depth_mm is None else self.withheld_depth_mm
+        return replace(self, depth_mm=shown, withheld_depth_mm=true, points=None, points_rgb=None)
+
     def supervised_mask(self, frames: int | Int[np.ndarray, "n"]) -> Bool[np.ndarray, "*n h w"]:
         """Mask of pixels used for supervision: the validity mask without detected specular highlights.
 
@@ -187,11 +279,23 @@ class EndoscopicSequence(Storable):
         Colours are means over the area of a pixel. A pixel is valid where all of its area is; its depth is
         that of the nearest source pixel, since a mean over an edge belongs to neither side.
         """
-        import cv2
-
         if self.width <= width:
             return self
-        size = (width, max(1, round(self.height * width / self.width)))
+        return self._resized((width, max(1, round(self.height * width / self.width))))
+
+    def with_square_pixels(self) -> EndoscopicSequence:
+        """The same frames, made lower or higher until both focal lengths agree; as in `at_most_width`.
+
+        A sequence whose pixels are square, to a percent, is returned as it is. All frames must have one
+        camera.
+        """
+        stretch = float(self.K[0, 1, 1] / self.K[0, 0, 0])
+        if abs(stretch - 1) <= _SQUARE:
+            return self
+        return self._resized((self.width, max(1, round(self.height / stretch))))
+
+    def _resized(self, size: tuple[int, int]) -> EndoscopicSequence:
+        import cv2
 
         def resized(stack: np.ndarray, interpolation: int) -> np.ndarray:
             return np.stack([cv2.resize(image, size, interpolation=interpolation) for image in stack])
@@ -203,15 +307,18 @@ class EndoscopicSequence(Storable):
         K[:, 0] *= size[0] / self.width
         K[:, 1] *= size[1] / self.height
         depth, observed, specular = self.depth_mm, self.observed, self.specular
+        withheld = self.withheld_depth_mm
         return replace(
             self,
             rgb=resized(self.rgb, cv2.INTER_AREA),
             K=K,
             mask=share(self.mask) > ALL_OF_AREA,
             depth_mm=None if depth is None else resized(depth, cv2.INTER_NEAREST),
+            withheld_depth_mm=None if withheld is None else resized(withheld, cv2.INTER_NEAREST),
             observed=None if observed is None else share(observed) > ALL_OF_AREA,
             specular=None if specular is None else share(specular) > 0,
             focal_std_px=None if self.focal_std_px is None else self.focal_std_px * size[0] / self.width,
+            depth_error=None if self.depth_error is None else resized(self.depth_error, cv2.INTER_NEAREST),
         )
 
     def training_part(self) -> EndoscopicSequence:
@@ -234,12 +341,14 @@ class EndoscopicSequence(Storable):
             mask=self.mask[train],
             split=Split("training", np.arange(len(train)), np.arange(0), self.split.version),
             world_from_camera=of_train(self.world_from_camera),
-            depth_mm=of_train(self.depth_mm),
+            depth_mm=of_train(self.depth_mm) if self.training_depth_known else None,
+            withheld_depth_mm=None,
             recording=None if recording is None else np.unique(recording, return_inverse=True)[1],
             frame_names=tuple(self.frame_name(int(frame)) for frame in train),
             observed=None,
             truth={},
             specular=of_train(self.specular),
+            depth_error=of_train(self.depth_error),
         )
 
     def save(self, path: Path) -> None:
@@ -250,7 +359,7 @@ class EndoscopicSequence(Storable):
         write_array(group, "K", self.K)
         write_array(group, "split/train", self.split.train.astype(np.int64))
         write_array(group, "split/test", self.split.test.astype(np.int64))
-        for name in ("depth_mm", "observed", "specular"):
+        for name in ("depth_mm", "withheld_depth_mm", "depth_error", "observed", "specular"):
             stack = getattr(self, name)
             if stack is not None:
                 write_frames(group, name, stack)
@@ -274,6 +383,8 @@ class EndoscopicSequence(Storable):
             group.attrs["intrinsics"] = self.intrinsics
         if self.focal_std_px is not None:
             group.attrs["focal_std_px"] = self.focal_std_px
+        if self.scale_source != "source":
+            group.attrs["scale_source"] = self.scale_source
 
     @classmethod
     def load(cls, path: Path) -> EndoscopicSequence:
@@ -285,6 +396,8 @@ class EndoscopicSequence(Storable):
             name: read_array(group, name) if name in group else None
             for name in (
                 "depth_mm",
+                "withheld_depth_mm",
+                "depth_error",
                 "observed",
                 "specular",
                 "world_from_camera",
@@ -312,6 +425,7 @@ class EndoscopicSequence(Storable):
             pose_source=cast("PoseSource", attributes.get("pose_source", "given")),
             intrinsics=cast("IntrinsicsSource", attributes.get("intrinsics", "given")),
             focal_std_px=cast("float | None", attributes.get("focal_std_px")),
+            scale_source=cast("ScaleSource", attributes.get("scale_source", "source")),
             **optional,
         )
 

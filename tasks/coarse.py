@@ -13,7 +13,7 @@ HISTORY = "history.json"
 """Training curve: a list of `{iteration, loss, psnr, n_gaussians}`."""
 
 
-@stage("coarse", version=4)
+@stage("coarse", version=5)
 def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     """Optimise the coarse scene; writes `scene/` and `history.json`.
 
@@ -22,6 +22,7 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     """
     from extrags.sequence import EndoscopicSequence
     from extrags.training import reconstruct
+    from extrags.training.starting import starts_at_random
 
     frames = slot.load(EndoscopicSequence, sequence)
     if config.train_on == "all":
@@ -31,6 +32,8 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     slot.save(result.scene)
     slot.save_json(HISTORY, result.history)
     slot.counts["n_gaussians"] = len(result.scene.gaussians)
+    # Without depth and points there is nothing that says where the surface is: to be told beside the figures.
+    slot.counts["random_start"] = int(starts_at_random(frames, frames.train))
     slot.counts["refined_poses"] = int(result.refined is not None)
     if result.refined is not None:
         slot.save(result.refined)

@@ -32,7 +32,7 @@ def render(slot: Slot, scene: Ref, sequence: Ref, train_on: Literal["train", "al
     slot.save(views)
     slot.counts.update(views=len(views), n_gaussians=views.n_gaussians)
     # Without true depth there is no true surface either, so the mesh is not needed.
-    if frames.depth_mm is None:
+    if frames.true_depth_mm is None:
         return
     mesh = scene_surface(shown, frames)
     if mesh is not None:
@@ -75,7 +75,7 @@ def measure(
         slot.load(RenderedViews, renders),
         frames,
         mesh=slot.load(Mesh, renders) if (slot.open(renders) / Mesh.stored_as).exists() else None,
-        true_surface=None if frames.depth_mm is None else true_surface(frames),
+        true_surface=None if frames.true_depth_mm is None else true_surface(frames),
         lpips=lpips_by_net(weights),
     )
     slot.save_json(METRICS_FILE, result.to_json(), indent=1)

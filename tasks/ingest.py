@@ -13,7 +13,7 @@ __all__ = ["ingest", "training_frames"]
 
 
 # The fingerprint covers the content of the files; their location is not part of the key.
-@stage("ingest", version=3, ignore=("source", "calibration"))
+@stage("ingest", version=4, ignore=("source", "calibration"))
 def ingest(
     slot: Slot,
     source: Source,
@@ -44,7 +44,8 @@ def ingest(
         height=sequence.height,
         has_poses=int(sequence.world_from_camera is not None),
         intrinsics=sequence.intrinsics,
-        has_depth=int(sequence.depth_mm is not None),
+        scale=sequence.scale_words if sequence.world_from_camera is not None else "",
+        has_depth=int(sequence.training_depth_known),
         masked_share=float(1 - sequence.mask.mean()),
         specular_share=0.0 if sequence.specular is None else float(sequence.specular.sum() / inside),
         saturated_share=float((saturated_mask(sequence.rgb) & sequence.mask).sum() / inside),

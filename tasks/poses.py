@@ -9,7 +9,7 @@ from tasks.stage import stage
 __all__ = ["poses"]
 
 
-@stage("poses", version=3)
+@stage("poses", version=4)
 def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
     """Estimate poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
 
@@ -31,6 +31,7 @@ def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
         test=len(posed.test),
         dropped=len(unposed) - len(posed),
         method=estimate.method,
+        scale=posed.scale_words,
         summary=estimate.summary,
         mean_reprojection_px=estimate.mean_reprojection_px,
         intrinsics=posed.intrinsics,

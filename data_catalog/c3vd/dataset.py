@@ -1,7 +1,8 @@
 """C3VD and C3VDv2 as a dataset: one video, or two of a scene under a split manifest.
 
 `c3vdv2/c1_cecum_t1_v2` and `c3vdv2/c1_cecum_t1@sparse` are found below a data root,
-`FOLDER/c1_cecum_t1@sparse` in a folder that holds the videos.
+`FOLDER/c1_cecum_t1@sparse` in a folder that holds the videos, and so are scenes that are not in the catalogue
+(`data_catalog.c3vd.unregistered`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from typing import Any
 
 from data_catalog.c3vd.published import Recording, RecordingPair, find, find_scene, published_sets
 from data_catalog.c3vd.reader import READER, pair_files, pair_frames
+from data_catalog.c3vd.unregistered import folders_of_scene, unregistered_pair
 from data_catalog.dataset import Descriptor, Source, file_digests
 from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.posed_frames import assembled
@@ -44,14 +46,18 @@ class C3vdDataset:
         return None if item is None else _described(item)
 
     def resolve(self, name_or_path: str) -> Source | None:
-        """A video or a pair by name, or a pair in a folder of its own."""
+        """A video or a pair by name, or a pair in a folder of its own, registered or not."""
         path = Path(name_or_path).expanduser()
         item = find(name_or_path)
         if item is not None:
             return self._source(item, None)
-        if len(path.parts) > 1 and path.parent.is_dir() and (pair := find_scene(path.name)) is not None:
+        if len(path.parts) < 2 or not path.parent.is_dir():
+            return None
+        pair = find_scene(path.name)
+        if pair is not None:
             return self._source(pair, [path.parent])
-        return None
+        folders = folders_of_scene(path.parent, path.name)
+        return None if folders is None else _read_from(path.name, folders)
 
     def fingerprint(self, source: Source, config: IngestConfig) -> dict[str, Any]:
         """Reader, content of both videos' files, and the manifest's line."""
@@ -82,8 +88,13 @@ class C3vdDataset:
             if folder is None:
                 instead = f"FOLDER/{item.name.partition('/')[2]} with the folder that the videos lie in"
                 raise not_on_this_machine(item.name, names[0], instead, roots)
-            folders.append(str(folder.resolve()))
-        return Source(name=item.name, dataset=self.name, format=READER.name, paths=tuple(folders))
+            folders.append(folder)
+        return _read_from(item.name, folders)
+
+
+def _read_from(name: str, folders: Sequence[Path]) -> Source:
+    paths = tuple(str(folder.resolve()) for folder in folders)
+    return Source(name=name, dataset=C3vdDataset.name, format=READER.name, paths=paths)
 
 
 def _videos(item: Recording | RecordingPair) -> tuple[Recording, ...]:
@@ -94,6 +105,9 @@ def _videos(item: Recording | RecordingPair) -> tuple[Recording, ...]:
 def _pair(source: Source) -> RecordingPair | None:
     """The pair that a source's name stands for; None for a single video."""
     item = find(source.name)
+    if item is None and len(source.paths) == 2:
+        train, test = (Path(path) for path in source.paths)
+        return unregistered_pair(source.name, train, test)
     expected = 1 if item is None else len(_videos(item))
     if len(source.paths) != expected:
         raise SourceError(f"{source.name} has {len(source.paths)} folders; expected {expected}")

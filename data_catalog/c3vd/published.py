@@ -45,10 +45,11 @@ class Recording(_Model):
     """One registered video."""
 
     dataset: str
+    """Empty where it is not registered."""
     segment: str
     """Colon and part of it, e.g. `c1_cecum`."""
     texture: str
-    """`t1` to `t4`."""
+    """`t1` to `t4`; empty where it is not registered."""
     video: str
     """`v1`, `v2`, `v3`; of C3VD `a`, `b`, `c`."""
     frames: int
@@ -56,7 +57,7 @@ class Recording(_Model):
     @property
     def scene(self) -> str:
         """Segment and texture: what several videos show."""
-        return f"{self.segment}_{self.texture}"
+        return f"{self.segment}_{self.texture}" if self.texture else self.segment
 
     @property
     def stem(self) -> str:
@@ -66,7 +67,7 @@ class Recording(_Model):
     @property
     def name(self) -> str:
         """`DATASET/SEQUENCE`."""
-        return f"{self.dataset}/{self.stem}"
+        return _named(self.dataset, self.stem)
 
 
 class RecordingPair(_Model):
@@ -82,7 +83,7 @@ class RecordingPair(_Model):
     @property
     def name(self) -> str:
         """`DATASET/SCENE@SETTING`."""
-        return f"{self.train.dataset}/{self.train.scene}@{self.setting}"
+        return _named(self.train.dataset, f"{self.train.scene}@{self.setting}")
 
     @property
     def train_frames(self) -> range:
@@ -93,6 +94,10 @@ class RecordingPair(_Model):
     def frames(self) -> int:
         """Frames that are used, both videos together."""
         return math.ceil(self.train.frames / self.train_every) + self.test.frames
+
+
+def _named(dataset: str, sequence: str) -> str:
+    return f"{dataset}/{sequence}" if dataset else sequence
 
 
 class _Roles(_Model):

@@ -24,7 +24,7 @@ from data_catalog.c3vd.coverage import Alignment, CoverageMesh, Surface, align, 
 from data_catalog.c3vd.pinhole import PinholeResampling
 from data_catalog.c3vd.published import PublishedSet, Recording, RecordingPair, find_recording, published_sets
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
-from data_catalog.c3vd.video import POSE_FILE, Video, is_video, read_depth_mm
+from data_catalog.c3vd.video import CALIBRATION_FILE, POSE_FILE, Video, is_video, read_depth_mm
 from data_catalog.content import view_mask
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import image_size, spread
@@ -118,12 +118,20 @@ READER = FolderReader(
 def open_recording(folder: Path, recording: Recording) -> Video:
     """A video whose number of frames is known.
 
+    Of an unregistered one the camera is `calibration.json`'s, else C3VDv2's (said in a warning), and depth
+    may be lacking.
+
     Raises:
         SourceError: another number of frames, so that a split manifest would mean other frames; and what
             `Video.open` raises.
     """
-    dataset: PublishedSet = published_sets()[recording.dataset]
-    video = Video.open(folder, calibration=dataset.calibration, depth_range_mm=dataset.depth_range_mm)
+    dataset: PublishedSet | None = published_sets().get(recording.dataset)
+    if dataset is None:
+        video = Video.open(folder)
+        if video.calibration != CALIBRATION_FILE:
+            logger.warning("%s: no %s, taken for the camera %s", folder, CALIBRATION_FILE, video.calibration)
+    else:
+        video = Video.open(folder, calibration=dataset.calibration, depth_range_mm=dataset.depth_range_mm)
     if len(video) != recording.frames:
         raise SourceError(
             f"{len(video)} frames (numbers {video.numbers[0]} to {video.numbers[-1]}); expected "
@@ -131,7 +139,7 @@ def open_recording(folder: Path, recording: Recording) -> Video:
             file=folder,
             field="rgb",
         )
-    if not video.depth_files:
+    if not video.depth_files and dataset is not None:
         raise SourceNotFoundError(
             f"no depth; {recording.name} is published with it", file=folder / "depth", field="depth"
         )

@@ -35,6 +35,7 @@ from data_catalog.images import read_colour, read_depth
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 
 __all__ = [
+    "CALIBRATION_FILE",
     "DEPTH_RANGE_MM",
     "POSE_FILE",
     "Layout",
@@ -51,6 +52,7 @@ DEPTH_RANGE_MM = 100.0
 """What the largest code stands for, in both datasets."""
 CLIP_CODE = 65535
 POSE_FILE = "pose.txt"
+CALIBRATION_FILE = "calibration.json"
 Layout = Literal["column-major", "row-major"]
 
 # A colon is not a metre long: a translation this far out is in another unit, or not a translation.
@@ -178,7 +180,7 @@ class Video:
         chosen = range(len(self)) if indices is None else indices
         fixed = [
             self.folder / name
-            for name in (POSE_FILE, "coverage_mesh.obj", "calibration.json")
+            for name in (POSE_FILE, "coverage_mesh.obj", CALIBRATION_FILE)
             if (self.folder / name).is_file()
         ]
         frames = [self.colour_files[k] for k in chosen]
@@ -334,13 +336,13 @@ def _poses_of_frames(
 
 
 def _camera(folder: Path, flat: bool, calibration: CalibrationName | None) -> tuple[ScaramuzzaCamera, str]:
-    file = folder / "calibration.json"
+    file = folder / CALIBRATION_FILE
     if file.is_file():
         try:
             content = json.loads(file.read_text())
         except (json.JSONDecodeError, UnicodeDecodeError) as error:
             raise SourceError(f"not readable as JSON: {error}", file=file, field="calibration") from error
-        return camera_from_json(content, file=file), "calibration.json"
+        return camera_from_json(content, file=file), CALIBRATION_FILE
     known = find_recording(folder.resolve().name)
     if calibration is None and known is not None:
         calibration = published_sets()[known.dataset].calibration

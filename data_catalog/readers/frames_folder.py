@@ -96,7 +96,7 @@ class _ContentMask:
 
 READER = FolderReader(
     name="frames",
-    version=3,
+    version=4,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
@@ -106,7 +106,7 @@ READER = FolderReader(
 
 
 def read_intrinsics(
-    folder: Path, width: int, height: int, *, guess_is_used: bool = True
+    folder: Path, width: int, height: int, *, pixel_aspect: float = 1.0, guess_is_used: bool = True
 ) -> Float[np.ndarray, "3 3"]:
     """K from `intrinsics.json` in a folder, or of the assumed field of view where there is none.
 
@@ -114,6 +114,7 @@ def read_intrinsics(
         folder: where the file is looked for.
         width: of the images it belongs to, in pixels.
         height: of the images it belongs to, in pixels.
+        pixel_aspect: width of a pixel over its height, for intrinsics from a field of view.
         guess_is_used: whether to warn of the assumed field of view; false where a calibration file follows.
 
     Raises:
@@ -128,7 +129,9 @@ def read_intrinsics(
             folder.name,
             ASSUMED_FIELD_OF_VIEW_DEG,
         )
-        return intrinsics_of_field_of_view(ASSUMED_FIELD_OF_VIEW_DEG, width, height)
+        return intrinsics_of_field_of_view(
+            ASSUMED_FIELD_OF_VIEW_DEG, width, height, pixel_aspect=pixel_aspect
+        )
     try:
         content = json.loads(file.read_text())
         if "K" in content:
@@ -141,7 +144,7 @@ def read_intrinsics(
                     file=file,
                     field="field_of_view_deg",
                 )
-            K = intrinsics_of_field_of_view(angle, width, height)
+            K = intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
         else:
             fx, fy, cx, cy = (float(content[key]) for key in ("fx", "fy", "cx", "cy"))
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])

@@ -66,6 +66,24 @@ class IngestConfig(StageConfig):
         description="frames that a list of poses names and that are absent are left out with a warning; the "
         "source is refused where more than this share is absent",
     )
+    withhold_depth: bool = Field(
+        False,
+        description="training frames keep no depth; held-out frames keep theirs for the evaluation alone. "
+        "Points of a source that has depth go with it",
+    )
+    scale_mm_per_unit: float | None = Field(
+        None,
+        gt=0,
+        le=1e6,
+        description="millimetres per unit of the source's poses, where their unit is arbitrary; None: it "
+        "stays arbitrary",
+    )
+    start_s: float = Field(
+        0.0, ge=0, description="of a video or DICOM file: read from here on, in seconds by its timestamps"
+    )
+    end_s: float | None = Field(
+        None, gt=0, description="of a video or DICOM file: read up to here, in seconds; None: to its end"
+    )
     field_of_view_deg: float | None = Field(
         None,
         ge=20,
@@ -117,6 +135,13 @@ class PosesConfig(StageConfig):
     )
     replace_given: bool = Field(
         False, description="estimate poses even if the source has them; the source's serve as reference"
+    )
+    working_distance_mm: float | None = Field(
+        None,
+        gt=0,
+        le=1000,
+        description="median distance from lens to tissue; makes an estimate by COLMAP metric where no depth "
+        "does. None: its scale is arbitrary",
     )
     rgbd_width: int = Field(192, ge=32, description="alignment by colour and depth works at most so wide")
     rgbd_neighbours: int = Field(6, ge=1, description="frames each frame is aligned with")

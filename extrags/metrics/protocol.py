@@ -293,8 +293,8 @@ def _depth_metrics(
     depth: np.ndarray, sequence: EndoscopicSequence, frame: int, region: Tensor
 ) -> dict[str, float | None]:
     errors = None
-    if sequence.depth_mm is not None:
-        errors = depth_errors(depth, sequence.depth_mm[frame], region.numpy())
+    if sequence.true_depth_mm is not None:
+        errors = depth_errors(depth, sequence.true_depth_mm[frame], region.numpy())
     keys = [metric.key for metric in registered_metrics("depth")]
     if errors is None:
         return dict.fromkeys(keys)
@@ -330,7 +330,7 @@ def _reasons(
     if metrics["depth_absrel"] is None:
         reasons["depth_absrel"] = (
             "the sequence has no true depth"
-            if sequence.depth_mm is None
+            if sequence.true_depth_mm is None
             else "no pixel has both a true and a rendered depth"
         )
     for name in ("observed", "unobserved"):

@@ -159,10 +159,10 @@ def surface_from_renders(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"])
 
 def surface_from_depth(sequence: EndoscopicSequence) -> TrueSurface | None:
     """The true surface from the true depth of all frames; None without poses, depth or surface."""
-    if sequence.depth_mm is None or sequence.world_from_camera is None:
+    if sequence.true_depth_mm is None or sequence.world_from_camera is None:
         return None
     frames = _all_frames(sequence)
-    depth = np.where(sequence.mask[frames], sequence.depth_mm[frames], 0).astype(np.float32)
+    depth = np.where(sequence.mask[frames], sequence.true_depth_mm[frames], 0).astype(np.float32)
     depth[~np.isfinite(depth)] = 0
     try:
         return TrueSurface(_fused(sequence.cameras[frames], depth), "depth")
@@ -328,17 +328,17 @@ def _parts(
 def _max_fused_depth(sequence: EndoscopicSequence) -> float:
     """Largest depth that is fused; surface that is only seen from farther away is not evaluated."""
     frames = _all_frames(sequence)
-    if sequence.depth_mm is None:
+    if sequence.true_depth_mm is None:
         return float("inf")
-    depth = sequence.depth_mm[frames]
+    depth = sequence.true_depth_mm[frames]
     known = depth[(depth > 0) & np.isfinite(depth) & sequence.mask[frames]]
     return float(np.quantile(known, PROTOCOL_FUSION.depth_quantile)) if known.size else float("inf")
 
 
 def _threshold(sequence: EndoscopicSequence) -> float:
-    if sequence.metric or sequence.depth_mm is None:
+    if sequence.metric or sequence.true_depth_mm is None:
         return THRESHOLD_MM
-    depth = sequence.depth_mm[sequence.train]
+    depth = sequence.true_depth_mm[sequence.train]
     known = depth[(depth > 0) & np.isfinite(depth) & sequence.mask[sequence.train]]
     return THRESHOLD_SHARE * float(np.median(known)) if known.size else THRESHOLD_MM
 

@@ -7,16 +7,19 @@ from extrags.poses.estimate import PoseEstimate, estimate_poses, with_estimated_
 from extrags.poses.registration_report import errors_against_given
 from extrags.poses.rgbd import RgbdAlignment, align_by_depth
 from extrags.poses.scale import DepthScale, depth_scale
+from extrags.poses.triangulation import Triangulation, triangulate_points
 
 __all__ = [
     "DepthScale",
     "LensCalibration",
     "PoseEstimate",
     "RgbdAlignment",
+    "Triangulation",
     "align_by_depth",
     "depth_scale",
     "errors_against_given",
     "estimate_poses",
+    "triangulate_points",
     "with_calibration",
     "with_estimated_poses",
 ]

@@ -90,37 +90,44 @@ def with_calibration(sequence: EndoscopicSequence, calibration: LensCalibration)
 
     A lens without distortion only replaces `K`. Else all frames, held-out ones too, are resampled to the
     pinhole of the lens's central resolution; what the lens did not see leaves the validity mask. Poses and
-    points are of the camera's centre and stay as they are.
+    points are of the camera's centre and stay as they are. Pixels that were not square are.
 
     Args:
-        sequence: frames as the lens made them.
+        sequence: frames as the lens made them; their pixels need not be square.
         calibration: of all of them.
 
     Returns:
         A copy with `intrinsics` set to `estimated`; the same sequence where nothing was determined.
 
     Raises:
-        ShapeError: when the frames have another size than the lens.
+        ShapeError: when the frames, with square pixels, have another size than the lens.
     """
-    lens = calibration.lens
+    lens, given = calibration.lens, sequence
+    sequence = sequence.with_square_pixels()
     if (lens.width, lens.height) != (sequence.width, sequence.height):
         raise ShapeError(
             f"{sequence.name}: frames of {sequence.width} x {sequence.height} pixels, expected "
             f"{lens.width} x {lens.height} as the lens has"
         )
     if not calibration.determined:
-        return sequence
+        return given
     known = replace(sequence, intrinsics="estimated", focal_std_px=calibration.focal_std_px)
     if lens.is_pinhole:
         return replace(known, K=np.tile(lens.K, (len(sequence), 1, 1)))
     plan = Undistortion.planned(lens)
-    depth, observed, specular = sequence.depth_mm, sequence.observed, sequence.specular
+    observed, specular = sequence.observed, sequence.specular
+
+    def moved(lengths: np.ndarray | None) -> np.ndarray | None:
+        return None if lengths is None else np.stack([plan.depth(frame) for frame in lengths])
+
     return replace(
         known,
         K=np.tile(plan.K, (len(sequence), 1, 1)),
         rgb=np.stack([plan.colour(image) for image in sequence.rgb]),
         mask=np.stack([plan.mask(mask) for mask in sequence.mask]),
-        depth_mm=None if depth is None else np.stack([plan.depth(frame) for frame in depth]),
+        depth_mm=moved(sequence.depth_mm),
+        withheld_depth_mm=moved(sequence.withheld_depth_mm),
+        depth_error=moved(sequence.depth_error),
         observed=None if observed is None else np.stack([plan.mask(frame) for frame in observed]),
         # One highlight among the pixels that a sample touches spoils it.
         specular=None

@@ -2,14 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import subprocess
-import sys
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -18,9 +12,8 @@ from jaxtyping import Bool, Float, UInt8
 from extrags.cameras import as_rotation
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
-from extrags.events import Progress, emit
 from extrags.poses.calibration import LensCalibration, with_calibration
-from extrags.poses.job import PoseJob, PoseJobResult
+from extrags.poses.job import PoseJob, PoseJobResult, run_job
 from extrags.poses.registration_report import (
     colmap_report,
     errors_against_given,
@@ -29,7 +22,8 @@ from extrags.poses.registration_report import (
 )
 from extrags.poses.rgbd import align_by_depth
 from extrags.poses.scale import depth_scale
-from extrags.sequence import EndoscopicSequence, Split
+from extrags.sequence import EndoscopicSequence, ScaleSource, Split
+from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 
 __all__ = ["PoseEstimate", "estimate_poses", "with_estimated_poses"]
 
@@ -48,8 +42,12 @@ class PoseEstimate:
         points: of the surface, [P, 3], float32, in the unit of the poses.
         points_rgb: their colours, [P, 3].
         mean_reprojection_px: over the observations in training frames; None without such.
-        metric: true when the unit is the millimetre, from known depth.
+        metric: true when the unit is the millimetre.
         report: counts of features, matches and registrations, ready for JSON.
+        truth_per_unit: length of one unit of the poses in the unit of withheld true depth; None where no
+            depth is withheld or the poses are metric. The evaluation compares with the truth by it; no
+            pose and no point depends on it.
+        scale_source: what makes the estimate metric, if anything does.
         calibration: of the lens, where the sequence's intrinsics were a guess; None where they were given.
     """
 
@@ -61,6 +59,8 @@ class PoseEstimate:
     mean_reprojection_px: float | None
     metric: bool
     report: dict[str, Any]
+    truth_per_unit: float | None = None
+    scale_source: ScaleSource = "source"
     calibration: LensCalibration | None = None
 
     @property
@@ -75,8 +75,17 @@ class PoseEstimate:
         lens = "" if self.calibration is None else f"; {self.calibration.summary}"
         return (
             f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
-            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames{lens}"
+            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames; {self._scale}{lens}"
         )
+
+    @property
+    def _scale(self) -> str:
+        return {
+            "source": "scale as that of the depth" if self.method == "rgbd" else "arbitrary scale",
+            "setting": "scale from ingest.scale_mm_per_unit",
+            "depth": "scale from depth",
+            "working_distance": "scale from the working distance given",
+        }[self.scale_source]
 
     def to_json(self, given: EndoscopicSequence) -> dict[str, Any]:
         """Counts and errors as plain JSON.
@@ -91,6 +100,7 @@ class PoseEstimate:
             "summary": self.summary,
             "registered": [bool(found) for found in self.registered],
             "mean_reprojection_px": self.mean_reprojection_px,
+            "truth_per_unit": self.truth_per_unit,
             "against_given": errors,
             **self.report,
         }
@@ -102,7 +112,9 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     *COLMAP*: SIFT inside the validity mask, known intrinsics held fixed, incremental mapping on the training
     frames alone; the largest model counts. Held-out frames are registered afterwards against the finished
     map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the millimetre
-    (`extrags.poses.depth_scale`). COLMAP runs in a process of its own.
+    (`extrags.poses.depth_scale`); where it has none and `config.working_distance_mm` is given, the median
+    depth of the pixels, interpolated between the points that a frame observes, becomes that. COLMAP runs in
+    a process of its own.
 
     *An unknown lens* (`sequence.intrinsics` is `guessed`, see `PosesConfig.refine_intrinsics`): focal
     length and radial distortion are estimated with the map (`extrags.poses.self_calibration`), and the
@@ -128,6 +140,9 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
     """
     config = PosesConfig() if config is None else config
+    if not sequence.training_depth_known:
+        # Held-out frames may have depth for the evaluation alone.
+        sequence = replace(sequence, depth_mm=None)
     if len(sequence.train) < MIN_TRAINING_FRAMES:
         raise CaptureError(
             f"{sequence.name}: poses need at least {MIN_TRAINING_FRAMES} training frames, "
@@ -135,7 +150,10 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
         )
     if config.fallback == "rgbd":
         return _by_depth(sequence, config, None)
-    result = _run(_job(sequence, config), sequence.name)
+    unknown_lens = _estimates_lens(sequence, config)
+    # The lenses that are tried have one focal length.
+    seen = sequence.with_square_pixels() if unknown_lens else sequence
+    result = _run(_job(seen, config, unknown_lens=unknown_lens), sequence.name)
     registered = np.isfinite(result.world_from_camera).all((1, 2))
     report = colmap_report(sequence, result, registered)
     calibration = None
@@ -145,7 +163,8 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
         told("%s: %s", sequence.name, calibration.summary)
     if _enough(report, config):
         _warn_of_missing(sequence, report)
-        return replace(_from_colmap(sequence, result, registered, report), calibration=calibration)
+        found = _from_colmap(seen, result, registered, report, config)
+        return replace(found, calibration=calibration)
     if config.fallback == "never":
         instead = "Alignment by colour and depth is switched off (poses.fallback)."
     elif sequence.depth_mm is None:
@@ -161,7 +180,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     raise CaptureError(failure_message(sequence.name, report, config.min_registered_share, instead=instead))
 
 
-def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
+def _job(sequence: EndoscopicSequence, config: PosesConfig, *, unknown_lens: bool = False) -> PoseJob:
     recording = sequence.recording
     return PoseJob(
         rgb=sequence.rgb,
@@ -171,7 +190,7 @@ def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
         train=np.asarray(sequence.train, dtype=np.int64),
         test=np.asarray(sequence.test, dtype=np.int64),
         settings=config.model_dump(),
-        unknown_lens=_estimates_lens(sequence, config),
+        unknown_lens=unknown_lens,
     )
 
 
@@ -187,24 +206,33 @@ def _estimates_lens(sequence: EndoscopicSequence, config: PosesConfig) -> bool:
 
 
 def _from_colmap(
-    sequence: EndoscopicSequence, result: PoseJobResult, registered: np.ndarray, report: dict[str, Any]
+    sequence: EndoscopicSequence,
+    result: PoseJobResult,
+    registered: np.ndarray,
+    report: dict[str, Any],
+    config: PosesConfig,
 ) -> PoseEstimate:
     poses, points = _cleaned(result.world_from_camera, registered), result.points
-    scale = None
+    mm_per_unit: float | None = None
+    scale_source: ScaleSource = "source"
+    seen = (result.observed_frame, result.observed_point, result.observed_px)
+    scale = truth = None
     if sequence.depth_mm is not None and sequence.metric:
-        scale = depth_scale(
-            poses,
-            points,
-            result.observed_frame,
-            result.observed_point,
-            result.observed_px,
-            sequence.depth_mm,
-            sequence.mask,
-        )
+        scale = depth_scale(poses, points, *seen, sequence.depth_mm, sequence.mask)
+    elif sequence.true_depth_mm is not None and config.working_distance_mm is None:
+        truth = depth_scale(poses, points, *seen, sequence.true_depth_mm, sequence.mask)
     if scale is not None:
-        poses[:, :3, 3] *= scale.mm_per_unit
-        points = points * scale.mm_per_unit
+        mm_per_unit, scale_source = scale.mm_per_unit, "depth"
         report["scale"] = asdict(scale)
+    elif config.working_distance_mm is not None:
+        mm_per_unit, scale_source = (
+            _told_scale(sequence, poses, result, config.working_distance_mm),
+            "working_distance",
+        )
+        report["scale"] = {"mm_per_unit": mm_per_unit, "working_distance_mm": config.working_distance_mm}
+    if mm_per_unit is not None:
+        poses[:, :3, 3] *= mm_per_unit
+        points = points * mm_per_unit
     return PoseEstimate(
         method="colmap",
         world_from_camera=poses,
@@ -212,9 +240,30 @@ def _from_colmap(
         points=points.astype(np.float32),
         points_rgb=result.points_rgb,
         mean_reprojection_px=float(report["mean_reprojection_px"]),
-        metric=scale is not None,
+        metric=mm_per_unit is not None,
         report=report,
+        scale_source=scale_source,
+        truth_per_unit=None if truth is None else truth.mm_per_unit,
     )
+
+
+def _told_scale(
+    sequence: EndoscopicSequence, poses: np.ndarray, result: PoseJobResult, working_distance_mm: float
+) -> float:
+    """Millimetres per unit, so that surface is so far from the training frames, in the median over pixels.
+
+    Over pixels and not over points: points lie where features are, in a tube mostly far away. Depth is
+    interpolated between the points that each frame observes.
+    """
+    pose = poses[result.observed_frame]
+    z = np.einsum("oi,oi->o", pose[:, :3, 2], result.points[result.observed_point] - pose[:, :3, 3])
+    found = []
+    for frame in np.unique(result.observed_frame):
+        rows = (result.observed_frame == frame) & (z > 0)
+        if rows.sum() >= MIN_POINTS_PER_VIEW:
+            lattice = pixel_lattice(sequence.mask[frame])
+            found.append(interpolated_depth(result.observed_px[rows], z[rows], lattice))
+    return working_distance_mm / float(np.median(np.concatenate(found) if found else z[z > 0]))
 
 
 def _by_depth(
@@ -253,14 +302,16 @@ def _by_depth(
         mean_reprojection_px=None,
         metric=sequence.metric,
         report=report,
+        scale_source="depth" if sequence.metric else "source",
     )
 
 
 def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -> EndoscopicSequence:
     """The sequence with poses and points, without the frames that did not register.
 
-    Frames keep their names; the split is renumbered. `truth` is kept as it is. Where a lens was estimated,
-    `K` is that of its pinhole, and frames of a distorted lens are resampled to it
+    Frames keep their names; the split is renumbered. `truth` is kept and told that the world is another
+    (`world`). Where true depth was withheld, it is brought to the unit of the poses, for the evaluation.
+    Where a lens was estimated, `K` is that of its pinhole, and frames of a distorted lens are resampled to it
     (`extrags.poses.with_calibration`).
 
     Raises:
@@ -279,13 +330,22 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
     def of_kept(stack: np.ndarray | None) -> Any:
         return None if stack is None else stack[kept]
 
+    def of_truth(depth: np.ndarray | None) -> Any:
+        if depth is None or estimate.metric:
+            return of_kept(depth)
+        if estimate.truth_per_unit is None:
+            return None  # its unit is not that of the poses, so that nothing could be compared with it
+        return (depth[kept] / estimate.truth_per_unit).astype(depth.dtype)
+
     split = sequence.split
+    hidden = not sequence.training_depth_known
     posed = replace(
         sequence,
         rgb=sequence.rgb[kept],
         K=sequence.K[kept],
         mask=sequence.mask[kept],
-        depth_mm=of_kept(sequence.depth_mm),
+        depth_mm=of_truth(sequence.depth_mm) if hidden else of_kept(sequence.depth_mm),
+        withheld_depth_mm=of_truth(sequence.withheld_depth_mm),
         recording=of_kept(sequence.recording),
         observed=of_kept(sequence.observed),
         specular=of_kept(sequence.specular),
@@ -295,43 +355,15 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         metric=estimate.metric,
         points=estimate.points,
         points_rgb=estimate.points_rgb,
+        scale_source=estimate.scale_source,
         pose_source="estimated" if estimate.method == "colmap" else "aligned",
+        truth={**sequence.truth, "world": "estimated"} if sequence.truth else {},
     )
     return posed if estimate.calibration is None else with_calibration(posed, estimate.calibration)
 
 
 def _run(job: PoseJob, name: str) -> PoseJobResult:
-    """Run the job in a process of its own and pass its progress on."""
-    with TemporaryDirectory(prefix="extrags-poses-") as scratch:
-        folder = Path(scratch)
-        job.save(folder)
-        log = folder / "colmap.log"
-        # The child must find this very package, installed or not.
-        root = str(Path(__file__).resolve().parents[2])
-        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
-        with (
-            log.open("wb") as log_file,
-            subprocess.Popen(
-                [sys.executable, "-m", "extrags.poses.colmap", scratch],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=log_file,
-                text=True,
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
-            ) as process,
-        ):
-            try:
-                for line in process.stdout or ():
-                    told = json.loads(line)
-                    emit(Progress("poses", told["done"], told["total"], told["values"]))
-                code = process.wait()
-            except BaseException:
-                process.kill()
-                raise
-        if code != 0 or not (folder / "result.json").exists():
-            last = log.read_text(errors="replace").strip().splitlines()[-8:]
-            raise CaptureError(f"{name}: COLMAP's process ended with code {code}:\n" + "\n".join(last))
-        return PoseJobResult.load(folder)
+    return run_job("extrags.poses.colmap", job, name, stage="poses")
 
 
 def _cleaned(found: np.ndarray, registered: np.ndarray) -> np.ndarray:

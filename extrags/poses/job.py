@@ -1,15 +1,22 @@
-"""Messages between the caller and COLMAP's process: files in a scratch folder."""
+"""Messages between the caller and COLMAP's process: files in a scratch folder; and how the process is run."""
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-__all__ = ["PoseJob", "PoseJobResult"]
+from extrags.errors import CaptureError
+from extrags.events import Progress, emit
+
+__all__ = ["PoseJob", "PoseJobResult", "run_job"]
 
 
 @dataclass(frozen=True)
@@ -25,6 +32,7 @@ class PoseJob:
         test: indices of frames registered afterwards.
         settings: fields of `PosesConfig`.
         unknown_lens: whether `K`, then the same for all frames, is a guess and the lens is to be estimated.
+        world_from_camera: known poses, [F, 4, 4]; None where they are to be found.
     """
 
     rgb: np.ndarray
@@ -35,11 +43,16 @@ class PoseJob:
     test: np.ndarray
     settings: dict[str, Any]
     unknown_lens: bool = False
+    world_from_camera: np.ndarray | None = None
 
     def save(self, folder: Path) -> None:
         """Write the job."""
+        known: dict[str, Any] = {}
+        if self.world_from_camera is not None:
+            known["world_from_camera"] = self.world_from_camera
         np.savez(
             folder / "job.npz",
+            **known,
             rgb=self.rgb,
             mask=self.mask,
             K=self.K,
@@ -98,3 +111,47 @@ class PoseJobResult:
         """Read the result."""
         with np.load(folder / "result.npz") as arrays:
             return cls(**dict(arrays.items()), report=json.loads((folder / "result.json").read_text()))
+
+
+def run_job(module: str, job: PoseJob, name: str, *, stage: str) -> PoseJobResult:
+    """Run a job in a process of its own and pass its progress on.
+
+    Args:
+        module: run as `python -m MODULE FOLDER`.
+        job: its input.
+        name: of the sequence, for errors.
+        stage: named in progress events.
+
+    Raises:
+        CaptureError: when the process ends on its own, with its last words.
+    """
+    with TemporaryDirectory(prefix="extrags-poses-") as scratch:
+        folder = Path(scratch)
+        job.save(folder)
+        log = folder / "colmap.log"
+        # The child must find this very package, installed or not.
+        root = str(Path(__file__).resolve().parents[2])
+        paths = [root, *filter(None, [os.environ.get("PYTHONPATH")])]
+        with (
+            log.open("wb") as log_file,
+            subprocess.Popen(
+                [sys.executable, "-m", module, scratch],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=log_file,
+                text=True,
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+            ) as process,
+        ):
+            try:
+                for line in process.stdout or ():
+                    told = json.loads(line)
+                    emit(Progress(stage, told["done"], told["total"], told["values"]))
+                code = process.wait()
+            except BaseException:
+                process.kill()
+                raise
+        if code != 0 or not (folder / "result.json").exists():
+            last = log.read_text(errors="replace").strip().splitlines()[-8:]
+            raise CaptureError(f"{name}: COLMAP's process ended with code {code}:\n" + "\n".join(last))
+        return PoseJobResult.load(folder)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from itertools import combinations
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
-__all__ = ["registration_pairs", "spread_evenly", "training_pairs"]
+__all__ = ["neighbouring_pairs", "registration_pairs", "spread_evenly", "training_pairs"]
 
 Pair = tuple[int, int]
 
@@ -46,6 +46,36 @@ def training_pairs(
             pairs |= {(int(i), int(j)) for i, j in zip(members, members[offset:], strict=False)}
     pairs |= {(int(i), int(j)) for i, j in combinations(spread_evenly(train, exhaustive_below), 2)}
     return sorted(pairs)
+
+
+def neighbouring_pairs(
+    train: Int[np.ndarray, "n_train"], world_from_camera: Float[np.ndarray, "f 4 4"], *, neighbours: int
+) -> list[Pair]:
+    """Pairs of training frames that stand near each other and look the same way, whatever their order.
+
+    A distance between centres as long as the median distance of a frame from its `neighbours`-th weighs as
+    much as a turn by one radian: photographs of an object are not in the order of any path.
+
+    Args:
+        train: indices of the training frames.
+        world_from_camera: poses of all frames.
+        neighbours: frames that each frame is paired with.
+
+    Returns:
+        Pairs (i, j) with i before j in `train`, sorted, none twice.
+    """
+    count = min(neighbours, len(train) - 1)
+    if count < 1:
+        return []
+    poses = world_from_camera[train]
+    apart = np.linalg.norm(poses[:, None, :3, 3] - poses[None, :, :3, 3], axis=-1)
+    turn = np.arccos(np.clip(poses[:, :3, 2] @ poses[:, :3, 2].T, -1, 1))
+    unit = float(np.median(np.sort(apart, axis=1)[:, count]))
+    far = apart / max(unit, 1e-12) + turn
+    np.fill_diagonal(far, np.inf)
+    nearest = np.argsort(far, axis=1, kind="stable")[:, :count]
+    places = {(min(i, int(j)), max(i, int(j))) for i, row in enumerate(nearest) for j in row}
+    return sorted((int(train[i]), int(train[j])) for i, j in places)
 
 
 def registration_pairs(

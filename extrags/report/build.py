@@ -92,7 +92,7 @@ def _facts(inputs: ReportInputs) -> list[tuple[str, str]]:
     recordings = 1 if sequence.recording is None else len(np.unique(sequence.recording))
     if recordings > 1:
         facts.append(("Recordings", count(recordings)))
-    facts.append(("Unit of length", "millimetres" if sequence.metric else "arbitrary"))
+    facts.append(("Scale", sequence.scale_words.removesuffix(" scale")))
     if sequence.intrinsics != "given":
         facts.append(("Focal length", intrinsics_in_words(sequence)))
     if (gaussians := metric_of(final, "n_gaussians")) is not None:
@@ -199,7 +199,7 @@ def _missing_reasons(inputs: ReportInputs) -> list[tuple[str, str]]:
 def _views(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:
     held_out = min(config.held_out_views, len(inputs.frames)) if inputs.coarse or inputs.final else 0
     virtual = 0 if inputs.pseudo is None else min(config.virtual_views, len(inputs.pseudo.rendered))
-    has_depth = held_out > 0 and inputs.sequence.depth_mm is not None
+    has_depth = held_out > 0 and inputs.sequence.true_depth_mm is not None
     images = 5 * (held_out + virtual + (held_out if has_depth else 0))
     largest = IMAGE_BYTES // max(1, images)
     coarse, final = _per_view_psnr(inputs.coarse_metrics), _per_view_psnr(inputs.final_metrics)

@@ -65,12 +65,12 @@ def depth_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> ImageTab
         The table, or None when none of the views has true depth.
     """
     sequence = inputs.sequence
-    if sequence.depth_mm is None:
+    if sequence.true_depth_mm is None:
         return None
     chosen = evenly_spaced(len(inputs.frames), views)
     frames = inputs.frames[chosen]
     masks = sequence.mask[frames]
-    truth = sequence.depth_mm[frames].astype(np.float64)
+    truth = sequence.true_depth_mm[frames].astype(np.float64)
     known = (truth > 0) & np.isfinite(truth) & masks
     if not known.any():
         return None

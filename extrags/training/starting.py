@@ -1,10 +1,12 @@
-"""Starting points of the optimisation: Gaussians on the surface given by depth or sparse points."""
+"""Starting points of the optimisation: on the surface given by depth or sparse points, else at random."""
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import cKDTree
 
 from extrags.cameras import pixel_rays
@@ -12,35 +14,67 @@ from extrags.errors import CaptureError
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.sequence import EndoscopicSequence
+from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
+from extrags.training.random_start import depth_range, random_depth
 
-__all__ = ["depth_from_points", "median_depth", "starting_gaussians", "surface_normals", "thin_out"]
+__all__ = [
+    "depth_from_points",
+    "median_depth",
+    "starting_gaussians",
+    "starts_at_random",
+    "surface_normals",
+    "thin_out",
+]
+
+_log = logging.getLogger(__name__)
 
 NORMAL_NEIGHBOURS = 12
 """Points beside a point whose plane gives its normal."""
 
-MIN_POINTS_PER_VIEW = 20
-"""A view with fewer visible sparse points gives no interpolated depth."""
+MEASURED_FRAMES = 40
+"""Frames at most whose interpolated depth gives the length scale of a scene of sparse points."""
+
+SURFACE_OPACITY, RANDOM_OPACITY = 0.5, 0.1
+"""Opacity at the start: on a known surface, and at random points, which must not hide each other."""
 
 
 def median_depth(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> float:
     """Median distance from lens to surface over frames, in world units: the scene's length scale.
 
+    From depth, else interpolated between sparse points, else from where the cameras stand and look
+    (`extrags.training.random_start.depth_range`).
+
     Raises:
-        CaptureError: when neither depth nor points are known.
+        CaptureError: when neither depth nor points are known, and all cameras stand in one place.
     """
-    if sequence.depth_mm is not None:
-        depth = sequence.depth_mm[frames]
-        valid = (depth > 0) & sequence.mask[frames]
-        if valid.any():
-            return float(np.median(depth[valid]))
-    if sequence.points is not None and len(sequence.points):
-        _, z = sequence.cameras[frames].project(sequence.points)
-        if (z > 0).any():
-            return float(np.median(z[z > 0]))
-    raise CaptureError(
-        f"{sequence.name}: neither depth nor sparse points are known, so there is nothing to start "
-        "the reconstruction from; provide depth, or let the poses stage triangulate points"
-    )
+    depth = _known_depth(sequence, frames)
+    if depth is not None:
+        return float(np.median(depth[(depth > 0) & sequence.mask[frames]]))
+    if sequence.points is not None and len(sequence.points) >= MIN_POINTS_PER_VIEW:
+        found = []
+        chosen = np.linspace(0, len(frames) - 1, min(len(frames), MEASURED_FRAMES)).round().astype(np.int64)
+        for frame in frames[chosen]:
+            pixels, z, inside = _seen(sequence, int(frame))
+            if inside.sum() >= MIN_POINTS_PER_VIEW:
+                # Not of the points themselves: they lie where features are, and mostly far down a tube.
+                lattice = pixel_lattice(sequence.mask[frame])
+                found.append(interpolated_depth(pixels[inside], z[inside], lattice))
+        if found:
+            return float(np.median(np.concatenate(found)))
+    return depth_range(sequence.cameras[frames], sequence.name).typical
+
+
+def starts_at_random(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> bool:
+    """Whether `starting_gaussians` knows neither depth nor enough points in any of the frames.
+
+    Points that no frame sees at all are no sparse start but another world: they are refused as before.
+    """
+    if _known_depth(sequence, frames) is not None:
+        return False
+    if sequence.points is None or len(sequence.points) < MIN_POINTS_PER_VIEW:
+        return True
+    most = max(int(_seen(sequence, int(frame))[2].sum()) for frame in frames)
+    return 0 < most < MIN_POINTS_PER_VIEW
 
 
 def starting_gaussians(
@@ -53,10 +87,11 @@ def starting_gaussians(
     thickness: float = 1.0,
     seed: int = 0,
 ) -> Gaussians:
-    """Gaussians from back-projected depth, or from sparse points where there is no depth.
+    """Gaussians from back-projected depth, from sparse points without depth, or at random without either.
 
     Each point carries the mean albedo of its pixels: the colour with light and response divided out.
-    Radii follow the distance to the three nearest neighbours.
+    Radii follow the distance to the three nearest neighbours. Random points lie in the cameras' frusta; they
+    are round and faint, and a warning says so.
 
     Args:
         sequence: posed frames.
@@ -65,16 +100,29 @@ def starting_gaussians(
         light: the light the optimisation starts with; None keeps colours as they are.
         sh_degree: degree of the (zero) higher harmonics.
         thickness: along the surface's normal, as a share of the radius; 1 makes round Gaussians.
-        seed: chooses among equivalent pixels.
+        seed: chooses among equivalent pixels, and random points.
 
     Raises:
-        CaptureError: when neither depth nor points are known.
+        CaptureError: when neither depth nor points are known and all cameras stand in one place; when no
+            frame sees any of the points; when masks leave no pixel.
     """
-    depth = sequence.depth_mm
-    if depth is None:
-        depth = depth_from_points(sequence, frames)
     cameras = sequence.cameras[frames]
-    valid = (depth[frames] > 0) & sequence.mask[frames]
+    at_random = starts_at_random(sequence, frames)
+    if at_random:
+        within = depth_range(cameras, sequence.name)
+        _log.warning(
+            "%s: neither depth nor enough sparse points are known; the reconstruction starts from random "
+            "points, %.3g to %.3g units from the cameras, %s",
+            sequence.name,
+            within.near,
+            within.far,
+            "round the point they look at" if within.meeting is not None else "along their path",
+        )
+        depth = random_depth(cameras, within, seed=seed)
+    else:
+        known = _known_depth(sequence, frames)
+        depth = depth_from_points(sequence, frames)[frames] if known is None else known
+    valid = (depth > 0) & sequence.mask[frames]
     count = int(valid.sum())
     if count == 0:
         raise CaptureError(f"{sequence.name}: no valid depth in any training frame")
@@ -84,7 +132,7 @@ def starting_gaussians(
     if count > 10 * max_points:
         chosen = np.sort(generator.choice(chosen, 10 * max_points, replace=False))
     rays = pixel_rays(cameras).reshape(-1, 3)[chosen]
-    z = depth[frames].reshape(-1)[chosen].astype(np.float64)
+    z = depth.reshape(-1)[chosen].astype(np.float64)
     view = chosen // (sequence.width * sequence.height)
     points = cameras.centers[view] + z[:, None] * rays
     rgb = sequence.rgb[frames].reshape(-1, 3)[chosen].astype(np.float64) / 255
@@ -101,10 +149,10 @@ def starting_gaussians(
         points,
         np.clip(rgb, 0, None),
         np.maximum(radius, floor),
-        opacity=0.5,
+        opacity=RANDOM_OPACITY if at_random else SURFACE_OPACITY,
         sh_degree=sh_degree,
-        normals=surface_normals(points) if thickness != 1 else None,
-        thickness=thickness,
+        normals=None if at_random or thickness == 1 else surface_normals(points),
+        thickness=1.0 if at_random else thickness,
     )
 
 
@@ -164,8 +212,6 @@ def depth_from_points(
     Raises:
         CaptureError: when no frame sees enough points.
     """
-    from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator
-
     points = sequence.points
     if points is None or len(points) < MIN_POINTS_PER_VIEW:
         raise CaptureError(
@@ -173,25 +219,42 @@ def depth_from_points(
             f"at least {MIN_POINTS_PER_VIEW} are needed to start the reconstruction"
         )
     depth = np.zeros(sequence.rgb.shape[:3], np.float32)
-    cameras = sequence.cameras
-    u, v = np.meshgrid(np.arange(sequence.width) + 0.5, np.arange(sequence.height) + 0.5)
+    everywhere = np.stack(
+        np.meshgrid(np.arange(sequence.width) + 0.5, np.arange(sequence.height) + 0.5), axis=-1
+    )
     used = 0
     for frame in frames:
-        (pixels,), (z,) = cameras[int(frame)].project(points)
-        inside = cameras.contains(pixels)
-        column, row = pixels[inside].astype(np.int64).T
-        inside[inside] = sequence.mask[frame][row, column]
+        pixels, z, inside = _seen(sequence, int(frame))
         if inside.sum() < MIN_POINTS_PER_VIEW:
             continue
         used += 1
-        # Inverse depth is linear across a plane in the image; depth is not.
-        linear = LinearNDInterpolator(pixels[inside], 1 / z[inside])(u, v)
-        nearest = NearestNDInterpolator(pixels[inside], 1 / z[inside])(u, v)
-        inverse = np.where(np.isfinite(linear), linear, nearest)
-        depth[frame] = np.where(sequence.mask[frame], 1 / inverse, 0)
+        found = interpolated_depth(pixels[inside], z[inside], everywhere)
+        depth[frame] = np.where(sequence.mask[frame], found, 0)
     if used == 0:
         raise CaptureError(
             f"{sequence.name}: no training frame sees {MIN_POINTS_PER_VIEW} of the "
             f"{len(points)} sparse points; are poses and points in the same frame and scale?"
         )
     return depth
+
+
+def _known_depth(
+    sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]
+) -> Float[np.ndarray, "m h w"] | None:
+    """Depth of the frames; None where no valid pixel of them has any."""
+    if sequence.depth_mm is None:
+        return None
+    depth = sequence.depth_mm[frames]
+    return depth if bool(((depth > 0) & sequence.mask[frames]).any()) else None
+
+
+def _seen(
+    sequence: EndoscopicSequence, frame: int
+) -> tuple[Float[np.ndarray, "p 2"], Float[np.ndarray, "p"], Bool[np.ndarray, "p"]]:
+    """Pixels and z-depths of the sparse points, and which of them fall into a frame's mask."""
+    points = np.zeros((0, 3)) if sequence.points is None else sequence.points
+    (pixels,), (z,) = sequence.cameras[frame].project(points)
+    inside = sequence.cameras.contains(pixels)
+    column, row = pixels[inside].astype(np.int64).T
+    inside[inside] = sequence.mask[frame][row, column]
+    return pixels, z, inside

@@ -31,6 +31,9 @@ __all__ = [
 
 DEFAULT_PROFILE = "balanced"
 
+SHORT_NAMES = {"--scale": "ingest.scale_mm_per_unit"}
+"""Settings with a flag of their own beside that of their name."""
+
 
 class Parser(argparse.ArgumentParser):
     """A parser that raises `ConfigError` for wrong usage, with the option that was perhaps meant."""
@@ -160,6 +163,16 @@ def add_settings(parser: Parser, group: str = "") -> None:
         parser.add_argument(
             f"--{name}", dest="settings", action=_Assign, default=argparse.SUPPRESS, help=argparse.SUPPRESS
         )
+    for flag, name in SHORT_NAMES.items():
+        if name in known:
+            parser.add_argument(
+                flag,
+                dest="settings",
+                metavar="MM",
+                action=_Assign,
+                default=argparse.SUPPRESS,
+                help=f"the same as --{name}: millimetres per unit of poses whose unit is arbitrary",
+            )
     parser.add_argument(
         "--help-settings",
         metavar="GROUP",
@@ -185,7 +198,7 @@ class _Assign(argparse.Action):
         if option_string == "--set":
             changed = parsed_settings([values])
         else:
-            name = str(option_string).removeprefix("--")
+            name = SHORT_NAMES.get(str(option_string), str(option_string).removeprefix("--"))
             changed = {name: _settings()[name].parse(values)}
         # Not in place: the dictionary that is there first is the parser's default.
         setattr(namespace, self.dest, {**getattr(namespace, self.dest), **changed})

@@ -228,6 +228,91 @@ class TestPairs:
         assert (caught.value.file, caught.value.field) == (str(file), "v")
 
 
+@pytest.fixture(scope="module")
+def recordings(data_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same two videos under a name that the catalogue does not know."""
+    folder = tmp_path_factory.mktemp("ours")
+    for name in ("v1", "v2"):
+        shutil.copytree(data_root / f"{SCENE}_{name}", folder / f"phantom7_{name}")
+    return folder
+
+
+class TestUnregistered:
+    """A scene in this layout that the catalogue does not know."""
+
+    @pytest.fixture(autouse=True)
+    def nothing_else(self, monkeypatch) -> None:
+        monkeypatch.setattr("data_catalog.named_folders.data_roots", list)
+
+    def test_it_pairs_as_registered_ones_do(self, recordings, data_root) -> None:
+        source = resolve(recordings / "phantom7@sparse")
+        assert source.name == "phantom7@sparse"
+        assert [Path(path).name for path in source.paths] == ["phantom7_v2", "phantom7_v1"]
+        sequence = read(source, SMALL)
+        registered = read(data_root / "c3vdv2_sim" / "c9_transverse1_t3@sparse", SMALL)
+        assert (sequence.split.name, sequence.split.version) == ("sparse", 1)
+        np.testing.assert_array_equal(sequence.train, registered.train)
+        np.testing.assert_array_equal(sequence.rgb, registered.rgb)
+        np.testing.assert_array_equal(sequence.world_from_camera, registered.world_from_camera)
+        np.testing.assert_array_equal(sequence.observed, registered.observed)
+        assert sequence.frame_name(0) == "phantom7_v2_0000"
+
+    def test_the_other_way_round(self, recordings) -> None:
+        source = resolve(recordings / "phantom7@distanced")
+        assert [Path(path).name for path in source.paths] == ["phantom7_v1", "phantom7_v2"]
+
+    def test_fingerprint_holds_no_place(self, recordings, tmp_path) -> None:
+        before = source_fingerprint(recordings / "phantom7@sparse")
+        assert json.loads(json.dumps(before)) == before
+        copy = Path(shutil.copytree(recordings, tmp_path / "elsewhere"))
+        assert source_fingerprint(copy / "phantom7@sparse") == before
+        assert source_fingerprint(copy / "phantom7@distanced") != before
+
+    def test_every_tenth_frame_of_a_recording_that_is_not_thinned(self, tmp_path) -> None:
+        for name, frames, phase in (("v1", 4, 0.0), ("v3", 61, 1.0)):
+            write_video(tmp_path / f"ours_{name}", frames=frames, width=25, phase=phase, seed=8)
+        sequence = read(tmp_path / "ours@sparse", IngestConfig(width=20))
+        assert sequence.frame_names[:3] == ("ours_v3_0000", "ours_v3_0010", "ours_v3_0020")
+        assert (len(sequence.train), len(sequence.test)) == (7, 4)
+
+    def test_an_assumed_camera_is_said(self, recordings, caplog, tmp_path) -> None:
+        copy = Path(shutil.copytree(recordings, tmp_path / "elsewhere"))
+        for file in copy.glob("*/calibration.json"):
+            file.unlink()
+        with caplog.at_level("WARNING"):
+            read(copy / "phantom7@sparse", SMALL)
+        assert (
+            "phantom7_v2: no calibration.json, taken for the camera as published with c3vdv2" in caplog.text
+        )
+
+    def test_without_depth(self, recordings, tmp_path) -> None:
+        copy = Path(shutil.copytree(recordings, tmp_path / "elsewhere"))
+        shutil.rmtree(copy / "phantom7_v1" / "depth")
+        with pytest.raises(SourceError, match="field depth: no depth for this frame, but for 20 of 40"):
+            read(copy / "phantom7@sparse", SMALL)
+        shutil.rmtree(copy / "phantom7_v2" / "depth")
+        assert read(copy / "phantom7@sparse", SMALL).depth_mm is None
+
+    @pytest.mark.parametrize(
+        ("gone", "name", "message"),
+        [
+            ("v1", "phantom7@sparse", r"phantom7_v1: no such folder: .* there is phantom7_v2, which"),
+            ("v2", "phantom7@distanced", r"phantom7_v2: no such folder: .* there is phantom7_v1, which"),
+            (None, "phantom8@sparse", r"phantom8_v1: no recording .*recordings of phantom7; did you mean"),
+        ],
+    )
+    def test_absent(self, recordings, tmp_path, gone, name, message) -> None:
+        copy = Path(shutil.copytree(recordings, tmp_path / "elsewhere"))
+        if gone is not None:
+            shutil.rmtree(copy / f"phantom7_{gone}")
+        with pytest.raises(SourceNotFoundError, match=message):
+            resolve(copy / name)
+
+    def test_no_such_setting(self, recordings) -> None:
+        with pytest.raises(UnknownSequenceError, match=r"no setting 'spars'.*did you mean sparse"):
+            resolve(recordings / "phantom7@spars")
+
+
 class TestCoverage:
     def test_observed_agrees_with_brute_force(self, only_here) -> None:
         """Each held-out pixel's point, carried into every training frame and held against its depth."""

@@ -65,7 +65,7 @@ class TestNames:
     def test_file_instead_of_folder(self, tmp_path) -> None:
         file = tmp_path / "notes.txt"
         file.write_bytes(b"0")
-        with pytest.raises(SourceError, match=r"expected a folder .* or a video \(\.mp4"):
+        with pytest.raises(SourceError, match=r"expected a folder .* a video \(\.mp4.* or a DICOM file"):
             resolve(file)
 
 

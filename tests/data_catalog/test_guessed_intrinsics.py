@@ -28,6 +28,17 @@ def test_a_round_picture_has_its_own_centre_and_field_of_view(guess) -> None:
     np.testing.assert_array_equal(found[:, 0, 0], found[:, 1, 1])
 
 
+def test_pixels_need_not_be_square(guess) -> None:
+    # Twice as wide as high: the rim is an ellipse in pixels.
+    guess[:, 1, 1] *= 2
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    seen = np.tile(np.hypot(u - 104, (v - 80) / 2) < 32, (3, 1, 1))
+    found = fitted_to_picture(guess, seen)
+    np.testing.assert_allclose(found[:, :2, 2], np.tile([104.0, 80.0], (3, 1)), atol=1.5)
+    np.testing.assert_allclose(found[:, 0, 0], 32, atol=1.0)
+    np.testing.assert_allclose(found[:, 1, 1], 2 * found[:, 0, 0])
+
+
 def test_a_whole_image_stays_as_it_is(guess) -> None:
     np.testing.assert_array_equal(fitted_to_picture(guess, np.ones((3, HEIGHT, WIDTH), bool)), guess)
 

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from data_catalog.phantom.trajectories import MIN_CLEARANCE_MM, camera_path
 from data_catalog.ray_casting import RayCaster
 from data_catalog.visibility import observed_from_depth
 from extrags.cameras import Cameras, invert_poses, pixel_rays
+from extrags.config import IngestConfig
 from extrags.sequence import EndoscopicSequence
 
 
@@ -212,3 +215,28 @@ class TestDeterminism:
         fine = large.z_depth(large.cameras("b", share))
         # With three times the pixels, every middle pixel has its centre on a coarse pixel's.
         np.testing.assert_allclose(fine[1::3, 1::3], coarse, rtol=1e-4)
+
+
+def test_depth_may_be_withheld() -> None:
+    """Training frames without depth; evaluation as before, from the same images."""
+    from data_catalog import read
+    from data_catalog.true_surface import true_surface
+
+    config = IngestConfig(width=40, height=32, max_frames=12)
+    given = read("phantom/0@sparse", config)
+    hidden = read("phantom/0@sparse", config.model_copy(update={"withhold_depth": True}))
+    np.testing.assert_array_equal(hidden.rgb, given.rgb)
+    np.testing.assert_array_equal(hidden.observed, given.observed)
+    np.testing.assert_array_equal(hidden.true_depth_mm, given.depth_mm)
+    assert hidden.depth_mm is not None
+    assert not hidden.depth_mm[hidden.train].any()
+    assert hidden.depth_mm[hidden.test].all()
+    assert hidden.metric
+    assert hidden.training_part().depth_mm is None
+    surface = true_surface(hidden)
+    assert surface is not None
+    assert surface.kind == "mesh"
+    # The wall is in the world of the given poses, not in that of estimated ones.
+    elsewhere = true_surface(replace(hidden, truth={**hidden.truth, "world": "estimated"}))
+    assert elsewhere is not None
+    assert elsewhere.kind == "depth"

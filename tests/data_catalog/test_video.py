@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import weakref
+from collections.abc import Collection
 from pathlib import Path
 
 import cv2
@@ -10,22 +12,28 @@ import numpy as np
 import pytest
 
 from data_catalog.catalog import read, resolve, source_fingerprint
-from data_catalog.readers.video import choose_frames, survey
+from data_catalog.footage import FootageFrame, TimeSpan
+from data_catalog.readers.footage_frames import footage_frames
+from data_catalog.readers.video import VideoFile
+from data_catalog.survey import Survey, choose_frames, survey
 from extrags.config import IngestConfig
-from extrags.errors import SourceError
+from extrags.errors import ConfigError, SourceError
 from extrags.events import Progress, subscribed
+from tests.data_catalog.footage_fixture import (
+    interlaced,
+    retimed,
+    turned,
+    write_flagged,
+    write_ten_bit,
+    write_video,
+)
 from tests.data_catalog.test_content import in_a_circle, moving_scene, rim
 
 SIZE = (320, 180)
 
 
-def write_video(file: Path, frames: np.ndarray, code: str = "FFV1") -> Path:
-    """Lossless by default."""
-    writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*code), 25, (frames.shape[2], frames.shape[1]))
-    for frame in frames:
-        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-    writer.release()
-    return file
+def surveyed(file: Path) -> Survey:
+    return survey(VideoFile(file).frames(TimeSpan()), file=file)
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +46,41 @@ def video(tmp_path_factory) -> Path:
         frames[k] = cv2.GaussianBlur(frames[k], (0, 0), 3)
     frames = in_a_circle(frames, rim(160, 90, 84))
     return write_video(tmp_path_factory.mktemp("video") / "exam.avi", frames)
+
+
+class TestIntrinsics:
+    def test_a_guess_follows_the_round_picture(self, video) -> None:
+        sequence = read(video)
+        assert sequence.intrinsics == "guessed"
+        # 90 degrees over the circle of 84 pixels, less its blurred rim.
+        np.testing.assert_allclose(sequence.K[:, 0, 0], 84, atol=4)
+        np.testing.assert_allclose(sequence.K[:, :2, 2], np.tile([160, 90], (len(sequence), 1)), atol=1.5)
+
+    def test_stated_beside_the_video(self, tmp_path) -> None:
+        file = write_video(tmp_path / "a.avi", moving_scene(12, *SIZE, speed=6))
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"field_of_view_deg": 80}))
+        sequence = read(file)
+        assert sequence.intrinsics == "given"
+        with pytest.raises(ConfigError, match="states its intrinsics itself"):
+            read(file, IngestConfig(calibration=str(calibration_file(tmp_path))))
+
+    def test_a_calibration_file_takes_the_place_of_the_guess(self, tmp_path, caplog) -> None:
+        file = write_video(tmp_path / "a.avi", moving_scene(12, *SIZE, speed=6))
+        with caplog.at_level("WARNING"):
+            sequence = read(file, IngestConfig(calibration=str(calibration_file(tmp_path))))
+        assert sequence.intrinsics == "given"
+        np.testing.assert_allclose(sequence.K[:, 0, 0], 210)
+        assert "assuming a horizontal field of view" not in caplog.text
+
+
+def calibration_file(folder: Path) -> Path:
+    file = folder / "camchain.yaml"
+    file.write_text(
+        "cam0:\n  camera_model: pinhole\n  distortion_model: radtan\n"
+        "  distortion_coeffs: [-0.1, 0.01, 0, 0]\n  intrinsics: [210, 210, 159.5, 89.5]\n"
+        "  resolution: [320, 180]\n"
+    )
+    return file
 
 
 class TestChoice:
@@ -79,17 +122,17 @@ class TestChoice:
 
     def test_measured_motion_is_the_motion(self, tmp_path) -> None:
         file = write_video(tmp_path / "a.avi", moving_scene(10, *SIZE, speed=8))
-        found = survey(file)
+        found = surveyed(file)
         np.testing.assert_allclose(np.diff(found.path), 8 / 320, rtol=0.15)
         assert (found.width, found.height) == SIZE
 
     def test_noise_does_not_add_up(self, tmp_path) -> None:
-        """A scope that stands still for ten seconds under sensor noise and trembling has not moved."""
+        """A scope that stands still for five seconds under sensor noise and trembling has not moved."""
         rng = np.random.default_rng(0)
         scene = moving_scene(3, *SIZE, speed=1)
-        frames = scene[rng.integers(0, 2, 250)] + rng.normal(0, 6, (250, 180, 320, 1))
+        frames = scene[rng.integers(0, 2, 125)] + rng.normal(0, 6, (125, 180, 320, 1))
         file = write_video(tmp_path / "a.avi", np.clip(frames, 0, 255).astype(np.uint8))
-        assert survey(file).path[-1] < 0.01
+        assert surveyed(file).path[-1] < 0.01
 
     def test_a_small_motion_is_used_whole(self, tmp_path) -> None:
         file = write_video(tmp_path / "a.avi", moving_scene(40, *SIZE, speed=1))
@@ -139,6 +182,152 @@ class TestReading:
     def test_a_compressed_video(self, tmp_path) -> None:
         file = write_video(tmp_path / "a.mp4", moving_scene(20, *SIZE, speed=6), "mp4v")
         assert len(read(file)) > 6
+
+
+class TestKindsOfFiles:
+    """What endoscopes and their recorders give."""
+
+    def test_interlaced(self, tmp_path, caplog) -> None:
+        scene = moving_scene(60, 320, 240, speed=3)
+        file = write_video(tmp_path / "a.avi", interlaced(scene))
+        with caplog.at_level("WARNING"):
+            sequence = read(file)
+        assert "a.avi: interlaced" in caplog.text
+        for name, image in zip(sequence.frame_names, sequence.rgb, strict=True):
+            # Of one moment: its lines are those of the first of the two pictures.
+            np.testing.assert_array_equal(image[::2], scene[2 * int(name)][::2])
+            assert np.abs(image[1::2].astype(int) - scene[2 * int(name)][1::2]).mean() < 4
+
+    def test_flagged_as_interlaced(self, tmp_path, caplog) -> None:
+        """OpenCV decodes such files to empty pictures."""
+        scene = moving_scene(40, 320, 240, speed=3)
+        file = write_flagged(tmp_path / "a.mpg", interlaced(scene))
+        with caplog.at_level("WARNING"):
+            sequence = read(file, IngestConfig(max_frames=6))
+        assert "a.mpg: interlaced" in caplog.text
+        for name, image in zip(sequence.frame_names, sequence.rgb, strict=True):
+            assert np.abs(image.astype(int) - scene[2 * int(name)]).mean() < 12
+
+    def test_not_interlaced(self, tmp_path, caplog) -> None:
+        with caplog.at_level("WARNING"):
+            read(write_video(tmp_path / "a.avi", moving_scene(30, 320, 240, speed=5)))
+        assert "a.avi: interlaced" not in caplog.text
+
+    def test_ten_bits(self, tmp_path) -> None:
+        scene = moving_scene(12, *SIZE, speed=6)
+        sequence = read(write_ten_bit(tmp_path / "a.y4m", scene))
+        for name, image in zip(sequence.frame_names, sequence.rgb, strict=True):
+            assert image.dtype == np.uint8
+            assert np.abs(image.astype(int) - scene[int(name)]).mean() < 6
+
+    def test_pixels_that_are_not_square(self, tmp_path) -> None:
+        file = write_ten_bit(tmp_path / "a.y4m", moving_scene(12, *SIZE, speed=6), pixel_aspect="16:15")
+        sequence = read(file)
+        K = sequence.K[0]
+        assert K[0, 0] == pytest.approx(160)
+        assert K[1, 1] == pytest.approx(160 * 16 / 15)
+        square = sequence.with_square_pixels()
+        assert (square.width, square.height) == (320, 169)
+        assert square.K[0, 1, 1] == pytest.approx(160, rel=0.002)
+
+    def test_a_rotation_in_the_container(self, tmp_path) -> None:
+        scene = moving_scene(12, *SIZE, speed=6)
+        plain = write_video(tmp_path / "a.mp4", scene, "mp4v")
+        upright = tmp_path / "upright.mp4"
+        upright.write_bytes(turned(plain.read_bytes(), SIZE[1]))
+        before, after = read(plain), read(upright)
+        assert after.rgb.shape[1:3] == SIZE
+        assert after.K[0, 0, 2] == SIZE[1] / 2
+        shared = sorted(set(before.frame_names) & set(after.frame_names))
+        assert shared
+        for name in shared:
+            first, second = (item.rgb[item.frame_names.index(name)] for item in (before, after))
+            np.testing.assert_array_equal(second, np.rot90(first, -1))
+
+    def test_a_frame_rate_that_varies(self, tmp_path, caplog) -> None:
+        """Forty frames in four seconds, then twenty in twenty: timestamps tell which part is the longer."""
+        first, second = moving_scene(40, *SIZE, speed=3), 255 - moving_scene(61, *SIZE, speed=3)[41:, ::-1]
+        plain = write_video(tmp_path / "plain.mp4", np.concatenate([first, second]), "mp4v")
+        file = tmp_path / "a.mp4"
+        file.write_bytes(retimed(plain.read_bytes(), [1280] * 40 + [12800] * 20))
+        times = [frame.time_s for frame in VideoFile(file).frames(TimeSpan())]
+        np.testing.assert_allclose(times, [*(0.1 * np.arange(40)), *(4 + np.arange(20))], atol=1e-3)
+        with caplog.at_level("INFO"):
+            numbers = [int(name) for name in read(file).frame_names]
+        assert min(numbers) >= 40
+        assert "the frame rate varies, from 0.1 to 1 s a frame" in caplog.text
+        assert max(int(name) for name in read(plain).frame_names) < 40
+
+    def test_a_part_of_it(self, tmp_path) -> None:
+        file = write_video(tmp_path / "a.avi", moving_scene(50, *SIZE, speed=3))
+        numbers = [int(name) for name in read(file, IngestConfig(start_s=0.4, end_s=1.2)).frame_names]
+        assert min(numbers) >= 10
+        assert max(numbers) < 30
+        with pytest.raises(SourceError, match=r"no frame from 60 to 70 s \(ingest.start_s, ingest.end_s\)"):
+            read(file, IngestConfig(start_s=60, end_s=70))
+        with pytest.raises(ConfigError, match=r"ingest\.end_s = 2 is not after ingest\.start_s = 3"):
+            read(file, IngestConfig(start_s=3, end_s=2))
+
+
+@pytest.fixture(scope="module")
+def cut(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A title, 40 frames of one place with a flash in their midst, and 25 of another."""
+    title = np.full((50, SIZE[1], SIZE[0], 3), 20, np.uint8)
+    for image in title:
+        cv2.putText(image, "EXAM 12", (60, 100), cv2.FONT_HERSHEY_SIMPLEX, 1.5, (255, 255, 255), 3)
+    first = moving_scene(40, *SIZE, speed=4)
+    first[20:22] = 250
+    second = 255 - moving_scene(65, *SIZE, speed=4)[40:, ::-1]
+    return write_video(tmp_path_factory.mktemp("cut") / "a.avi", np.concatenate([title, first, second]))
+
+
+class TestShots:
+    def test_the_longest_that_moves_is_read(self, cut, caplog) -> None:
+        with caplog.at_level("WARNING"):
+            numbers = [int(name) for name in read(cut).frame_names]
+        assert min(numbers) >= 50
+        assert max(numbers) < 90
+        # The flash neither ends the shot nor is chosen.
+        assert max(numbers) >= 85
+        assert not {70, 71} & set(numbers)
+        assert "cut into 3 shots; the longest that moves is read, 2.0 to 3.6 s" in caplog.text
+        assert "0.0 to 2.0 s" in caplog.text
+
+    def test_another_is_taken_by_its_time(self, cut) -> None:
+        numbers = [int(name) for name in read(cut, IngestConfig(start_s=3.6)).frame_names]
+        assert min(numbers) >= 90
+
+    def test_a_quick_move_is_no_cut(self, tmp_path) -> None:
+        found = surveyed(write_video(tmp_path / "a.avi", moving_scene(20, *SIZE, speed=40)))
+        assert len(found.all_shots()) == 1
+
+    def test_memory_does_not_grow_with_the_length(self, tmp_path) -> None:
+        """Frames that are alive at the same time, over both passes."""
+        scene = moving_scene(200, 64, 48, speed=1)
+        alive: weakref.WeakSet[FootageFrame] = weakref.WeakSet()
+        most = 0
+
+        class Long:
+            file = tmp_path / "long"
+            announced = 420
+            pixel_aspect = 1.0
+
+            def frames(self, span: TimeSpan, numbers: Collection[int] | None = None):
+                nonlocal most
+                for number in range(self.announced):
+                    if numbers is None or number in numbers:
+                        back_and_forth = abs((number + 200) % 398 - 199)
+                        frame = FootageFrame(number, number / 25, scene[back_and_forth].copy())
+                        alive.add(frame)
+                        most = max(most, len(alive))
+                        yield frame
+                        del frame
+
+        source = footage_frames(Long(), IngestConfig())
+        assert len(source.frames) == 200
+        for frame in source.frames:
+            source.read_colour(frame)
+        assert most <= 3
 
 
 class TestRefused:

@@ -140,3 +140,85 @@ def test_highlights_do_not_supervise_and_saturation_is_told_apart() -> None:
     assert marked.mask[0].any()
     pixels = np.array([[[249, 249, 249], [0, 250, 0]]], np.uint8)
     np.testing.assert_array_equal(saturated_mask(pixels), [[False, True]])
+
+
+class TestWithoutTrainingDepth:
+    def test_only_the_evaluation_knows_depth(self, tmp_path: Path) -> None:
+        whole = small_sequence()
+        assert whole.depth_mm is not None
+        assert whole.training_depth_known
+        hidden = whole.without_training_depth()
+        assert hidden.depth_mm is not None
+        assert not hidden.training_depth_known
+        assert hidden.metric
+        assert not hidden.depth_mm[hidden.train].any()
+        np.testing.assert_array_equal(hidden.depth_mm[hidden.test], whole.depth_mm[whole.test])
+        np.testing.assert_array_equal(hidden.true_depth_mm, whole.depth_mm)
+        assert (hidden.points, hidden.points_rgb) == (None, None)
+        part = hidden.training_part()
+        assert (part.depth_mm, part.withheld_depth_mm, part.true_depth_mm) == (None, None, None)
+        hidden.save(tmp_path / "sequence")
+        loaded = EndoscopicSequence.load(tmp_path / "sequence")
+        np.testing.assert_array_equal(loaded.true_depth_mm, whole.depth_mm)
+        small = hidden.at_most_width(4)
+        assert small.withheld_depth_mm is not None
+        assert small.withheld_depth_mm.shape == (4, 3, 4)
+        assert whole.depth_mm[whole.train].any(), "the sequence it was made of stays as it is"
+
+    def test_twice_is_once(self) -> None:
+        hidden = small_sequence().without_training_depth()
+        np.testing.assert_array_equal(hidden.without_training_depth().true_depth_mm, hidden.true_depth_mm)
+
+    def test_without_depth_there_is_nothing_to_hide(self) -> None:
+        bare = replace(small_sequence(), depth_mm=None)
+        assert bare.without_training_depth() is bare
+        assert bare.points is not None
+
+    def test_estimated_depth_is_no_truth(self) -> None:
+        """A stage that fills in depth where none was known leaves zeros as the truth."""
+        whole = small_sequence()
+        assert whole.depth_mm is not None
+        filled = replace(whole, withheld_depth_mm=np.zeros_like(whole.depth_mm))
+        assert filled.training_depth_known
+        assert filled.true_depth_mm is None
+
+    def test_held_out_frames_do_not_change_the_training_part(self) -> None:
+        """Held-out depth may be there or not: the training part is the same, byte by byte."""
+        hidden = small_sequence().without_training_depth()
+        bare = replace(hidden, depth_mm=None, withheld_depth_mm=None)
+        assert not bare.training_depth_known
+        assert bare.training_part().depth_mm is hidden.training_part().depth_mm is None
+
+
+class TestScale:
+    def test_all_lengths_are_multiplied(self, tmp_path: Path) -> None:
+        generator = np.random.default_rng(3)
+        poses = np.tile(np.eye(4), (4, 1, 1))
+        poses[:, :3, 3] = generator.random((4, 3))
+        arbitrary = replace(small_sequence(), world_from_camera=poses, metric=False)
+        assert arbitrary.scale_words == "arbitrary scale"
+        found = arbitrary.in_millimetres(25.0, "setting")
+        assert found.metric
+        assert found.scale_words == "millimetres from the scale given"
+        assert found.world_from_camera is not None
+        np.testing.assert_allclose(found.world_from_camera[:, :3, 3], 25 * poses[:, :3, 3])
+        np.testing.assert_array_equal(found.world_from_camera[:, :3, :3], poses[:, :3, :3])
+        assert arbitrary.points is not None
+        np.testing.assert_allclose(found.points, 25 * arbitrary.points)
+        assert arbitrary.depth_mm is not None
+        assert found.depth_mm is not None
+        assert found.depth_mm.dtype == np.float32
+        np.testing.assert_allclose(found.depth_mm, 25 * arbitrary.depth_mm, rtol=1e-6)
+        found.save(tmp_path / "sequence")
+        assert EndoscopicSequence.load(tmp_path / "sequence").scale_source == "setting"
+        assert found.training_part().scale_source == "setting"
+
+    def test_a_lens_in_pixels_is_not(self) -> None:
+        sequence = replace(small_sequence(), intrinsics="estimated", focal_std_px=1.5, metric=False)
+        scaled = sequence.in_millimetres(2.5, "setting")
+        assert (scaled.intrinsics, scaled.focal_std_px) == ("estimated", 1.5)
+        assert scaled.training_part().focal_std_px == 1.5
+
+    def test_poses_are_needed(self) -> None:
+        with pytest.raises(ShapeError, match="no poses"):
+            replace(small_sequence(), world_from_camera=None).in_millimetres(2.0, "setting")

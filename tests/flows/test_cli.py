@@ -181,6 +181,12 @@ class TestSettings:
         assert (config.coarse.seed, config.finetune.seed) == (5, 3)
         assert config.enhance == PROFILES["quick"].with_seed(3).enhance
 
+    def test_the_scale_has_a_short_name(self) -> None:
+        given = parser("run").parse_args(["run", SEQUENCE, "--scale", "12.5"])
+        assert run_config(given).ingest.scale_mm_per_unit == 12.5
+        with pytest.raises(ConfigError, match=r"scale_mm_per_unit.*above 0"):
+            parser("run").parse_args(["run", SEQUENCE, "--scale", "0"])
+
     def test_the_last_one_counts(self) -> None:
         flag, assignment = ["--coarse.iterations", "7"], ["--set", "coarse.iterations=8"]
         assert parsed(*flag, *assignment) == {"coarse.iterations": 8}

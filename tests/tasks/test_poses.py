@@ -47,7 +47,10 @@ def read(store: str, ref: Ref) -> EndoscopicSequence:
 def test_the_method_stands_in_counts_and_account(store: str, posed: Ref) -> None:
     counts = Store(store).manifest(posed).counts
     assert counts["method"] == "rgbd"
-    assert counts["summary"] == "by colour and depth: 6 of 6 training frames, 1 of 1 held-out frames"
+    assert (
+        counts["summary"]
+        == "by colour and depth: 6 of 6 training frames, 1 of 1 held-out frames; scale from depth"
+    )
     assert counts["dropped"] == 0
     assert (counts["intrinsics"], counts["focal_std_px"]) == ("given", None)
     report = json.loads((Store(store).open(posed) / "poses.json").read_bytes())

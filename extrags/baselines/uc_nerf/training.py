@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 
@@ -25,6 +26,7 @@ from extrags.config import UcNerfConfig
 from extrags.errors import CaptureError, DivergedError
 from extrags.events import Progress, emit
 from extrags.sequence import EndoscopicSequence
+from extrags.training.random_start import depth_range
 from extrags.training.views import View, epochs, real_views
 
 __all__ = [
@@ -36,6 +38,8 @@ __all__ = [
     "sparse_depths",
     "train",
 ]
+
+_log = logging.getLogger(__name__)
 
 HISTORY_EVERY = 50
 """Iterations between two entries of the history."""
@@ -93,7 +97,8 @@ def train(
         stage: named in progress events.
 
     Raises:
-        CaptureError: with fewer than three training frames, or when neither depth nor points are known.
+        CaptureError: with fewer than three training frames; when neither depth nor points are known and all
+            cameras stand in one place.
         DivergedError: when the loss does not stay finite.
 
     Source: Guo et al.: UC-NeRF: Uncertainty-aware Conditional Neural Radiance Fields from Endoscopic Sparse
@@ -127,8 +132,13 @@ class _Training:
         self.sparse = sparse
         self.views = real_views(sequence, frames)
         known = np.concatenate([item.z for item in sparse])
-        nearest, farthest = np.quantile(known, _DEPTH_QUANTILES)
         cameras = sequence.cameras[frames]
+        if len(known):
+            nearest, farthest = np.quantile(known, _DEPTH_QUANTILES)
+            scale = float(np.median(known))
+        else:
+            within = depth_range(cameras, sequence.name)
+            nearest, scale, farthest = within.near, within.typical, within.far
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(config.seed)
             network = UcNerfNetwork(config)
@@ -139,7 +149,7 @@ class _Training:
             cameras=cameras,
             inverse_range=(1 / (FAR_MARGIN * float(farthest)), 1 / (NEAR_MARGIN * float(nearest))),
             center=cameras.centers.mean(axis=0),
-            scale=float(np.median(known)),
+            scale=scale,
         )
         self.images = PosedImages.of(self.scene.rgb, cameras)
         self.center = torch.from_numpy(self.scene.center.astype(np.float32))
@@ -216,9 +226,11 @@ class _Training:
         confidence = 1 - guide[2]
         loss = config.color_weight * squared
         rendered = found.depth[len(pixels) :]
-        loss = loss + config.sparse_depth_weight * functional.smooth_l1_loss(
-            rendered / scene.scale, sparse_z / scene.scale
-        )
+        # The mean over no pixel at all would be NaN.
+        if len(sparse_z):
+            loss = loss + config.sparse_depth_weight * functional.smooth_l1_loss(
+                rendered / scene.scale, sparse_z / scene.scale
+            )
         loss = loss + config.stereo_weight * (
             self._stereo_loss(prior, encoded, rays, view, frame)
             + (confidence * (found.depth - 1 / guide[0]).abs() / scene.scale).mean()
@@ -234,12 +246,14 @@ class _Training:
     ) -> Tensor:
         """What supervises the stereo network itself: known depth on both levels, and agreement of colours."""
         scene, known = self.scene, self.sparse[frame]
-        at_known = Rays(rays.pixels[-len(known.z) :], rays.K, rays.viewmat, rays.width, rays.height)
-        target = torch.from_numpy((scene.scale / known.z).astype(np.float32))
-        levels = [
-            functional.smooth_l1_loss(at_known.sampled(inverse[None])[0] * scene.scale, target)
-            for inverse in (prior.coarse_inverse, prior.inverse)
-        ]
+        levels = []
+        if len(known.z):
+            at_known = Rays(rays.pixels[-len(known.z) :], rays.K, rays.viewmat, rays.width, rays.height)
+            target = torch.from_numpy((scene.scale / known.z).astype(np.float32))
+            levels = [
+                functional.smooth_l1_loss(at_known.sampled(inverse[None])[0] * scene.scale, target)
+                for inverse in (prior.coarse_inverse, prior.inverse)
+            ]
         height, width = prior.inverse.shape
         small = self.images[[frame]].resized(width, height)
         weight = _resized(view.weight[..., None], prior.inverse)[0]
@@ -274,7 +288,9 @@ def sparse_depths(
     """Known depth at a few pixels of each frame: where structure from motion would have it.
 
     The sparse points of the source where it has some; else its depth at the strongest corners of the image.
-    Nothing between these pixels is used.
+    Nothing between these pixels is used. Where neither is known, or not enough, no pixel has a depth, which a
+    warning says: agreement of colours is then all that supervises, between depths that follow from the
+    cameras (`extrags.training.random_start.depth_range`).
 
     Args:
         sequence: posed frames.
@@ -282,17 +298,17 @@ def sparse_depths(
         per_frame: corners of a frame at most.
 
     Raises:
-        CaptureError: when neither depth nor points are known, or too few pixels have any.
+        CaptureError: when too few pixels of a frame have a depth, though others have enough.
     """
     if sequence.points is not None and len(sequence.points) >= _MIN_SPARSE:
         found = [_visible_points(sequence, int(frame), sequence.points) for frame in frames]
-    elif sequence.depth_mm is not None:
+    elif sequence.depth_mm is not None and bool((sequence.depth_mm[frames] > 0).any()):
         found = [_depth_at_corners(sequence, int(frame), sequence.depth_mm, per_frame) for frame in frames]
     else:
-        raise CaptureError(
-            f"{sequence.name}: neither depth nor sparse points are known; provide depth, or let the poses "
-            "stage triangulate points"
+        _log.warning(
+            "%s: neither depth nor enough sparse points are known; colours alone supervise", sequence.name
         )
+        return [SparseDepth(np.zeros((0, 2)), np.zeros(0)) for _ in frames]
     for item, frame in zip(found, frames, strict=True):
         if len(item.z) < _MIN_SPARSE:
             raise CaptureError(

@@ -186,6 +186,34 @@ struct DepthImages {
   float scale, weight;
 };
 
+// A source frame of a sweep: homogeneous pixel = (from_pixel * reference pixel) * depth + offset.
+struct SweepSource {
+  const float* grey;  // [h, w]
+  const float* mask;  // [h, w]: one where it counts
+  float from_pixel[9];
+  float offset[3];
+};
+
+struct SweepImages {
+  int height, width, steps, n_sources, kept, radius;
+  const float* reference;  // [h, w]: brightness less its local mean, zero outside the mask
+  const float* mask;       // [h, w]
+  const float* base;       // [h, w]: depth
+  const float* ratios;     // [steps]: of hypothesis and base
+  const SweepSource* sources;
+  float* cost;  // [steps, h, w]
+};
+
+struct SemiGlobal {
+  int height, width, steps;
+  const float* cost;  // [steps, h, w]
+  const float* grey;  // [h, w]
+  float small_step, jump, edge;
+  float* position;  // [h, w], as the next two
+  float* lowest;
+  float* margin;
+};
+
 struct KernelTable {
   const char* name;
   void (*forward)(View*, const Scene*, const Images*);
@@ -194,6 +222,8 @@ struct KernelTable {
   double (*loss)(const LossImages*, Buffer* working);
   double (*inverse_depth)(const DepthImages*, Buffer* working, int64_t* compared);
   void (*adam)(const AdamStep*);
+  void (*sweep)(const SweepImages*, Buffer* scratch);
+  void (*semi_global)(const SemiGlobal*, Buffer* volume, Buffer* scratch);
   int64_t (*first_nonfinite)(const float* values, int64_t count);
   double (*fma_chain)(int64_t rounds);
 };

@@ -30,6 +30,7 @@ namespace EXTRAGS_ISA {
 #include "adam.inl"
 #include "loss.inl"
 #include "inverse_depth.inl"
+#include "sweep.inl"
 
 struct ViewContext {
   View* view;
@@ -283,7 +284,7 @@ static double fma_chain(int64_t rounds) {
 }
 
 const KernelTable table = {EXTRAGS_ISA_NAME, forward, backward, query, loss, inverse_depth, adam,
-                           first_nonfinite, fma_chain};
+                           sweep, semi_global, first_nonfinite, fma_chain};
 
 }  // namespace EXTRAGS_ISA
 }  // namespace extrags

@@ -362,6 +362,60 @@ std::tuple<double, int64_t> inverse_depth(const In& depth, const In& alpha, cons
   return {loss, compared};
 }
 
+// Working memory of stereo, one block per thread of the pool; calls take turns.
+struct StereoMemory {
+  std::mutex mutex;
+  Buffer volume{};
+  Buffer scratch[kMaxThreads]{};
+};
+
+StereoMemory& stereo_memory() {
+  static StereoMemory* const memory = new StereoMemory;  // outlives all calls
+  return *memory;
+}
+
+// Brightness, mask, 3 x 3 matrix from pixels of the reference, offset
+using SourceTuple = std::tuple<In, In, In, In>;
+
+void sweep(const In& reference, const In& mask, const In& base, const In& ratios,
+           const std::vector<SourceTuple>& sources, int kept, int radius, Out cost) {
+  expect(reference.ndim() == 2, "a reference");
+  const size_t height = reference.shape(0), width = reference.shape(1), pixels = height * width;
+  expect(height > 1 && width > 1 && mask.size() == pixels && base.size() == pixels, "mask or base");
+  expect(cost.size() == pixels * ratios.size(), "costs");
+  expect(!sources.empty() && kept >= 1 && kept <= static_cast<int>(sources.size()) && radius >= 0, "sources");
+  std::vector<SweepSource> packed;
+  for (const auto& [grey, valid, matrix, offset] : sources) {
+    expect(grey.size() == pixels && valid.size() == pixels && matrix.size() == 9 && offset.size() == 3, "a source");
+    SweepSource source{grey.data(), valid.data(), {}, {}};
+    std::copy_n(matrix.data(), 9, source.from_pixel);
+    std::copy_n(offset.data(), 3, source.offset);
+    packed.push_back(source);
+  }
+  const SweepImages images{static_cast<int>(height), static_cast<int>(width), static_cast<int>(ratios.size()),
+                           static_cast<int>(packed.size()), kept, radius, reference.data(), mask.data(),
+                           base.data(), ratios.data(), packed.data(), cost.data()};
+  nb::gil_scoped_release release_gil;
+  StereoMemory& memory = stereo_memory();
+  const std::lock_guard<std::mutex> lock(memory.mutex);
+  active()->sweep(&images, memory.scratch);
+}
+
+void semi_global(const In& cost, const In& grey, float small_step, float jump, float edge, Out position, Out lowest,
+                 Out margin) {
+  expect(cost.ndim() == 3 && cost.shape(0) >= 3, "costs");
+  const size_t pixels = cost.shape(1) * cost.shape(2);
+  expect(grey.size() == pixels && position.size() == pixels && lowest.size() == pixels && margin.size() == pixels,
+         "an image");
+  const SemiGlobal job{static_cast<int>(cost.shape(1)), static_cast<int>(cost.shape(2)),
+                       static_cast<int>(cost.shape(0)), cost.data(), grey.data(), small_step, jump, edge,
+                       position.data(), lowest.data(), margin.data()};
+  nb::gil_scoped_release release_gil;
+  StereoMemory& memory = stereo_memory();
+  const std::lock_guard<std::mutex> lock(memory.mutex);
+  active()->semi_global(&job, &memory.volume, memory.scratch);
+}
+
 // Values, gradients, first and second moments, learning rate or one per column
 using AdamTuple = std::tuple<Out, In, Out, Out, std::variant<float, std::vector<float>>>;
 
@@ -471,6 +525,11 @@ NB_MODULE(_native, m) {
         nb::arg("ssim_mask").none() = nb::none());
   m.def("inverse_depth", &inverse_depth, nb::arg("depth"), nb::arg("alpha"), nb::arg("target"),
         nb::arg("gradient").noconvert(), nb::arg("scale"), nb::arg("weight"));
+  m.def("sweep", &sweep, nb::arg("reference"), nb::arg("mask"), nb::arg("base"), nb::arg("ratios"),
+        nb::arg("sources"), nb::arg("kept"), nb::arg("radius"), nb::arg("cost").noconvert());
+  m.def("semi_global", &semi_global, nb::arg("cost"), nb::arg("grey"), nb::arg("small_step"), nb::arg("jump"),
+        nb::arg("edge"), nb::arg("position").noconvert(), nb::arg("lowest").noconvert(),
+        nb::arg("margin").noconvert());
   m.def("adam", &adam, nb::arg("parameters"), nb::arg("steps").noconvert(), nb::arg("bias1"),
         nb::arg("bias2"), nb::arg("visible").none().noconvert(), nb::arg("beta1"), nb::arg("beta2"),
         nb::arg("eps"));

@@ -319,10 +319,22 @@ class TestSparseDepth:
         assert len(found.z) >= 20
         assert found.z.max() < 40
 
-    def test_nothing_known_is_an_error(self) -> None:
+    def test_cameras_alone_must_do(self, caplog: pytest.LogCaptureFixture) -> None:
+        """Neither depth nor points: colours supervise, between depths that follow from the cameras."""
         sequence = replace(slanted_plane(), depth_mm=None)
+        with caplog.at_level("WARNING", logger="extrags.baselines.uc_nerf.training"):
+            result = train(sequence, TINY.model_copy(update={"iterations": 2}))
+        assert "colours alone supervise" in caplog.text
+        assert all(np.isfinite(entry["loss"]) for entry in result.history)
+        far, near = result.scene.inverse_range
+        assert 0 < far < 1 / result.scene.scale < near
+
+    def test_one_place_is_an_error(self) -> None:
+        sequence = slanted_plane()
+        assert sequence.world_from_camera is not None
+        still = np.repeat(sequence.world_from_camera[:1], len(sequence), axis=0)
         with pytest.raises(CaptureError, match="slanted/0: neither depth nor sparse points"):
-            train(sequence, TINY)
+            train(replace(sequence, depth_mm=None, world_from_camera=still), TINY)
 
     def test_two_frames_are_an_error(self) -> None:
         sequence = slanted_plane(frames=4, held_out=2)

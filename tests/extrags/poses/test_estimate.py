@@ -118,7 +118,9 @@ def test_a_frame_without_pose_is_named(run: Run) -> None:
     assert run.estimate.report["unregistered_train"] == []
     assert "no pose for held-out frames arc-8" in run.log
     assert run.estimate.report["registrations"]["arc-3"]["inliers"] > 50
-    assert run.estimate.summary == "by COLMAP: 7 of 7 training frames, 1 of 2 held-out frames"
+    assert run.estimate.summary == (
+        "by COLMAP: 7 of 7 training frames, 1 of 2 held-out frames; scale from depth"
+    )
     json.dumps(run.estimate.report, allow_nan=False)
 
 
@@ -178,6 +180,68 @@ def test_frames_in_the_middle_may_fail(run: Run) -> None:
                 run.estimate, registered=registered[:3], world_from_camera=run.estimate.world_from_camera[:3]
             ),
         )
+
+
+def test_withheld_depth_changes_neither_poses_nor_points(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without training depth the unit is COLMAP's own; the truth follows it, for the evaluation alone."""
+    monkeypatch.setattr(estimate_module, "_run", lambda *_: run.raw)
+    hidden = run.sequence.without_training_depth()
+    found = estimate_poses(hidden, CONFIG)
+    blind = estimate_poses(replace(hidden, depth_mm=None, withheld_depth_mm=None), CONFIG)
+    assert not found.metric
+    np.testing.assert_array_equal(found.points, blind.points)
+    np.testing.assert_array_equal(found.world_from_camera, blind.world_from_camera)
+    assert found.report == blind.report
+    assert found.truth_per_unit == pytest.approx(run.estimate.report["scale"]["mm_per_unit"])
+    assert blind.truth_per_unit is None
+    posed = with_estimated_poses(hidden, found)
+    assert not posed.metric
+    assert posed.true_depth_mm is not None
+    assert run.sequence.depth_mm is not None
+    np.testing.assert_allclose(
+        posed.true_depth_mm * found.truth_per_unit, run.sequence.depth_mm[:8], rtol=1e-5
+    )
+    assert posed.training_part().depth_mm is None
+    unknown = with_estimated_poses(hidden, replace(found, truth_per_unit=None))
+    assert unknown.true_depth_mm is None
+
+
+def test_a_working_distance_makes_the_estimate_metric(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(estimate_module, "_run", lambda *_: run.raw)
+    told = CONFIG.model_copy(update={"working_distance_mm": 21.0})
+    hidden = run.sequence.without_training_depth()
+    found = estimate_poses(hidden, told)
+    assert found.metric
+    assert found.truth_per_unit is None
+    assert found.report["scale"]["working_distance_mm"] == 21.0
+    assert found.summary.endswith("scale from the working distance given")
+    posed = with_estimated_poses(hidden, found)
+    assert posed.scale_words == "millimetres from the working distance given"
+    # The truth stays in its own millimetres: how far what was told is off counts in the figures.
+    np.testing.assert_array_equal(posed.true_depth_mm, run.sequence.depth_mm[:8])  # type: ignore[index]
+    # The room is as far away as that when its median true depth is told.
+    assert run.sequence.depth_mm is not None
+    true = float(np.median(run.sequence.depth_mm[run.sequence.train]))
+    right = estimate_poses(hidden, CONFIG.model_copy(update={"working_distance_mm": true}))
+    mm_per_unit = run.estimate.report["scale"]["mm_per_unit"]
+    assert right.report["scale"]["mm_per_unit"] == pytest.approx(mm_per_unit, rel=0.03)
+    # Where depth is known, it is measured and not told.
+    measured = estimate_poses(run.sequence, told)
+    np.testing.assert_array_equal(measured.points, run.estimate.points)
+    posed = with_estimated_poses(run.sequence, measured)
+    assert posed.scale_words == "millimetres from known depth"
+
+
+def test_held_out_depth_is_none_to_fall_back_on(
+    turning: EndoscopicSequence, no_parallax: PoseJobResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimate_module, "_run", lambda *_: no_parallax)
+    split = replace(turning.split, train=np.array([0, 1, 2, 3]), test=np.array([4, 5]))
+    hidden = replace(turning, split=split).without_training_depth()
+    with pytest.raises(CaptureError, match="The source has no depth that frames could be aligned by"):
+        estimate_poses(hidden, CONFIG.model_copy(update={"fallback": "auto"}))
+    with pytest.raises(CaptureError, match="needs depth, and there is none"):
+        estimate_poses(hidden, CONFIG.model_copy(update={"fallback": "rgbd"}))
 
 
 def test_without_texture_the_account_says_so(sequence: EndoscopicSequence) -> None:

@@ -103,6 +103,32 @@ class TestFocalLength:
         np.testing.assert_array_equal(with_estimated_poses(given, kept).K, room.K)
 
 
+@pytest.fixture(scope="module")
+def wide(room: EndoscopicSequence) -> EndoscopicSequence:
+    """Pixels 1.25 times as wide as high."""
+    size = (WIDTH, round(1.25 * HEIGHT))
+    taller = np.stack([cv2.resize(image, size, interpolation=cv2.INTER_CUBIC) for image in room.rgb])
+    K = guessed(room).K.copy()
+    K[:, 1] *= size[1] / HEIGHT
+    mask = np.ones(taller.shape[:3], dtype=bool)
+    return replace(guessed(room), rgb=taller, K=K, mask=mask, observed=None, specular=None)
+
+
+class TestPixelsThatAreNotSquare:
+    def test_the_lens_is_found_and_they_are_square_then(self, wide: EndoscopicSequence) -> None:
+        found = estimate_poses(wide, CONFIG)
+        assert found.calibration is not None
+        assert found.calibration.determined
+        assert found.calibration.focal_px == pytest.approx(TRUE_FOCAL_PX, rel=0.03)
+        posed = with_estimated_poses(wide, found)
+        assert posed.rgb.shape[1:3] == (HEIGHT, WIDTH)
+        assert posed.K[0, 0, 0] == posed.K[0, 1, 1] == found.calibration.focal_px
+
+    def test_with_a_guess_they_stay(self, wide: EndoscopicSequence) -> None:
+        lens = Lens("SIMPLE_PINHOLE", (WIDTH / 2, WIDTH / 2, HEIGHT / 2), WIDTH, HEIGHT)
+        assert with_calibration(wide, LensCalibration(lens, determined=False)) is wide
+
+
 def test_a_distorted_lens_is_found_and_undone(room: EndoscopicSequence) -> None:
     bent = guessed(seen_through(BENT, room))
     found = estimate_poses(bent, CONFIG)
@@ -158,7 +184,14 @@ class TestWithCalibration:
     def test_other_maps_are_resampled_too(self, room: EndoscopicSequence) -> None:
         spots = np.zeros_like(room.mask)
         spots[:, HEIGHT // 2, WIDTH // 2] = True
-        given = replace(guessed(room), depth_mm=room.depth_mm, observed=room.mask, specular=spots)
+        given = replace(
+            guessed(room),
+            depth_mm=room.depth_mm,
+            withheld_depth_mm=room.depth_mm,
+            depth_error=np.full(room.mask.shape, 0.1, np.float32),
+            observed=room.mask,
+            specular=spots,
+        )
         calibration = LensCalibration(BENT, determined=True, std={"f": 1.5})
         posed = with_calibration(given, calibration)
         assert posed.depth_mm is not None
@@ -168,6 +201,9 @@ class TestWithCalibration:
         assert posed.focal_std_px == 1.5
         np.testing.assert_array_equal(posed.observed, posed.mask)
         assert 1 <= posed.specular[0].sum() <= 16
+        np.testing.assert_array_equal(posed.withheld_depth_mm, posed.depth_mm)
+        assert posed.depth_error is not None
+        np.testing.assert_allclose(posed.depth_error[posed.mask], 0.1, rtol=1e-5)
         assert posed.depth_mm[0, HEIGHT // 2, WIDTH // 2] == pytest.approx(
             given.depth_mm[0, HEIGHT // 2, WIDTH // 2],  # type: ignore[index]
             rel=0.02,

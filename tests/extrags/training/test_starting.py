@@ -7,7 +7,14 @@ import pytest
 
 from extrags.errors import CaptureError
 from extrags.sequence import EndoscopicSequence
-from extrags.training.starting import depth_from_points, median_depth, starting_gaussians, thin_out
+from extrags.training.random_start import depth_range
+from extrags.training.starting import (
+    depth_from_points,
+    median_depth,
+    starting_gaussians,
+    starts_at_random,
+    thin_out,
+)
 
 
 class TestStartingGaussians:
@@ -33,12 +40,38 @@ class TestStartingGaussians:
         second = starting_gaussians(changed, tube_sequence.train, 300)
         np.testing.assert_array_equal(first.means.numpy(), second.means.numpy())
 
-    def test_nothing_to_start_from(self, tube_sequence: EndoscopicSequence) -> None:
+    def test_cameras_alone_give_random_points(
+        self, tube_sequence: EndoscopicSequence, caplog: pytest.LogCaptureFixture
+    ) -> None:
         bare = replace(tube_sequence, depth_mm=None)
-        with pytest.raises(CaptureError, match="neither depth nor sparse points"):
-            median_depth(bare, bare.train)
-        with pytest.raises(CaptureError, match="no depth and 0 sparse points"):
-            starting_gaussians(bare, bare.train, 100)
+        within = depth_range(bare.training_cameras, bare.name)
+        assert starts_at_random(bare, bare.train)
+        assert median_depth(bare, bare.train) == within.typical
+        with caplog.at_level("WARNING", logger="extrags.training.starting"):
+            first, second = (starting_gaussians(bare, bare.train, 300, thickness=0.1) for _ in range(2))
+        assert "starts from random points" in caplog.text
+        assert "along their path" in caplog.text
+        np.testing.assert_array_equal(first.means.numpy(), second.means.numpy())
+        # Round and faint: nothing is known of the surface.
+        assert float(first.opacities.sigmoid().max()) < 0.2
+        np.testing.assert_allclose(first.scales[:, 0].numpy(), first.scales[:, 2].numpy(), rtol=1e-5)
+        few = replace(bare, points=np.random.default_rng(0).normal(size=(5, 3)))
+        assert starts_at_random(few, few.train)
+
+    def test_depth_that_the_training_frames_lack_is_not_used(self, tube_sequence: EndoscopicSequence) -> None:
+        hidden = tube_sequence.without_training_depth()
+        bare = replace(hidden, depth_mm=None, withheld_depth_mm=None)
+        assert median_depth(hidden, hidden.train) == median_depth(bare, bare.train)
+        first, second = (starting_gaussians(part, part.train, 300) for part in (hidden, bare))
+        np.testing.assert_array_equal(first.means.numpy(), second.means.numpy())
+
+    def test_nothing_to_start_from(self, tube_sequence: EndoscopicSequence) -> None:
+        assert tube_sequence.world_from_camera is not None
+        still = np.repeat(tube_sequence.world_from_camera[:1], len(tube_sequence), axis=0)
+        bare = replace(tube_sequence, depth_mm=None, world_from_camera=still)
+        for refused in (median_depth, lambda *given: starting_gaussians(*given, 100)):
+            with pytest.raises(CaptureError, match="neither depth nor sparse points are known, and all"):
+                refused(bare, bare.train)
 
     def test_sparse_points_give_rough_depth(self, tube_sequence: EndoscopicSequence) -> None:
         generator = np.random.default_rng(0)
@@ -46,6 +79,11 @@ class TestStartingGaussians:
         points = np.stack([10 * np.cos(angle), 10 * np.sin(angle), along], axis=1)
         sparse = replace(tube_sequence, depth_mm=None, points=points)
         depth = depth_from_points(sparse, sparse.train)
+        assert not starts_at_random(sparse, sparse.train)
+        # Of the surface in view, not of the points, of which most are far down the tube.
+        assert median_depth(sparse, sparse.train) == pytest.approx(
+            float(np.median(depth[sparse.train][sparse.mask[sparse.train]])), rel=0.05
+        )
         truth = tube_sequence.depth_mm
         assert truth is not None
         both = (truth[sparse.train] > 0) & (truth[sparse.train] < 30)

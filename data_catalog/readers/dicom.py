@@ -1,0 +1,296 @@
+"""Reader of a DICOM multi-frame file: read like a video; poses come later.
+
+A file with one of `DICOM_SUFFIXES`, a file without suffix that begins as DICOM files do, or a folder that
+holds one such file and no images. Needs pydicom, which the extra `dicom` brings. Beside the file, both
+optional: `intrinsics.json` and `mask.png`, as in `data_catalog.readers.frames_folder`. How frames are chosen
+and what is masked: `data_catalog.readers.footage_frames`.
+
+Read are uncompressed and JPEG-compressed pixels (whatever pydicom decodes with Pillow), and the streams of
+MPEG-2, MPEG-4 and HEVC that video endoscopes store, which go to the reader of videos. Colours: RGB, YBR_FULL,
+YBR_FULL_422, MONOCHROME2; of more than 8 bits the highest 8. Timestamps: Frame Time Vector, Frame Time, Cine
+Rate or Recommended Display Frame Rate. Pixels that are not square stay as they are; the intrinsics say so.
+
+Nothing of a file but its pixels, their format and their timing is looked at: names and dates of patients stay
+where they are. What is burnt into the picture is masked as in a video, not removed.
+
+Format: DICOM PS3.3 (C.7.6.3, C.7.6.5) and PS3.5 (annex A).
+"""
+
+from __future__ import annotations
+
+import logging
+import tempfile
+import weakref
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from data_catalog.folder_reader import FolderReader
+from data_catalog.footage import Footage, FootageFrame, TimeSpan
+from data_catalog.posed_frames import SourceFrames
+from data_catalog.readers.footage_frames import footage_frames
+from data_catalog.readers.video import VideoFile, only_file, with_files_beside
+from extrags.config import IngestConfig
+from extrags.errors import MissingDependencyError, SourceError, SourceNotFoundError
+
+__all__ = ["DICOM_SUFFIXES", "READER", "DicomFile", "open_dicom"]
+
+logger = logging.getLogger(__name__)
+
+DICOM_SUFFIXES = (".dcm", ".dicom")
+_MAGIC_AT, _MAGIC = 128, b"DICM"
+_LOOKED_AT = (
+    "Rows",
+    "Columns",
+    "NumberOfFrames",
+    "PhotometricInterpretation",
+    "PixelRepresentation",
+    "BitsStored",
+    "PixelAspectRatio",
+    "FrameTimeVector",
+    "FrameTime",
+    "CineRate",
+    "RecommendedDisplayFrameRate",
+)
+_COLOURS = ("RGB", "YBR_FULL", "YBR_FULL_422", "MONOCHROME2")
+_USUAL_FRAMES_PER_S = 25.0
+_PIXEL_ELEMENT_BYTES = 12
+"""Tag, representation and length of the pixel data, in all compressed syntaxes."""
+
+
+class DicomFile:
+    """Frames of a DICOM file, each compressed on its own or not at all, as `data_catalog.footage.Footage`.
+
+    Args:
+        file: a multi-frame file.
+        header: its elements before the pixels.
+
+    Raises:
+        SourceError: one frame only, or colours that are not understood.
+    """
+
+    def __init__(self, file: Path, header: Any) -> None:
+        self._file = file
+        self._announced = int(header.get("NumberOfFrames") or 1)
+        if self._announced < 2:
+            raise SourceError(
+                "a single frame; expected a multi-frame file", file=file, field="NumberOfFrames"
+            )
+        colours = str(header.get("PhotometricInterpretation"))
+        if colours not in _COLOURS:
+            raise SourceError(
+                f"{colours} is not understood; expected one of {', '.join(_COLOURS)}",
+                file=file,
+                field="PhotometricInterpretation",
+            )
+        if header.get("PixelRepresentation"):
+            raise SourceError(
+                "signed values are no colours; expected 0", file=file, field="PixelRepresentation"
+            )
+        self._is_compressed = bool(header.file_meta.TransferSyntaxUID.is_encapsulated)
+        self._surplus_bits = max(0, int(header.get("BitsStored") or 8) - 8)
+        self._times_s: list[float] = _times_s(header, self._announced, file).tolist()
+        self._pixel_aspect = _pixel_aspect(header)
+
+    @property
+    def file(self) -> Path:
+        """Named in messages."""
+        return self._file
+
+    @property
+    def announced(self) -> int:
+        """Number of frames according to the header."""
+        return self._announced
+
+    @property
+    def pixel_aspect(self) -> float:
+        """Width of a pixel over its height."""
+        return self._pixel_aspect
+
+    def frames(self, span: TimeSpan, numbers: Collection[int] | None = None) -> Iterator[FootageFrame]:
+        """Decode from the beginning; frames that are not asked for are passed over.
+
+        Args:
+            span: frames outside are not given.
+            numbers: of the frames to give; None gives all.
+
+        Yields:
+            Frames in order.
+
+        Raises:
+            SourceError: damaged, or a compression that pydicom does not decode.
+        """
+        wanted = [
+            number
+            for number in range(self._announced)
+            if self._times_s[number] in span and (numbers is None or number in numbers)
+        ]
+        decoded = self._compressed(wanted, numbers is None) if self._is_compressed else self._plain(wanted)
+        for number in wanted:
+            with _dicom_errors(self._file, number):
+                pixels = next(decoded, None)
+            if pixels is None:
+                raise SourceError(
+                    f"{self._announced} frames announced, {number} there: the file is truncated",
+                    file=self._file,
+                    frame=number,
+                )
+            yield FootageFrame(number, self._times_s[number], self._rgb(pixels))
+
+    def _plain(self, wanted: Sequence[int]) -> Iterator[np.ndarray]:
+        from pydicom.pixels.utils import pixel_array
+
+        # pydicom 3.0's iterator misreads YBR_FULL_422 from the second frame on: having converted the first,
+        # it takes the rest for RGB, which is longer. Each frame lies at a known place, so nothing is lost.
+        yield from (pixel_array(self._file, index=number) for number in wanted)
+
+    def _compressed(self, wanted: Sequence[int], one_after_another: bool) -> Iterator[np.ndarray]:
+        from pydicom.pixels.utils import iter_pixels
+
+        if not wanted:
+            return
+        if one_after_another:
+            # Given indices, each frame is looked for from the beginning of the file.
+            yield from islice(iter_pixels(self._file), wanted[0], wanted[-1] + 1)
+        else:
+            yield from iter_pixels(self._file, indices=wanted)
+
+    def _rgb(self, pixels: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
+        eight_bit = (pixels >> self._surplus_bits).astype(np.uint8)
+        return eight_bit if eight_bit.ndim == 3 else np.repeat(eight_bit[..., None], 3, axis=2)
+
+
+class _DicomVideo(VideoFile):
+    """A video stream inside a DICOM file. FFmpeg reads files only, so the stream is copied to one."""
+
+    def __init__(self, file: Path, header: Any) -> None:
+        folder = tempfile.TemporaryDirectory(prefix="extrags-")
+        weakref.finalize(self, folder.cleanup)
+        stream = Path(folder.name) / "stream"
+        with _dicom_errors(file, None):
+            _copy_stream(file, stream)
+        super().__init__(stream, named=file)
+        if "PixelAspectRatio" in header:
+            self._pixel_aspect = _pixel_aspect(header)
+
+
+def open_dicom(file: Path) -> Footage:
+    """A DICOM file as footage.
+
+    Raises:
+        MissingDependencyError: without pydicom.
+        SourceNotFoundError: no such file.
+        SourceError: no DICOM file, no pixels in it, or pixels that are not understood.
+    """
+    if find_spec("pydicom") is None:
+        raise MissingDependencyError(
+            f"{file.name}: DICOM files need pydicom: not installed. "
+            "Install with: pip install 'extrags[dicom]'"
+        )
+    from pydicom import dcmread
+    from pydicom.uid import HEVCM10P51, HEVCMP51, MPEGTransferSyntaxes
+
+    if not file.is_file():
+        raise SourceNotFoundError("no such file", file=file)
+    with _dicom_errors(file, None):
+        header = dcmread(file, stop_before_pixels=True, specific_tags=list(_LOOKED_AT))
+        syntax = header.file_meta.TransferSyntaxUID
+    if header.get("Rows") is None or header.get("Columns") is None:
+        raise SourceError("the file holds no pixels", file=file, field="Rows")
+    if syntax in (*MPEGTransferSyntaxes, HEVCMP51, HEVCM10P51):
+        return _DicomVideo(file, header)
+    return DicomFile(file, header)
+
+
+def _dicom_file(place: Path) -> Path | None:
+    found = only_file(place, DICOM_SUFFIXES)
+    if found is None and place.is_file() and not place.suffix:
+        # As scanners and archives export them: no suffix, but a signature.
+        with place.open("rb") as stream:
+            stream.seek(_MAGIC_AT)
+            return place if stream.read(len(_MAGIC)) == _MAGIC else None
+    return found
+
+
+def _recognises(place: Path) -> bool:
+    return _dicom_file(place) is not None
+
+
+def _files(place: Path) -> list[Path]:
+    file = _dicom_file(place)
+    return [] if file is None else with_files_beside(file)
+
+
+def _frames(place: Path, config: IngestConfig) -> SourceFrames:
+    file = _dicom_file(place)
+    if file is None:
+        raise SourceNotFoundError("no DICOM file here", file=place)
+    return footage_frames(open_dicom(file), config)
+
+
+READER = FolderReader(
+    name="dicom",
+    version=2,
+    summary="a DICOM multi-frame file (dcm), optionally with intrinsics.json and mask.png beside it",
+    recognises=_recognises,
+    files=_files,
+    frames=_frames,
+    conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
+)
+
+
+def _times_s(header: Any, count: int, file: Path) -> Float[np.ndarray, "f"]:
+    """When each frame is shown."""
+    steps_ms = header.get("FrameTimeVector")
+    if steps_ms is not None and np.size(steps_ms) == count:
+        return np.cumsum(np.asarray(steps_ms, dtype=np.float64)) / 1000
+    rate = header.get("CineRate") or header.get("RecommendedDisplayFrameRate")
+    step_ms = header.get("FrameTime") or (1000 / float(rate) if rate else None)
+    if step_ms is None:
+        logger.info("%s: no timing, taken for %g frames a second", file.name, _USUAL_FRAMES_PER_S)
+        step_ms = 1000 / _USUAL_FRAMES_PER_S
+    return np.arange(count) * float(step_ms) / 1000
+
+
+def _pixel_aspect(header: Any) -> float:
+    """Width over height; the file gives height and width."""
+    ratio = header.get("PixelAspectRatio")
+    if ratio is None or len(ratio) != 2 or min(float(value) for value in ratio) <= 0:
+        return 1.0
+    return float(ratio[1]) / float(ratio[0])
+
+
+def _copy_stream(file: Path, place: Path) -> None:
+    """Copy the fragments of the encapsulated pixel data."""
+    from pydicom import dcmread
+    from pydicom.encaps import generate_fragments, parse_basic_offsets
+
+    with file.open("rb") as source, place.open("wb") as copy:
+        dcmread(source, stop_before_pixels=True)
+        source.seek(_PIXEL_ELEMENT_BYTES, 1)
+        parse_basic_offsets(source)
+        for fragment in generate_fragments(source):
+            copy.write(fragment)
+
+
+@contextmanager
+def _dicom_errors(file: Path, frame: int | None) -> Iterator[None]:
+    """What pydicom and Pillow raise for a file, as the errors of a source."""
+    from pydicom.errors import InvalidDicomError
+
+    try:
+        yield
+    except InvalidDicomError as error:
+        raise SourceError("no DICOM file, or damaged from its first bytes", file=file) from error
+    except NotImplementedError as error:
+        raise SourceError(f"cannot be decoded: {error}", file=file, field="TransferSyntaxUID") from error
+    except (AttributeError, KeyError, RuntimeError, ValueError, OSError, EOFError) as error:
+        raise SourceError(
+            f"damaged, truncated, or of an unknown compression: {error}", file=file, frame=frame
+        ) from error

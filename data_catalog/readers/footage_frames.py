@@ -1,0 +1,198 @@
+"""What readers of videos and of DICOM files share: from footage to the frames of a sequence.
+
+The footage is decoded twice, frame by frame, so that memory does not grow with its length. The first pass
+(`data_catalog.survey`) measures; the frames are chosen; the second pass decodes them at full size, undoes
+interlacing, and takes samples for the mask along the way: the round picture, the dark frame and burnt-in text
+(`data_catalog.content`). Of a footage with cuts the longest shot is read; `ingest.start_s` and `ingest.end_s`
+take another part. Frame names are the frames' numbers in the file.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Bool, Int, UInt8
+
+from data_catalog.content import content_mask
+from data_catalog.footage import Footage, FootageFrame, TimeSpan
+from data_catalog.images import spread
+from data_catalog.interlacing import deinterlaced
+from data_catalog.posed_frames import PosedFrame, SourceFrames
+from data_catalog.readers.frames_folder import INTRINSICS_FILE, read_intrinsics
+from data_catalog.sampling import Sampling
+from data_catalog.survey import Shot, Survey, choose_frames, survey
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError, SourceError
+from extrags.lens import Lens
+
+__all__ = ["MAX_FRAMES", "footage_frames"]
+
+logger = logging.getLogger(__name__)
+
+MAX_FRAMES = 200
+"""So many are chosen at most, unless `ingest.max_frames` says otherwise."""
+_SAMPLE_WIDTH = 640
+_MAX_SAMPLES = 32
+_NAMED_SHOTS = 5
+
+
+def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
+    """Survey a footage, choose frames, and hand over how they are decoded.
+
+    `intrinsics.json` and `mask.png` beside the file are taken where they are there; without the first the
+    intrinsics are a guess.
+
+    Args:
+        footage: of one recording.
+        config: number of frames, and the part in seconds.
+
+    Raises:
+        ConfigError: a part that ends before it begins.
+        SourceError: damaged, empty in that part, or a picture that hardly moves.
+    """
+    file = footage.file
+    if config.end_s is not None and config.end_s <= config.start_s:
+        raise ConfigError(f"ingest.end_s = {config.end_s:g} is not after ingest.start_s = {config.start_s:g}")
+    span = TimeSpan(config.start_s, np.inf if config.end_s is None else config.end_s)
+    found = survey(footage.frames(span), file=file, announced=footage.announced, span=span)
+    shot = found.longest_shot()
+    _report(found, shot, footage)
+    here = slice(shot.first, shot.last + 1)
+    chosen = choose_frames(
+        found.path[here], found.sharpness[here], config.max_frames or MAX_FRAMES, file=file
+    )
+    numbers = found.numbers[here][chosen]
+    logger.info("%s: %d of %d frames chosen", file.name, len(chosen), len(found))
+    K = read_intrinsics(
+        file.parent,
+        found.width,
+        found.height,
+        pixel_aspect=footage.pixel_aspect,
+        guess_is_used=config.calibration is None,
+    )
+    lens = Lens.pinhole(K, found.width, found.height)
+    mask_file = file.parent / "mask.png"
+    second = _SecondPass(footage, span, numbers, found.numbers[here], interlaced=shot.interlaced)
+    return SourceFrames(
+        frames=[
+            PosedFrame(
+                name=f"{number:06d}",
+                file=file,
+                lens=lens,
+                mask_file=mask_file if mask_file.is_file() else None,
+                number=number,
+            )
+            for number in numbers.tolist()
+        ],
+        pose_file=file,
+        metric=False,
+        # No more frames were chosen than may be kept, so that each is asked for, in order.
+        read_colour=second.image,
+        masks=second,
+        intrinsics="given" if (file.parent / INTRINSICS_FILE).is_file() else "guessed",
+        looked_at=len(found),
+    )
+
+
+def _report(found: Survey, shot: Shot, footage: Footage) -> None:
+    """Say what a user should know about a footage before poses are looked for."""
+    name = footage.file.name
+    shots = found.all_shots()
+    if len(shots) > 1:
+        others = sorted((other for other in shots if other != shot), key=lambda other: -other.duration_s)
+        listed = ", ".join(_seconds(found, other) for other in others[:_NAMED_SHOTS])
+        more = f" and {len(others) - _NAMED_SHOTS} more" if len(others) > _NAMED_SHOTS else ""
+        logger.warning(
+            "%s: cut into %d shots; the longest that moves is read, %s, and these are not: %s%s. "
+            "ingest.start_s and ingest.end_s take another part",
+            name,
+            len(shots),
+            _seconds(found, shot),
+            listed,
+            more,
+        )
+    if shot.interlaced:
+        logger.warning(
+            "%s: interlaced; every second line is interpolated, so that each frame shows one moment", name
+        )
+    if abs(footage.pixel_aspect - 1) > 1e-3:
+        logger.info("%s: pixels are %.4g times as wide as high", name, footage.pixel_aspect)
+    steps = np.diff(found.times_s)
+    if len(steps) and steps.max() > 1.5 * np.median(steps) + 1e-3:
+        logger.info("%s: the frame rate varies, from %.3g to %.3g s a frame", name, steps.min(), steps.max())
+
+
+def _seconds(found: Survey, shot: Shot) -> str:
+    start_s = found.times_s[shot.first]
+    return f"{start_s:.1f} to {start_s + shot.duration_s:.1f} s"
+
+
+class _SecondPass:
+    """Decodes the chosen frames in order; what is tissue is found from samples of the same shot."""
+
+    def __init__(
+        self,
+        footage: Footage,
+        span: TimeSpan,
+        numbers: Int[np.ndarray, "n"],
+        of_shot: Int[np.ndarray, "f"],
+        *,
+        interlaced: bool,
+    ) -> None:
+        self._footage = footage
+        self._interlaced = interlaced
+        self._samples: list[UInt8[np.ndarray, "h w 3"]] = []
+        self._chosen = set(numbers.tolist())
+        # Decoding ends with the last chosen frame.
+        reached = of_shot[of_shot <= numbers[-1]]
+        self._sampled = {int(reached[k]) for k in spread(len(reached), _MAX_SAMPLES)}
+        self._frames = self._decoded(span)
+
+    def _decoded(self, span: TimeSpan) -> Iterator[FootageFrame]:
+        for frame in self._footage.frames(span, self._chosen | self._sampled):
+            rgb = deinterlaced(frame.rgb) if self._interlaced else frame.rgb
+            if frame.number in self._sampled:
+                self._samples.append(_sample(rgb))
+            if frame.number in self._chosen:
+                yield FootageFrame(frame.number, frame.time_s, rgb)
+
+    def image(self, frame: PosedFrame) -> UInt8[np.ndarray, "h w 3"]:
+        """The image of the next frame.
+
+        Raises:
+            SourceError: it cannot be decoded a second time.
+        """
+        for decoded in self._frames:
+            if decoded.number == frame.number:
+                return decoded.rgb
+        raise SourceError(
+            "the frame was chosen, but could not be decoded the second time",
+            file=frame.file,
+            frame=frame.label,
+        )
+
+    def see(
+        self, frame: PosedFrame, image: UInt8[np.ndarray, "h w 3"], sampled: UInt8[np.ndarray, "h2 w2 3"]
+    ) -> None:
+        """Nothing new: samples are taken while decoding."""
+
+    def mask(self, frame: PosedFrame, sampling: Sampling) -> Bool[np.ndarray, "h2 w2"]:
+        """The picture inside its dark frame, less burnt-in text."""
+        import cv2
+
+        small = content_mask(np.stack(self._samples)).astype(np.float32)
+        size = (frame.lens.width, frame.lens.height)
+        whole = cv2.resize(small, size, interpolation=cv2.INTER_LINEAR) > 0.999
+        return sampling.mask(np.asarray(whole, dtype=bool), file=frame.file)
+
+
+def _sample(rgb: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    import cv2
+
+    height, width = rgb.shape[:2]
+    if width <= _SAMPLE_WIDTH:
+        return rgb.copy()
+    size = (_SAMPLE_WIDTH, round(_SAMPLE_WIDTH * height / width))
+    return np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA))

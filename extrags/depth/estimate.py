@@ -1,0 +1,303 @@
+"""Depth of a sequence's training frames, from all cues there are."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+import zarr
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from extrags.config import PosesConfig
+from extrags.config.depth import DepthConfig
+from extrags.depth.completion import CompletionNetwork, completion_inputs
+from extrags.depth.frames import PosedFrames, select_sources
+from extrags.depth.stereo import StereoDepth, StereoSettings, multi_view_stereo
+from extrags.depth.weights import load_completion
+from extrags.errors import CaptureError
+from extrags.events import Progress, emit
+from extrags.poses.triangulation import triangulate_points
+from extrags.sequence import EndoscopicSequence
+from extrags.store.storable import Storable
+from extrags.training.random_start import depth_range
+from extrags.zarr_io import open_group, read_array, write_array, write_frames
+
+__all__ = ["DepthEstimate", "estimate_depth", "with_estimated_depth"]
+
+_LOG = logging.getLogger(__name__)
+
+MIN_POINTS = 12
+"""Fewer points in a view say nothing about the range of its depths."""
+
+CERTAIN, HOPELESS = 0.02, 1.0
+"""Bounds of the expected relative error."""
+
+STEREO_ERRORS = (0.03, 0.5)
+"""Expected relative error of stereo without completion: where all sources agree, and where none does."""
+
+
+@dataclass(frozen=True)
+class DepthEstimate(Storable):
+    """Dense depth of frames, with its expected error and where it comes from.
+
+    Args:
+        depth: z-depth in the poses' unit, 0 outside the mask, [F, H, W].
+        expected_error: expected relative error of it, calibrated on procedural scenes, 0 outside the mask,
+            [F, H, W].
+        points: sparse points the search started from, [P, 3].
+        points_rgb: their colours, [P, 3].
+        report: facts on each cue, ready for JSON.
+    """
+
+    stored_as: ClassVar[str] = "depth"
+
+    depth: Float[np.ndarray, "f h w"]
+    expected_error: Float[np.ndarray, "f h w"]
+    points: Float[np.ndarray, "p 3"]
+    points_rgb: UInt8[np.ndarray, "p 3"]
+    report: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def summary(self) -> str:
+        """One line for plans and logs."""
+        return (
+            f"expected error {100 * self.report['median_expected_error']:.1f} % in the median; "
+            f"{self.report['n_points']} points, {self.report['agreeing_share']:.0%} of pixels confirmed by "
+            "other frames"
+        )
+
+    def save(self, path: Path) -> None:
+        """Write a zarr v3 group; one frame per chunk."""
+        group = open_group(path, mode="w")
+        write_frames(group, "depth", self.depth)
+        write_frames(group, "expected_error", self.expected_error)
+        write_array(group, "points", self.points)
+        write_array(group, "points_rgb", self.points_rgb)
+        group.attrs["report"] = self.report
+
+    @classmethod
+    def load(cls, path: Path) -> DepthEstimate:
+        """Read what `save` wrote."""
+        group = zarr.open_group(str(path), mode="r")
+        names = ("depth", "expected_error", "points", "points_rgb")
+        report: Any = group.attrs["report"]
+        return cls(*(read_array(group, name) for name in names), report=report)
+
+
+def estimate_depth(
+    sequence: EndoscopicSequence,
+    config: DepthConfig | None = None,
+    poses: PosesConfig | None = None,
+    *,
+    stage: str = "depth",
+) -> DepthEstimate:
+    """Depth of all frames of a sequence, which should be its training part.
+
+    Points give the range to search; stereo searches it, with the depth that brightness predicts as a weak
+    prior; a network completes the result and says how wrong it expects to be.
+
+    Args:
+        sequence: with poses.
+        config: what to use; None takes the defaults.
+        poses: settings of the features that points are triangulated from; None takes the defaults.
+        stage: named in progress events.
+
+    Raises:
+        CaptureError: with a single frame, or when all cameras stand in one place.
+        WeightsError: when the weights of the completion cannot be read.
+    """
+    config = DepthConfig() if config is None else config
+    if len(sequence) < 2:
+        raise CaptureError(f"{sequence.name}: depth from other frames needs at least two, found one")
+    seconds: dict[str, float] = {}
+    begun = time.monotonic()
+    points, points_rgb, origin = _points(sequence, config, poses)
+    seconds["points"] = time.monotonic() - begun
+    small = sequence.at_most_width(config.max_width)
+    near, typical, far = _ranges(small, points, config)
+    frames = posed_frames(small)
+    sources = torch.from_numpy(
+        select_sources(
+            small.cameras.world_from_camera.astype(np.float64),
+            small.K.astype(np.float64),
+            frames.size,
+            typical,
+            config.sources,
+        )
+    )
+    recording = small.recording
+    told = _Told(stage, 3 * len(sequence))
+    begun = time.monotonic()
+    stereo = multi_view_stereo(
+        frames,
+        sources,
+        torch.from_numpy(near).float(),
+        torch.from_numpy(far).float(),
+        StereoSettings(
+            hypotheses=config.hypotheses,
+            radius_px=config.window_radius_px,
+            shading_weight=StereoSettings.shading_weight if config.shading else 0.0,
+        ),
+        recording=None if recording is None else torch.from_numpy(recording),
+        told=told.step,
+    )
+    seconds["stereo"] = time.monotonic() - begun
+    begun = time.monotonic()
+    network = load_completion(config.completion)
+    if network is None:
+        log_depth, error = stereo.fused, _stereo_error(stereo)
+        told.step(len(sequence))
+    else:
+        log_depth, error = _completed(network, frames, stereo, _point_depths(small, points), told)
+    seconds["completion"] = time.monotonic() - begun
+    log_depth, error = (_enlarged(part, sequence.height, sequence.width) for part in (log_depth, error))
+    depth = np.where(sequence.mask, np.exp(log_depth), 0).astype(np.float32)
+    error = np.where(sequence.mask, np.clip(error, CERTAIN, HOPELESS), 0).astype(np.float32)
+    confirmed = (stereo.agrees * stereo.seen > 0) & frames.mask
+    report: dict[str, Any] = {
+        "points_from": origin,
+        "n_points": len(points),
+        "sources_median": float((sources >= 0).sum(1).median()),
+        "agreeing_share": float(confirmed.sum() / frames.mask.sum().clamp_min(1)),
+        "shading": [
+            {
+                "slope": fit.slope,
+                "scatter": min(fit.scatter, 9.0),
+                "spread": min(fit.spread, 9.0),
+                "pixels": fit.n_pixels,
+            }
+            for fit in stereo.fits
+        ],
+        "completion": config.completion,
+        "median_expected_error": float(np.median(error[sequence.mask])) if sequence.mask.any() else 1.0,
+        "seconds": {name: round(value, 3) for name, value in seconds.items()},
+    }
+    return DepthEstimate(depth, error, points.astype(np.float64), points_rgb, report)
+
+
+def with_estimated_depth(sequence: EndoscopicSequence, estimate: DepthEstimate) -> EndoscopicSequence:
+    """The training part of a sequence with its estimated depth, the expected error of it, and the points."""
+    points = (
+        {}
+        if sequence.points is not None or not len(estimate.points)
+        else {"points": estimate.points, "points_rgb": estimate.points_rgb}
+    )
+    return replace(sequence, depth_mm=estimate.depth, depth_error=estimate.expected_error, **points)
+
+
+class _Told:
+    """Progress of the stage, counted in passes over frames."""
+
+    def __init__(self, stage: str, total: int) -> None:
+        self.stage, self.done, self.total = stage, 0, total
+
+    def step(self, frames: int) -> None:
+        self.done += frames
+        emit(Progress(self.stage, self.done, self.total))
+
+
+def posed_frames(sequence: EndoscopicSequence) -> PosedFrames:
+    """A sequence's frames as tensors."""
+    return PosedFrames(
+        rgb=torch.from_numpy(sequence.rgb).permute(0, 3, 1, 2).float() / 255,
+        mask=torch.from_numpy(sequence.mask.copy()),
+        K=torch.from_numpy(sequence.K).float(),
+        world_from_camera=torch.from_numpy(sequence.cameras.world_from_camera).float(),
+    )
+
+
+def _points(
+    sequence: EndoscopicSequence, config: DepthConfig, poses: PosesConfig | None
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Sparse points, their colours, and where they come from."""
+    if sequence.points is not None and len(sequence.points) >= MIN_POINTS:
+        rgb = sequence.points_rgb
+        rgb = np.full((len(sequence.points), 3), 128, np.uint8) if rgb is None else rgb
+        return sequence.points, rgb, "the source or the poses stage"
+    if config.triangulate:
+        found = triangulate_points(sequence, poses)
+        if len(found) >= MIN_POINTS:
+            return found.points, found.points_rgb, "triangulation with the given poses"
+    _LOG.warning(
+        "%s: no points to tell the range of depths; it is guessed from the cameras' motion", sequence.name
+    )
+    return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), "none"
+
+
+def _ranges(
+    sequence: EndoscopicSequence, points: np.ndarray, config: DepthConfig
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Nearest, typical and farthest depth of each frame."""
+    count = len(sequence)
+    if len(points) < MIN_POINTS:
+        guessed = depth_range(sequence.cameras, sequence.name)
+        return tuple(np.full(count, value) for value in (guessed.near, guessed.typical, guessed.far))  # type: ignore[return-value]
+    pixels, z = sequence.cameras.project(points)
+    found = np.full((count, 3), np.nan)
+    everything = []
+    for frame in range(count):
+        inside = _inside(sequence, frame, pixels[frame], z[frame])
+        everything.append(z[frame][inside])
+        if inside.sum() >= MIN_POINTS:
+            found[frame] = np.quantile(z[frame][inside], (0.02, 0.5, 0.98))
+    together = np.concatenate(everything)
+    overall = np.quantile(together if len(together) else z[z > 0], (0.02, 0.5, 0.98))
+    # A frame with few points may see what none of them lies on: it searches the whole scene's range.
+    found = np.where(np.isnan(found), overall, found)
+    low = np.minimum(found[:, 0], 0.5 * (found[:, 0] + overall[0]))
+    return low / config.range_margin, found[:, 1], np.maximum(found[:, 2], overall[1]) * config.range_margin
+
+
+def _inside(sequence: EndoscopicSequence, frame: int, pixels: np.ndarray, z: np.ndarray) -> np.ndarray:
+    column, row = np.floor(np.nan_to_num(pixels, nan=-1.0, posinf=-1.0, neginf=-1.0)).astype(np.int64).T
+    inside = (z > 0) & (column >= 0) & (column < sequence.width) & (row >= 0) & (row < sequence.height)
+    inside[inside] = sequence.mask[frame][row[inside], column[inside]]
+    return np.asarray(inside)
+
+
+def _point_depths(sequence: EndoscopicSequence, points: np.ndarray) -> Tensor:
+    """z-depth of points at the pixels they fall on, the nearest one first; 0 elsewhere."""
+    depth = np.zeros(sequence.rgb.shape[:3], np.float32)
+    if len(points):
+        pixels, z = sequence.cameras.project(points)
+        for frame in range(len(sequence)):
+            inside = np.flatnonzero(_inside(sequence, frame, pixels[frame], z[frame]))
+            inside = inside[np.argsort(-z[frame][inside])]
+            column, row = np.floor(pixels[frame][inside]).astype(np.int64).T
+            depth[frame, row, column] = z[frame][inside]
+    return torch.from_numpy(depth)
+
+
+@torch.no_grad()
+def _completed(
+    network: CompletionNetwork, frames: PosedFrames, stereo: StereoDepth, points: Tensor, told: _Told
+) -> tuple[Tensor, Tensor]:
+    inputs = completion_inputs(frames, stereo, points)
+    log_depth, log_error = [], []
+    for frame in range(len(frames)):
+        found, expected = network(inputs.channels[frame : frame + 1])
+        log_depth.append(found + inputs.log_scale[frame])
+        log_error.append(expected)
+        told.step(1)
+    return torch.cat(log_depth), torch.cat(log_error).exp()
+
+
+def _stereo_error(stereo: StereoDepth) -> Tensor:
+    """A rough expected error without the network, from the share of sources that agree."""
+    low, high = STEREO_ERRORS
+    return high * (low / high) ** (stereo.agrees * stereo.seen)
+
+
+def _enlarged(images: Tensor, height: int, width: int) -> np.ndarray:
+    if images.shape[1:] != (height, width):
+        images = functional.interpolate(
+            images[:, None], size=(height, width), mode="bilinear", align_corners=False
+        )[:, 0]
+    return images.numpy()

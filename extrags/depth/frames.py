@@ -1,0 +1,139 @@
+"""Posed frames as tensors, and which of them stereo matches with each other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+__all__ = ["PosedFrames", "select_sources", "source_from_reference"]
+
+BEST_ANGLE_DEG = 10.0
+"""Angle between two views' rays to the surface that matches best: larger ones change what is seen."""
+
+ANGLE_SPREAD = 0.9
+"""Standard deviation, of the angle's logarithm, of the preference for `BEST_ANGLE_DEG`."""
+
+MAX_TURN_DEG = 60.0
+"""Frames whose optical axes differ by more share too little."""
+
+
+@dataclass(frozen=True)
+class PosedFrames:
+    """What stereo reads of frames with known poses, on one device.
+
+    Args:
+        rgb: colours in [0, 1], [F, 3, H, W].
+        mask: pixels that show tissue, [F, H, W].
+        K: pinhole intrinsics in pixels, pixel centres at +0.5, [F, 3, 3].
+        world_from_camera: poses, OpenCV axes, [F, 4, 4].
+    """
+
+    rgb: Float[Tensor, "f 3 h w"]
+    mask: Bool[Tensor, "f h w"]
+    K: Float[Tensor, "f 3 3"]
+    world_from_camera: Float[Tensor, "f 4 4"]
+
+    def __len__(self) -> int:
+        return int(self.rgb.shape[0])
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in pixels."""
+        return int(self.rgb.shape[2]), int(self.rgb.shape[3])
+
+    def rays(self) -> Float[Tensor, "f 3 h w"]:
+        """Directions through the pixels' centres in camera coordinates, with z = 1."""
+        height, width = self.size
+        rows, columns = torch.meshgrid(
+            torch.arange(height, device=self.rgb.device) + 0.5,
+            torch.arange(width, device=self.rgb.device) + 0.5,
+            indexing="ij",
+        )
+        fx, fy, cx, cy = (self.K[:, i, j, None, None] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        x, y = (columns - cx) / fx, (rows - cy) / fy
+        return torch.stack([x, y, torch.ones_like(x)], dim=1)
+
+    def grey(self) -> Float[Tensor, "f h w"]:
+        """What is correlated: the logarithm of brightness, in which a change of exposure is an offset.
+
+        Green and blue carry the vessels; red is nearly the same everywhere on mucosa.
+        """
+        weights = torch.tensor([0.2, 0.5, 0.3], device=self.rgb.device)
+        return torch.log(torch.einsum("fchw,c->fhw", self.rgb, weights) + 0.03)
+
+
+def source_from_reference(
+    frames: PosedFrames, reference: Int[Tensor, "b"], source: Int[Tensor, "b"]
+) -> Float[Tensor, "b 3 4"]:
+    """Rigid motions from camera coordinates of `reference` to those of `source`."""
+    to_world = frames.world_from_camera[reference]
+    from_world = torch.linalg.inv(frames.world_from_camera[source])
+    return (from_world @ to_world)[:, :3]
+
+
+def select_sources(
+    world_from_camera: Float[np.ndarray, "f 4 4"],
+    K: Float[np.ndarray, "f 3 3"],
+    size: tuple[int, int],
+    typical_depth: Float[np.ndarray, "f"],
+    count: int,
+) -> Int[np.ndarray, "f s"]:
+    """The frames that each frame is matched with: shared view times a triangulation angle near ten degrees.
+
+    Views are compared by points in front of the reference at half, once and twice its typical depth. What
+    is chosen lies on different sides of the reference where it can: the score of a candidate falls with
+    its closeness to those already chosen.
+
+    Args:
+        world_from_camera: poses.
+        K: intrinsics in pixels.
+        size: height and width in pixels.
+        typical_depth: median depth of each frame, in the poses' unit.
+        count: S, at most one less than the frames.
+
+    Returns:
+        Indices of frames, the best first; -1 where there are fewer than S useful ones.
+    """
+    height, width = size
+    frames = len(world_from_camera)
+    chosen = np.full((frames, max(0, min(count, frames - 1))), -1, dtype=np.int64)
+    columns, rows = np.meshgrid((np.arange(7) + 0.5) / 7 * width, (np.arange(5) + 0.5) / 5 * height)
+    pixels = np.stack([columns.ravel(), rows.ravel(), np.ones(columns.size)], axis=1)
+    centers, axes = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
+    from_world = np.linalg.inv(world_from_camera)
+    for frame in range(frames):
+        rays = pixels @ np.linalg.inv(K[frame]).T
+        shells = np.concatenate([rays * typical_depth[frame] * share for share in (0.6, 1.0, 1.7)])
+        points = shells @ world_from_camera[frame, :3, :3].T + centers[frame]
+        scores = np.zeros(frames)
+        for other in range(frames):
+            baseline = float(np.linalg.norm(centers[other] - centers[frame]))
+            turn = np.degrees(np.arccos(np.clip(axes[frame] @ axes[other], -1, 1)))
+            if other == frame or baseline <= 1e-9 * typical_depth[frame] or turn > MAX_TURN_DEG:
+                continue
+            local = points @ from_world[other, :3, :3].T + from_world[other, :3, 3]
+            z = np.maximum(local[:, 2], 1e-9)
+            u = K[other, 0, 0] * local[:, 0] / z + K[other, 0, 2]
+            v = K[other, 1, 1] * local[:, 1] / z + K[other, 1, 2]
+            seen = (local[:, 2] > 1e-6) & (u > 0) & (u < width) & (v > 0) & (v < height)
+            to_first, to_second = points - centers[frame], points - centers[other]
+            cosine = np.einsum("ni,ni->n", to_first, to_second)
+            cosine /= np.linalg.norm(to_first, axis=1) * np.linalg.norm(to_second, axis=1) + 1e-12
+            angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+            worth = np.exp(-0.5 * (np.log(np.maximum(angle, 1e-6) / BEST_ANGLE_DEG) / ANGLE_SPREAD) ** 2)
+            scores[other] = float((worth * seen).mean())
+        for slot in range(chosen.shape[1]):
+            best = int(np.argmax(scores))
+            if scores[best] < 1e-3:
+                break
+            chosen[frame, slot] = best
+            toward = centers[best] - centers[frame]
+            offset = centers - centers[best]
+            near = np.linalg.norm(offset, axis=1) / (np.linalg.norm(toward) + 1e-12)
+            scores *= 1 - 0.6 * np.exp(-0.5 * (near / 0.5) ** 2)
+            scores[best] = 0
+    return chosen

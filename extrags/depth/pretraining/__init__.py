@@ -1,0 +1,1 @@
+"""Pretraining of the depth completion on procedural cavities, which no evaluation uses."""

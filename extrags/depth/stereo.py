@@ -1,0 +1,242 @@
+"""Dense depth of posed frames from each other: two sweeps, the light as a prior, agreement of the views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from extrags.depth.consistency import agreement
+from extrags.depth.frames import PosedFrames
+from extrags.depth import matching, native
+from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
+
+__all__ = ["StereoDepth", "StereoSettings", "multi_view_stereo"]
+
+SATURATED = 0.97
+"""Brightness above which a pixel says nothing about its distance."""
+
+COST_LEVELS = 127.5
+"""Levels per unit of the costs that are kept as bytes."""
+
+SURE_AGREEMENT = 1.5
+"""Sources that must agree with a depth for the fit of the shading, together with the frame's own."""
+
+
+@dataclass(frozen=True)
+class StereoSettings:
+    """How stereo searches.
+
+    Args:
+        hypotheses: depths of the first sweep, evenly spaced in log-depth.
+        radius_px: windows have sides of 2 radius + 1 pixels.
+        best_share: share of the sources, those that match best, whose costs are averaged.
+        small_step: semi-global penalty of a change by one hypothesis.
+        jump: semi-global penalty of larger changes.
+        shading_weight: weight of the prior that shading gives; it is bounded, so that clear matches win.
+        shading_scatters: scatters of the shading fit at which the prior reaches its weight.
+        refinement_hypotheses: depths of the second sweep, around the surface that the first one found.
+        refinement_extent: half the width of the second sweep, in steps of the first.
+        refinement_small_step: as `small_step`, in the second sweep.
+        refinement_jump: as `jump`, in the second sweep.
+        tolerance: log-ratio up to which depths of two frames agree.
+    """
+
+    hypotheses: int = 96
+    radius_px: int = 3
+    best_share: float = 0.5
+    small_step: float = 0.15
+    jump: float = 1.5
+    shading_weight: float = 0.2
+    shading_scatters: float = 4.0
+    refinement_hypotheses: int = 13
+    refinement_extent: float = 3.0
+    refinement_small_step: float = 0.1
+    refinement_jump: float = 0.5
+    tolerance: float = 0.05
+
+
+@dataclass(frozen=True)
+class StereoDepth:
+    """Result of stereo for all frames, with what tells how far to trust it.
+
+    Args:
+        log_depth: logarithm of z-depth, [F, H, W]; defined inside the mask.
+        cost: matching cost of that depth, in [0, 2], [F, H, W].
+        margin: how much better it is than the best other hypothesis, [F, H, W].
+        seen: share of the sources that see the point, [F, H, W].
+        agrees: share of those whose depth is the same, [F, H, W].
+        violates: share of those that see through the point, [F, H, W].
+        difference: mean log-ratio to the sources' depths, bounded, [F, H, W].
+        fused: mean log-depth over the frame and the sources that agree, [F, H, W].
+        shading: log-depth that brightness predicts, [F, H, W].
+        fits: the fit of shading, one per recording.
+        recording: recording of each frame, [F].
+        n_sources: number of sources of each frame, [F].
+    """
+
+    log_depth: Float[Tensor, "f h w"]
+    cost: Float[Tensor, "f h w"]
+    margin: Float[Tensor, "f h w"]
+    seen: Float[Tensor, "f h w"]
+    agrees: Float[Tensor, "f h w"]
+    violates: Float[Tensor, "f h w"]
+    difference: Float[Tensor, "f h w"]
+    fused: Float[Tensor, "f h w"]
+    shading: Float[Tensor, "f h w"]
+    fits: list[ShadingFit]
+    recording: Int[Tensor, "f"]
+    n_sources: Int[Tensor, "f"]
+
+
+def multi_view_stereo(
+    frames: PosedFrames,
+    sources: Int[Tensor, "f s"],
+    near: Float[Tensor, "f"],
+    far: Float[Tensor, "f"],
+    settings: StereoSettings | None = None,
+    *,
+    recording: Int[Tensor, "f"] | None = None,
+    chunk: int = 1,
+    told: Callable[[int], None] | None = None,
+) -> StereoDepth:
+    """Depth of every frame from its sources.
+
+    Args:
+        frames: frames with poses.
+        sources: what each is matched with, from `select_sources`.
+        near: smallest depth searched, per frame.
+        far: largest depth searched, per frame.
+        settings: how to search; None takes the defaults.
+        recording: recording of each frame, numbered from zero: exposure and response are one recording's.
+        chunk: frames at a time.
+        told: called with the number of frames done, twice for each.
+    """
+    settings = StereoSettings() if settings is None else settings
+    device, n = frames.rgb.device, len(frames)
+    recording = torch.zeros(n, dtype=torch.long, device=device) if recording is None else recording
+    grey, brightness = frames.grey(), smoothed_brightness(frames)
+    steps = torch.linspace(-1, 1, settings.hypotheses, device=device)
+    log_base = 0.5 * (near.log() + far.log())
+    offsets = 0.5 * (far.log() - near.log())[:, None] * steps[None]
+    parts = torch.arange(n, device=device).split(chunk)
+    kernels = native if device.type == "cpu" else matching
+    costs, first = [], []
+    for part in parts:
+        base = log_base[part].exp()[:, None, None].expand(-1, *frames.size)
+        cost = _cost(frames, part, sources, base, offsets[part], settings)
+        # A byte is fine enough for what is only ranked again, and many frames are kept.
+        costs.append((cost * COST_LEVELS).round().clamp(0, 255).to(torch.uint8))
+        position, _, _ = kernels.best_steps(
+            cost, grey[part], small_step=settings.small_step, jump=settings.jump
+        )
+        first.append(_log_depth(position, log_base[part][:, None, None], offsets[part]))
+        if told is not None:
+            told(len(part))
+    depth = torch.cat(first).exp()
+    agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
+    count = (sources >= 0).sum(1)
+    sure = torch.cat([a.agrees * a.seen for a in agreed]) * count[:, None, None] >= SURE_AGREEMENT
+    sure &= frames.mask & (frames.rgb.amax(dim=1) < SATURATED)
+    fits = fit_shading(brightness, depth.log(), sure, recording)
+    shading = torch.empty_like(brightness)
+    for g, fit in enumerate(fits):
+        shading[recording == g] = fit.log_depth(brightness[recording == g])
+    found, matched, margins = [], [], []
+    for number, part in enumerate(parts):
+        cost = costs[number].float() / COST_LEVELS
+        cost += _prior(shading[part], fits, recording[part], log_base[part], offsets[part], settings)
+        costs[number] = torch.empty(0)
+        position, _, margin = kernels.best_steps(
+            cost, grey[part], small_step=settings.small_step, jump=settings.jump
+        )
+        margins.append(margin)
+        log_depth = _log_depth(position, log_base[part][:, None, None], offsets[part])
+        surface = _median(log_depth, frames.mask[part])
+        step = offsets[part][:, 1] - offsets[part][:, 0]
+        finer = torch.linspace(-1, 1, settings.refinement_hypotheses, device=device)[None]
+        finer = finer * (settings.refinement_extent * step)[:, None]
+        cost = _cost(frames, part, sources, surface.exp(), finer, settings)
+        position, _, _ = kernels.best_steps(
+            cost, grey[part], small_step=settings.refinement_small_step, jump=settings.refinement_jump
+        )
+        found.append(_log_depth(position, surface, finer))
+        nearest = position.round().long().clamp(0, finer.shape[1] - 1)
+        matched.append(cost.gather(1, nearest[:, None])[:, 0])
+        if told is not None:
+            told(len(part))
+    log_depth = torch.cat(found)
+    depth = torch.where(frames.mask, log_depth.exp(), 0.0)
+    agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
+
+    def joined(name: str) -> Tensor:
+        return torch.cat([getattr(a, name) for a in agreed])
+
+    return StereoDepth(
+        log_depth=log_depth,
+        cost=torch.cat(matched),
+        margin=torch.cat(margins),
+        seen=joined("seen"),
+        agrees=joined("agrees"),
+        violates=joined("violates"),
+        difference=joined("difference"),
+        fused=joined("fused"),
+        shading=shading,
+        fits=fits,
+        recording=recording,
+        n_sources=count,
+    )
+
+
+def _cost(
+    frames: PosedFrames,
+    part: Tensor,
+    sources: Tensor,
+    base: Tensor,
+    offsets: Tensor,
+    settings: StereoSettings,
+) -> Tensor:
+    kernels = native if base.device.type == "cpu" else matching
+    return kernels.matching_cost(
+        frames,
+        part,
+        sources[part],
+        base,
+        offsets,
+        radius_px=settings.radius_px,
+        best_share=settings.best_share,
+    )
+
+
+def _log_depth(position: Tensor, log_base: Tensor, offsets: Tensor) -> Tensor:
+    step = (offsets[:, 1] - offsets[:, 0])[:, None, None]
+    return log_base + offsets[:, 0, None, None] + position * step
+
+
+def _prior(
+    shading: Tensor,
+    fits: list[ShadingFit],
+    recording: Tensor,
+    log_base: Tensor,
+    offsets: Tensor,
+    settings: StereoSettings,
+) -> Tensor:
+    """Cost of leaving the depth that the brightness predicts, bounded; nothing where there was no fit."""
+    scatter = torch.tensor([fit.scatter for fit in fits], device=shading.device)[recording]
+    hypotheses = log_base[:, None] + offsets
+    away = (hypotheses[:, :, None, None] - shading[:, None]).abs()
+    away = away / (settings.shading_scatters * scatter[:, None, None, None])
+    return settings.shading_weight * away.clamp_max(1.5)
+
+
+def _median(log_depth: Tensor, mask: Tensor) -> Tensor:
+    """Median over 5 x 5 pixels inside the mask: steps and single outliers go, edges stay."""
+    value = torch.where(mask, log_depth, float("nan"))
+    padded = functional.pad(value[:, None], (2, 2, 2, 2), value=float("nan"))[:, 0]
+    windows = padded.unfold(1, 5, 1).unfold(2, 5, 1).flatten(3)
+    median = windows.nanmedian(dim=3).values
+    return torch.where(torch.isfinite(median), median, log_depth)

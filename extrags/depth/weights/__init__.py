@@ -1,0 +1,69 @@
+"""Weights of the depth completion: those of the package, trained by this project, or a user's own.
+
+`completion.json` beside this file says how they were made and how they score.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from importlib.resources import files
+from pathlib import Path
+
+from safetensors.torch import load_file
+
+from extrags.depth.completion import CompletionNetwork
+from extrags.errors import WeightsError
+
+__all__ = ["BUNDLED", "NONE", "completion_digest", "find_completion", "load_completion"]
+
+BUNDLED = "bundled"
+"""Setting: the weights of the package."""
+NONE = "none"
+"""Setting: no network; the depth is that of stereo."""
+
+
+def find_completion(setting: str) -> Path | None:
+    """File of the weights; None for `none`.
+
+    Raises:
+        WeightsError: when there is no such file.
+    """
+    if setting == NONE:
+        return None
+    bundled = setting == BUNDLED
+    file = Path(str(files(__name__))) / "completion.safetensors" if bundled else Path(setting).expanduser()
+    if not file.is_file() or file.suffix != ".safetensors":
+        raise WeightsError(
+            f"depth.completion={setting}: there is no .safetensors file {file}; {BUNDLED} takes the weights of "
+            f"the package, {NONE} leaves stereo as it is"
+        )
+    return file
+
+
+def completion_digest(setting: str) -> str | None:
+    """Digest of the weights, independent of their path; None without.
+
+    Raises:
+        WeightsError: as `find_completion`.
+    """
+    file = find_completion(setting)
+    return None if file is None else hashlib.blake2b(file.read_bytes(), digest_size=16).hexdigest()
+
+
+def load_completion(setting: str) -> CompletionNetwork | None:
+    """The network with its weights, ready to use; None for `none`.
+
+    Raises:
+        WeightsError: when there is no such file, or it holds another network.
+    """
+    file = find_completion(setting)
+    if file is None:
+        return None
+    network = CompletionNetwork()
+    try:
+        network.load_state_dict({name: value.float() for name, value in load_file(file).items()})
+    except (RuntimeError, ValueError) as error:
+        raise WeightsError(
+            f"depth.completion={setting}: {file} is not a completion network: {error}"
+        ) from error
+    return network.eval()

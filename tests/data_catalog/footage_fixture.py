@@ -1,0 +1,167 @@
+"""Small videos and DICOM files of the kinds that endoscopes and their recorders give."""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from PIL import Image
+
+_BOXES_OF_BOXES = (b"moov", b"trak", b"mdia", b"minf", b"stbl")
+
+
+def write_video(file: Path, frames: np.ndarray, code: str = "FFV1") -> Path:
+    """Lossless by default."""
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter_fourcc(*code), 25, (frames.shape[2], frames.shape[1]))
+    for frame in frames:
+        writer.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
+    writer.release()
+    return file
+
+
+def write_flagged(file: Path, woven: np.ndarray) -> Path:
+    """MPEG-2 whose header says that it is interlaced, as recorders write it."""
+    import av
+
+    with av.open(str(file), "w") as container:
+        options = {"flags": "+ildct+ilme", "b": "8000000"}
+        stream = container.add_stream("mpeg2video", rate=25, options=options)
+        stream.height, stream.width = woven.shape[1:3]
+        stream.pix_fmt = "yuv420p"
+        for image in woven:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+        container.mux(stream.encode())
+    return file
+
+
+def write_ten_bit(file: Path, frames: np.ndarray, *, pixel_aspect: str = "1:1") -> Path:
+    """YUV4MPEG2 with 10 bits a channel and halved chroma, limited range."""
+    height, width = frames.shape[1:3]
+    header = f"YUV4MPEG2 W{width} H{height} F25:1 Ip A{pixel_aspect} C420p10\n"
+    with file.open("wb") as stream:
+        stream.write(header.encode())
+        for frame in frames:
+            red, green, blue = np.moveaxis(frame.astype(float) / 255, -1, 0)
+            luma = 0.299 * red + 0.587 * green + 0.114 * blue
+            planes = [64 + 876 * luma]
+            for colour, scale in ((blue, 1.772), (red, 1.402)):
+                chroma = 512 + 896 * (colour - luma) / scale
+                planes.append(chroma.reshape(height // 2, 2, width // 2, 2).mean(axis=(1, 3)))
+            stream.write(b"FRAME\n")
+            stream.writelines(np.rint(plane).astype("<u2").tobytes() for plane in planes)
+    return file
+
+
+def retimed(mp4: bytes, steps: Sequence[int]) -> bytes:
+    """An MP4 with another duration for each frame, in units of its clock (512 are 40 ms)."""
+
+    def walked(block: bytes) -> bytes:
+        out, at = b"", 0
+        while at < len(block):
+            size, kind = struct.unpack(">I4s", block[at : at + 8])
+            body = block[at + 8 : at + size]
+            at += size
+            if kind == b"edts":
+                continue
+            if kind in _BOXES_OF_BOXES:
+                body = walked(body)
+            if kind == b"stts":
+                entries = [struct.pack(">II", 1, step) for step in steps]
+                body = struct.pack(">II", 0, len(steps)) + b"".join(entries)
+            if kind == b"mdhd":
+                body = body[:16] + struct.pack(">I", sum(steps)) + body[20:]
+            out += struct.pack(">I4s", len(body) + 8, kind) + body
+        return out
+
+    return walked(mp4)
+
+
+def turned(mp4: bytes, height: int) -> bytes:
+    """An MP4 that says that it is to be shown a quarter turn clockwise."""
+    at = mp4.index(b"tkhd") + 4 + 40
+    matrix = struct.pack(">9i", 0, 1 << 16, 0, -(1 << 16), 0, 0, height << 16, 0, 1 << 30)
+    return mp4[:at] + matrix + mp4[at + len(matrix) :]
+
+
+def interlaced(scene: np.ndarray) -> np.ndarray:
+    """Each two pictures woven into one, line by line."""
+    woven = scene[::2].copy()
+    woven[:, 1::2] = scene[1::2, 1::2]
+    return woven
+
+
+def write_dicom(
+    file: Path,
+    frames: np.ndarray,
+    *,
+    colours: str = "RGB",
+    jpeg: bool = False,
+    stream: bytes | None = None,
+    bits: int = 8,
+    **elements: Any,
+) -> Path:
+    """A multi-frame file of the ultrasound kind, the oldest for endoscopy.
+
+    Args:
+        file: to write.
+        frames: [F, h, w, 3], or grey [F, h, w].
+        colours: photometric interpretation; the values are converted.
+        jpeg: compressed frame by frame; else as they are.
+        stream: a whole video in place of frames.
+        bits: stored of 8 or 16.
+        elements: more of them.
+    """
+    from pydicom.dataset import Dataset, FileMetaDataset
+    from pydicom.encaps import encapsulate
+    from pydicom.uid import MPEG4HP41, ExplicitVRLittleEndian, JPEGBaseline8Bit, generate_uid
+
+    dataset = Dataset()
+    dataset.file_meta = FileMetaDataset()
+    syntax = MPEG4HP41 if stream else JPEGBaseline8Bit if jpeg else ExplicitVRLittleEndian
+    dataset.file_meta.TransferSyntaxUID = syntax
+    dataset.SOPClassUID = dataset.file_meta.MediaStorageSOPClassUID = "1.2.840.10008.5.1.4.1.1.3.1"
+    dataset.SOPInstanceUID = dataset.file_meta.MediaStorageSOPInstanceUID = generate_uid()
+    dataset.PatientName = "Doe^Jane"
+    dataset.NumberOfFrames, dataset.Rows, dataset.Columns = frames.shape[:3]
+    dataset.SamplesPerPixel = 3 if frames.ndim == 4 else 1
+    dataset.PhotometricInterpretation = colours
+    dataset.BitsStored = bits
+    dataset.BitsAllocated = 8 if bits <= 8 else 16
+    dataset.HighBit = bits - 1
+    dataset.PixelRepresentation = 0
+    if frames.ndim == 4:
+        dataset.PlanarConfiguration = 0
+    for name, value in elements.items():
+        setattr(dataset, name, value)
+    if stream is not None:
+        dataset.PixelData = encapsulate([stream])
+    elif jpeg:
+        dataset.PixelData = encapsulate([_jpeg(frame) for frame in frames])
+    else:
+        values = frames if colours in ("RGB", "MONOCHROME2") else np.stack([_ybr(frame) for frame in frames])
+        if colours == "YBR_FULL_422":
+            values = np.stack(
+                [values[:, :, ::2, 0], values[:, :, 1::2, 0], values[:, :, ::2, 1], values[:, :, ::2, 2]], -1
+            )
+        dataset.PixelData = values.astype("<u2" if bits > 8 else np.uint8).tobytes()
+    if dataset.file_meta.TransferSyntaxUID.is_encapsulated:
+        dataset["PixelData"].VR = "OB"
+        dataset["PixelData"].is_undefined_length = True
+    dataset.save_as(file, enforce_file_format=True)
+    return file
+
+
+def _ybr(rgb: np.ndarray) -> np.ndarray:
+    luma_red_blue = cv2.cvtColor(rgb, cv2.COLOR_RGB2YCrCb)
+    return luma_red_blue[..., [0, 2, 1]]
+
+
+def _jpeg(rgb: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(rgb).save(buffer, "JPEG", quality=95, subsampling=0)
+    return buffer.getvalue()
