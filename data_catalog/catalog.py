@@ -12,12 +12,12 @@ from typing import Any
 
 from data_catalog.c3vd.dataset import C3vdDataset
 from data_catalog.checks import check_sequence
-from data_catalog.dataset import Dataset, Descriptor, Source
+from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
 from data_catalog.folders import FolderDataset
 from data_catalog.phantom.dataset import PhantomDataset
 from data_catalog.specular import with_specular
 from extrags.config import IngestConfig
-from extrags.errors import ConfigError, UnknownSequenceError
+from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["DATASETS", "describe", "list_sequences", "read", "resolve", "source_fingerprint"]
@@ -80,8 +80,13 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
         ConfigError: settings that this source cannot be read with.
     """
     source = source if isinstance(source, Source) else resolve(source)
-    config = config or IngestConfig()
-    sequence = _dataset(source).read(source, config)
+    dataset, config = _dataset(source), config or IngestConfig()
+    if config.calibration is not None and not isinstance(dataset, FolderDataset):
+        raise ConfigError(
+            f"ingest.calibration is given, but {source.name} states its intrinsics itself; give one of the "
+            "two"
+        )
+    sequence = dataset.read(source, config)
     check_sequence(sequence, file=source.path or source.name)
     if config.scale_mm_per_unit is not None:
         sequence = _scaled(sequence, config.scale_mm_per_unit)
@@ -100,13 +105,22 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
     Returns:
         Plain JSON: for the phantom its settings and generator version; for a folder the reader's name and
         version, and name, size and BLAKE2b digest of each file the reader looks at; for two videos under a
-        split manifest the same of both, and the manifest's line.
+        split manifest the same of both, and the manifest's line. Where the settings name a calibration file,
+        size and digest of it.
 
     Raises:
         SourceError: the folder is not readable as a sequence.
+        SourceNotFoundError: there is no such calibration file.
     """
     source = source if isinstance(source, Source) else resolve(source)
-    return _dataset(source).fingerprint(source, config or IngestConfig())
+    config = config or IngestConfig()
+    found = _dataset(source).fingerprint(source, config)
+    if config.calibration is None:
+        return found
+    file = Path(config.calibration).expanduser()
+    if not file.is_file():
+        raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
+    return found | {"calibration": file_digests([("calibration", file)])}
 
 
 def _scaled(sequence: EndoscopicSequence, mm_per_unit: float) -> EndoscopicSequence:

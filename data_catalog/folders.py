@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from data_catalog.c3vd import reader as c3vd
+from data_catalog.calibration_files import with_calibration_file
 from data_catalog.dataset import Descriptor, Source
 from data_catalog.folder_reader import FolderReader
 from data_catalog.named_folders import find_folder, not_on_this_machine
+from data_catalog.posed_frames import assembled
 from data_catalog.readers import (
     colmap_model,
     dicom,
@@ -109,8 +111,12 @@ class FolderDataset:
         return _reader(source).fingerprint(Path(source.paths[0]))
 
     def read(self, source: Source, config: IngestConfig) -> EndoscopicSequence:
-        """Whatever its reader makes of it."""
-        return _reader(source).read(Path(source.paths[0]), config, source.name)
+        """Whatever its reader makes of it, with the lens of `config.calibration` where that is given."""
+        reader, place = _reader(source), Path(source.paths[0])
+        if config.calibration is None:
+            return reader.read(place, config, source.name)
+        frames = with_calibration_file(reader.frames(place, config), Path(config.calibration).expanduser())
+        return assembled(frames, config, source.name)
 
     def _source(self, path: Path, reader: FolderReader) -> Source:
         return Source(

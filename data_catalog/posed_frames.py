@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.checks import check_depth, check_intrinsics, check_pose
+from data_catalog.guessed_intrinsics import fitted_to_picture
 from data_catalog.images import COLOUR_SUFFIXES, read_colour, read_depth, read_mask, spread
-from data_catalog.lens import Lens
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from data_catalog.splits import every_nth
 from data_catalog.visibility import observed_by_depth
@@ -24,6 +24,7 @@ from extrags.cameras import Cameras
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
+from extrags.lens import Lens
 from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["MaskFinder", "PosedFrame", "SourceFrames", "assembled"]
@@ -110,6 +111,8 @@ class SourceFrames:
         points: sparse points of the source.
         points_rgb: their colours.
         truth: what else is known, for `EndoscopicSequence.truth`.
+        intrinsics: whether the lenses are stated by the source, or guessed because nothing states them; then
+            all frames have one.
         looked_at: steps of progress that were reported before the first frame is read.
     """
 
@@ -131,6 +134,7 @@ class SourceFrames:
     points: Float[np.ndarray, "p 3"] | None = None
     points_rgb: UInt8[np.ndarray, "p 3"] | None = None
     truth: Callable[[EndoscopicSequence], dict[str, Any]] | None = None
+    intrinsics: Literal["given", "guessed"] = "given"
     looked_at: int = 0
 
 
@@ -160,6 +164,8 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         emit(Progress("ingest", index, source.looked_at + len(kept)))
     K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
     rgb, mask = np.stack(pixels.colours), pixels.masks(kept)
+    if source.intrinsics == "guessed":
+        K = fitted_to_picture(K, mask)
     depth_mm = np.stack(pixels.depths) if pixels.depths else None
     observed = None
     if world_from_camera is not None:
@@ -179,6 +185,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         observed=observed,
         points=source.points,
         points_rgb=source.points_rgb,
+        intrinsics=source.intrinsics,
     )
     return sequence if source.truth is None else replace(sequence, truth=source.truth(sequence))
 

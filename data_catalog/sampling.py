@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.images import Resampling
-from data_catalog.lens import Lens, Undistortion
 from extrags.config import IngestConfig
+from extrags.lens import Lens, Undistortion
 
 __all__ = ["CameraModel", "LensSampling", "Sampling"]
 

@@ -17,14 +17,27 @@ from extrags.store.storable import Storable
 from extrags.thresholds import SATURATED
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["EndoscopicSequence", "PoseSource", "ScaleSource", "Split", "saturated_mask"]
+__all__ = [
+    "EndoscopicSequence",
+    "IntrinsicsSource",
+    "PoseSource",
+    "ScaleSource",
+    "Split",
+    "saturated_mask",
+]
 
+_SQUARE = 0.01
+"""Focal lengths across and down that differ by a smaller share are those of square pixels."""
 ALL_OF_AREA = 0.999
 """A downscaled pixel is valid above this share of valid area; below one because of rounding."""
 
 PoseSource = Literal["given", "estimated", "aligned", "refined"]
 """Origin of the poses. given: by the source; estimated: by COLMAP; aligned: by RGB-D alignment; refined:
 corrected during the reconstruction."""
+
+IntrinsicsSource = Literal["given", "guessed", "estimated"]
+"""Origin of the intrinsics. given: by the source or a calibration file; guessed: a usual field of view,
+because nothing states them; estimated: by bundle adjustment, with the poses."""
 
 
 ScaleSource = Literal["source", "setting", "depth", "working_distance"]
@@ -81,6 +94,8 @@ class EndoscopicSequence(Storable):
         specular: true on specular highlights, [F, H, W]; they have no weight in training, but count in the
             evaluation of held-out frames like any other pixel. None where they were not detected.
         pose_source: origin of the poses; the reconstruction may refine estimated ones.
+        intrinsics: origin of `K`; the poses stage estimates what was guessed.
+        focal_std_px: standard deviation of an estimated focal length, in pixels; None where it was not.
         withheld_depth_mm: true z-depth that the evaluation alone may use, 0 where unknown, [F, H, W]; None
             where `depth_mm` is the truth. See `true_depth_mm`.
         scale_source: what the unit of length rests on; of no account where it is arbitrary.
@@ -109,6 +124,8 @@ class EndoscopicSequence(Storable):
     truth: dict[str, Any] = field(default_factory=dict)
     specular: Bool[np.ndarray, "f h w"] | None = None
     pose_source: PoseSource = "given"
+    intrinsics: IntrinsicsSource = "given"
+    focal_std_px: float | None = None
     withheld_depth_mm: Float[np.ndarray, "f h w"] | None = None
     scale_source: ScaleSource = "source"
     depth_error: Float[np.ndarray, "f h w"] | None = None
@@ -262,11 +279,23 @@ class EndoscopicSequence(Storable):
         Colours are means over the area of a pixel. A pixel is valid where all of its area is; its depth is
         that of the nearest source pixel, since a mean over an edge belongs to neither side.
         """
-        import cv2
-
         if self.width <= width:
             return self
-        size = (width, max(1, round(self.height * width / self.width)))
+        return self._resized((width, max(1, round(self.height * width / self.width))))
+
+    def with_square_pixels(self) -> EndoscopicSequence:
+        """The same frames, made lower or higher until both focal lengths agree; as in `at_most_width`.
+
+        A sequence whose pixels are square, to a percent, is returned as it is. All frames must have one
+        camera.
+        """
+        stretch = float(self.K[0, 1, 1] / self.K[0, 0, 0])
+        if abs(stretch - 1) <= _SQUARE:
+            return self
+        return self._resized((self.width, max(1, round(self.height / stretch))))
+
+    def _resized(self, size: tuple[int, int]) -> EndoscopicSequence:
+        import cv2
 
         def resized(stack: np.ndarray, interpolation: int) -> np.ndarray:
             return np.stack([cv2.resize(image, size, interpolation=interpolation) for image in stack])
@@ -288,6 +317,7 @@ class EndoscopicSequence(Storable):
             withheld_depth_mm=None if withheld is None else resized(withheld, cv2.INTER_NEAREST),
             observed=None if observed is None else share(observed) > ALL_OF_AREA,
             specular=None if specular is None else share(specular) > 0,
+            focal_std_px=None if self.focal_std_px is None else self.focal_std_px * size[0] / self.width,
             depth_error=None if self.depth_error is None else resized(self.depth_error, cv2.INTER_NEAREST),
         )
 
@@ -349,6 +379,10 @@ class EndoscopicSequence(Storable):
         # Written only where it differs from the default, so that older artefacts keep their digest.
         if self.pose_source != "given":
             group.attrs["pose_source"] = self.pose_source
+        if self.intrinsics != "given":
+            group.attrs["intrinsics"] = self.intrinsics
+        if self.focal_std_px is not None:
+            group.attrs["focal_std_px"] = self.focal_std_px
         if self.scale_source != "source":
             group.attrs["scale_source"] = self.scale_source
 
@@ -389,6 +423,8 @@ class EndoscopicSequence(Storable):
             metric=bool(attributes["metric"]),
             truth=truth,
             pose_source=cast("PoseSource", attributes.get("pose_source", "given")),
+            intrinsics=cast("IntrinsicsSource", attributes.get("intrinsics", "given")),
+            focal_std_px=cast("float | None", attributes.get("focal_std_px")),
             scale_source=cast("ScaleSource", attributes.get("scale_source", "source")),
             **optional,
         )

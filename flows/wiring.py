@@ -153,7 +153,14 @@ class SequenceRun(Pipeline):
         with self._stage("ingest") as row:
             source = resolve(self.outcome.name)
             fingerprint = source_fingerprint(source, self.config.ingest)
-            inputs = {"source": source, "fingerprint": fingerprint, "config": self.config.ingest}
+            # The calibration file counts by its content, which is in the fingerprint.
+            config = self.config.ingest.model_copy(update={"calibration": None})
+            inputs = {
+                "source": source,
+                "fingerprint": fingerprint,
+                "config": config,
+                "calibration": self.config.ingest.calibration,
+            }
             self.refs["ingest"] = self.refs["sequence"] = self._run_task(row, Call(ingest, inputs))
 
     def poses(self) -> None:

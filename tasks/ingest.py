@@ -13,13 +13,27 @@ __all__ = ["ingest", "training_frames"]
 
 
 # The fingerprint covers the content of the files; their location is not part of the key.
-@stage("ingest", version=2, ignore=("source",))
-def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: IngestConfig) -> None:
-    """Read a source into `sequence/`."""
+@stage("ingest", version=4, ignore=("source", "calibration"))
+def ingest(
+    slot: Slot,
+    source: Source,
+    fingerprint: dict[str, Any],
+    config: IngestConfig,
+    calibration: str | None = None,
+) -> None:
+    """Read a source into `sequence/`.
+
+    Args:
+        slot: the artefact to write.
+        source: where it lies.
+        fingerprint: of its content, and of the calibration file's.
+        config: settings without `calibration`, whose path is not part of the key.
+        calibration: path of the calibration file; None without.
+    """
     from data_catalog import read
     from extrags.sequence import saturated_mask
 
-    sequence = read(source, config)
+    sequence = read(source, config.model_copy(update={"calibration": calibration}))
     slot.save(sequence)
     inside = max(1, int(sequence.mask.sum()))
     slot.counts.update(
@@ -29,6 +43,7 @@ def ingest(slot: Slot, source: Source, fingerprint: dict[str, Any], config: Inge
         width=sequence.width,
         height=sequence.height,
         has_poses=int(sequence.world_from_camera is not None),
+        intrinsics=sequence.intrinsics,
         scale=sequence.scale_words if sequence.world_from_camera is not None else "",
         has_depth=int(sequence.training_depth_known),
         masked_share=float(1 - sequence.mask.mean()),

@@ -9,12 +9,13 @@ from tasks.stage import stage
 __all__ = ["poses"]
 
 
-@stage("poses", version=3)
+@stage("poses", version=4)
 def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
     """Estimate poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
 
     Poses of the source are not used for the estimate. If there are any, the errors of the estimate relative
-    to them are in `poses.json` under `against_given`.
+    to them are in `poses.json` under `against_given`; what is known of a lens that nobody stated, under
+    `calibration`.
     """
     from extrags.poses import estimate_poses, with_estimated_poses
     from extrags.sequence import EndoscopicSequence
@@ -33,4 +34,7 @@ def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
         scale=posed.scale_words,
         summary=estimate.summary,
         mean_reprojection_px=estimate.mean_reprojection_px,
+        intrinsics=posed.intrinsics,
+        focal_px=float(posed.K[0, 0, 0]),
+        focal_std_px=posed.focal_std_px,
     )

@@ -39,7 +39,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=3, ignore=("rows",))
+@stage("report", version=5, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],

@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
 from data_catalog.images import Resampling
-from data_catalog.lens import sample_depth
 from extrags.cameras import unproject_pixels
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
+from extrags.lens import sample_depth
 
 __all__ = ["USUAL_FIELD_OF_VIEW_DEG", "USUAL_WIDTH", "PinholeResampling"]
 

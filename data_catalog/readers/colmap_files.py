@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from data_catalog.lens import LENS_PARAMETERS, Lens
 from data_catalog.rotations import quaternion_rotation
 from extrags.cameras import compose, invert_poses
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.lens import LENS_PARAMETERS, Lens
 
 __all__ = ["ColmapImage", "ColmapModel", "read_model", "write_model"]
 

@@ -11,7 +11,7 @@
         length_unit.txt                             optional: `mm`; otherwise the scale is arbitrary
 
 COLMAP's poses are camera-from-world in OpenCV axes with pixel centres at +0.5; they are inverted once on
-reading and nothing else is turned or scaled. Every model of `data_catalog.lens` is understood; images of
+reading and nothing else is turned or scaled. Every model of `extrags.lens` is understood; images of
 distorted cameras are resampled to a pinhole, those of pinhole cameras are taken as they are. Of several
 models (`sparse/0`, `sparse/1`, ...) the one with the most images is read. The sparse points become the
 starting points. Images that the model does not name have no pose and are left out, which the log says.
@@ -28,13 +28,13 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
-from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
 from data_catalog.readers.frame_list import present_frames, split_by_name
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
+from extrags.lens import Lens
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["READER", "model_folder", "points_of", "read_depth_map", "write_colmap", "write_depth_map"]

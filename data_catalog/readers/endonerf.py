@@ -32,10 +32,10 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import colour_files, read_colour, read_mask, spread
-from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.lens import Lens
 
 __all__ = ["POSES_FILE", "READER", "MaskPolarity", "mask_polarity", "polarity_of_images", "read_llff"]
 

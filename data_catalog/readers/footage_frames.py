@@ -19,13 +19,13 @@ from data_catalog.content import content_mask
 from data_catalog.footage import Footage, FootageFrame, TimeSpan
 from data_catalog.images import spread
 from data_catalog.interlacing import deinterlaced
-from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
-from data_catalog.readers.frames_folder import read_intrinsics
+from data_catalog.readers.frames_folder import INTRINSICS_FILE, read_intrinsics
 from data_catalog.sampling import Sampling
 from data_catalog.survey import Shot, Survey, choose_frames, survey
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError
+from extrags.lens import Lens
 
 __all__ = ["MAX_FRAMES", "footage_frames"]
 
@@ -41,7 +41,8 @@ _NAMED_SHOTS = 5
 def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
     """Survey a footage, choose frames, and hand over how they are decoded.
 
-    `intrinsics.json` and `mask.png` beside the file are taken where they are there.
+    `intrinsics.json` and `mask.png` beside the file are taken where they are there; without the first the
+    intrinsics are a guess.
 
     Args:
         footage: of one recording.
@@ -64,7 +65,13 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
     )
     numbers = found.numbers[here][chosen]
     logger.info("%s: %d of %d frames chosen", file.name, len(chosen), len(found))
-    K = read_intrinsics(file.parent, found.width, found.height, pixel_aspect=footage.pixel_aspect)
+    K = read_intrinsics(
+        file.parent,
+        found.width,
+        found.height,
+        pixel_aspect=footage.pixel_aspect,
+        guess_is_used=config.calibration is None,
+    )
     lens = Lens.pinhole(K, found.width, found.height)
     mask_file = file.parent / "mask.png"
     second = _SecondPass(footage, span, numbers, found.numbers[here], interlaced=shot.interlaced)
@@ -84,6 +91,7 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
         # No more frames were chosen than may be kept, so that each is asked for, in order.
         read_colour=second.image,
         masks=second,
+        intrinsics="given" if (file.parent / INTRINSICS_FILE).is_file() else "guessed",
         looked_at=len(found),
     )
 

@@ -3,10 +3,11 @@
 Images lie in the folder itself, or in `images/` or `rgb/` below it, and are taken in natural order (9 before
 10). Optional beside them: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or
 `field_of_view_deg` (horizontal), in pixels of the files with centres at +0.5; and `mask.png` (white is
-tissue). Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log; lens
-distortion is not undone here. Without a mask, the dark frame round the picture is found from all frames: dark
-everywhere, always, and joined to the image border; so are a round picture and burnt-in text
-(`data_catalog.content`).
+tissue). Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log: the
+sequence's intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A
+calibration file (`ingest.calibration`) may stand in for both. Without a mask, the dark frame round the
+picture is found from all frames: dark everywhere, always, and joined to the image border; so are a round
+picture and burnt-in text (`data_catalog.content`).
 """
 
 from __future__ import annotations
@@ -21,18 +22,19 @@ from jaxtyping import Bool, Float, UInt8
 from data_catalog.checks import check_intrinsics
 from data_catalog.content import content_mask
 from data_catalog.folder_reader import FolderReader
+from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
 from data_catalog.images import colour_files, image_size
-from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.sampling import Sampling
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
+from extrags.lens import Lens
 
-__all__ = ["ASSUMED_FIELD_OF_VIEW_DEG", "READER", "read_intrinsics"]
+__all__ = ["INTRINSICS_FILE", "READER", "read_intrinsics"]
 
 logger = logging.getLogger(__name__)
 
-ASSUMED_FIELD_OF_VIEW_DEG = 90.0
+INTRINSICS_FILE = "intrinsics.json"
 _NOT_FRAMES = ("mask.png",)
 
 
@@ -50,7 +52,7 @@ def _recognises(folder: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    extra = [folder / "intrinsics.json", folder / "mask.png"]
+    extra = [folder / INTRINSICS_FILE, folder / "mask.png"]
     return sorted([*_images(folder), *(file for file in extra if file.is_file())])
 
 
@@ -59,7 +61,8 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     if not files:
         raise SourceNotFoundError("no image in this folder", file=folder)
     width, height = image_size(files[0], frame=files[0].name)
-    lens = Lens.pinhole(read_intrinsics(folder, width, height), width, height)
+    K = read_intrinsics(folder, width, height, guess_is_used=config.calibration is None)
+    lens = Lens.pinhole(K, width, height)
     mask_file = folder / "mask.png"
     return SourceFrames(
         frames=[
@@ -69,6 +72,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         pose_file=folder,
         metric=False,
         masks=_ContentMask(),
+        intrinsics="given" if (folder / INTRINSICS_FILE).is_file() else "guessed",
     )
 
 
@@ -86,12 +90,13 @@ class _ContentMask:
 
     def mask(self, frame: PosedFrame, sampling: Sampling) -> Bool[np.ndarray, "h2 w2"]:
         """The picture inside its dark frame, less burnt-in text."""
-        return content_mask(np.stack(self._seen))
+        seen = sampling.mask(np.ones((frame.lens.height, frame.lens.width), dtype=bool), file=frame.file)
+        return np.asarray(content_mask(np.stack(self._seen)) & seen)
 
 
 READER = FolderReader(
     name="frames",
-    version=3,
+    version=4,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
@@ -101,7 +106,7 @@ READER = FolderReader(
 
 
 def read_intrinsics(
-    folder: Path, width: int, height: int, *, pixel_aspect: float = 1.0
+    folder: Path, width: int, height: int, *, pixel_aspect: float = 1.0, guess_is_used: bool = True
 ) -> Float[np.ndarray, "3 3"]:
     """K from `intrinsics.json` in a folder, or of the assumed field of view where there is none.
 
@@ -110,18 +115,23 @@ def read_intrinsics(
         width: of the images it belongs to, in pixels.
         height: of the images it belongs to, in pixels.
         pixel_aspect: width of a pixel over its height, for intrinsics from a field of view.
+        guess_is_used: whether to warn of the assumed field of view; false where a calibration file follows.
 
     Raises:
         SourceError: the file is damaged or describes no pinhole.
     """
-    file = folder / "intrinsics.json"
+    file = folder / INTRINSICS_FILE
     if not file.is_file():
-        logger.warning(
-            "%s has no intrinsics.json: assuming a horizontal field of view of %g degrees",
+        logger.log(
+            logging.WARNING if guess_is_used else logging.DEBUG,
+            "%s has no intrinsics.json: assuming a horizontal field of view of %g degrees, until the poses "
+            "stage estimates it",
             folder.name,
             ASSUMED_FIELD_OF_VIEW_DEG,
         )
-        return _from_field_of_view(ASSUMED_FIELD_OF_VIEW_DEG, width, height, pixel_aspect)
+        return intrinsics_of_field_of_view(
+            ASSUMED_FIELD_OF_VIEW_DEG, width, height, pixel_aspect=pixel_aspect
+        )
     try:
         content = json.loads(file.read_text())
         if "K" in content:
@@ -134,7 +144,7 @@ def read_intrinsics(
                     file=file,
                     field="field_of_view_deg",
                 )
-            K = _from_field_of_view(angle, width, height, pixel_aspect)
+            K = intrinsics_of_field_of_view(angle, width, height, pixel_aspect=pixel_aspect)
         else:
             fx, fy, cx, cy = (float(content[key]) for key in ("fx", "fy", "cx", "cy"))
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
@@ -146,10 +156,3 @@ def read_intrinsics(
         raise SourceError(f"found shape {K.shape}; expected 3 x 3 numbers", file=file, field="K")
     check_intrinsics(K, width, height, file=file)
     return K
-
-
-def _from_field_of_view(
-    angle_deg: float, width: int, height: int, pixel_aspect: float
-) -> Float[np.ndarray, "3 3"]:
-    focal = width / 2 / np.tan(np.radians(angle_deg) / 2)
-    return np.array([[focal, 0, width / 2], [0, focal * pixel_aspect, height / 2], [0, 0, 1.0]])

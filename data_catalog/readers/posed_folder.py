@@ -37,11 +37,11 @@ from typing import Any
 from data_catalog.checks import check_intrinsics
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import colour_files, image_size
-from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frame_list import load_frame_list, matrix_of
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.lens import Lens
 
 __all__ = ["POSES_FILE", "READER"]
 

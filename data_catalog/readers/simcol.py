@@ -25,7 +25,6 @@ from jaxtyping import Float
 from data_catalog.dataset import Descriptor
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import image_size, natural_key, read_depth
-from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.rotations import quaternion_rotation
 from data_catalog.sampling import LensSampling
@@ -33,6 +32,7 @@ from data_catalog.visibility import observed_by_depth
 from extrags.cameras import compose
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.lens import Lens
 
 __all__ = ["DEPTH_STEP_MM", "READER", "decode_depth_mm", "intrinsics", "read_poses"]
 

@@ -24,13 +24,13 @@ from data_catalog.checks import check_intrinsics
 from data_catalog.dataset import Descriptor
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import read_mask
-from data_catalog.lens import Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.rotations import quaternion_rotation
 from data_catalog.sampling import LensSampling
 from extrags.cameras import compose
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.lens import Lens
 
 __all__ = ["READER", "read_points", "read_poses", "read_view_names"]
 

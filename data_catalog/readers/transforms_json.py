@@ -28,11 +28,11 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, image_size, natural_key, read_depth, save_images
-from data_catalog.lens import LENS_PARAMETERS, Lens
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frame_list import load_frame_list, matrix_of, present_frames, split_by_name
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
+from extrags.lens import LENS_PARAMETERS, Lens
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["READER", "TRANSFORMS_FILE", "write_transforms"]

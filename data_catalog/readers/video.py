@@ -2,8 +2,8 @@
 
 A file with one of `VIDEO_SUFFIXES`, or a folder that holds one such file and no images. Beside the file, both
 optional: `intrinsics.json` and `mask.png`, as in `data_catalog.readers.frames_folder`; without the first a
-field of view of 90 degrees is assumed and said so, without the second the picture's outline and burnt-in text
-are found. How frames are chosen: `data_catalog.readers.footage_frames`.
+field of view of 90 degrees is assumed and said so until the poses stage estimates it, without the second the
+picture's outline and burnt-in text are found. How frames are chosen: `data_catalog.readers.footage_frames`.
 
 Frames are decoded by FFmpeg through PyAV: upright (a rotation in the container is applied), 8 bit a channel
 whatever the depth of the file, at the timestamps of the container, which may be uneven. Pixels that are not
@@ -26,6 +26,7 @@ from data_catalog.footage import FootageFrame, TimeSpan
 from data_catalog.images import colour_files
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames
+from data_catalog.readers.frames_folder import INTRINSICS_FILE
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 
@@ -152,7 +153,7 @@ def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
 
 def with_files_beside(file: Path) -> list[Path]:
     """A footage and what belongs to it, sorted."""
-    beside = [file.parent / name for name in ("intrinsics.json", "mask.png")]
+    beside = [file.parent / name for name in (INTRINSICS_FILE, "mask.png")]
     return sorted([file, *(other for other in beside if other.is_file())])
 
 
@@ -174,7 +175,7 @@ def _frames(place: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="video",
-    version=2,
+    version=3,
     summary="a video file (mp4, avi, mov, mkv, ...), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

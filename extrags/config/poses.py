@@ -32,6 +32,18 @@ class PosesConfig(StageConfig):
         description="auto: where COLMAP fails and depth is there, frames are aligned by colour and depth; "
         "never: COLMAP alone; rgbd: alignment by colour and depth from the start",
     )
+    refine_intrinsics: Literal["auto", "always", "never"] = Field(
+        "auto",
+        description="auto: where the source states no intrinsics, focal length and radial distortion are "
+        "estimated with the poses; always: even if it does; never: they stay as they came",
+    )
+    max_focal_std_share: float = Field(
+        0.04,
+        gt=0,
+        le=1,
+        description="an estimated focal length is taken where its standard deviation is at most this share "
+        "of it; else the guess is kept and called so",
+    )
     replace_given: bool = Field(
         False, description="estimate poses even if the source has them; the source's serve as reference"
     )

@@ -92,6 +92,13 @@ class IngestConfig(StageConfig):
         description="horizontal field of view of the pinhole that distorted sources are resampled to; None: "
         "the source's usual one (C3VD and C3VDv2 100; others: that of their central resolution)",
     )
+    calibration: str | None = Field(
+        None,
+        min_length=1,
+        description="calibration file of the endoscope, for sources that state no intrinsics: OpenCV (YAML "
+        "or XML), Kalibr (camchain), Scaramuzza (calib_results.txt); its content counts in cache keys, not "
+        "its path",
+    )
 
 
 class LightConfig(StageConfig):

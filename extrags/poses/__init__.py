@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from extrags.poses.calibration import LensCalibration, with_calibration
 from extrags.poses.estimate import PoseEstimate, estimate_poses, with_estimated_poses
 from extrags.poses.registration_report import errors_against_given
 from extrags.poses.rgbd import RgbdAlignment, align_by_depth
@@ -10,6 +11,7 @@ from extrags.poses.triangulation import Triangulation, triangulate_points
 
 __all__ = [
     "DepthScale",
+    "LensCalibration",
     "PoseEstimate",
     "RgbdAlignment",
     "Triangulation",
@@ -18,5 +20,6 @@ __all__ = [
     "errors_against_given",
     "estimate_poses",
     "triangulate_points",
+    "with_calibration",
     "with_estimated_poses",
 ]

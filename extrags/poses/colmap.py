@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from extrags.lens import Lens
 from extrags.poses.features import (
     PAIRS_PER_CALL,
     Told,
@@ -28,6 +29,7 @@ from extrags.poses.features import (
 )
 from extrags.poses.job import PoseJob, PoseJobResult
 from extrags.poses.pairs import Pair, registration_pairs, training_pairs
+from extrags.poses.self_calibration import largest_model, map_with_unknown_lens, model_sizes
 
 __all__ = ["run_colmap"]
 
@@ -79,27 +81,51 @@ def run_colmap(folder: Path, job: PoseJob) -> PoseJobResult:
     def mapped() -> None:
         told.reach(min(told.done + 1, map_made))
 
-    models = pycolmap.incremental_mapping(
-        database_path,
-        images,
-        folder,
-        options=_mapping_options(pycolmap, job.settings),
-        next_image_callback=mapped,
-    )
+    def make_map(database: Path, options: Any) -> dict[int, Any]:
+        models: dict[int, Any] = pycolmap.incremental_mapping(
+            database, images, folder, options=options, next_image_callback=mapped
+        )
+        return models
+
+    def options() -> Any:
+        return _mapping_options(pycolmap, job.settings)
+
+    lens: Lens | None = None
+    if job.unknown_lens:
+        found = map_with_unknown_lens(
+            pycolmap,
+            database_path,
+            _guessed_lens(job),
+            job.settings,
+            len(job.train),
+            make_map,
+            options,
+            lambda model: read_model(model, np.full((frames, 4, 4), np.nan), {}),
+        )
+        best, lens = found.model, found.calibration.lens
+        report["calibration"] = found.calibration.to_json()
+        report["model_sizes"] = found.model_sizes
+    else:
+        models = make_map(database_path, options())
+        best = largest_model(models)
+        report["model_sizes"] = model_sizes(models)
     told.reach(map_made)
-    report["model_sizes"] = sorted((model.num_reg_images() for model in models.values()), reverse=True)
     poses = np.full((frames, 4, 4), np.nan)
-    if not models:
+    if best is None:
         told.reach(told.total)
         return nothing(poses, report | {"registrations": {}})
-    # Ties go to the first model, whatever the order of the dictionary.
-    best = models[
-        max(models, key=lambda key: (models[key].num_reg_images(), models[key].num_points3D(), -key))
-    ]
     result = read_model(best, poses, report)
-    _register_held_out(pycolmap, folder, job, best, result, schedule, told)
+    _register_held_out(pycolmap, folder, job, best, result, schedule, told, lens)
     told.reach(told.total, registered=float(np.isfinite(poses).all((1, 2)).sum()))
     return result
+
+
+def _guessed_lens(job: PoseJob) -> Lens:
+    """The pinhole that all frames were guessed to have."""
+    K = job.K[0]
+    focal = float(np.sqrt(K[0, 0] * K[1, 1]))
+    height, width = job.rgb.shape[1:3]
+    return Lens("SIMPLE_PINHOLE", (focal, float(K[0, 2]), float(K[1, 2])), width, height)
 
 
 def _match_report(pycolmap: Any, database: Any, frames: np.ndarray, pairs: list[Pair]) -> dict[str, Any]:
@@ -182,8 +208,12 @@ def _register_held_out(
     result: PoseJobResult,
     schedule: dict[str, int],
     told: Told,
+    lens: Lens | None,
 ) -> None:
-    """Pose of each held-out frame from its matches to triangulated points; the map stays as it is."""
+    """Pose of each held-out frame from its matches to triangulated points; the map stays as it is.
+
+    `lens` is the one that all frames were found to have; None takes the camera that each frame came with.
+    """
     images = {frame_number(model.image(number).name): model.image(number) for number in model.reg_image_ids()}
     mapped = np.array(sorted(images), dtype=np.int64)
     registrations: dict[str, dict[str, int]] = {}
@@ -212,7 +242,7 @@ def _register_held_out(
                 pycolmap,
                 np.array([keypoints[mine] for mine, _ in matches], dtype=np.float64).reshape(-1, 2),
                 np.array([model.point3D(point).xyz for _, point in matches]).reshape(-1, 3),
-                database.read_camera(own.camera_id),
+                database.read_camera(own.camera_id) if lens is None else _camera(pycolmap, lens),
                 int(job.settings["seed"]),
             )
             registrations[str(frame)] = {"matches": len(matches), "inliers": inliers}
@@ -236,6 +266,12 @@ def _absolute_pose(
     if inliers < max(MIN_POSE_INLIERS, POSE_INLIER_SHARE * len(pixels)):
         return None, inliers
     return world_from_camera(answer["cam_from_world"]), inliers
+
+
+def _camera(pycolmap: Any, lens: Lens) -> Any:
+    return pycolmap.Camera(
+        model=lens.model, width=lens.width, height=lens.height, params=list(lens.parameters)
+    )
 
 
 def _main() -> None:

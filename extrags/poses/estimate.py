@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from extrags.cameras import as_rotation
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
+from extrags.poses.calibration import LensCalibration, with_calibration
 from extrags.poses.job import PoseJob, PoseJobResult, run_job
 from extrags.poses.registration_report import (
     colmap_report,
@@ -47,6 +48,7 @@ class PoseEstimate:
             depth is withheld or the poses are metric. The evaluation compares with the truth by it; no
             pose and no point depends on it.
         scale_source: what makes the estimate metric, if anything does.
+        calibration: of the lens, where the sequence's intrinsics were a guess; None where they were given.
     """
 
     method: Literal["colmap", "rgbd"]
@@ -59,6 +61,7 @@ class PoseEstimate:
     report: dict[str, Any]
     truth_per_unit: float | None = None
     scale_source: ScaleSource = "source"
+    calibration: LensCalibration | None = None
 
     @property
     def summary(self) -> str:
@@ -69,9 +72,10 @@ class PoseEstimate:
         if "colmap" in found:
             failed = found["colmap"]
             why = f" (COLMAP registered only {failed['registered_train']})"
+        lens = "" if self.calibration is None else f"; {self.calibration.summary}"
         return (
             f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
-            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames; {self._scale}"
+            f"{why}, {found['registered_test']} of {found['n_test']} held-out frames; {self._scale}{lens}"
         )
 
     @property
@@ -112,6 +116,10 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     depth of the pixels, interpolated between the points that a frame observes, becomes that. COLMAP runs in
     a process of its own.
 
+    *An unknown lens* (`sequence.intrinsics` is `guessed`, see `PosesConfig.refine_intrinsics`): focal
+    length and radial distortion are estimated with the map (`extrags.poses.self_calibration`), and the
+    guess is kept, with a warning, where the frames do not determine them.
+
     *Colour and depth* (`extrags.poses.rgbd`): where the sequence has depth and COLMAP registers too few
     training frames, unless `config.fallback` says `never`; or from the start if it says `rgbd`. Again
     training frames first, held-out ones against what these made.
@@ -142,12 +150,21 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
         )
     if config.fallback == "rgbd":
         return _by_depth(sequence, config, None)
-    result = _run(_job(sequence, config), sequence.name)
+    unknown_lens = _estimates_lens(sequence, config)
+    # The lenses that are tried have one focal length.
+    seen = sequence.with_square_pixels() if unknown_lens else sequence
+    result = _run(_job(seen, config, unknown_lens=unknown_lens), sequence.name)
     registered = np.isfinite(result.world_from_camera).all((1, 2))
     report = colmap_report(sequence, result, registered)
+    calibration = None
+    if "calibration" in report:
+        calibration = LensCalibration.from_json(report["calibration"])
+        told = _LOG.info if calibration.determined else _LOG.warning
+        told("%s: %s", sequence.name, calibration.summary)
     if _enough(report, config):
         _warn_of_missing(sequence, report)
-        return _from_colmap(sequence, result, registered, report, config)
+        found = _from_colmap(seen, result, registered, report, config)
+        return replace(found, calibration=calibration)
     if config.fallback == "never":
         instead = "Alignment by colour and depth is switched off (poses.fallback)."
     elif sequence.depth_mm is None:
@@ -163,7 +180,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     raise CaptureError(failure_message(sequence.name, report, config.min_registered_share, instead=instead))
 
 
-def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
+def _job(sequence: EndoscopicSequence, config: PosesConfig, *, unknown_lens: bool = False) -> PoseJob:
     recording = sequence.recording
     return PoseJob(
         rgb=sequence.rgb,
@@ -173,7 +190,19 @@ def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
         train=np.asarray(sequence.train, dtype=np.int64),
         test=np.asarray(sequence.test, dtype=np.int64),
         settings=config.model_dump(),
+        unknown_lens=unknown_lens,
     )
+
+
+def _estimates_lens(sequence: EndoscopicSequence, config: PosesConfig) -> bool:
+    if config.refine_intrinsics == "never":
+        return False
+    if config.refine_intrinsics == "auto" and sequence.intrinsics != "guessed":
+        return False
+    if np.ptp(sequence.K, axis=0).any():
+        _LOG.warning("%s: the frames have several cameras; their intrinsics are kept", sequence.name)
+        return False
+    return True
 
 
 def _from_colmap(
@@ -282,6 +311,8 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
 
     Frames keep their names; the split is renumbered. `truth` is kept and told that the world is another
     (`world`). Where true depth was withheld, it is brought to the unit of the poses, for the evaluation.
+    Where a lens was estimated, `K` is that of its pinhole, and frames of a distorted lens are resampled to it
+    (`extrags.poses.with_calibration`).
 
     Raises:
         ShapeError: when the estimate is of another sequence.
@@ -308,7 +339,7 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
 
     split = sequence.split
     hidden = not sequence.training_depth_known
-    return replace(
+    posed = replace(
         sequence,
         rgb=sequence.rgb[kept],
         K=sequence.K[kept],
@@ -328,6 +359,7 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         pose_source="estimated" if estimate.method == "colmap" else "aligned",
         truth={**sequence.truth, "world": "estimated"} if sequence.truth else {},
     )
+    return posed if estimate.calibration is None else with_calibration(posed, estimate.calibration)
 
 
 def _run(job: PoseJob, name: str) -> PoseJobResult:

@@ -97,6 +97,11 @@ def extract(pycolmap: Any, folder: Path, job: PoseJob, frames: np.ndarray, told:
         )
         with opened(pycolmap, folder / "database.db") as database:
             reader.existing_camera_id = database.read_image_with_name(members[0]).camera_id
+            if job.unknown_lens:
+                # Pairs are then verified by fundamental matrices, which hold for any focal length.
+                camera = database.read_camera(reader.existing_camera_id)
+                camera.has_prior_focal_length = False
+                database.update_camera(camera)
         for start in range(0, len(members), _IMAGES_PER_CALL):
             part = members[start : start + _IMAGES_PER_CALL]
             pycolmap.extract_features(

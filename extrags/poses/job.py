@@ -31,6 +31,7 @@ class PoseJob:
         train: indices of frames the map is made of.
         test: indices of frames registered afterwards.
         settings: fields of `PosesConfig`.
+        unknown_lens: whether `K`, then the same for all frames, is a guess and the lens is to be estimated.
         world_from_camera: known poses, [F, 4, 4]; None where they are to be found.
     """
 
@@ -41,6 +42,7 @@ class PoseJob:
     train: np.ndarray
     test: np.ndarray
     settings: dict[str, Any]
+    unknown_lens: bool = False
     world_from_camera: np.ndarray | None = None
 
     def save(self, folder: Path) -> None:
@@ -58,13 +60,14 @@ class PoseJob:
             train=self.train,
             test=self.test,
         )
-        (folder / "job.json").write_text(json.dumps(self.settings))
+        content = {"settings": self.settings, "unknown_lens": self.unknown_lens}
+        (folder / "job.json").write_text(json.dumps(content))
 
     @classmethod
     def load(cls, folder: Path) -> PoseJob:
         """Read the job."""
         with np.load(folder / "job.npz") as arrays:
-            return cls(**dict(arrays.items()), settings=json.loads((folder / "job.json").read_text()))
+            return cls(**dict(arrays.items()), **json.loads((folder / "job.json").read_text()))
 
 
 @dataclass(frozen=True)

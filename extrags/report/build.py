@@ -21,6 +21,7 @@ from extrags.report.wording import (
     count,
     described_metrics,
     duration,
+    intrinsics_in_words,
     metric_of,
     number,
     shown_metrics,
@@ -93,6 +94,8 @@ def _facts(inputs: ReportInputs) -> list[tuple[str, str]]:
     if recordings > 1:
         facts.append(("Recordings", count(recordings)))
     facts.append(("Scale", sequence.scale_words.removesuffix(" scale")))
+    if sequence.intrinsics != "given":
+        facts.append(("Focal length", intrinsics_in_words(sequence)))
     if (gaussians := metric_of(final, "n_gaussians")) is not None:
         facts.append(("Gaussians", count(gaussians)))
     if inputs.stages:

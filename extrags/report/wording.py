@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from extrags.metrics.registry import Metric, metrics
+from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "Comparison",
@@ -15,6 +16,7 @@ __all__ = [
     "count",
     "described_metrics",
     "duration",
+    "intrinsics_in_words",
     "metric_of",
     "number",
     "percent",
@@ -71,6 +73,16 @@ def duration(seconds: float | int | None) -> str:
     if whole < 3600:
         return f"{whole // 60} min {whole % 60:02d} s"
     return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def intrinsics_in_words(sequence: EndoscopicSequence) -> str:
+    """Focal length and field of view of the first frame, and how they are known."""
+    focal_px = float(sequence.K[0, 0, 0])
+    angle_deg = math.degrees(2 * math.atan(sequence.width / 2 / focal_px))
+    if sequence.intrinsics == "guessed":
+        return f"guessed: {focal_px:.1f} px ({angle_deg:.0f} degrees), not determined"
+    spread = "" if sequence.focal_std_px is None else f" \N{PLUS-MINUS SIGN} {sequence.focal_std_px:.1f}"
+    return f"{focal_px:.1f} px{spread} (field of view {angle_deg:.0f} degrees), {sequence.intrinsics}"
 
 
 def metric_of(tree: Mapping[str, Any] | None, *path: str) -> float | None:

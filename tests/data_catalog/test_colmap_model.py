@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from data_catalog.catalog import read, resolve, source_fingerprint
-from data_catalog.lens import Lens, Undistortion
 from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
 from data_catalog.readers.colmap_model import model_folder, points_of, read_depth_map, write_colmap
 from extrags.config import IngestConfig
+from extrags.lens import Lens, Undistortion
 from extrags.sequence import Split
 from tests.data_catalog.layouts import carried_error_mm, same_frames
 

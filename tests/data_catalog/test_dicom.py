@@ -97,6 +97,7 @@ class TestReading:
         sequence = read(file)
         assert len(sequence) >= 20
         assert sequence.world_from_camera is None
+        assert sequence.intrinsics == "guessed"
         for name, image in zip(sequence.frame_names, sequence.rgb, strict=True):
             np.testing.assert_array_equal(image, scene[int(name)])
         assert not sequence.mask[0][~circle.mask(*SIZE)].any()

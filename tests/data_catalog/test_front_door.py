@@ -16,10 +16,10 @@ from data_catalog import FolderReader, PosedFrame, SourceFrames
 from data_catalog.catalog import DATASETS
 from data_catalog.dataset import Dataset
 from data_catalog.folders import READERS, readers, register_reader
-from data_catalog.lens import Lens
 from data_catalog.specular import specular_masks
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, PoseError, SourceError
+from extrags.lens import Lens
 
 
 def test_every_name_of_the_front_door_is_there() -> None:

@@ -48,6 +48,41 @@ def video(tmp_path_factory) -> Path:
     return write_video(tmp_path_factory.mktemp("video") / "exam.avi", frames)
 
 
+class TestIntrinsics:
+    def test_a_guess_follows_the_round_picture(self, video) -> None:
+        sequence = read(video)
+        assert sequence.intrinsics == "guessed"
+        # 90 degrees over the circle of 84 pixels, less its blurred rim.
+        np.testing.assert_allclose(sequence.K[:, 0, 0], 84, atol=4)
+        np.testing.assert_allclose(sequence.K[:, :2, 2], np.tile([160, 90], (len(sequence), 1)), atol=1.5)
+
+    def test_stated_beside_the_video(self, tmp_path) -> None:
+        file = write_video(tmp_path / "a.avi", moving_scene(12, *SIZE, speed=6))
+        (tmp_path / "intrinsics.json").write_text(json.dumps({"field_of_view_deg": 80}))
+        sequence = read(file)
+        assert sequence.intrinsics == "given"
+        with pytest.raises(ConfigError, match="states its intrinsics itself"):
+            read(file, IngestConfig(calibration=str(calibration_file(tmp_path))))
+
+    def test_a_calibration_file_takes_the_place_of_the_guess(self, tmp_path, caplog) -> None:
+        file = write_video(tmp_path / "a.avi", moving_scene(12, *SIZE, speed=6))
+        with caplog.at_level("WARNING"):
+            sequence = read(file, IngestConfig(calibration=str(calibration_file(tmp_path))))
+        assert sequence.intrinsics == "given"
+        np.testing.assert_allclose(sequence.K[:, 0, 0], 210)
+        assert "assuming a horizontal field of view" not in caplog.text
+
+
+def calibration_file(folder: Path) -> Path:
+    file = folder / "camchain.yaml"
+    file.write_text(
+        "cam0:\n  camera_model: pinhole\n  distortion_model: radtan\n"
+        "  distortion_coeffs: [-0.1, 0.01, 0, 0]\n  intrinsics: [210, 210, 159.5, 89.5]\n"
+        "  resolution: [320, 180]\n"
+    )
+    return file
+
+
 class TestChoice:
     def test_sharp_frames_of_what_moves(self, video) -> None:
         sequence = read(video)
@@ -187,9 +222,13 @@ class TestKindsOfFiles:
 
     def test_pixels_that_are_not_square(self, tmp_path) -> None:
         file = write_ten_bit(tmp_path / "a.y4m", moving_scene(12, *SIZE, speed=6), pixel_aspect="16:15")
-        K = read(file).K[0]
+        sequence = read(file)
+        K = sequence.K[0]
         assert K[0, 0] == pytest.approx(160)
         assert K[1, 1] == pytest.approx(160 * 16 / 15)
+        square = sequence.with_square_pixels()
+        assert (square.width, square.height) == (320, 169)
+        assert square.K[0, 1, 1] == pytest.approx(160, rel=0.002)
 
     def test_a_rotation_in_the_container(self, tmp_path) -> None:
         scene = moving_scene(12, *SIZE, speed=6)

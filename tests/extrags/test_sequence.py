@@ -213,6 +213,12 @@ class TestScale:
         assert EndoscopicSequence.load(tmp_path / "sequence").scale_source == "setting"
         assert found.training_part().scale_source == "setting"
 
+    def test_a_lens_in_pixels_is_not(self) -> None:
+        sequence = replace(small_sequence(), intrinsics="estimated", focal_std_px=1.5, metric=False)
+        scaled = sequence.in_millimetres(2.5, "setting")
+        assert (scaled.intrinsics, scaled.focal_std_px) == ("estimated", 1.5)
+        assert scaled.training_part().focal_std_px == 1.5
+
     def test_poses_are_needed(self) -> None:
         with pytest.raises(ShapeError, match="no poses"):
             replace(small_sequence(), world_from_camera=None).in_millimetres(2.0, "setting")

@@ -52,6 +52,7 @@ def test_the_method_stands_in_counts_and_account(store: str, posed: Ref) -> None
         == "by colour and depth: 6 of 6 training frames, 1 of 1 held-out frames; scale from depth"
     )
     assert counts["dropped"] == 0
+    assert (counts["intrinsics"], counts["focal_std_px"]) == ("given", None)
     report = json.loads((Store(store).open(posed) / "poses.json").read_bytes())
     assert report["against_given"]["train"]["ate_rmse"] < 0.1
     assert report["against_given"]["test"]["frames"] == 1
@@ -100,3 +101,18 @@ def test_where_poses_come_from_is_kept_on_disk(tmp_path: Path) -> None:
     replace(sequence, pose_source="refined").save(tmp_path / "refined")
     assert EndoscopicSequence.load(tmp_path / "refined").pose_source == "refined"
     assert EndoscopicSequence.load(tmp_path / "refined").training_part().pose_source == "refined"
+
+
+def test_where_intrinsics_come_from_is_kept_on_disk(tmp_path: Path) -> None:
+    sequence = room_sequence(4, width=40, height=30)
+    sequence.save(tmp_path / "given")
+    written = (tmp_path / "given" / "zarr.json").read_text()
+    # Older artefacts keep their digest.
+    assert "intrinsics" not in written
+    assert "focal_std_px" not in written
+    assert EndoscopicSequence.load(tmp_path / "given").intrinsics == "given"
+    replace(sequence, intrinsics="estimated", focal_std_px=1.5).save(tmp_path / "estimated")
+    loaded = EndoscopicSequence.load(tmp_path / "estimated")
+    assert (loaded.intrinsics, loaded.focal_std_px) == ("estimated", 1.5)
+    assert loaded.training_part().intrinsics == "estimated"
+    assert loaded.at_most_width(20).focal_std_px == 0.75

@@ -250,3 +250,20 @@ def test_networks_of_lpips_that_were_asked_for_have_columns(inputs: ReportInputs
     text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
     assert "0.432" in text
     assert "on the network AlexNet and VGG16" in text
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "std", "said"),
+    [
+        ("estimated", 1.25, "30.0 px ± 1.2 (field of view "),
+        ("guessed", None, "guessed: 30.0 px ("),
+    ],
+)
+def test_intrinsics_that_nobody_stated_are_told(
+    inputs: ReportInputs, html: str, intrinsics: str, std: float | None, said: str
+) -> None:
+    sequence = replace(inputs.sequence, intrinsics=intrinsics, focal_std_px=std)
+    told = build_report(replace(inputs, sequence=sequence), CONFIG)
+    assert said in told
+    assert ("degrees), not determined" in told) == (intrinsics == "guessed")
+    assert "Focal length" not in html

@@ -7,8 +7,8 @@ import numpy as np
 import PIL.Image  # noqa: F401  (the same)
 import pytest
 
-from data_catalog.lens import LENS_PARAMETERS, Lens, Undistortion, sample_depth
 from extrags.errors import SourceError
+from extrags.lens import LENS_PARAMETERS, Lens, Undistortion, sample_depth
 
 WIDTH, HEIGHT = 160, 128
 DISTORTION = {

@@ -1,0 +1,294 @@
+"""Calibration files of endoscopes (OpenCV, Kalibr, Scaramuzza), for sources that state no intrinsics.
+
+* OpenCV: YAML, XML or JSON of `cv::FileStorage` with `camera_matrix` and `distortion_coefficients` (0, 4, 5,
+  8 or more numbers; with 4 and `fisheye_model: 1` the Kannala-Brandt fisheye), and `image_width` and
+  `image_height`, without which the calibration holds for the images as they are.
+* Kalibr: the `camchain.yaml` with the camera `cam0`: pinhole with radtan, equidistant, fov or no distortion.
+* Scaramuzza: `calib_results.txt` of OCamCalib, a polynomial of fourth degree.
+
+In all three the centre of the first pixel is (0, 0); here it is (0.5, 0.5).
+
+Source: https://docs.opencv.org (calib3d, FileStorage); Kalibr's wiki, "Supported models" and "Yaml formats";
+Scaramuzza et al., "A toolbox for easily calibrating omnidirectional cameras", IROS 2006.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_catalog.c3vd.pinhole import PinholeResampling
+from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera, camera_from_json
+from data_catalog.posed_frames import SourceFrames
+from data_catalog.sampling import LensSampling, Sampling
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError, SourceError, SourceNotFoundError
+from extrags.lens import Lens
+
+__all__ = ["read_calibration", "with_calibration_file"]
+
+_PROPORTION_TOLERANCE = 0.005
+_OPENCV_NAMES = {
+    "K": ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K"),
+    "D": ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D"),
+    "width": ("image_width", "image_Width"),
+    "height": ("image_height", "image_Height"),
+    "fisheye": ("fisheye_model",),
+}
+_OPENCV_COUNTS = (0, 4, 5, 8, 12, 14)
+_KALIBR_MODELS = {
+    "none": ("PINHOLE", 0),
+    "radtan": ("OPENCV", 4),
+    "equidistant": ("OPENCV_FISHEYE", 4),
+    "fov": ("FOV", 1),
+}
+
+
+def read_calibration(file: Path, width: int, height: int) -> Lens | ScaramuzzaCamera:
+    """The camera that a calibration file describes, for images of a size.
+
+    Args:
+        file: told apart by its content.
+        width: of the images, in pixels.
+        height: of the images, in pixels.
+
+    Returns:
+        A lens of COLMAP's names (pixel centres at +0.5), or Scaramuzza's camera (centres at integers).
+
+    Raises:
+        SourceNotFoundError: no such file.
+        SourceError: damaged, of an unknown kind, or for images of another proportion; names file and field.
+    """
+    if not file.is_file():
+        raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (UnicodeDecodeError, OSError) as error:
+        raise SourceError(f"cannot be read as text: {error}", file=file, field="calibration") from error
+    if "#polynomial coefficients" in text:
+        return _ocamcalib(text, file).scaled(width, height, file=file)
+    if "distortion_model" in text and "cam0" in text:
+        return _scaled(_kalibr(text, file), width, height, file)
+    if any(name in text for name in _OPENCV_NAMES["K"][:3]):
+        return _scaled(_opencv(text, width, height, file), width, height, file)
+    raise SourceError(
+        "no calibration recognised; expected OpenCV's camera_matrix, Kalibr's cam0 with distortion_model, or "
+        "OCamCalib's polynomial coefficients",
+        file=file,
+        field="calibration",
+    )
+
+
+def with_calibration_file(source: SourceFrames, file: Path) -> SourceFrames:
+    """A source with the lens of a calibration file in place of its guess.
+
+    Raises:
+        ConfigError: the source states its intrinsics itself.
+        SourceError: from `read_calibration`.
+    """
+    if source.intrinsics != "guessed":
+        raise ConfigError(
+            f"ingest.calibration is {file.name}, but the source {source.pose_file.name} states its "
+            "intrinsics itself; give one of the two"
+        )
+    lenses = {
+        lens: read_calibration(file, lens.width, lens.height)
+        for lens in dict.fromkeys(frame.lens for frame in source.frames)
+    }
+    return replace(
+        source,
+        frames=[replace(frame, lens=lenses[frame.lens]) for frame in source.frames],
+        intrinsics="given",
+        intrinsics_file=file,
+        sampling=_sampling,
+    )
+
+
+def _sampling(camera: Any, config: IngestConfig, first: Sampling | None) -> Sampling:
+    """As for any other lens: the source's size and central resolution unless the settings say otherwise."""
+    if not isinstance(camera, ScaramuzzaCamera):
+        return LensSampling.planned(camera, config, first)
+    usual: dict[str, Any] = {}
+    if config.width is None and config.downscale is None:
+        usual["downscale"] = 1
+    if config.field_of_view_deg is None:
+        usual["field_of_view_deg"] = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.a0)))
+    return PinholeResampling.planned(camera, config.model_copy(update=usual))
+
+
+@dataclass(frozen=True)
+class _Described:
+    """What a file says of a camera, pixel centres at integers."""
+
+    model: str
+    K: np.ndarray
+    distortion: tuple[float, ...]
+    width: int
+    height: int
+
+
+def _scaled(found: _Described, width: int, height: int, file: Path) -> Lens:
+    ratio = width / found.width
+    if abs(height - ratio * found.height) > max(1.0, _PROPORTION_TOLERANCE * height):
+        raise SourceError(
+            f"the calibration is for {found.width} x {found.height} pixels; an image of {width} x {height} "
+            f"has another proportion, expected {width} x {round(ratio * found.height)}",
+            file=file,
+            field="calibration",
+        )
+    fx, fy = found.K[0, 0] * ratio, found.K[1, 1] * ratio
+    cx, cy = (found.K[0, 2] + 0.5) * ratio, (found.K[1, 2] + 0.5) * ratio
+    parameters = (*(float(value) for value in (fx, fy, cx, cy)), *found.distortion)
+    try:
+        return Lens(found.model, parameters, width, height)
+    except SourceError as error:
+        raise SourceError(error.problem, file=file, field=error.field) from error
+
+
+def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
+    import cv2
+
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        K, D = (_matrix(storage, name) for name in ("K", "D"))
+        width, height = (
+            _whole(storage, name) or size for name, size in (("width", width), ("height", height))
+        )
+        fisheye = bool(_whole(storage, "fisheye"))
+        storage.release()
+    except (cv2.error, SystemError) as error:
+        # Where a constructor fails, the binding reports a SystemError.
+        raise SourceError(
+            f"OpenCV cannot read it; expected what cv::FileStorage writes: {error}",
+            file=file,
+            field="calibration",
+        ) from error
+    if K is None or K.shape != (3, 3):
+        raise SourceError("expected a matrix of 3 x 3 numbers", file=file, field="camera_matrix")
+    terms = () if D is None else tuple(float(value) for value in D.reshape(-1))
+    if len(terms) not in _OPENCV_COUNTS or (fisheye and len(terms) != 4):
+        expected = "4" if fisheye else ", ".join(map(str, _OPENCV_COUNTS))
+        raise SourceError(
+            f"{len(terms)} numbers; expected {expected}", file=file, field="distortion_coefficients"
+        )
+    if any(terms[8:]):
+        raise SourceError(
+            "thin-prism and tilt terms are not known here; expected them to be 0",
+            file=file,
+            field="distortion_coefficients",
+        )
+    terms = terms[:8]
+    if abs(K[0, 1]) > 1e-6 * abs(K[0, 0]):
+        raise SourceError(f"a skew of {K[0, 1]:g}; expected 0", file=file, field="camera_matrix")
+    if fisheye:
+        model = "OPENCV_FISHEYE"
+    elif not any(terms):
+        model, terms = "PINHOLE", ()
+    elif len(terms) == 4:
+        model = "OPENCV"
+    else:
+        model, terms = "FULL_OPENCV", (*terms, 0.0, 0.0, 0.0)[:8]
+    return _Described(model, K, terms, width, height)
+
+
+def _node(storage: Any, key: str) -> Any:
+    found = (storage.getNode(name) for name in _OPENCV_NAMES[key])
+    return next((item for item in found if not item.empty()), None)
+
+
+def _matrix(storage: Any, key: str) -> np.ndarray | None:
+    item = _node(storage, key)
+    return None if item is None or not item.isMap() else np.asarray(item.mat(), dtype=np.float64)
+
+
+def _whole(storage: Any, key: str) -> int:
+    """A whole number; 0 where it is not there."""
+    item = _node(storage, key)
+    return 0 if item is None else int(item.real())
+
+
+def _kalibr(text: str, file: Path) -> _Described:
+    import yaml
+
+    try:
+        content = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise SourceError(f"no YAML: {error}", file=file, field="calibration") from error
+    camera = content.get("cam0") if isinstance(content, Mapping) else None
+    if not isinstance(camera, Mapping):
+        raise SourceError("expected the entries of a camera", file=file, field="cam0")
+    if camera.get("camera_model") != "pinhole":
+        raise SourceError(
+            f"found {camera.get('camera_model')!r}; expected pinhole", file=file, field="camera_model"
+        )
+    kind = camera.get("distortion_model")
+    if kind not in _KALIBR_MODELS:
+        raise SourceError(
+            f"found {kind!r}; expected {', '.join(_KALIBR_MODELS)}", file=file, field="distortion_model"
+        )
+    model, count = _KALIBR_MODELS[kind]
+    fx, fy, cx, cy = _numbers(camera.get("intrinsics"), 4, file, "intrinsics")
+    terms = _numbers(camera.get("distortion_coeffs"), count, file, "distortion_coeffs") if count else ()
+    width, height = (int(size) for size in _numbers(camera.get("resolution"), 2, file, "resolution"))
+    if width < 1 or height < 1:
+        raise SourceError(f"{width} x {height} pixels; expected positive", file=file, field="resolution")
+    return _Described(model, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]]), terms, width, height)
+
+
+def _ocamcalib(text: str, file: Path) -> ScaramuzzaCamera:
+    """Axes of the toolbox are rows, columns and backwards; here columns, rows and forwards."""
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if len(rows) < 5:
+        raise SourceError(
+            f"{len(rows)} lines with numbers; expected 5: polynomial, inverse, centre, affine, size",
+            file=file,
+            field="calibration",
+        )
+    count, *terms = _numbers(rows[0], len(rows[0]), file, "polynomial coefficients")
+    if count != len(terms) or len(terms) != 5:
+        raise SourceError(
+            f"{len(terms)} coefficients; expected 5, a polynomial of fourth degree",
+            file=file,
+            field="polynomial coefficients",
+        )
+    row, column = _numbers(rows[2], 2, file, "center")
+    c, d, e = _numbers(rows[3], 3, file, "affine parameters")
+    height, width = _numbers(rows[4], 2, file, "image size")
+    if abs(c) < 0.1:
+        raise SourceError(f"c = {c:g}; expected nearly 1", file=file, field="affine parameters")
+    # The stretch lies on the rows there and on the columns here: all lengths are counted in rows.
+    content = {
+        "width": width,
+        "height": height,
+        "cx": column,
+        "cy": row,
+        "a0": -c * terms[0],
+        "a1": -terms[1],
+        "a2": -terms[2] / c,
+        "a3": -terms[3] / c**2,
+        "a4": -terms[4] / c**3,
+        "c": 1 / c,
+        "d": d / c,
+        "e": e / c,
+    }
+    return camera_from_json(content, file=file)
+
+
+def _numbers(values: Any, count: int, file: Path, field: str) -> tuple[float, ...]:
+    """So many finite numbers.
+
+    Raises:
+        SourceError: others.
+    """
+    listed = list(values) if isinstance(values, Sequence) and not isinstance(values, str) else None
+    try:
+        found = None if listed is None else tuple(float(value) for value in listed)
+    except (TypeError, ValueError):
+        found = None
+    if found is None or len(found) != count or not np.isfinite(found).all():
+        raise SourceError(f"found {values!r}; expected {count} finite numbers", file=file, field=field)
+    return found

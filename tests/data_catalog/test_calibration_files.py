@@ -1,0 +1,240 @@
+"""Calibration files of three toolboxes, each against the toolbox's own projection."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_catalog import read, resolve, source_fingerprint
+from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
+from data_catalog.calibration_files import read_calibration
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError, SourceError, SourceNotFoundError
+from extrags.lens import Lens
+
+WIDTH, HEIGHT = 160, 128
+K = np.array([[110.0, 0, 83.0], [0, 113.0, 60.5], [0, 0, 1]])
+RAYS = np.column_stack([np.random.default_rng(0).uniform(-0.6, 0.6, (50, 2)), np.ones(50)])
+
+OCAMCALIB = """\
+#polynomial coefficients for the DIRECT mapping function (ocam_model.ss in MATLAB).
+
+ 5 -9.1e+01 0.000000e+00 1.3e-03 -2.1e-06 8.0e-09
+
+#polynomial coefficients for the inverse mapping function (ocam_model.invpol in MATLAB)
+
+ 3 130.1 80.2 -3.1
+
+#center: "row" and "column", starting from 0 (C convention)
+
+62.25 78.5
+
+#affine parameters "c", "d", "e"
+
+0.9985 0.0012 -0.0021
+
+#image size: "height" and "width"
+
+128 160
+"""
+
+
+def opencv_file(path: Path, distortion: list[float], *, fisheye: bool = False, sized: bool = True) -> Path:
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    if sized:
+        storage.write("image_width", WIDTH)
+        storage.write("image_height", HEIGHT)
+    if fisheye:
+        storage.write("fisheye_model", 1)
+    storage.write("camera_matrix", K)
+    storage.write("distortion_coefficients", np.array([distortion]))
+    storage.release()
+    return path
+
+
+def kalibr_file(path: Path, model: str, terms: list[float]) -> Path:
+    path.write_text(
+        "cam0:\n  cam_overlaps: []\n  camera_model: pinhole\n"
+        f"  distortion_coeffs: {terms}\n  distortion_model: {model}\n"
+        f"  intrinsics: [110.0, 113.0, 83.0, 60.5]\n  resolution: [{WIDTH}, {HEIGHT}]\n  rostopic: /scope\n"
+    )
+    return path
+
+
+def projected(lens: Lens | ScaramuzzaCamera, rays: np.ndarray) -> np.ndarray:
+    """Pixels with their centres at integers, as the toolboxes count."""
+    if isinstance(lens, ScaramuzzaCamera):
+        return lens.project(rays)
+    return np.stack(lens.project(rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]), axis=1) - 0.5
+
+
+class TestOpenCV:
+    @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+    @pytest.mark.parametrize("count", [4, 5, 8])
+    def test_projection_is_opencvs(self, tmp_path, suffix, count) -> None:
+        terms = [-0.21, 0.05, 0.002, -0.001, 0.01, 0.02, -0.01, 0.004][:count]
+        lens = read_calibration(opencv_file(tmp_path / f"scope.{suffix}", terms), WIDTH, HEIGHT)
+        expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), K, np.array(terms))[0][:, 0]
+        np.testing.assert_allclose(projected(lens, RAYS), expected, atol=1e-9)
+
+    def test_fisheye(self, tmp_path) -> None:
+        terms = [0.03, -0.01, 0.004, -0.001]
+        lens = read_calibration(opencv_file(tmp_path / "a.yml", terms, fisheye=True), WIDTH, HEIGHT)
+        expected = cv2.fisheye.projectPoints(RAYS[:, None], np.zeros(3), np.zeros(3), K, np.array(terms))[0]
+        np.testing.assert_allclose(projected(lens, RAYS), expected[:, 0], atol=1e-9)
+
+    def test_no_distortion_is_a_pinhole(self, tmp_path) -> None:
+        lens = read_calibration(opencv_file(tmp_path / "a.yml", [0.0] * 5), WIDTH, HEIGHT)
+        assert isinstance(lens, Lens)
+        assert lens.is_pinhole
+        np.testing.assert_allclose(lens.K[:2, 2], [83.5, 61.0])
+
+    def test_images_of_another_size(self, tmp_path) -> None:
+        file = opencv_file(tmp_path / "a.yml", [-0.2, 0.05, 0, 0])
+        small, large = (read_calibration(file, s * WIDTH, s * HEIGHT) for s in (1, 2))
+        np.testing.assert_allclose(projected(large, RAYS) + 0.5, 2 * (projected(small, RAYS) + 0.5))
+        with pytest.raises(SourceError, match="for 160 x 128 pixels; an image of 160 x 90"):
+            read_calibration(file, 160, 90)
+        assert read_calibration(opencv_file(file, [0.1, 0, 0, 0], sized=False), 320, 200).width == 320
+
+    @pytest.mark.parametrize(
+        ("content", "problem"),
+        [
+            ("camera_matrix: [1, 2", "calibration"),
+            ("%YAML:1.0\n---\ncamera_matrix: 3\n", "camera_matrix"),
+            ("just words", "no calibration recognised"),
+        ],
+    )
+    def test_damaged(self, tmp_path, content, problem) -> None:
+        (tmp_path / "a.yml").write_text(content)
+        with pytest.raises(SourceError, match=problem):
+            read_calibration(tmp_path / "a.yml", WIDTH, HEIGHT)
+
+    def test_terms_that_are_not_known(self, tmp_path) -> None:
+        with pytest.raises(SourceError, match="thin-prism and tilt terms"):
+            read_calibration(opencv_file(tmp_path / "a.yml", [0.1] * 12), WIDTH, HEIGHT)
+        with pytest.raises(SourceError, match=r"3 numbers; expected 0, 4, 5, 8, 12, 14"):
+            read_calibration(opencv_file(tmp_path / "b.yml", [0.1] * 3), WIDTH, HEIGHT)
+        with pytest.raises(SourceNotFoundError, match="no such calibration file"):
+            read_calibration(tmp_path / "none.yml", WIDTH, HEIGHT)
+
+
+class TestKalibr:
+    @pytest.mark.parametrize(
+        ("model", "terms"),
+        [("radtan", [-0.2, 0.05, 0.002, -0.001]), ("equidistant", [0.03, -0.01, 0.004, -0.001])],
+    )
+    def test_projection(self, tmp_path, model, terms) -> None:
+        lens = read_calibration(kalibr_file(tmp_path / "camchain.yaml", model, terms), WIDTH, HEIGHT)
+        if model == "radtan":
+            expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), K, np.array(terms))[0][:, 0]
+        else:
+            coefficients = np.array(terms)
+            expected = cv2.fisheye.projectPoints(RAYS[:, None], np.zeros(3), np.zeros(3), K, coefficients)[0]
+            expected = expected[:, 0]
+        np.testing.assert_allclose(projected(lens, RAYS), expected, atol=1e-9)
+
+    def test_field_of_view_model_and_none(self, tmp_path) -> None:
+        lens = read_calibration(kalibr_file(tmp_path / "a.yaml", "fov", [0.9]), WIDTH, HEIGHT)
+        assert isinstance(lens, Lens)
+        assert lens.model == "FOV"
+        plain = read_calibration(kalibr_file(tmp_path / "b.yaml", "none", []), WIDTH, HEIGHT)
+        assert isinstance(plain, Lens)
+        assert plain.is_pinhole
+
+    def test_what_is_not_known(self, tmp_path) -> None:
+        with pytest.raises(SourceError, match="found 'omni'; expected none, radtan"):
+            read_calibration(kalibr_file(tmp_path / "a.yaml", "omni", [1.0]), WIDTH, HEIGHT)
+        with pytest.raises(SourceError, match="expected 4 finite numbers"):
+            read_calibration(kalibr_file(tmp_path / "b.yaml", "radtan", [1.0]), WIDTH, HEIGHT)
+
+
+class TestScaramuzza:
+    def test_rays_are_the_toolboxs(self, tmp_path) -> None:
+        """cam2world of the toolbox's C code: rows and columns, z backwards."""
+        (tmp_path / "calib_results.txt").write_text(OCAMCALIB)
+        camera = read_calibration(tmp_path / "calib_results.txt", WIDTH, HEIGHT)
+        assert isinstance(camera, ScaramuzzaCamera)
+        c, d, e = 0.9985, 0.0012, -0.0021
+        rng = np.random.default_rng(0)
+        row, column = rng.uniform(20, 110, 40), rng.uniform(20, 140, 40)
+        x = (row - 62.25 - d * (column - 78.5)) / (c - d * e)
+        y = (-e * (row - 62.25) + c * (column - 78.5)) / (c - d * e)
+        z = np.polyval([8.0e-09, -2.1e-06, 1.3e-03, 0, -9.1e01], np.hypot(x, y))
+        expected = np.column_stack([y, x, -z])
+        expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+        np.testing.assert_allclose(camera.rays(np.column_stack([column, row])), expected, atol=1e-12)
+
+    def test_other_degrees(self, tmp_path) -> None:
+        (tmp_path / "a.txt").write_text(OCAMCALIB.replace(" 5 -9.1e+01", " 6 -9.1e+01 0"))
+        with pytest.raises(SourceError, match="6 coefficients; expected 5"):
+            read_calibration(tmp_path / "a.txt", WIDTH, HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def plain_frames(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("frames")
+    rng = np.random.default_rng(0)
+    for index in range(4):
+        small = rng.integers(40, 255, (HEIGHT // 8, WIDTH // 8, 3), dtype=np.uint8)
+        image = cv2.resize(small, (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
+        Image.fromarray(image).save(folder / f"{index}.png")
+    return folder
+
+
+class TestPlainFrames:
+    def test_without_it_they_are_guessed(self, plain_frames) -> None:
+        sequence = read(plain_frames)
+        assert sequence.intrinsics == "guessed"
+        assert sequence.K[0, 0, 0] == pytest.approx(WIDTH / 2)
+
+    def test_with_it_they_are_given_and_straight(self, plain_frames, tmp_path, caplog) -> None:
+        file = opencv_file(tmp_path / "scope.yml", [-0.2, 0.03, 0.0, 0.0])
+        sequence = read(plain_frames, IngestConfig(calibration=str(file)))
+        assert sequence.intrinsics == "given"
+        assert "assuming a horizontal field of view" not in caplog.text
+        assert sequence.K[0, 0, 0] == pytest.approx(np.sqrt(110.0 * 113.0))
+        assert (sequence.rgb != read(plain_frames).rgb).any()
+
+    def test_scaramuzzas_too(self, plain_frames, tmp_path) -> None:
+        (tmp_path / "calib_results.txt").write_text(OCAMCALIB)
+        config = IngestConfig(calibration=str(tmp_path / "calib_results.txt"))
+        sequence = read(plain_frames, config)
+        assert (sequence.width, sequence.height) == (WIDTH, HEIGHT)
+        assert sequence.K[0, 0, 0] == pytest.approx(0.9985 * 91.0)
+        assert sequence.intrinsics == "given"
+
+    def test_content_counts_and_not_the_path(self, plain_frames, tmp_path) -> None:
+        terms = [-0.2, 0.03, 0.0, 0.0]
+        first = opencv_file(tmp_path / "a.yml", terms)
+        (tmp_path / "other").mkdir()
+        second = opencv_file(tmp_path / "other" / "b.yml", terms)
+
+        def key(file: Path) -> str:
+            return json.dumps(source_fingerprint(resolve(plain_frames), IngestConfig(calibration=str(file))))
+
+        assert key(first) == key(second)
+        before = key(first)
+        opencv_file(first, [-0.21, *terms[1:]])
+        assert key(first) != before
+        assert "calibration" not in source_fingerprint(plain_frames)
+        with pytest.raises(SourceNotFoundError, match="no such calibration file"):
+            key(tmp_path / "none.yml")
+
+    def test_not_beside_intrinsics_that_are_stated(self, plain_frames, tmp_path) -> None:
+        config = IngestConfig(calibration=str(opencv_file(tmp_path / "a.yml", [0.1, 0, 0, 0])))
+        stated = plain_frames / "intrinsics.json"
+        stated.write_text('{"field_of_view_deg": 80}')
+        try:
+            assert read(plain_frames).intrinsics == "given"
+            with pytest.raises(ConfigError, match="states its intrinsics itself"):
+                read(plain_frames, config)
+        finally:
+            stated.unlink()
+        with pytest.raises(ConfigError, match="phantom/3@sparse states its intrinsics itself"):
+            read("phantom/3@sparse", config)
