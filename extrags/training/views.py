@@ -49,7 +49,7 @@ CONFIDENT_ERROR = 0.15
 
 
 def depth_confidence(expected_error: Float[np.ndarray, "*f h w"]) -> Float[np.ndarray, "*f h w"]:
-    """Weight of estimated depth in the loss: one where it is sure, falling as the inverse square of its error.
+    """Weight of estimated depth in the loss: one where it is sure, else as the inverse square of its error.
 
     Args:
         expected_error: relative, as in `EndoscopicSequence.depth_error`.

@@ -92,11 +92,11 @@ class Cavities:
         self.warp = Waves.random(generator, c, 0.5, 3.0, slope=0.5, waves=12)
         self.bends = self.uniform(0.0, 0.55, c, 3, 2)
         self.bend_frequency = self.uniform(0.15, 0.8, c, 3)
-        self.bend_phase = self.uniform(0, 2 * math.pi, c, 3, 2)
+        self.bend_phase = self.uniform(0.0, 2 * math.pi, c, 3, 2)
         self.flattening = self.uniform(0.0, 0.25, c, 1)
         self.triangle = self.uniform(0.0, 0.18, c, 1)
         self.twist = self.uniform(-0.6, 0.6, c, 1)
-        self.angle_phase = self.uniform(0, 2 * math.pi, c, 3)
+        self.angle_phase = self.uniform(0.0, 2 * math.pi, c, 3)
         self.fold_height = self.uniform(0.0, 0.5, c, 1)
         self.fold_period = self.uniform(0.5, 1.8, c, 1)
         self.fold_width = self.uniform(0.08, 0.35, c, 1)
@@ -134,7 +134,7 @@ class Cavities:
         c = self.scenes
         point = self.uniform(-0.6, 0.6, c, 2, 3)
         point[:, :, 2] = self.uniform(0.45, 1.0, c, 2)
-        direction = self.uniform(-1, 1, c, 2, 3)
+        direction = self.uniform(-1.0, 1.0, c, 2, 3)
         direction = direction / direction.norm(dim=2, keepdim=True)
         radius = self.uniform(-0.12, 0.12, c, 2)
         return point, direction, radius
@@ -228,9 +228,9 @@ class Cavities:
         """Poses of a short clip in each scene, smooth, looking where the kind of organ lets one look."""
         c, device = self.scenes, self.device
         t = torch.arange(frames, device=device, dtype=torch.float32)[None]
-        speed = 0.03 * (0.3 / 0.03) ** self.uniform(0, 1, c, 1)
+        speed = 0.03 * (0.3 / 0.03) ** self.uniform(0.0, 1.0, c, 1)
         wander = self.uniform(0.0, 0.10, c, 2) * (speed / 0.1).clamp(0.3, 1.5)
-        phase = self.uniform(0, 2 * math.pi, c, 4)
+        phase = self.uniform(0.0, 2 * math.pi, c, 4)
         rate = self.uniform(0.2, 1.2, c, 4)
         sway = torch.stack(
             [
@@ -240,39 +240,39 @@ class Cavities:
             dim=2,
         )
         if self.kind in ("colon", "airways"):
-            sign = torch.where(self.uniform(0, 1, c, 1) < 0.5, -1.0, 1.0)
-            start = self.uniform(-2, 2, c, 1) if self.kind == "colon" else self.uniform(-1.5, 1.5, c, 1)
+            sign = torch.where(self.uniform(0.0, 1.0, c, 1) < 0.5, -1.0, 1.0)
+            start = self.uniform(-2.0, 2.0, c, 1) if self.kind == "colon" else self.uniform(-1.5, 1.5, c, 1)
             z = start + sign * speed * t
             offset = self.uniform(-0.4, 0.4, c, 1, 2)
             middle = self.center_line(z) if self.kind == "colon" else torch.zeros(c, frames, 2, device=device)
             ahead = self.center_line(z + 0.4) if self.kind == "colon" else middle
             position = torch.cat([middle + offset + sway, z[:, :, None]], dim=2)
             forward = torch.cat([ahead - middle, torch.full((c, frames, 1), 0.4, device=device)], dim=2)
-            tilt = self.uniform(-0.9, 0.9, c, 1, 2) * self.uniform(0.2, 1, c, 1, 1)
+            tilt = self.uniform(-0.9, 0.9, c, 1, 2) * self.uniform(0.2, 1.0, c, 1, 1)
         elif self.kind == "sac":
-            heading = self.uniform(-1, 1, c, 1, 3)
+            heading = self.uniform(-1.0, 1.0, c, 1, 3)
             heading = heading / heading.norm(dim=2, keepdim=True)
             position = (
                 self.uniform(-0.35, 0.35, c, 1, 3) * self.axes + heading * speed[:, :, None] * t[:, :, None]
             )
             position = position + torch.nn.functional.pad(sway, (0, 1))
-            forward = self.uniform(-1, 1, c, 1, 3).expand(c, frames, 3)
+            forward = self.uniform(-1.0, 1.0, c, 1, 3).expand(c, frames, 3)
             tilt = self.uniform(-0.2, 0.2, c, 1, 2)
         else:
-            heading = self.uniform(-1, 1, c, 1, 3) * torch.tensor([1.0, 1.0, 0.5], device=device)
+            heading = self.uniform(-1.0, 1.0, c, 1, 3) * torch.tensor([1.0, 1.0, 0.5], device=device)
             position = heading * speed[:, :, None] * (t - frames / 2)[:, :, None] + torch.nn.functional.pad(
                 sway, (0, 1)
             )
             # Some look at one place from different sides.
             aim = torch.cat([self.uniform(-0.3, 0.3, c, 1, 2), self.distance[:, :, None]], dim=2)
-            around = (self.uniform(0, 1, c, 1, 1) < 0.5).float()
+            around = (self.uniform(0.0, 1.0, c, 1, 1) < 0.5).float()
             forward = aim - around * position
             tilt = self.uniform(-0.4, 0.4, c, 1, 2)
         drift = torch.stack(
             [torch.sin(rate[:, 2:3] * t + phase[:, 2:3]), torch.sin(rate[:, 3:] * t + phase[:, 3:])], 2
         )
         tilt = tilt + self.uniform(0.0, 0.12, c, 1, 1) * drift
-        return _looking(position, forward, tilt, self.uniform(0, 2 * math.pi, c, 1))
+        return _looking(position, forward, tilt, self.uniform(0.0, 2 * math.pi, c, 1))
 
 
 def _looking(position: Tensor, forward: Tensor, tilt: Tensor, roll: Tensor) -> Tensor:

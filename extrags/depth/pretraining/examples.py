@@ -93,7 +93,7 @@ def _searched(clips: Clips, scene: Cavities) -> tuple[Tensor, Tensor, Tensor]:
         )
         chosen[part] = np.where(found >= 0, found + first, -1)
     sources = torch.from_numpy(chosen).to(device)
-    allowed = 2 + (scene.uniform(0, 1, n // v).repeat_interleave(v) * 5).long()
+    allowed = 2 + (scene.uniform(0.0, 1.0, n // v).repeat_interleave(v) * 5).long()
     ranks = torch.arange(SOURCES, device=device)[None]
     sources = torch.where(ranks < allowed[:, None].clamp_max(SOURCES), sources, -1)
     near = low / scene.uniform(1.1, 2.0, n)
@@ -107,13 +107,13 @@ def _miscalibrated(clips: Clips, scene: Cavities) -> PosedFrames:
     n = len(clips.depth)
     device = clips.depth.device
     per_clip = n // v
-    amount = (scene.uniform(0, 1, per_clip) < 0.5).float() * scene.uniform(0, 1, per_clip)
+    amount = (scene.uniform(0.0, 1.0, per_clip) < 0.5).float() * scene.uniform(0.0, 1.0, per_clip)
     amount = amount.repeat_interleave(v)[:, None]
-    turn = amount * math.radians(0.2) * scene.uniform(-1, 1, n, 3)
+    turn = amount * math.radians(0.2) * scene.uniform(-1.0, 1.0, n, 3)
     centers = frames.world_from_camera[:, :3, 3]
     pace = (centers.roll(-1, 0) - centers).norm(dim=1)
     pace = pace.unflatten(0, (per_clip, v))[:, :-1].mean(1).repeat_interleave(v)[:, None]
-    shift = amount * 0.04 * pace * scene.uniform(-1, 1, n, 3)
+    shift = amount * 0.04 * pace * scene.uniform(-1.0, 1.0, n, 3)
     wrong = torch.eye(4, device=device).repeat(n, 1, 1)
     a, b, c = turn.unbind(1)
     zero = torch.zeros_like(a)
@@ -122,7 +122,7 @@ def _miscalibrated(clips: Clips, scene: Cavities) -> PosedFrames:
     )
     poses = frames.world_from_camera @ wrong
     poses[:, :3, 3] += shift
-    focal = 1 + (scene.uniform(0, 1, per_clip) < 0.25).float() * scene.uniform(-0.03, 0.03, per_clip)
+    focal = 1 + (scene.uniform(0.0, 1.0, per_clip) < 0.25).float() * scene.uniform(-0.03, 0.03, per_clip)
     K = frames.K.clone()
     K[:, [0, 1], [0, 1]] *= focal.repeat_interleave(v)[:, None]
     return replace(frames, world_from_camera=poses, K=K)
@@ -132,9 +132,9 @@ def _sparse_points(clips: Clips, scene: Cavities) -> Tensor:
     """Depth at random pixels, a little wrong, one in thirty far off; none in a third of the clips."""
     n, height, width = clips.depth.shape
     v = clips.views
-    share = 0.03 * scene.uniform(0, 1, n // v).square() * (scene.uniform(0, 1, n // v) > 1 / 3)
-    chosen = scene.uniform(0, 1, n, height, width) < share.repeat_interleave(v)[:, None, None]
-    noise = torch.exp(0.02 * scene.uniform(-1, 1, n, height, width))
-    stray = scene.uniform(0, 1, n, height, width) < 1 / 30
+    share = 0.03 * scene.uniform(0.0, 1.0, n // v).square() * (scene.uniform(0.0, 1.0, n // v) > 1 / 3)
+    chosen = scene.uniform(0.0, 1.0, n, height, width) < share.repeat_interleave(v)[:, None, None]
+    noise = torch.exp(0.02 * scene.uniform(-1.0, 1.0, n, height, width))
+    stray = scene.uniform(0.0, 1.0, n, height, width) < 1 / 30
     noise = torch.where(stray, torch.exp(scene.uniform(-0.7, 0.7, n, height, width)), noise)
     return torch.where(chosen & clips.frames.mask, clips.depth * noise, 0.0)

@@ -55,7 +55,7 @@ class _Mucosa:
             Waves.random(generator, c, low, high, slope=0.3, waves=32)
             for low, high in ((8.0, 30.0), (25.0, 90.0))
         ]
-        self.mottle_strength = [uniform(0.0, 0.12, c, 1) * uniform(0, 1, c, 1) for _ in range(2)]
+        self.mottle_strength = [uniform(0.0, 0.12, c, 1) * uniform(0.0, 1.0, c, 1) for _ in range(2)]
         self.relief = Waves.random(generator, c, 15.0, 60.0, slope=0.8, waves=24)
         self.relief_strength = uniform(0.0, 0.35, c, 1)
         self.rod_colour = uniform(0.2, 0.6, c, 1).expand(c, 3)
@@ -87,7 +87,7 @@ def photograph(scene: Cavities, generator: torch.Generator, size: tuple[int, int
     c, device, uniform = scene.scenes, scene.device, scene.uniform
     poses = scene.camera_paths(views)
     clear = scene.clearance(poses[:, :, :3, 3]).min(dim=1).values > NEAREST_WALL
-    focal = 0.5 * width / torch.tan(0.5 * torch.deg2rad(uniform(55, 125, c)))
+    focal = 0.5 * width / torch.tan(0.5 * torch.deg2rad(uniform(55.0, 125.0, c)))
     K = torch.zeros(c, 3, 3, device=device)
     K[:, 0, 0] = K[:, 1, 1] = focal
     K[:, 0, 2] = width / 2 + uniform(-0.03, 0.03, c) * width
@@ -182,14 +182,14 @@ class _Lamps:
         c, uniform = scene.scenes, scene.uniform
         self.offset = uniform(-0.2, 0.2, c, 3, 3) * torch.tensor([1.0, 1.0, 0.15], device=scene.device)
         self.power = torch.cat(
-            [torch.ones(c, 1, device=scene.device), uniform(-1, 1, c, 2).clamp_min(0)], dim=1
+            [torch.ones(c, 1, device=scene.device), uniform(-1.0, 1.0, c, 2).clamp_min(0)], dim=1
         )
         self.spread = uniform(0.0, 2.5, c, 1)
         self.around = uniform(0.0, 0.3, c, 1)
-        self.shine = uniform(0.0, 0.6, c, 1) * uniform(0, 1, c, 1)
-        self.sharpness = uniform(20, 200, c, 1)
-        self.fixed = (uniform(0, 1, c, 1) < 0.08).float() * uniform(0.5, 1.0, c, 1)
-        self.sun = uniform(-1, 1, c, 3)
+        self.shine = uniform(0.0, 0.6, c, 1) * uniform(0.0, 1.0, c, 1)
+        self.sharpness = uniform(20.0, 200.0, c, 1)
+        self.fixed = (uniform(0.0, 1.0, c, 1) < 0.08).float() * uniform(0.5, 1.0, c, 1)
+        self.sun = uniform(-1.0, 1.0, c, 3)
 
     def radiance(
         self, scene: Cavities, mucosa: _Mucosa, points: Tensor, rotation: Tensor, center: Tensor
@@ -245,11 +245,11 @@ class _Sensor:
     def __init__(self, scene: Cavities, views: int) -> None:
         c, uniform = scene.scenes, scene.uniform
         self.target = uniform(0.25, 0.6, c, 1)
-        self.drift = uniform(0.0, 0.12, c, 1) * uniform(-1, 1, c, views)
-        self.automatic = (uniform(0, 1, c, 1) < 0.3).float()
+        self.drift = uniform(0.0, 0.12, c, 1) * uniform(-1.0, 1.0, c, views)
+        self.automatic = (uniform(0.0, 1.0, c, 1) < 0.3).float()
         self.vignetting = uniform(0.0, 0.4, c)
         self.gamma = uniform(1.0, 2.4, c)
-        self.shoulder = (uniform(0, 1, c) < 0.5).float()
+        self.shoulder = (uniform(0.0, 1.0, c) < 0.5).float()
         self.noise = uniform(0.0, 0.012, c)
         self.blur = uniform(0.0, 0.8, c)
 

@@ -99,7 +99,7 @@ class ExampleBank:
 
         rgb = (channels[:, RGB] + 0.5).clamp(1e-4, 1)
         order = torch.randperm(3, generator=self._generator, device=device)
-        rgb = rgb[:, order] if float(uniform(0, 1, 1)) < 0.3 else rgb
+        rgb = rgb[:, order] if float(uniform(0.0, 1.0, 1)) < 0.3 else rgb
         rgb = (rgb * uniform(0.7, 1.2, n, 3, 1, 1)).clamp(1e-4, 1) ** uniform(0.7, 1.4, n, 1, 1, 1)
         inside = channels[:, 11:12]
         return torch.cat([(rgb - 0.5) * inside, channels[:, RGB.stop :]], dim=1)

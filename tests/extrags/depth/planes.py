@@ -13,7 +13,7 @@ __all__ = ["inside_sphere", "tilted_plane"]
 def _texture(points: torch.Tensor) -> torch.Tensor:
     """Smooth random brightness of surface points, [..., 3] to [...]."""
     generator = torch.Generator().manual_seed(4)
-    waves = torch.randn(3, 40, generator=generator) * 4
+    waves = torch.randn(3, 40, generator=generator) * 9
     phases = 6.3 * torch.rand(40, generator=generator)
     return 0.45 + 0.05 * torch.sin(points @ waves + phases).sum(-1).clamp(-7, 7)
 
@@ -39,7 +39,9 @@ def _frames(depth_of, views: int, height: int, width: int, pace: float) -> tuple
 
 def tilted_plane(views: int = 5, height: int = 40, width: int = 52) -> tuple[PosedFrames, torch.Tensor]:
     """A plane 30 degrees off the image plane, about 2 units away; frames and true z-depth."""
-    normal = torch.tensor([np.sin(np.pi / 6), 0.0, np.cos(np.pi / 6)], dtype=torch.float32)[None, :, None, None]
+    normal = torch.tensor([np.sin(np.pi / 6), 0.0, np.cos(np.pi / 6)], dtype=torch.float32)[
+        None, :, None, None
+    ]
 
     def depth_of(centers: torch.Tensor, rays: torch.Tensor) -> torch.Tensor:
         return (2.0 - (normal * centers).sum(1)) / (normal * rays).sum(1)
