@@ -318,7 +318,7 @@ class TestFinished:
         assert sequence["status"] == "ok"
         assert {stage["state"] for stage in sequence["stages"]} == {"cached", "skipped"}
         assert sequence["metrics"] == first.metrics
-        assert "9 cached, 1 skipped" in capsys.readouterr().err
+        assert "9 cached, 2 skipped" in capsys.readouterr().err
 
     def test_plan_says_why(
         self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
