@@ -1,7 +1,8 @@
 r"""A small network that completes stereo: depth everywhere, with the error to expect of it.
 
-It sees the image, the depth of stereo with what tells how far to trust it, sparse points, and the depth
-that brightness predicts, all relative to the frame's own median depth; it has no notion of scale. Its
+It sees the image, the depth of stereo with what tells how far to trust it, and the depth that brightness
+predicts, all relative to the frame's own median depth; it has no notion of scale. (Sparse points have a
+channel, in which it was shown better ones than triangulation gives; `estimate_depth` leaves it empty.) Its
 log-depth is a mixture, pixel by pixel, of stereo, shading and a value of its own,
 
 .. math:: \log d = \log d_\text{frame} + \sum_k w_k \, \ell_k + r ,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -29,7 +28,7 @@ from extrags.store.storable import Storable
 from extrags.training.random_start import depth_range
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["DepthEstimate", "estimate_depth", "with_estimated_depth"]
+__all__ = ["DepthEstimate", "estimate_depth", "posed_frames", "with_estimated_depth"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -46,7 +45,7 @@ STEREO_TRUST_ERRORS = 1.5
 """How far, in expected errors of the network, stereo may be from it."""
 
 ERROR_FACTOR = 1.25
-"""Of the network's expected error: on phantoms 11 to 13, which it never saw, it is so much too small."""
+"""Of the network's expected error, which is so much too small on phantoms; it saw none of them."""
 
 ALONE_ERROR = 0.35
 """Expected relative error, at least, of a frame that no other could be matched with: the network was never
@@ -65,8 +64,8 @@ class DepthEstimate(Storable):
 
     Args:
         depth: z-depth in the poses' unit, 0 outside the mask, [F, H, W].
-        expected_error: expected relative error of it, calibrated on procedural scenes, 0 outside the mask,
-            [F, H, W].
+        expected_error: expected relative error of it, as the network says it and by `ERROR_FACTOR`, 0
+            outside the mask, [F, H, W].
         points: sparse points the search started from, [P, 3].
         points_rgb: their colours, [P, 3].
         report: facts on each cue, ready for JSON.
@@ -133,10 +132,7 @@ def estimate_depth(
     config = DepthConfig() if config is None else config
     if len(sequence) < 2:
         raise CaptureError(f"{sequence.name}: depth from other frames needs at least two, found one")
-    seconds: dict[str, float] = {}
-    begun = time.monotonic()
     points, points_rgb, origin = _points(sequence, config, poses)
-    seconds["points"] = time.monotonic() - begun
     small = sequence.at_most_width(config.max_width)
     near, typical, far = _ranges(small, points, config)
     frames = posed_frames(small)
@@ -148,7 +144,6 @@ def estimate_depth(
         radius_px=config.window_radius_px,
         shading_weight=StereoSettings.shading_weight if config.shading else 0.0,
     )
-    begun = time.monotonic()
     stereo = multi_view_stereo(
         frames,
         sources,
@@ -158,14 +153,11 @@ def estimate_depth(
         recording=None if recording is None else torch.from_numpy(recording),
         told=told.step,
     )
-    seconds["stereo"] = time.monotonic() - begun
-    begun = time.monotonic()
     network = load_completion(config.completion)
     if network is None:
         log_depth, error = stereo.fused, _stereo_error(stereo)
     else:
         log_depth, error, stereo = _completed(network, frames, small, stereo, config, settings, told)
-    seconds["completion"] = time.monotonic() - begun
     full = sequence.height, sequence.width
     depth = np.where(sequence.mask, np.exp(_enlarged(log_depth, *full)), 0).astype(np.float32)
     expected = np.clip(_enlarged(error, *full), CERTAIN, HOPELESS)
@@ -174,8 +166,8 @@ def estimate_depth(
     report: dict[str, Any] = {
         "points_from": origin,
         "n_points": len(points),
-        "sources_median": float((sources >= 0).sum(1).median()),
-        "frames_alone": int((sources < 0).all(1).sum()),
+        "sources_median": float(stereo.n_sources.median()),
+        "frames_alone": int((stereo.n_sources == 0).sum()),
         "agreeing_share": float(confirmed.sum() / frames.mask.sum().clamp_min(1)),
         "shading": [
             {
@@ -188,13 +180,20 @@ def estimate_depth(
         ],
         "completion": config.completion,
         "median_expected_error": float(np.median(expected[sequence.mask])) if sequence.mask.any() else 1.0,
-        "seconds": {name: round(value, 3) for name, value in seconds.items()},
     }
     return DepthEstimate(depth, expected, points.astype(np.float64), points_rgb, report)
 
 
 def with_estimated_depth(sequence: EndoscopicSequence, estimate: DepthEstimate) -> EndoscopicSequence:
-    """The training part of a sequence with its estimated depth, the expected error of it, and the points."""
+    """A sequence with the estimated depth of its frames, the expected error of it, and the points.
+
+    Args:
+        sequence: the frames that were given to `estimate_depth`; points of its own are kept.
+        estimate: depth and expected error, [F, H, W].
+
+    Raises:
+        ShapeError: when the estimate is of other frames.
+    """
     known = sequence.points is not None or not len(estimate.points)
     return replace(
         sequence,
@@ -217,7 +216,11 @@ class _Told:
 
 
 def posed_frames(sequence: EndoscopicSequence) -> PosedFrames:
-    """A sequence's frames as tensors."""
+    """A sequence's frames as tensors on the processor.
+
+    Raises:
+        ShapeError: while the poses are unknown.
+    """
     return PosedFrames(
         rgb=torch.from_numpy(sequence.rgb).permute(0, 3, 1, 2).float() / 255,
         mask=torch.from_numpy(sequence.mask.copy()),

@@ -10,10 +10,11 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file, save_file
 
 from extrags.depth.completion import CompletionNetwork
 from extrags.depth.pretraining.cavities import KINDS
-from extrags.depth.pretraining.examples import SIZES, make_examples
+from extrags.depth.pretraining.examples import SIZES, Examples, make_examples
 from extrags.depth.pretraining.training import CompletionTraining, ExampleBank, score, train_completion
 
 log = logging.getLogger("extrags.depth.pretraining")
@@ -42,10 +43,10 @@ def main() -> None:
     begun = time.monotonic()
     bank, held_out = ExampleBank(generator), ExampleBank(generator)
     if options.bank is not None and options.bank.exists():
-        stored = torch.load(options.bank, map_location=device, weights_only=False)
+        stored = torch.load(options.bank, map_location=device, weights_only=True)
         for target, parts in zip((bank, held_out), stored, strict=True):
-            for part in parts:
-                target.add(part)
+            for channels, truth, known in parts:
+                target.add(Examples(channels, truth, known))
         log.info("%d examples read", len(bank))
     for number in range(options.batches):
         target = held_out if number < options.validation_batches and not len(held_out) > 400 else bank
@@ -59,11 +60,17 @@ def main() -> None:
         if time.monotonic() - begun > options.seconds:
             break
     if options.bank is not None and options.batches:
-        torch.save((bank.all_of_size(), held_out.all_of_size()), options.bank)
+        parts = [
+            [(part.channels, part.truth, part.known) for part in kept.all_of_size()]
+            for kept in (bank, held_out)
+        ]
+        torch.save(parts, options.bank)
     log.info("%d examples, %d to validate, %.0f s", len(bank), len(held_out), time.monotonic() - begun)
+    if not len(bank) or not len(held_out):
+        parser.error("there are no examples to train on, or none to validate with: more batches, or a bank")
     network = CompletionNetwork()
     if options.start is not None:
-        network.load_state_dict(torch.load(options.start, map_location="cpu", weights_only=True))
+        network.load_state_dict({name: value.float() for name, value in load_file(options.start).items()})
     settings = CompletionTraining(options.iterations, options.batch, options.learning_rate)
 
     def told(iteration: int, means: dict[str, float]) -> None:
@@ -78,7 +85,8 @@ def main() -> None:
     network = train_completion(bank, settings, network, told=told, half=device.type == "cuda")
     scores = score(network, held_out.all_of_size())
     log.info("%s", scores)
-    torch.save({k: v.cpu().half() for k, v in network.state_dict().items()}, options.folder / "completion.pt")
+    weights = {name: value.cpu().half().contiguous() for name, value in network.state_dict().items()}
+    save_file(weights, options.folder / "completion.safetensors")
     record = {
         "settings": asdict(settings),
         "examples": len(bank),

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from extrags.depth.completion import RAYS, RGB, STEREO, CompletionNetwork, completion_loss
+from extrags.depth.completion import MASK, RAYS, RGB, STEREO, CompletionNetwork, completion_loss
 from extrags.depth.pretraining.examples import Examples
 from extrags.errors import DivergedError
 
@@ -101,7 +101,7 @@ class ExampleBank:
         order = torch.randperm(3, generator=self._generator, device=device)
         rgb = rgb[:, order] if float(uniform(0.0, 1.0, 1)) < 0.3 else rgb
         rgb = (rgb * uniform(0.7, 1.2, n, 3, 1, 1)).clamp(1e-4, 1) ** uniform(0.7, 1.4, n, 1, 1, 1)
-        inside = channels[:, 11:12]
+        inside = channels[:, MASK : MASK + 1]
         return torch.cat([(rgb - 0.5) * inside, channels[:, RGB.stop :]], dim=1)
 
 

@@ -114,3 +114,14 @@ def test_a_single_frame_is_refused(withheld: EndoscopicSequence) -> None:
     one = replace(withheld, split=Split("one", withheld.train[:1], withheld.train[1:])).training_part()
     with pytest.raises(CaptureError, match="needs at least two"):
         estimate_depth(one)
+
+
+def test_a_frame_that_nothing_matches_is_told_to_be_a_guess(withheld: EndoscopicSequence) -> None:
+    part = withheld.training_part()
+    poses = part.cameras.world_from_camera.copy()
+    poses[0, :3, :3] = poses[0, :3, :3] @ np.diag([-1.0, 1.0, -1.0])  # looks the other way
+    found = estimate_depth(part.with_poses(poses), DepthConfig(**SETTINGS))
+    assert found.report["frames_alone"] == 1
+    assert found.expected_error[0][part.mask[0]].min() >= 0.35
+    assert np.median(found.expected_error[1:][part.mask[1:]]) < 0.1
+    assert found.report == estimate_depth(part.with_poses(poses), DepthConfig(**SETTINGS)).report
