@@ -84,7 +84,7 @@ def completion_inputs(
     if points is not None:
         logs = torch.log(points.clamp_min(1e-9)) - log_scale[:, None, None]
         at_points = torch.where(points > 0, logs.clamp(-FARTHEST_LOG, FARTHEST_LOG), 0.0)
-    rays = frames.rays()[:, :2]
+    rays = frames.rays[:, :2]
     saturated = (frames.rgb.amax(dim=1) >= SATURATED).float()
     single = [
         relative,

@@ -55,7 +55,7 @@ def agreement(
         tolerance: log-ratio of depths up to which they agree.
     """
     height, width = frames.size
-    rays = frames.rays()[references]
+    rays = frames.rays[references]
     own = depth[references]
     valid = (own > 0) & frames.mask[references]
     # Between two surfaces an interpolated depth belongs to neither: the nearest pixel's is taken.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -45,6 +46,7 @@ class PosedFrames:
         """Height and width in pixels."""
         return int(self.rgb.shape[2]), int(self.rgb.shape[3])
 
+    @cached_property
     def rays(self) -> Float[Tensor, "f 3 h w"]:
         """Directions through the pixels' centres in camera coordinates, with z = 1."""
         height, width = self.size
@@ -57,6 +59,7 @@ class PosedFrames:
         x, y = (columns - cx) / fx, (rows - cy) / fy
         return torch.stack([x, y, torch.ones_like(x)], dim=1)
 
+    @cached_property
     def grey(self) -> Float[Tensor, "f h w"]:
         """What is correlated: the logarithm of brightness, in which a change of exposure is an offset.
 

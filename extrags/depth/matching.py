@@ -56,11 +56,11 @@ def matching_cost(
         Costs in [0, 2]; 1 where nothing could be compared.
     """
     height, width = frames.size
-    grey = frames.grey()
+    grey = frames.grey
     mask = frames.mask.float()
     own = mask[references]
     centred = centred_brightness(grey, frames.mask, references, radius_px)
-    rays = frames.rays()[references]
+    rays = frames.rays[references]
     costs = torch.empty(len(references), offsets.shape[1], height, width, device=grey.device)
     present = sources >= 0
     kept = kept_sources(sources, best_share)

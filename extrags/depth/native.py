@@ -27,10 +27,11 @@ def matching_cost(
     """As `extrags.depth.matching.matching_cost`, on the processor."""
     kernels = compiled_kernels()
     height, width = frames.size
-    grey = frames.grey()
+    grey = frames.grey
     centred = centred_brightness(grey, frames.mask, references, radius_px)
-    greys = [np.ascontiguousarray(image) for image in grey.numpy()]
-    masks = [np.ascontiguousarray(image) for image in frames.mask.numpy().astype(np.float32)]
+    greys = grey.numpy()
+    used = torch.cat([references, sources[sources >= 0]]).unique().tolist()
+    masks = {frame: frames.mask[frame].numpy().astype(np.float32) for frame in used}
     costs = torch.empty(len(references), offsets.shape[1], height, width)
     ratios = torch.exp(offsets).numpy()
     K = frames.K.double()

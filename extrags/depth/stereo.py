@@ -119,7 +119,7 @@ def multi_view_stereo(
     settings = StereoSettings() if settings is None else settings
     device, n = frames.rgb.device, len(frames)
     recording = torch.zeros(n, dtype=torch.long, device=device) if recording is None else recording
-    grey, brightness = frames.grey(), smoothed_brightness(frames)
+    grey, brightness = frames.grey, smoothed_brightness(frames)
     steps = torch.linspace(-1, 1, settings.hypotheses, device=device)
     log_base = 0.5 * (near.log() + far.log())
     offsets = 0.5 * (far.log() - near.log())[:, None] * steps[None]
@@ -224,7 +224,7 @@ def sweep_around(
     """
     settings = StereoSettings() if settings is None else settings
     kernels = native if log_depth.device.type == "cpu" else matching
-    grey, n = frames.grey(), len(frames)
+    grey, n = frames.grey, len(frames)
     offsets = torch.linspace(-half_width, half_width, hypotheses, device=log_depth.device)[None]
     found, matched = [], []
     parts = torch.arange(n, device=log_depth.device).split(1)

@@ -29,7 +29,7 @@ def _frames(depth_of, views: int, height: int, width: int, pace: float) -> tuple
         K=K.repeat(views, 1, 1),
         world_from_camera=poses,
     )
-    rays = frames.rays()
+    rays = frames.rays
     centers = poses[:, :3, 3, None, None]
     depth = depth_of(centers, rays)
     points = (centers + depth[:, None] * rays).permute(0, 2, 3, 1)

@@ -64,7 +64,7 @@ def test_costs_do_not_depend_on_threads_or_instructions() -> None:
                 kernels.set_isa(name)
                 set_threads(count)
                 cost = native.matching_cost(frames, **_case())
-                steps = native.best_steps(cost, frames.grey()[[2, 0]], small_step=0.1, jump=0.6)
+                steps = native.best_steps(cost, frames.grey[[2, 0]], small_step=0.1, jump=0.6)
                 results.append(torch.cat([cost.flatten(), *(part.flatten() for part in steps)]))
     finally:
         kernels.set_isa(before)
