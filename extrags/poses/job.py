@@ -16,7 +16,7 @@ import numpy as np
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
 
-__all__ = ["PoseJob", "PoseJobResult", "run_job"]
+__all__ = ["PoseJob", "PoseJobResult", "reserve_stdout", "run_job"]
 
 
 @dataclass(frozen=True)
@@ -111,6 +111,15 @@ class PoseJobResult:
         """Read the result."""
         with np.load(folder / "result.npz") as arrays:
             return cls(**dict(arrays.items()), report=json.loads((folder / "result.json").read_text()))
+
+
+def reserve_stdout() -> None:
+    """Keep the process's standard output for progress; what native code prints joins the log.
+
+    COLMAP's solver now and then prints a line of its own, which would stand among the JSON.
+    """
+    sys.stdout = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
 
 
 def run_job(module: str, job: PoseJob, name: str, *, stage: str) -> PoseJobResult:
