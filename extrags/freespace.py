@@ -47,8 +47,8 @@ class FreeSpace(Storable):
         origin_mm: corner of voxel (0, 0, 0) in world units.
         axes: rows are the grid's unit axes in world coordinates, det +1.
         voxel_mm: edge of a voxel in world units.
-        clearance: distance of the voxel's centre from the nearest occupied voxel in world units,
-            zero inside those, float32, [S, S, S].
+        clearance: distance of the voxel's centre from the nearest occupied voxel in world units, less what
+            the surface there may be off; zero inside those, float32, [S, S, S].
 
     Raises:
         ShapeError: when the arrays do not fit each other.
@@ -177,7 +177,14 @@ class FreeSpace(Storable):
         return np.where(inside, state, UNKNOWN).astype(np.uint8)
 
 
-def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | None = None) -> FreeSpace:
+def carve(
+    scene: Scene,
+    mesh: Mesh,
+    cameras: Cameras,
+    config: FreespaceConfig | None = None,
+    *,
+    surface_error_mm: Float[np.ndarray, "v"] | None = None,
+) -> FreeSpace:
     """Occupancy and clearance by space carving with rendered transmittance.
 
     The visibility of a voxel is the mean of its `top_views` largest transmittances over the training
@@ -191,6 +198,8 @@ def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | 
         mesh: its surface.
         cameras: the training views.
         config: settings.
+        surface_error_mm: expected distance of each vertex from the true surface, which clearance is reduced
+            by (`extrags.surface_error`); None for a surface from measured depth.
 
     Returns:
         The grid, aligned with the principal axes of mesh and cameras.
@@ -239,6 +248,9 @@ def carve(scene: Scene, mesh: Mesh, cameras: Cameras, config: FreespaceConfig | 
         distance = np.maximum(np.asarray(distance_transform_edt(~occupied)) - 0.5, 0.0) * voxel_mm
     else:
         distance = np.full(occupancy.shape, size * voxel_mm)
+    if surface_error_mm is not None and len(surface_error_mm):
+        vertices = _to_grid(mesh.vertices.astype(np.float64), origin_mm, axes, voxel_mm)
+        distance = np.maximum(distance - _nearest_error(vertices, surface_error_mm, size), 0.0)
     space = FreeSpace(occupancy, origin_mm, axes, voxel_mm, distance.astype(np.float32))
     _log.info("freespace: %.1f %% of %d^3 voxels of %.3g are free", 100 * space.free_share, size, voxel_mm)
     return space
@@ -352,6 +364,19 @@ def _voxels_of_mesh(
         samples = np.einsum("wc,tcx->twx", weights, corners[cuts == n]).reshape(-1, 3)
         _mark(marked, np.floor(samples).astype(np.int64))
     return marked
+
+
+def _nearest_error(
+    vertices: Float[np.ndarray, "v 3"], error_mm: Float[np.ndarray, "v"], size: int
+) -> Float[np.ndarray, "s s s"]:
+    """Largest error in the voxel with a vertex that is nearest to each voxel (vertices in grid coordinates)."""
+    from scipy.ndimage import distance_transform_edt
+
+    largest = np.full((size, size, size), -1.0)
+    index = np.clip(np.floor(vertices).astype(np.int64), 0, size - 1)
+    np.maximum.at(largest, tuple(index.T), error_mm)
+    nearest = distance_transform_edt(largest < 0, return_distances=False, return_indices=True)
+    return np.asarray(largest[tuple(nearest)])
 
 
 def _ball_mask(centers: Float[np.ndarray, "n 3"], size: int, radius: float) -> Bool[np.ndarray, "s s s"]:

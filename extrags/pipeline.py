@@ -452,11 +452,16 @@ class InMemoryPipeline(Pipeline):
     def freespace(self) -> None:
         """`extrags.freespace.carve`."""
         from extrags.freespace import carve
+        from extrags.surface_error import surface_error_mm
 
         mesh = _made(self.result.mesh, "surface")
         with self._timed("freespace"):
             self.result.freespace = carve(
-                self.result.coarse, mesh, self._training.training_cameras, self.config.freespace
+                self.result.coarse,
+                mesh,
+                self._training.training_cameras,
+                self.config.freespace,
+                surface_error_mm=surface_error_mm(mesh, self._training),
             )
 
     def explore(self) -> None:

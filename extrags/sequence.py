@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.store.storable import Storable
-from extrags.thresholds import SATURATED
+from extrags.thresholds import RELIABLE_DEPTH_ERROR, SATURATED
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
 __all__ = [
@@ -262,6 +262,23 @@ class EndoscopicSequence(Storable):
         """
         mask = self.mask[frames]
         return np.array(mask) if self.specular is None else np.asarray(mask & ~self.specular[frames])
+
+    def reliable_depth_mm(self, frames: int | Int[np.ndarray, "n"]) -> Float[np.ndarray, "*n h w"] | None:
+        """Depth that stands for a seen surface: measured, or estimated with a small expected error.
+
+        Args:
+            frames: index of one frame, or indices of several.
+
+        Returns:
+            [H, W] for one frame, [N, H, W] for several; 0 outside the mask, where depth is unknown and where
+            an estimate expects more than `RELIABLE_DEPTH_ERROR`. None where the sequence has no depth.
+        """
+        if self.depth_mm is None:
+            return None
+        reliable = np.array(self.mask[frames])
+        if self.depth_error is not None:
+            reliable &= self.depth_error[frames] <= RELIABLE_DEPTH_ERROR
+        return np.where(reliable, self.depth_mm[frames], 0).astype(np.float32)
 
     def frame_name(self, index: int) -> str:
         """Name of a frame, for messages."""

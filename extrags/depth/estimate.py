@@ -17,6 +17,7 @@ from torch.nn import functional
 from extrags.config import PosesConfig
 from extrags.config.depth import DepthConfig
 from extrags.depth.completion import CompletionNetwork, completion_inputs
+from extrags.depth.edges import sharpened
 from extrags.depth.frames import PosedFrames, select_sources
 from extrags.depth.stereo import StereoDepth, StereoSettings, multi_view_stereo, sweep_around
 from extrags.depth.weights import NONE, load_completion
@@ -158,6 +159,7 @@ def estimate_depth(
         log_depth, error = stereo.fused, _stereo_error(stereo)
     else:
         log_depth, error, stereo = _completed(network, frames, small, stereo, config, settings, told)
+    log_depth = sharpened(log_depth, error, frames)
     full = sequence.height, sequence.width
     depth = np.where(sequence.mask, np.exp(_enlarged(log_depth, *full)), 0).astype(np.float32)
     expected = np.clip(_enlarged(error, *full), CERTAIN, HOPELESS)

@@ -350,9 +350,12 @@ def _near_known_surface(
 
 
 def _real_depth(scene: Scene, sequence: EndoscopicSequence, frame: int) -> Float[np.ndarray, "h w"]:
-    if sequence.depth_mm is not None:
-        return np.asarray(np.where(sequence.mask[frame], sequence.depth_mm[frame], 0))
+    reliable = sequence.reliable_depth_mm(frame)
+    if reliable is not None and sequence.depth_error is None:
+        return reliable
     with torch.no_grad():
         rendering = scene.render(sequence.cameras[frame])
     depth = rendering.depth[0].numpy()
-    return np.asarray(np.where((rendering.alpha[0].numpy() > HOLE_ALPHA), depth, 0))
+    rendered = np.where((rendering.alpha[0].numpy() > HOLE_ALPHA), depth, 0)
+    # Where an estimate is unsure the scene knows better: there other frames have had their say.
+    return rendered if reliable is None else np.where(reliable > 0, reliable, rendered)

@@ -30,8 +30,8 @@ def gather_references(
 ) -> ReferenceViews:
     """Prepare real frames as references of a scene.
 
-    Depth is the measured one where the sequence has it, else the scene's rendering where it is
-    opaque. Without a light model, how brightness falls with distance is fitted to the views.
+    Depth is the measured one where the sequence has it, or an estimate that is reliable
+    (`EndoscopicSequence.reliable_depth_mm`), else the scene's rendering where it is opaque. Without a light model, how brightness falls with distance is fitted to the views.
 
     Args:
         scene: the reconstruction; needed for depth and for what each frame saw.
@@ -94,9 +94,10 @@ def _depth_and_seen(
         seen.append(visibility_of(rendering)[0] > SEEN_WEIGHT)
         rendered = torch.where(rendering.alpha[0] > SOLID_ALPHA, rendering.depth[0], torch.zeros(()))
         depth = rendered
-        if sequence.depth_mm is not None:
-            measured = torch.from_numpy(sequence.depth_mm[frame].astype(np.float32))
-            depth = torch.where(measured > 0, measured, rendered)
+        reliable = sequence.reliable_depth_mm(int(frame))
+        if reliable is not None:
+            known = torch.from_numpy(reliable)
+            depth = torch.where(known > 0, known, rendered)
         mask = torch.from_numpy(sequence.mask[frame])
         depths.append(torch.where(mask, depth, torch.zeros(())))
     return torch.stack(depths), torch.stack(seen)

@@ -48,7 +48,7 @@ class Pairs:
         layers: of the degraded views, [P].
         target: the real image, in [0, 1], [P, 3, H, W].
         weight: 1 where the target is valid tissue and not saturated, [P, 1, H, W].
-        depth_mm: true z-depth, 0 where unknown, [P, 1, H, W].
+        depth_mm: z-depth, measured or reliably estimated, 0 where unknown, [P, 1, H, W].
         frame: frame of the sequence, [P].
         synthetic: which pairs come from unoptimised or perturbed Gaussians, [P].
         validation: which pairs are for validation, [P].
@@ -300,9 +300,9 @@ def pair_views(
     """Layers of frames with their true images; every fifth training frame is for validation."""
     rgb = sequence.rgb[frames]
     valid = sequence.supervised_mask(frames) & ~saturated_mask(rgb)
-    depth = np.zeros(valid.shape, dtype=np.float32)
-    if sequence.depth_mm is not None:
-        depth = np.where(sequence.mask[frames], sequence.depth_mm[frames], 0).astype(np.float32)
+    depth = sequence.reliable_depth_mm(frames)
+    if depth is None:
+        depth = np.zeros(valid.shape, dtype=np.float32)
     train = np.asarray(sequence.train, dtype=np.int64)
     position = np.searchsorted(np.sort(train), frames)
     return Pairs(
