@@ -7,6 +7,7 @@ import logging
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
 from extrags.cameras import pixel_rays
@@ -33,6 +34,10 @@ NORMAL_NEIGHBOURS = 12
 
 MEASURED_FRAMES = 40
 """Frames at most whose interpolated depth gives the length scale of a scene of sparse points."""
+
+BESIDE_RELIABLE_PX = 3
+"""Unsure depth starts no Gaussian so near to sure depth: it is the edge of a fold, between two surfaces. A wide
+area of unsure depth is all there is, and is kept."""
 
 SURFACE_OPACITY, RANDOM_OPACITY = 0.5, 0.1
 """Opacity at the start: on a known surface, and at random points, which must not hide each other."""
@@ -89,6 +94,9 @@ def starting_gaussians(
 ) -> Gaussians:
     """Gaussians from back-projected depth, from sparse points without depth, or at random without either.
 
+    Of estimated depth, pixels beside which it is surer start none: where depth jumps, an estimate lies between
+    both surfaces, and Gaussians there would hang as a curtain in front of what was never seen.
+
     Each point carries the mean albedo of its pixels: the colour with light and response divided out.
     Radii follow the distance to the three nearest neighbours. Random points lie in the cameras' frusta; they
     are round and faint, and a warning says so.
@@ -121,7 +129,11 @@ def starting_gaussians(
         depth = random_depth(cameras, within, seed=seed)
     else:
         known = _known_depth(sequence, frames)
-        depth = depth_from_points(sequence, frames)[frames] if known is None else known
+        depth = (
+            depth_from_points(sequence, frames)[frames]
+            if known is None
+            else np.where(_edges_of_estimate(sequence, frames), 0, known)
+        )
     valid = (depth > 0) & sequence.mask[frames]
     count = int(valid.sum())
     if count == 0:
@@ -246,6 +258,19 @@ def _known_depth(
         return None
     depth = sequence.depth_mm[frames]
     return depth if bool(((depth > 0) & sequence.mask[frames]).any()) else None
+
+
+def _edges_of_estimate(
+    sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]
+) -> Bool[np.ndarray, "m h w"]:
+    """Unsure pixels of estimated depth beside sure ones; none where depth was measured."""
+    edges = np.zeros((len(frames), sequence.height, sequence.width), dtype=bool)
+    reliable = sequence.reliable_depth_mm(frames)
+    if sequence.depth_error is None or reliable is None:
+        return edges
+    for position, sure in enumerate(reliable > 0):
+        edges[position] = binary_dilation(sure, iterations=BESIDE_RELIABLE_PX) & ~sure
+    return edges
 
 
 def _seen(
