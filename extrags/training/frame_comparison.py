@@ -19,6 +19,9 @@ MAX_WIDTH_PX = 320
 SOURCES = 6
 """Other frames that each frame is compared with."""
 
+MANY_FRAMES = 100
+"""With more frames than this each is compared with half as many: the optimisation does not grow with them."""
+
 MIN_SHARED = 0.1
 """Share of a frame's pixels that another must show for the two to be compared."""
 
@@ -146,10 +149,11 @@ class ComparedFrames:
         shared = (seen & (cosine > MIN_COSINE)).mean(axis=1)
         shared[frame] = 0
         good = np.flatnonzero(shared >= WELL_SHARED)
-        if len(good) < SOURCES:
-            order = np.argsort(-shared, kind="stable")[:SOURCES]
+        count = SOURCES if len(self) <= MANY_FRAMES else SOURCES // 2
+        if len(good) < count:
+            order = np.argsort(-shared, kind="stable")[:count]
             return [int(other) for other in order if shared[other] >= MIN_SHARED]
-        return [int(good[place]) for place in np.linspace(0, len(good) - 1, SOURCES).astype(np.int64)]
+        return [int(good[place]) for place in np.linspace(0, len(good) - 1, count).astype(np.int64)]
 
     def compare(self, frame: int, source: int) -> PairComparison | None:
         """A frame against another; None where they share too little.
