@@ -219,7 +219,7 @@ def case_of(case: Case) -> dict[str, Any]:
         "peak_mib": max(peaks) if peaks else None,
         "metrics": outcome.metrics["final"] if failed is None else None,
         "evaluation": None if measured is None else f"{measured.uri}/{METRICS_FILE}",
-        "held_out_trained_on": any(row.reason == HELD_OUT_TRAINED_ON for row in rows),
+        "held_out_trained_on": any(row.reason.startswith(HELD_OUT_TRAINED_ON) for row in rows),
         "error": "" if failed is None else f"{failed.stage}: {failed.reason}",
     }
 

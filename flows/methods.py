@@ -123,6 +123,7 @@ def three_dgs(config: PipelineConfig) -> dict[str, Any]:
         "coarse.densify.split_scale_share": 0.01,
         "coarse.light.enabled": False,
         "coarse.min_footprint_px": 0.0,
+        "coarse.inconsistent_frames": "ignore",
         "coarse.refine_poses": False,
     }
 

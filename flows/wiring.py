@@ -199,15 +199,17 @@ class SequenceRun(Pipeline):
             self.refs["coarse"] = self._run_task(
                 row, Call(coarse, {"sequence": frames, "config": self.config.coarse})
             )
-            if oracle:
-                row.reason = HELD_OUT_TRAINED_ON
             counts = self._manifest("coarse").counts
+            said = [HELD_OUT_TRAINED_ON] if oracle else []
             if counts.get("refined_poses"):
                 # The scene was optimised with the corrected poses: later stages need them.
                 inputs = {"sequence": self.refs["sequence"], "coarse": self.refs["coarse"]}
                 self.refs["sequence"] = self._run_uncounted(Call(refined_frames, inputs))
                 self.refs["training"] = self._training_frames()
-                row.reason = f"poses refined, by {counts['refined_mean_turn_deg']:.2f} degrees on average"
+                said.append(f"poses refined, by {counts['refined_mean_turn_deg']:.2f} degrees on average")
+            if counts.get("inconsistent_frames"):
+                said.append(str(counts["inconsistent_frames"]))
+            row.reason = "; ".join(said)
 
     def assess(self) -> None:
         """What the scene lacks, and the plan."""

@@ -7,15 +7,21 @@ from extrags.store import Ref, Slot
 from tasks.divergence import keep_last_finite_scene
 from tasks.stage import stage
 
-__all__ = ["HISTORY", "coarse", "refined_frames"]
+__all__ = ["FRAME_WEIGHTS", "HISTORY", "coarse", "refined_frames"]
+
+FRAME_WEIGHTS = "frame_weights.json"
+"""What was found of each training frame (`extrags.training.frame_weights.FrameWeights.to_json`)."""
 
 HISTORY = "history.json"
 """Training curve: a list of `{iteration, loss, psnr, n_gaussians}`."""
 
 
-@stage("coarse", version=5)
+@stage("coarse", version=6)
 def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     """Optimise the coarse scene; writes `scene/` and `history.json`.
+
+    Where blurred and moved frames were looked for, also writes `frame_weights.json`; what was found is
+    said in the counts (`inconsistent_frames`).
 
     If poses were refined (`refined_poses` in the counts), also writes `refined_poses/`: the poses of the
     training frames that the scene was optimised with.
@@ -32,6 +38,10 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     slot.save(result.scene)
     slot.save_json(HISTORY, result.history)
     slot.counts["n_gaussians"] = len(result.scene.gaussians)
+    if result.frame_weights is not None:
+        slot.save_json(FRAME_WEIGHTS, result.frame_weights.to_json(), indent=1)
+        if result.frame_weights.statements:
+            slot.counts["inconsistent_frames"] = "; ".join(result.frame_weights.statements)
     # Without depth and points there is nothing that says where the surface is: to be told beside the figures.
     slot.counts["random_start"] = int(starts_at_random(frames, frames.train))
     slot.counts["refined_poses"] = int(result.refined is not None)

@@ -14,7 +14,7 @@ __all__ = ["finetune", "judge"]
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("finetune-judge", version=3, ignore=("weights",))
+@stage("finetune-judge", version=4, ignore=("weights",))
 def judge(
     slot: Slot,
     scene: Ref,
@@ -51,7 +51,7 @@ def judge(
     slot.counts["amount"] = judgement.amount
 
 
-@stage("finetune", version=6)
+@stage("finetune", version=7)
 def finetune(
     slot: Slot,
     scene: Ref,

@@ -255,6 +255,12 @@ class CoarseConfig(StageConfig):
         description="standard deviation, in pixels of the training view that resolves it best, below which "
         "the two larger axes of a Gaussian do not shrink; 0: no bound, as in 3DGS",
     )
+    inconsistent_frames: Literal["ignore", "report", "weight"] = Field(
+        "weight",
+        description="training frames that are blurred, or show tissue that has moved: report: named in log, "
+        "artefact and report; weight: blurred ones count less as well. Looked for where depth is known, by "
+        "comparison with the frames that see the same surface",
+    )
     optimiser: OptimiserConfig = OptimiserConfig()
     densify: DensifyConfig = DensifyConfig()
     light: LightConfig = LightConfig()

@@ -16,6 +16,7 @@ from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.thresholds import HOLE_ALPHA
+from extrags.training.frame_weights import weighted_views
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
 from extrags.training.starting import median_depth, surface_normals, thin_out
@@ -118,7 +119,10 @@ def finetune(
         )
         if new_gaussians is not None:
             start = Scene(Gaussians.concatenated(scene.gaussians, new_gaussians), scene.light)
-    real = real_views(sequence, frames)
+    if coarse.inconsistent_frames == "weight":
+        real, _ = weighted_views(sequence, frames, coarse)
+    else:
+        real = real_views(sequence, frames)
     virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)
     generator = np.random.default_rng(config.seed)
     next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)

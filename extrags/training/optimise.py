@@ -16,6 +16,7 @@ from extrags.events import Progress, emit
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.training.footprint import APPLIED_EVERY, SmallestFootprint
+from extrags.training.frame_weights import FrameWeights
 from extrags.training.pose_refinement import PoseRefinement, RefinedPoses
 from extrags.training.schedule import Schedule
 from extrags.training.step import Observation, TrainingStep, training_step
@@ -39,11 +40,13 @@ class TrainingResult:
         history: every 50 iterations `{iteration, loss, psnr, n_gaussians}`; the PSNR is of the view just
             drawn, inside its weights.
         refined: corrected poses of the training frames, where they were refined; the scene belongs to these.
+        frame_weights: which training frames are blurred or have moved, where that was looked for.
     """
 
     scene: Scene
     history: list[dict[str, float]]
     refined: RefinedPoses | None = None
+    frame_weights: FrameWeights | None = None
 
 
 def optimise(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
@@ -14,14 +15,17 @@ from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training.footprint import SmallestFootprint
+from extrags.training.frame_weights import weighted_views
 from extrags.training.normal_term import NormalTerm
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.pose_refinement import PoseRefinement
 from extrags.training.schedule import Schedule
 from extrags.training.starting import median_depth, starting_gaussians
-from extrags.training.views import epochs, real_views
+from extrags.training.views import epochs
 
 __all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent", "smallest_footprint"]
+
+logger = logging.getLogger(__name__)
 
 
 def reconstruct(
@@ -46,7 +50,8 @@ def reconstruct(
 
     Returns:
         The scene; where poses were refined (`refines_poses`), `refined` holds those of `frames`, and the
-        scene belongs to them (`extrags.training.pose_refinement.with_refined_poses`).
+        scene belongs to them (`extrags.training.pose_refinement.with_refined_poses`). Frames that are
+        blurred or have moved are named in the log (`config.inconsistent_frames`).
 
     Source: the loss of 3DGS [ExtraGS, eq. 3] inside the mask, with inverse depth where it is known; see
     docs/references.md.
@@ -72,7 +77,9 @@ def reconstruct(
         thickness=config.thickness,
         seed=config.seed,
     )
-    views = real_views(sequence, chosen)
+    views, weights = weighted_views(sequence, chosen, config)
+    for statement in () if weights is None else weights.statements:
+        logger.warning("%s: %s", sequence.name, statement)
     order = epochs(len(views), np.random.default_rng(config.seed))
     schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
     if config.normal_weight > 0:
@@ -81,13 +88,14 @@ def reconstruct(
     if refines_poses(sequence, config):
         settings = config.pose_refinement
         poses = PoseRefinement(sequence.cameras[chosen], settings, depth, config.iterations)
-    return optimise(
+    result = optimise(
         Scene(gaussians, light),
         lambda _: views[next(order)],
         schedule,
         poses=poses,
         footprint=smallest_footprint(config, sequence.cameras[chosen]),
     )
+    return replace(result, frame_weights=weights)
 
 
 def smallest_footprint(config: CoarseConfig, cameras: Cameras) -> SmallestFootprint | None:

@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from extrags.config import CoarseConfig, DensifyConfig
+from extrags.errors import CaptureError
+from extrags.sequence import EndoscopicSequence
+from extrags.training import reconstruct
+from extrags.training.frame_comparison import ComparedFrames
+from extrags.training.frame_weights import (
+    LEAST_SHARPNESS,
+    LEAST_WEIGHT,
+    FrameWeights,
+    frame_weights,
+    weighted_views,
+)
+from extrags.training.views import real_views
+from tests.extrags.training.textured_plane import (
+    FOCAL_PX,
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    blurred_along_rows,
+    changed,
+    textured_plane,
+)
+
+WEIGHT = CoarseConfig(inconsistent_frames="weight")
+
+
+def deformed(image: np.ndarray, peak_px: float) -> np.ndarray:
+    """A bulge to the right in the left half."""
+    columns, rows = np.meshgrid(np.arange(WIDTH, dtype=np.float32), np.arange(HEIGHT, dtype=np.float32))
+    distance = np.hypot(columns - 0.3 * WIDTH, rows - 0.5 * HEIGHT) / (0.2 * WIDTH)
+    source = columns - peak_px * np.exp(-0.5 * distance**2)
+    return np.asarray(cv2.remap(image, source.astype(np.float32), rows, cv2.INTER_CUBIC))
+
+
+def judged(sequence: EndoscopicSequence) -> FrameWeights:
+    found = frame_weights(sequence, sequence.train)
+    assert found is not None
+    return found
+
+
+@pytest.fixture(scope="module")
+def plane() -> EndoscopicSequence:
+    return textured_plane()
+
+
+class TestClearFrames:
+    def test_all_count_one(self, plane: EndoscopicSequence) -> None:
+        found = judged(plane)
+        assert np.isfinite(found.sharpness).all()
+        assert found.weights.tolist() == [1.0] * FRAMES
+        assert not found.displaced.any()
+        assert found.statements == []
+
+    def test_their_views_are_left_alone(self, plane: EndoscopicSequence) -> None:
+        views = real_views(plane, plane.train)
+        assert all(a is b for a, b in zip(judged(plane).applied_to(views), views, strict=True))
+
+    def test_all_equally_soft_count_one(self, plane: EndoscopicSequence) -> None:
+        soft = np.stack([cv2.GaussianBlur(image, (0, 0), 1.5) for image in plane.rgb])
+        found = judged(replace(plane, rgb=soft))
+        assert found.weights.tolist() == [1.0] * FRAMES
+        assert not found.displaced.any()
+
+    def test_a_frame_of_smooth_tissue_is_no_blurred_frame(self, plane: EndoscopicSequence) -> None:
+        # The right half of the surface has little texture; frames differ in how much of it they show.
+        texture = plane.rgb.astype(np.float32)
+        means = texture.mean(axis=(1, 2), keepdims=True)
+        assert plane.depth_mm is not None
+        columns = (np.arange(WIDTH) + 0.5 - WIDTH / 2) / FOCAL_PX
+        poses = plane.cameras.world_from_camera
+        x = poses[:, None, None, 0, 3] + plane.depth_mm * columns * poses[:, None, None, 0, 0]
+        contrast = np.where(x > 0, 0.15, 1.0)[..., None]
+        found = judged(replace(plane, rgb=(means + contrast * (texture - means)).astype(np.uint8)))
+        assert found.weights.tolist() == [1.0] * FRAMES
+
+
+class TestBlur:
+    @pytest.mark.parametrize("length_px", [5, 9])
+    def test_motion_in_one_direction_is_found(self, plane: EndoscopicSequence, length_px: int) -> None:
+        found = judged(changed(plane, 3, blurred_along_rows(plane.rgb[3], length_px)))
+        assert np.flatnonzero(found.weights < 1).tolist() == [3]
+        assert not found.displaced.any()
+        assert "003.png" in found.statements[0]
+        assert "blurred" in found.statements[0]
+
+    def test_more_blur_counts_less(self, plane: EndoscopicSequence) -> None:
+        weights = [
+            judged(changed(plane, 3, blurred_along_rows(plane.rgb[3], length))).weights[3]
+            for length in (5, 7, 9)
+        ]
+        assert weights[0] > weights[1] > weights[2] >= LEAST_WEIGHT
+
+    def test_in_a_minority_of_several_frames(self, plane: EndoscopicSequence) -> None:
+        sequence = changed(plane, 2, blurred_along_rows(plane.rgb[2], 7))
+        sequence = changed(sequence, 5, blurred_along_rows(plane.rgb[5], 7))
+        assert np.flatnonzero(judged(sequence).weights < 1).tolist() == [2, 5]
+
+
+class TestMovement:
+    def test_a_deformed_frame_is_found(self, plane: EndoscopicSequence) -> None:
+        found = judged(changed(plane, 4, deformed(plane.rgb[4], 5.0)))
+        assert np.flatnonzero(found.displaced).tolist() == [4]
+        assert found.weights.tolist() == [1.0] * FRAMES
+        assert 0.05 < found.displaced[4] < 0.6
+        assert "disagrees" in found.statements[0]
+
+    def test_what_more_has_moved_is_more_displaced(self, plane: EndoscopicSequence) -> None:
+        shares = [judged(changed(plane, 4, deformed(plane.rgb[4], peak))).displaced[4] for peak in (3.0, 6.0)]
+        assert 0 < shares[0] < shares[1]
+
+    def test_a_wrong_pose_is_a_frame_that_disagrees(self, plane: EndoscopicSequence) -> None:
+        poses = plane.cameras.world_from_camera.copy()
+        poses[4, :3, 3] += poses[4, :3, :3] @ [1.5, 0, 0]
+        assert np.flatnonzero(judged(plane.with_poses(poses)).displaced).tolist() == [4]
+
+    def test_every_pose_a_little_wrong_is_none(self, plane: EndoscopicSequence) -> None:
+        poses = plane.cameras.world_from_camera.copy()
+        poses[:, :3, 3] += np.random.default_rng(1).uniform(-0.4, 0.4, (FRAMES, 3))
+        assert not judged(plane.with_poses(poses)).displaced.any()
+
+
+class TestViews:
+    def test_blur_takes_weight_from_colour_alone(self, plane: EndoscopicSequence) -> None:
+        sequence = changed(plane, 3, blurred_along_rows(plane.rgb[3], 9))
+        plain = real_views(sequence, sequence.train)[3]
+        views, found = weighted_views(sequence, sequence.train, WEIGHT)
+        assert found is not None
+        torch.testing.assert_close(views[3].weight, plain.weight * float(found.weights[3]))
+        assert views[3].normalisation == pytest.approx(float(plain.weight.sum()))
+        assert views[3].depth_confidence is None
+
+    def test_movement_is_only_reported(self, plane: EndoscopicSequence) -> None:
+        sequence = changed(plane, 4, deformed(plane.rgb[4], 5.0))
+        views, found = weighted_views(sequence, sequence.train, WEIGHT)
+        assert found is not None
+        assert found.statements
+        assert all(view.normalisation is None for view in views)
+
+    def test_reported_alone_they_keep_their_weights(self, plane: EndoscopicSequence) -> None:
+        sequence = changed(plane, 3, blurred_along_rows(plane.rgb[3], 9))
+        views, found = weighted_views(sequence, sequence.train, CoarseConfig(inconsistent_frames="report"))
+        assert found is not None
+        assert "it counts" not in found.statements[0]
+        assert all(view.normalisation is None for view in views)
+
+    def test_not_looked_for_where_switched_off(self, plane: EndoscopicSequence) -> None:
+        sequence = changed(plane, 3, blurred_along_rows(plane.rgb[3], 9))
+        views, found = weighted_views(sequence, sequence.train, CoarseConfig(inconsistent_frames="ignore"))
+        assert found is None
+        assert all(view.normalisation is None for view in views)
+
+
+class TestWithout:
+    def test_depth_nothing_is_judged(self, plane: EndoscopicSequence) -> None:
+        assert frame_weights(replace(plane, depth_mm=None), plane.train) is None
+
+    def test_frames_that_no_other_sees_count_fully(self, plane: EndoscopicSequence) -> None:
+        poses = plane.cameras.world_from_camera.copy()
+        poses[3, 0, 3] += 500
+        found = judged(changed(plane.with_poses(poses), 3, blurred_along_rows(plane.rgb[3], 9)))
+        assert np.isnan(found.sharpness[3])
+        assert found.weights[3] == 1
+        assert found.to_json()[3]["sharpness"] is None
+
+    def test_other_frames_are_not_looked_at(self, plane: EndoscopicSequence) -> None:
+        some = np.array([0, 1, 3, 4, 6])
+        spoiled = changed(plane, 5, np.zeros_like(plane.rgb[5]))
+        first, second = frame_weights(plane, some), frame_weights(spoiled, some)
+        assert first is not None
+        assert second is not None
+        np.testing.assert_array_equal(first.sharpness, second.sharpness)
+
+    def test_depth_frames_cannot_be_compared(self, plane: EndoscopicSequence) -> None:
+        with pytest.raises(CaptureError, match="made/plane"):
+            ComparedFrames(replace(plane, depth_mm=None), plane.train)
+
+
+class TestReconstruct:
+    CONFIG = CoarseConfig(
+        iterations=30,
+        max_points=300,
+        densify=DensifyConfig(enabled=False),
+        inconsistent_frames="weight",
+    )
+
+    def test_clear_frames_give_the_same_bits(self, plane: EndoscopicSequence) -> None:
+        off = self.CONFIG.model_copy(update={"inconsistent_frames": "ignore"})
+        with_weights, without = reconstruct(plane, self.CONFIG), reconstruct(plane, off)
+        assert without.frame_weights is None
+        for name, value in with_weights.scene.gaussians.parameters().items():
+            assert torch.equal(value, without.scene.gaussians.parameters()[name]), name
+
+    def test_names_blurred_frames(self, plane: EndoscopicSequence, caplog: pytest.LogCaptureFixture) -> None:
+        sequence = changed(plane, 3, blurred_along_rows(plane.rgb[3], 9))
+        with caplog.at_level(logging.WARNING, "extrags.training.reconstruction"):
+            result = reconstruct(sequence, self.CONFIG)
+        assert result.frame_weights is not None
+        assert result.frame_weights.sharpness[3] < LEAST_SHARPNESS
+        assert "frame 003.png is blurred" in caplog.text
