@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -40,6 +40,11 @@ logger = logging.getLogger(__name__)
 
 AMOUNTS = (1.0, 0.3, 0.1)
 """What is tried, as a factor of `finetune.pseudo_weight`, until one holds."""
+
+
+MIN_LEFT_OUT = 4
+"""Two or three frames say too little of how PSNR changes: then a trial leaves out others as well, in a second
+reconstruction."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +130,8 @@ def judge_finetuning(
 ) -> Judgement:
     """Try the fine-tuning on left-out training frames, and decide how much of it to keep.
 
-    One in `finetune.judge.leave_out_every` training frames is left out, in short runs. Without them the scene
+    One in `finetune.judge.leave_out_every` training frames is left out, in short runs; where that makes fewer
+    than `MIN_LEFT_OUT`, others are in another reconstruction, and all count together. Without them the scene
     is reconstructed briefly under its own light, some of its virtual views are rendered from that scene and
     restored with references among the kept frames, and it is fine-tuned as the whole scene would be. The
     control is fine-tuning on the kept frames alone: a brief reconstruction gains by any further step. The
@@ -160,55 +166,71 @@ def judge_finetuning(
         return Judgement(
             1.0, f"not judged: of {len(frames)} training frames none can be left out (at least {MIN_FRAMES})"
         )
-    part, left = _without_some_frames(sequence.at_most_width(settings.max_width), frames, config)
-    start = partial_scene(
-        scene,
-        replace(part, split=sequence.split),
-        coarse,
-        part.train,
-        iterations=max(1, round(settings.iterations_share * coarse.iterations)),
-        seed=config.seed,
-        stage="finetune-judge",
-    )
-    views = None
-    if enhancer is not None:
-        small = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
-        views = _restored(start, part, small, enhancer, enhance, settings.views, measure)
+    arms, left = [], []
+    for part, positions in _without_some_frames(
+        sequence.at_most_width(settings.max_width), frames, settings.leave_out_every
+    ):
+        left.append(positions)
+        start = partial_scene(
+            scene,
+            replace(part, split=sequence.split),
+            coarse,
+            part.train,
+            iterations=max(1, round(settings.iterations_share * coarse.iterations)),
+            seed=config.seed,
+            stage="finetune-judge",
+        )
+        views = None
+        if enhancer is not None:
+            small = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
+            views = _restored(start, part, small, enhancer, enhance, settings.views, measure)
+        arms.append((part, start, views))
     brief = config.model_copy(
         update={"iterations": max(1, round(settings.iterations_share * config.iterations))}
     )
-    before = _psnr_db(start, part)
+    before = [value for part, start, _ in arms for value in _psnr_db(start, part)]
 
     def after_finetuning(amount: float) -> list[float]:
         weight = {"pseudo_weight": amount * config.pseudo_weight} if amount > 0 else {}
-        pseudo_views = views if amount > 0 else None
-        found = finetune(
-            start, part, pseudo_views, brief.model_copy(update=weight), coarse, stage="finetune-judge"
-        )
-        return _psnr_db(found.scene, part)
+        after = []
+        for part, start, views in arms:
+            pseudo_views = views if amount > 0 else None
+            found = finetune(
+                start, part, pseudo_views, brief.model_copy(update=weight), coarse, stage="finetune-judge"
+            )
+            after += _psnr_db(found.scene, part)
+        return after
 
     control = after_finetuning(0.0)
     trials = [_trial(0.0, before, control, control)]
-    if views is not None:
+    if enhancer is not None:
         for amount in AMOUNTS:
             trials.append(_trial(amount, before, after_finetuning(amount), control))
             if trials[-1].holds(settings.max_loss_db):
                 break
     for trial in trials:
         emit(MetricRecorded("finetune", f"left_out_gain_db_at_{trial.amount:g}", trial.gain_db))
-    judgement = decide(trials, settings.max_loss_db, left)
+    judgement = decide(trials, settings.max_loss_db, np.sort(np.concatenate(left)))
     logger.info("finetune: %s", judgement.reason)
     return judgement
 
 
 def _without_some_frames(
-    sequence: EndoscopicSequence, frames: Int[np.ndarray, "n"], config: FinetuneConfig
-) -> tuple[EndoscopicSequence, Int[np.ndarray, "m"]]:
-    """The sequence with a split that holds out some training frames, and their positions among these."""
-    folds = leave_out_folds(frames, config.judge.leave_out_every)
-    # A fold from the middle: the first one would leave out the ends of the path, which nothing surrounds.
-    kept, left = folds[len(folds) // 2]
-    return replace(sequence, split=Split("leave-out", kept, left)), np.flatnonzero(np.isin(frames, left))
+    sequence: EndoscopicSequence, frames: Int[np.ndarray, "n"], every: int
+) -> Iterator[tuple[EndoscopicSequence, Int[np.ndarray, "m"]]]:
+    """The sequence with splits that hold out some training frames, and their positions among these.
+
+    One split leaves out a share of the frames; where that makes fewer than `MIN_LEFT_OUT`, others follow.
+    """
+    folds = leave_out_folds(frames, every)
+    # From the middle: the first fold would leave out the ends of the path, which nothing surrounds.
+    count = 0
+    for fold in sorted(range(len(folds)), key=lambda fold: (abs(fold - len(folds) // 2), -fold)):
+        kept, left = folds[fold]
+        yield replace(sequence, split=Split("leave-out", kept, left)), np.flatnonzero(np.isin(frames, left))
+        count += len(left)
+        if count >= MIN_LEFT_OUT:
+            return
 
 
 def _restored(

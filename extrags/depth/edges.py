@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -53,7 +53,7 @@ def _sharpened(
     log_depth: Float[Tensor, "h w"],
     error: Float[Tensor, "h w"],
     rgb: Float[Tensor, "3 h w"],
-    mask: Float[Tensor, "h w"],
+    mask: Bool[Tensor, "h w"],
 ) -> Float[Tensor, "h w"]:
     side = 2 * RADIUS_PX + 1
     padded = functional.pad(log_depth[None], (RADIUS_PX,) * 4, mode="replicate")

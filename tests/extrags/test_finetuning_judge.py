@@ -110,6 +110,7 @@ def test_the_control_is_compared_frame_by_frame(tube: Tube, monkeypatch: pytest.
         ]
     )
     monkeypatch.setattr(finetuning_judge, "_psnr_db", lambda *_: next(measured))
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
     found = judged(tube, ClassicalEnhancer(""))
     control, evenly, once = found.trials
     assert (control.over_control_db, control.over_control_error_db) == (0, 0)
@@ -134,11 +135,27 @@ def test_held_out_frames_are_not_looked_at(tube: Tube) -> None:
     assert judged(other, None) == judged(tube, None)
 
 
-def test_left_out_frames_are_training_frames_in_the_middle(tube: Tube) -> None:
+def test_left_out_frames_are_training_frames_in_the_middle(
+    tube: Tube, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
     found = judged(tube, None)
     assert [trial.amount for trial in found.trials] == [0.0]
     assert 0 < len(found.left_out) < len(tube.sequence.train)
     assert 0 not in found.left_out
+
+
+def test_a_few_left_out_frames_do_not_judge_alone(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
+    few = judged(tube, None)
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", len(few.left_out) + 1)
+    # Two reconstructions, before and after the control: all frames count alike.
+    measured = iter([[30.0, 30.0, 30.0], [20.0], [31.0, 31.0, 31.0], [17.0]])
+    monkeypatch.setattr(finetuning_judge, "_psnr_db", lambda *_: next(measured))
+    more = judged(tube, None)
+    assert set(few.left_out) < set(more.left_out)
+    assert more.trials[0].gain_db == pytest.approx(0)
+    assert more.trials[0].coarse_psnr_db == pytest.approx(27.5)
 
 
 def test_off_or_too_few_frames_keep_everything(tube: Tube) -> None:

@@ -40,6 +40,24 @@ class TestStartingGaussians:
         second = starting_gaussians(changed, tube_sequence.train, 300)
         np.testing.assert_array_equal(first.means.numpy(), second.means.numpy())
 
+    def test_the_edge_of_an_estimate_starts_nothing(self, tube_sequence: EndoscopicSequence) -> None:
+        depth = tube_sequence.depth_mm
+        assert depth is not None
+        # In front of the tube's wall: what an estimate makes of a jump. Also a wide area of little certainty.
+        wrong, error = depth.copy(), np.full_like(depth, 0.01)
+        column = tube_sequence.width // 2
+        wrong[:, :, column : column + 2] *= 0.5
+        error[:, :, column : column + 2] = 0.3
+        error[:, :, : column // 2] = 0.3
+        estimated = replace(tube_sequence, depth_mm=wrong, depth_error=error)
+        radius = starting_gaussians(estimated, estimated.train, 3000).means[:, :2].norm(dim=1).numpy()
+        believed = replace(estimated, depth_error=None)
+        before = starting_gaussians(believed, believed.train, 3000).means[:, :2].norm(dim=1).numpy()
+        assert (before < 6).sum() > 20
+        assert (radius < 6).sum() == 0
+        # What is unsure far from anything sure is all there is.
+        assert len(radius) > 0.8 * len(before)
+
     def test_cameras_alone_give_random_points(
         self, tube_sequence: EndoscopicSequence, caplog: pytest.LogCaptureFixture
     ) -> None:
