@@ -91,7 +91,7 @@ class ArtefactRecords(WritableFileSystem):
         Raises:
             FileNotFoundError: without an artefact; Prefect then runs the task.
         """
-        # The caller holds the key's lock and makes the artefact if there is none.
+        # A damaged artefact is no artefact: Prefect then makes it.
         ref = Store(self.root).find_or_set_aside(path)
         if ref is None:
             raise FileNotFoundError(path)

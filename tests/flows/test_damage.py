@@ -99,6 +99,18 @@ def test_who_only_looks_moves_nothing(finished: tuple[str, SequenceOutcome], sto
     assert not (Path(store.root) / "damaged").exists()
 
 
+def test_a_run_that_is_not_whole_in_the_store_is_no_finished_run(
+    finished: tuple[str, SequenceOutcome], store: Store
+) -> None:
+    from flows.commands.run import _from_store
+
+    _, whole = finished
+    arguments = ([SEQUENCE], tiny_config(), store.root, "quick", "extrags", "evaluate")
+    assert _from_store(*arguments) is not None
+    (Path(store.root) / "artefacts" / key_of(whole, "renders_final") / "renders/rgb/c/0/0/0/0").unlink()
+    assert _from_store(*arguments) is None
+
+
 @pytest.mark.usefixtures("prefect_server")
 def test_a_flow_goes_on(
     finished: tuple[str, SequenceOutcome], store: Store, caplog: pytest.LogCaptureFixture
@@ -184,7 +196,7 @@ def test_a_run_over_much_damage_ends_bit_identical(
     _, whole = finished
     root = Path(store.root)
     chance = random.Random(seed)
-    for pattern in chance.sample(["coarse", "explore*", "enhance*", "finetune*", "evaluate*", "render*"], 3):
+    for pattern in chance.sample(["coarse", "explore*", "enhance*", "finetune*", "evaluate*", "surface"], 3):
         store.rm(pattern)
     for file in chance.sample(files_of(root), 20):
         flip_bit(root / file, chance)
