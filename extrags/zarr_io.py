@@ -98,7 +98,7 @@ def read_array(group: zarr.Group, name: str) -> Any:
     return stored.astype(stored.dtype.newbyteorder("="), copy=False)
 
 
-def _chunks(array: zarr.Array) -> Iterator[tuple[Path, tuple[slice, ...]]]:
+def _chunks(array: zarr.Array[Any]) -> Iterator[tuple[Path, tuple[slice, ...]]]:
     """Files of an array, chunks or shards, and what of it they hold."""
     assert isinstance(array.store, LocalStore)
     folder = Path(array.store.root) / array.path
@@ -109,7 +109,7 @@ def _chunks(array: zarr.Array) -> Iterator[tuple[Path, tuple[slice, ...]]]:
         yield folder / array.metadata.encode_chunk_key(index), part
 
 
-def _first_unreadable(array: zarr.Array) -> Path:
+def _first_unreadable(array: zarr.Array[Any]) -> Path:
     """The first file of an array that cannot be read; the array's folder if all can."""
     for file, part in _chunks(array):
         try:
