@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 __all__ = [
+    "ArtefactGoneError",
     "CaptureError",
     "ConfigError",
+    "DamagedArtefactError",
     "DivergedError",
     "ExtragsError",
     "MissingDependencyError",
@@ -126,6 +128,59 @@ class UnknownSequenceError(ExtragsError, KeyError):
 
 class StoreError(ExtragsError, OSError):
     """The artefact store cannot be read or written."""
+
+
+class ArtefactGoneError(StoreError):
+    """An artefact that a ref names is not in the store any more, or other content has replaced it.
+
+    Args:
+        message: which one.
+        key: its key.
+    """
+
+    def __init__(self, message: str, key: str = "") -> None:
+        super().__init__(message)
+        self.key = key
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle with all fields, for errors that cross process boundaries."""
+        return (type(self), (str(self), self.key))
+
+
+class DamagedArtefactError(StoreError):
+    """Files of an artefact are missing, truncated or changed since they were stored.
+
+    Args:
+        problem: what is wrong.
+        file: the file, below the artefact where that is known.
+        stage: the stage that made it; empty where a file was read without the store.
+        key: its key.
+        store: root of its store.
+    """
+
+    def __init__(
+        self, problem: str, *, file: object = "", stage: str = "", key: str = "", store: str = ""
+    ) -> None:
+        self.problem = problem
+        self.file = str(file)
+        self.stage = stage
+        self.key = key
+        self.store = store
+        what = f"{self.file}: {problem}" if self.file else problem
+        if key:
+            what = (
+                f"artefact {key} of stage {stage} is damaged: {what}; `extrags cache verify --repair "
+                f"--store {store}` sets it aside, and the next run makes it anew"
+            )
+        super().__init__(what)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle with all fields, for errors that cross process boundaries."""
+        return (_rebuild_damage, (self.problem, self.file, self.stage, self.key, self.store))
+
+
+def _rebuild_damage(problem: str, file: str, stage: str, key: str, store: str) -> DamagedArtefactError:
+    return DamagedArtefactError(problem, file=file, stage=stage, key=key, store=store)
 
 
 class WeightsError(ExtragsError, FileNotFoundError):

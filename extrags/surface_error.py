@@ -41,8 +41,6 @@ def surface_error_mm(mesh: Mesh, sequence: EndoscopicSequence) -> Float[np.ndarr
         expected = sequence.depth_error[frame][row, column] * depth
         away = np.abs(z[inside] - depth)
         speaks = (depth > 0) & (z[inside] <= (1 + HIDDEN_SHARE) * depth)
-        error[inside] = np.where(
-            speaks, np.minimum(error[inside], np.maximum(expected, away)), error[inside]
-        )
+        error[inside] = np.where(speaks, np.minimum(error[inside], np.maximum(expected, away)), error[inside])
     known = np.isfinite(error)
     return np.where(known, error, np.median(error[known]) if known.any() else 0.0)

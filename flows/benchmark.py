@@ -13,6 +13,8 @@ from pydantic import Field
 from extrags.config import ProfileName
 from extrags.errors import ConfigError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
+from extrags.store import Store
+from flows.damage import again_after_damage
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
 from flows.pages import benchmark_page
@@ -92,16 +94,20 @@ def benchmark(
             # Invalid settings and missing models affect all runs: report them before the first run.
             config = _config_of(method, profile, settings, variants or {}, 0)
             preflight(config, "evaluate", METHODS[_variant(method, variants or {})[0]].leave_out)
-    found = [
-        run_method(method, sequence, profile, seed, settings, store, runner, variants=variants)
-        for sequence in sequences
-        for profile in profiles
-        for seed in seeds
-        for method in wanted
-    ]
-    cases = [case_of(case) for case in found]
     words = {method: summary_of(method, variants or {}) for method in wanted}
-    page = benchmark_page([case.outcome for case in found], cases, words, baseline, name, runner)
+
+    def run_all() -> tuple[list[dict[str, Any]], str]:
+        found = [
+            run_method(method, sequence, profile, seed, settings, store, runner, variants=variants)
+            for sequence in sequences
+            for profile in profiles
+            for seed in seeds
+            for method in wanted
+        ]
+        cases = [case_of(case) for case in found]
+        return cases, benchmark_page([case.outcome for case in found], cases, words, baseline, name, runner)
+
+    cases, page = again_after_damage(Store(store), run_all)
     create_markdown_artifact(
         benchmark_markdown(cases, baseline),
         key=artifact_key("benchmark", name),

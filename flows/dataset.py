@@ -14,6 +14,8 @@ from pydantic import Field
 
 from extrags.config import ProfileName
 from extrags.pipeline import StageName
+from extrags.store import Store
+from flows.damage import again_after_damage
 from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
 from flows.outcome import DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
@@ -70,23 +72,27 @@ def reconstruct_dataset(
         )
         return outcome_of(sequence, state)
 
-    if at_once == 1:
-        outcomes = [reconstruct(sequence) for sequence in sequences]
-    else:
-        with ThreadPoolExecutor(max_workers=at_once) as pool:
-            # Flow and observer are in context variables, which threads do not inherit.
-            futures = [pool.submit(copy_context().run, reconstruct, sequence) for sequence in sequences]
-            outcomes = [future.result() for future in futures]
-    page = None
-    if until == "report":
-        label = profile_label(profile, method)
-        page = dataset_page(outcomes, name, label, PrefectRunner(store, refresh))
+    def run_all() -> DatasetOutcome:
+        if at_once == 1:
+            outcomes = [reconstruct(sequence) for sequence in sequences]
+        else:
+            with ThreadPoolExecutor(max_workers=at_once) as pool:
+                # Flow and observer are in context variables, which threads do not inherit.
+                futures = [pool.submit(copy_context().run, reconstruct, sequence) for sequence in sequences]
+                outcomes = [future.result() for future in futures]
+        page = None
+        if until == "report":
+            label = profile_label(profile, method)
+            page = dataset_page(outcomes, name, label, PrefectRunner(store, refresh))
+        return DatasetOutcome(outcomes, page)
+
+    found = again_after_damage(Store(store), run_all)
     create_markdown_artifact(
-        dataset_markdown(outcomes),
+        dataset_markdown(found.sequences),
         key=artifact_key("dataset", name),
-        description=f"{len(outcomes)} sequences, profile {profile}",
+        description=f"{len(sequences)} sequences, profile {profile}",
     )
-    return DatasetOutcome(outcomes, page)
+    return found
 
 
 def outcome_of(sequence: str, state: State[Any]) -> SequenceOutcome:

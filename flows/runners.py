@@ -124,7 +124,7 @@ class DirectRunner:
             key = stage_key(call.task, call.inputs)
             if self.refresh:
                 store.rm(key)
-            found = store.find(key)
+            found = store.find_or_set_aside(key)
             ref = found or call.task.fn(store=self.store, label=label, **call.inputs)
             results.append(Result(ref, "ran" if found is None else "cached"))
         return results
@@ -145,6 +145,7 @@ class StoreRunner:
 
         Raises:
             NotInStoreError: at the first artefact that is missing.
+            DamagedArtefactError: at the first one that is damaged; it stays where it is.
         """
         store = Store(self.store)
         results = []

@@ -10,12 +10,13 @@ from typing import Any
 
 from data_catalog.catalog import resolve, source_fingerprint
 from extrags.config import PipelineConfig
-from extrags.errors import ExtragsError
+from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
 from extrags.metrics.registry import added_metrics
 from extrags.pipeline import HELD_OUT_TRAINED_ON, STAGES, Pipeline, StageName
 from extrags.store import Manifest, Ref, Store
+from flows.damage import again_after_damage
 from flows.outcome import Part, SequenceOutcome, StageRow
-from flows.runners import Call, NotInStoreError, Runner
+from flows.runners import Call, NotInStoreError, Runner, StoreRunner
 from tasks.assess import assess, plan
 from tasks.coarse import coarse, refined_frames
 from tasks.depth import depth, depth_frames, triangulation_settings
@@ -54,7 +55,7 @@ def run_sequence(
     """Run all stages of one sequence.
 
     A failing stage ends the sequence; finished artefacts stay in the store, and the next run resumes there.
-    The error is in the outcome, not raised.
+    The error is in the outcome, not raised. A damaged artefact is set aside and made anew (`flows.damage`).
 
     Args:
         name: `DATASET/SEQUENCE[@SETTING]` or a path.
@@ -99,6 +100,9 @@ class SequenceRun(Pipeline):
         self.store = Store(store)
         self.runner = runner
         self.profile = profile
+        self._given = config
+        self._before: dict[str, StageRow] = {}
+        """Rows of the attempts that met a damaged artefact."""
 
     @property
     def refs(self) -> dict[Part, Ref]:
@@ -109,8 +113,14 @@ class SequenceRun(Pipeline):
         """All stages up to one; see `run_sequence`."""
         begun = time.monotonic()
         try:
-            self.run_stages(until)
-        except _StoppedError:
+            if isinstance(self.runner, StoreRunner):
+                self._attempt(until)  # Who only looks moves nothing.
+            else:
+                again_after_damage(self.store, lambda: self._attempt(until))
+        except (_StoppedError, ArtefactGoneError, DamagedArtefactError) as error:
+            if not isinstance(error, _StoppedError):
+                last = self.outcome.stages[-1]
+                last.state, last.reason, self.outcome.error = "failed", str(error), error
             self.outcome.status = "failed"
             done = {row.stage for row in self.outcome.stages}
             failed = self.outcome.stages[-1].stage
@@ -119,6 +129,18 @@ class SequenceRun(Pipeline):
                     self.skip(stage, f"{failed} failed")
         self.outcome.seconds = time.monotonic() - begun
         return self.outcome
+
+    def _attempt(self, until: StageName) -> None:
+        """All stages from the beginning; raises what `again_after_damage` can mend."""
+        self._before |= {row.stage: row for row in self.outcome.stages}
+        self.outcome = SequenceOutcome(self.outcome.name)
+        self.config, self.plan = self._given, None
+        try:
+            self.run_stages(until)
+        except _StoppedError:
+            if isinstance(self.outcome.error, ArtefactGoneError | DamagedArtefactError):
+                raise self.outcome.error from None
+            raise
 
     def skip(self, stage: StageName, reason: str) -> None:
         """Add a row to the outcome and report the progress."""
@@ -401,6 +423,10 @@ class SequenceRun(Pipeline):
         if row is None:
             planned = self.planned(stage)
             row = StageRow(stage, "cached", reason="" if planned is None else planned.reason)
+            before = self._before.get(stage)
+            if before is not None:
+                row.seconds = before.seconds
+                row.state = "ran" if before.state == "ran" else "cached"
             self.outcome.stages.append(row)
         self._report_progress(row, "running")
         begun = time.monotonic()

@@ -14,7 +14,7 @@ RESTORER = "restorer"
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=4)
+@stage("enhance-train", version=5)
 def train(
     slot: Slot,
     scene: Ref,
@@ -38,7 +38,7 @@ def train(
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=3, ignore=("weights",))
+@stage("enhance-restore", version=4, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,

@@ -91,7 +91,8 @@ class ArtefactRecords(WritableFileSystem):
         Raises:
             FileNotFoundError: without an artefact; Prefect then runs the task.
         """
-        ref = Store(self.root).find(path)
+        # A damaged artefact is no artefact: Prefect then makes it.
+        ref = Store(self.root).find_or_set_aside(path)
         if ref is None:
             raise FileNotFoundError(path)
         metadata = ResultRecordMetadata(storage_key=path, serializer=JSONSerializer())
@@ -140,7 +141,7 @@ def stage(
             bound.apply_defaults()
             inputs = dict(bound.arguments)
             key = key_of.compute_key(None, inputs, None)
-            found = where.find(key)
+            found = where.find_or_set_aside(key)
             if found is not None and not _refreshing():
                 return found
             refs, settings = _split({name: value for name, value in inputs.items() if name not in ignore})

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from extrags.store.artefacts import Slot, Store
 from extrags.store.canonical import Ref, canonical, digest_of
-from extrags.store.manifest import MANIFEST, Manifest, content_digest
+from extrags.store.integrity import content_digest
+from extrags.store.manifest import MANIFEST, Manifest
 from extrags.store.storable import Storable
 
 __all__ = [

@@ -7,16 +7,17 @@ import json
 import logging
 import shutil
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
-from extrags.errors import StoreError
+from extrags.errors import ArtefactGoneError, DamagedArtefactError, StoreError
 from extrags.store.canonical import Ref
 from extrags.store.directory import DirectoryBackend, private_directory
-from extrags.store.manifest import Manifest, content_digest, software_versions
+from extrags.store.integrity import Damage, Depth, default_depth, find_damage, write_checksums
+from extrags.store.manifest import Manifest, software_versions, stage_of
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
 
@@ -26,6 +27,9 @@ log = logging.getLogger(__name__)
 
 
 S = TypeVar("S", bound=Storable)
+
+_opened: set[tuple[str, str, int, Depth]] = set()
+"""Artefacts whose contents this process has compared: path, digest, inode (another one after a repair)."""
 
 
 class Slot:
@@ -42,17 +46,21 @@ class Slot:
         self.counts: dict[str, float | int | str | None] = {}
         self._debug = path.with_name("debug")
         self._manifest: Manifest | None = None
+        self._inputs: dict[str, Ref] = {}
 
     def open(self, ref: Ref) -> Path:
         """Files of an input artefact."""
+        self._inputs[ref.digest] = ref
         return self.store.open(ref)
 
     def load(self, kind: type[S], ref: Ref) -> S:
         """An object from an input artefact, as `Store.load`."""
+        self._inputs[ref.digest] = ref
         return self.store.load(kind, ref)
 
     def load_json(self, file: str, ref: Ref) -> Any:
         """Plain JSON from an input artefact, as `Store.load_json`."""
+        self._inputs[ref.digest] = ref
         return self.store.load_json(file, ref)
 
     def save(self, value: Storable) -> None:
@@ -82,26 +90,40 @@ class Slot:
         """
         if self._manifest is None:
             raise StoreError("an unfinished artefact has no ref; read it after the block")
-        return Ref(uri=self.store.backend.uri(self._manifest.key), digest=self._manifest.digest)
+        return self.store._ref(self._manifest)
 
 
 class Store:
     """Content-addressed artefacts below a directory or an fsspec URL.
 
-    An artefact exists if and only if its manifest can be read; there is no other record that could become
-    stale. Safe for concurrent processes and against SIGKILL at any point. (After a power failure, `verify`
-    checks whether all bytes reached the disk.)
+    An artefact exists if and only if it has a manifest; there is no other record that could become stale.
+    Safe for concurrent processes and against SIGKILL at any point.
+
+    What is read is what was stored, or there is a `DamagedArtefactError`: number and size of files are
+    compared on every access, contents once per process and artefact, and chunks of arrays have checksums of
+    their own, which are compared whenever they are read (`extrags.zarr_io`).
 
     Args:
         root: a directory, or a URL such as `s3://bucket/prefix` or `memory://name`.
         cache: local directory for reading remote artefacts; default: the user's cache directory.
+        verify: which contents are compared when an artefact is opened for the first time: of `all` files, or
+            of those alone that are no chunks of arrays (`metadata`), which is faster for large artefacts;
+            default: `EXTRAGS_VERIFY`, else `all`.
 
     Raises:
         StoreError: for a URL that fsspec does not know.
+        ConfigError: for another value of `EXTRAGS_VERIFY`.
     """
 
-    def __init__(self, root: str | Path, *, cache: Path | None = None) -> None:
+    def __init__(
+        self,
+        root: str | Path,
+        *,
+        cache: Path | None = None,
+        verify: Literal["metadata", "all"] | None = None,
+    ) -> None:
         text = str(root)
+        self._depth: Depth = verify or default_depth()
         self.backend: DirectoryBackend | UrlBackend
         if "://" in text and not text.startswith("file://"):
             self.root = text.rstrip("/")
@@ -130,24 +152,45 @@ class Store:
         self.backend.check_writable()
 
     def find(self, key: str) -> Ref | None:
-        """The artefact of a key, or None."""
+        """The artefact of a key, or None.
+
+        Raises:
+            DamagedArtefactError: when its manifest is damaged, or files are missing, truncated or too many.
+        """
         manifest = self.backend.read_manifest(key)
-        return None if manifest is None else Ref(uri=self.backend.uri(key), digest=manifest.digest)
+        if manifest is None:
+            return None
+        damage = self.backend.damaged_sizes(manifest)
+        if damage is not None:
+            raise self._damaged(key, damage)
+        return self._ref(manifest)
+
+    def find_or_set_aside(self, key: str) -> Ref | None:
+        """As `find`, for who can make an artefact anew: a damaged one is set aside, and None returned."""
+        try:
+            return self.find(key)
+        except DamagedArtefactError as error:
+            self.set_aside(error)
+            return None
 
     def manifest(self, ref: Ref) -> Manifest:
         """Manifest of an artefact.
 
         Raises:
-            StoreError: when it is gone, or was replaced by other content.
+            ArtefactGoneError: when it is gone, or was replaced by other content.
+            DamagedArtefactError: when it is damaged.
         """
         key = _key_of(ref)
         manifest = self.backend.read_manifest(key)
         if manifest is None:
-            raise StoreError(f"artefact {key} is not in the store {self.root}; it was removed meanwhile")
+            raise ArtefactGoneError(
+                f"artefact {key} is not in the store {self.root}; it was removed meanwhile", key
+            )
         if manifest.digest != ref.digest:
-            raise StoreError(
+            raise ArtefactGoneError(
                 f"artefact {key} has digest {manifest.digest}, expected {ref.digest}: "
-                "it was replaced meanwhile"
+                "it was replaced meanwhile",
+                key,
             )
         return manifest
 
@@ -155,9 +198,35 @@ class Store:
         """Local directory with the files of an artefact; read only.
 
         Raises:
-            StoreError: when it is gone, replaced, or (remote) damaged.
+            ArtefactGoneError: when it is gone or was replaced.
+            DamagedArtefactError: when its files are not those that were stored.
         """
-        return self.backend.path(ref, self.manifest(ref))
+        manifest = self.manifest(ref)
+        damage = None
+        # A local copy that is damaged is dropped and fetched once more.
+        for _ in range(2):
+            path = self.backend.path(ref, manifest)
+            damage = self._first_look(path, manifest)
+            if damage is None:
+                return path
+            if not self.backend.drop_copy(manifest):
+                break
+            log.warning("the local copy of %s is damaged and is fetched again: %s", manifest.key, damage)
+        assert damage is not None
+        raise self._damaged(manifest.key, damage)
+
+    def _first_look(self, path: Path, manifest: Manifest) -> Damage | None:
+        """Compare contents, if this process has not done so; else number and size of files."""
+        try:
+            look = (str(path), manifest.digest, path.stat().st_ino, self._depth)
+            damage = find_damage(path, manifest, "sizes" if look in _opened else self._depth)
+        except FileNotFoundError as error:
+            if path.exists():
+                raise
+            raise ArtefactGoneError(f"artefact {manifest.key} was removed meanwhile", manifest.key) from error
+        if damage is None:
+            _opened.add(look)
+        return damage
 
     def load(self, kind: type[S], ref: Ref) -> S:
         """An object from an artefact.
@@ -169,7 +238,9 @@ class Store:
         Raises:
             StoreError: as `open`.
         """
-        found: S = kind.load(self.open(ref) / kind.stored_as)
+        path = self.open(ref)
+        with self._blaming([ref]):
+            found: S = kind.load(path / kind.stored_as)
         return found
 
     def load_json(self, file: str, ref: Ref) -> Any:
@@ -178,11 +249,101 @@ class Store:
         Raises:
             StoreError: as `open`.
         """
-        return json.loads((self.open(ref) / file).read_bytes())
+        path = self.open(ref)
+        with self._blaming([ref]):
+            return json.loads((path / file).read_bytes())
+
+    @contextmanager
+    def _blaming(self, refs: Iterable[Ref]) -> Iterator[None]:
+        """What fails inside the block because of damage, since the first look, is named as such."""
+        try:
+            yield
+        except Exception as error:
+            if isinstance(error, DamagedArtefactError) and error.key:
+                raise
+            for ref in refs:
+                self._check_what_was_read(ref, error)
+            raise
+
+    def _check_what_was_read(self, ref: Ref, error: Exception) -> None:
+        try:
+            manifest = self.manifest(ref)
+            path = self.backend.path(ref, manifest)
+            damage = find_damage(path, manifest, "all")
+        except (ArtefactGoneError, FileNotFoundError) as gone:
+            if isinstance(error, OSError):
+                # It was set aside or replaced while it was read.
+                raise ArtefactGoneError(f"{_key_of(ref)} went away while it was read", _key_of(ref)) from gone
+            return
+        if damage is not None:
+            self.backend.drop_copy(manifest)
+            raise self._damaged(manifest.key, damage) from error
+
+    def examine(self, key: str) -> DamagedArtefactError | None:
+        """Read all files of an artefact, on an object store the remote ones; what is wrong, or None.
+
+        Raises:
+            StoreError: when the store cannot be read.
+        """
+        try:
+            manifest = self.backend.read_manifest(key)
+        except DamagedArtefactError as error:
+            return error
+        damage = None if manifest is None else self.backend.examine(manifest)
+        return None if damage is None else self._damaged(key, damage)
 
     def verify(self, ref: Ref) -> bool:
         """Whether the files still have the digest they were stored with; reads all of them."""
-        return content_digest(self.open(ref))[0] == ref.digest
+        return self.manifest(ref).digest == ref.digest and self.examine(_key_of(ref)) is None
+
+    def keys(self) -> list[str]:
+        """Keys of all artefacts, damaged ones among them, sorted."""
+        return self.backend.names()
+
+    def set_aside(self, damage: DamagedArtefactError) -> str | None:
+        """Move a damaged artefact to `damaged/` in the store, so that its stage makes it anew.
+
+        A record of what is wrong, `damage.json`, lies beside it; `gc` removes both.
+
+        Args:
+            damage: what `find`, `open`, `load` or a stage raised, or `examine` returned.
+
+        Returns:
+            Where it is now; None when it is not damaged any more, because another process has made it anew.
+
+        Raises:
+            StoreError: when it cannot be moved.
+        """
+        if not damage.key or self.examine(damage.key) is None:
+            return None
+        record = {
+            "stage": damage.stage,
+            "key": damage.key,
+            "file": damage.file,
+            "problem": damage.problem,
+            "found": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        }
+        try:
+            place = self.backend.set_aside(damage.key, record)
+        except OSError as error:
+            raise StoreError(f"{damage.key} cannot be set aside in {self.root}: {error}") from error
+        if place is not None:
+            log.warning(
+                "stage %s: artefact %s is damaged (%s); it is set aside as %s and made anew when needed",
+                damage.stage,
+                damage.key,
+                f"{damage.file}: {damage.problem}" if damage.file else damage.problem,
+                place,
+            )
+        return place
+
+    def _damaged(self, key: str, damage: Damage) -> DamagedArtefactError:
+        return DamagedArtefactError(
+            damage.problem, file=damage.file, stage=stage_of(key), key=key, store=self.root
+        )
+
+    def _ref(self, manifest: Manifest) -> Ref:
+        return Ref(uri=self.backend.uri(manifest.key), digest=manifest.digest)
 
     @contextmanager
     def slot(
@@ -217,8 +378,9 @@ class Store:
             slot = Slot(scratch / "files", self)
             slot.path.mkdir()
             try:
-                yield slot
-                digest, files, size = content_digest(slot.path)
+                with self._blaming(slot._inputs.values()):
+                    yield slot
+                digest, files, size = write_checksums(slot.path)
                 slot._manifest = self.backend.commit(
                     slot.path,
                     Manifest(
@@ -261,10 +423,20 @@ class Store:
             log.warning("could not keep the debugging files of %s: %s", key, problem)
 
     def ls(self, pattern: str = "*") -> list[Manifest]:
-        """Manifests of the artefacts whose key, stage or label matches a shell pattern, by stage and age."""
-        manifests = [self.backend.read_manifest(key) for key in self.backend.names()]
+        """Manifests of the artefacts whose key, stage or label matches a shell pattern, by stage and age.
+
+        Those with a damaged manifest are left out, with a warning.
+        """
+        manifests = [self._readable_manifest(key) for key in self.backend.names()]
         chosen = [manifest for manifest in manifests if manifest is not None and _matches(manifest, pattern)]
         return sorted(chosen, key=lambda manifest: (manifest.started, manifest.key))
+
+    def _readable_manifest(self, key: str) -> Manifest | None:
+        try:
+            return self.backend.read_manifest(key)
+        except DamagedArtefactError as error:
+            log.warning("%s", error)
+            return None
 
     def rm(self, pattern: str) -> list[str]:
         """Remove artefacts by a shell pattern over key, stage or label; returns their keys."""
@@ -282,7 +454,7 @@ class Store:
         return self.backend.sweep(older_than_hours)
 
     def gc(self, current: Mapping[str, int] | None = None, *, older_than_hours: float = 24.0) -> list[str]:
-        """Garbage collection: `sweep`, debugging files of failures, and artefacts of outdated versions.
+        """Garbage collection: `sweep`, files of failures, damaged artefacts, and those of outdated versions.
 
         Args:
             current: version of each stage; artefacts of other versions are removed. None keeps all.
@@ -296,6 +468,7 @@ class Store:
         if failures.is_dir():
             removed += [f"failed/{entry.name}" for entry in sorted(failures.iterdir())]
             shutil.rmtree(failures)
+        removed += self.backend.remove_damaged()
         for manifest in self.ls() if current is not None else []:
             wanted = current.get(manifest.stage) if current is not None else None
             if wanted is not None and wanted != manifest.version and self.backend.discard(manifest.key):

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import fcntl
-import logging
+import json
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from pydantic import ValidationError
-
-from extrags.errors import StoreError
+from extrags.errors import DamagedArtefactError, StoreError
 from extrags.store.canonical import Ref
-from extrags.store.manifest import MANIFEST, Manifest
+from extrags.store.integrity import Damage, Depth, find_damage
+from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
 
-__all__ = ["DirectoryBackend", "private_directory", "sweep_directories"]
+__all__ = ["DAMAGED", "RECORD", "DirectoryBackend", "private_directory", "sweep_directories"]
 
-log = logging.getLogger(__name__)
+DAMAGED = "damaged"
+"""Where damaged artefacts are set aside, below the root of a store."""
+RECORD = "damage.json"
+"""Beside an artefact that was set aside: what is wrong with it."""
 
 
 class DirectoryBackend:
@@ -53,16 +56,25 @@ class DirectoryBackend:
             raise StoreError(f"the store {self.root} cannot be written: {reason}") from error
 
     def read_manifest(self, key: str) -> Manifest | None:
-        """Manifest of a key; None where there is no such artefact."""
+        """Manifest of a key; None where there is no such artefact.
+
+        Raises:
+            DamagedArtefactError: when the file is no manifest, or differs from its checksum.
+            StoreError: when it cannot be read.
+        """
         path = self.artefacts / key / MANIFEST
         try:
-            return Manifest.model_validate_json(path.read_bytes())
+            return parsed_manifest(path.read_bytes())
         except (FileNotFoundError, NotADirectoryError):
             return None
-        except ValidationError as error:
-            # Foreign or damaged file: the stage runs again and replaces it.
-            log.warning("%s is not a manifest (%d faults); ignored", path, error.error_count())
-            return None
+        except ValueError as error:
+            raise DamagedArtefactError(
+                f"is not the manifest that was written: {error}",
+                file=MANIFEST,
+                stage=stage_of(key),
+                key=key,
+                store=str(self.root),
+            ) from error
         except OSError as error:
             raise StoreError(f"{path} cannot be read: {error.strerror or error}") from error
 
@@ -81,12 +93,52 @@ class DirectoryBackend:
         """The artefact's files on the local disk."""
         return self.artefacts / manifest.key
 
+    def drop_copy(self, manifest: Manifest) -> bool:
+        """There are no copies; what is read is the artefact itself."""
+        return False
+
+    def damaged_sizes(self, manifest: Manifest) -> Damage | None:
+        """Whether files are missing, truncated or too many; reads no contents."""
+        return self._damage(manifest, "sizes")
+
+    def examine(self, manifest: Manifest) -> Damage | None:
+        """Whether the files differ from those that were stored; reads all of them."""
+        return self._damage(manifest, "all")
+
+    def _damage(self, manifest: Manifest, depth: Depth) -> Damage | None:
+        directory = self.artefacts / manifest.key
+        try:
+            return find_damage(directory, manifest, depth)
+        except FileNotFoundError:
+            if directory.exists():
+                raise
+            return None  # Another process has removed or replaced it meanwhile.
+
+    def set_aside(self, key: str, record: dict[str, Any]) -> str | None:
+        """Move an artefact to `damaged/`, with a record of what is wrong; None when it is gone already."""
+        place = self.root / DAMAGED / f"{key}.{secrets.token_hex(4)}"
+        place.mkdir(parents=True)
+        (place / RECORD).write_text(json.dumps(record, indent=1), encoding="utf-8")
+        try:
+            (self.artefacts / key).rename(place / "artefact")
+        except FileNotFoundError:
+            shutil.rmtree(place)
+            return None
+        return str(place)
+
+    def remove_damaged(self) -> list[str]:
+        """Remove what was set aside; returns the names."""
+        place = self.root / DAMAGED
+        names = [f"{DAMAGED}/{name}" for name in sorted(os.listdir(place))] if place.is_dir() else []
+        shutil.rmtree(place, ignore_errors=True)
+        return names
+
     def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
         """Move a finished scratch directory into place.
 
         If another process has committed the same content before, its artefact is kept.
         """
-        (scratch / MANIFEST).write_text(manifest.model_dump_json(indent=1))
+        (scratch / MANIFEST).write_bytes(manifest_text(manifest))
         target = self.artefacts / manifest.key
         target.parent.mkdir(parents=True, exist_ok=True)
         for _ in range(8):
@@ -94,7 +146,7 @@ class DirectoryBackend:
                 scratch.rename(target)
                 return manifest
             except OSError:
-                present = self.read_manifest(manifest.key)
+                present = self._intact(manifest.key)
                 if present is not None and present.digest == manifest.digest:
                     return present
                 if not target.exists():
@@ -103,6 +155,14 @@ class DirectoryBackend:
                 # the key is merely absent, which is a cache miss and never a half-written artefact.
                 self.discard(manifest.key)
         raise StoreError(f"artefact {manifest.key} is being replaced by others again and again")
+
+    def _intact(self, key: str) -> Manifest | None:
+        """Manifest of an artefact whose files are all as they were stored, or None."""
+        try:
+            present = self.read_manifest(key)
+        except DamagedArtefactError:
+            return None
+        return None if present is None or self.examine(present) is not None else present
 
     def discard(self, key: str) -> bool:
         """Remove an artefact: it is first renamed, so that it disappears atomically, then deleted."""

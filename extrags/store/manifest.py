@@ -1,22 +1,25 @@
-"""The `manifest.json` of an artefact, and the digest over its files."""
+"""The `manifest.json` of an artefact: its provenance, with a checksum of its own."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import platform
+import re
 from functools import cache
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from extrags.store.canonical import DIGEST_BYTES
 
-__all__ = ["MANIFEST", "Manifest", "content_digest", "software_versions"]
+__all__ = ["MANIFEST", "Manifest", "manifest_text", "parsed_manifest", "software_versions", "stage_of"]
 
 MANIFEST = "manifest.json"
-READ_BYTES = 1 << 20
+_CLOSE = b"\n}"
+_SEAL = b',\n "checksum": "'
+_SEALED = b'"\n}'
 
 
 class Manifest(BaseModel):
@@ -28,7 +31,7 @@ class Manifest(BaseModel):
     version: int
     key: str
     digest: str
-    """Digest over the files (relative names and bytes) without this manifest."""
+    """Digest over the files (relative names and bytes), without this manifest and the list of checksums."""
     label: str = ""
     """Display name: the sequence it was made for. Not part of the key."""
     config: dict[str, Any] = Field(default_factory=dict)
@@ -47,27 +50,48 @@ class Manifest(BaseModel):
     bytes: int = 0
     data: str = ""
     """On object stores: the prefix, below the artefact's own, that holds the files of this attempt."""
+    checksum: str = ""
+    """In the file: over the text before it. Manifests from before there were checksums have none."""
 
 
-def content_digest(directory: Path) -> tuple[str, int, int]:
-    """Digest, number of files and bytes below a directory; `manifest.json` at its top is left out.
+def manifest_text(manifest: Manifest) -> bytes:
+    """The JSON of a manifest, closed by a checksum over everything before it."""
+    head = manifest.model_dump_json(indent=1, exclude={"checksum"}).encode().removesuffix(_CLOSE)
+    return head + _SEAL + _checksum(head) + _SEALED
 
-    Two artefacts with equal digests hold the same files with the same bytes.
+
+def parsed_manifest(text: bytes) -> Manifest:
+    """A manifest from its JSON; those written before there were checksums have none.
+
+    Raises:
+        ValueError: when it is no manifest, or differs from its checksum.
     """
-    total = hashlib.blake2b(digest_size=DIGEST_BYTES)
-    files = 0
-    size = 0
-    for name, path in sorted((path.relative_to(directory).as_posix(), path) for path in directory.rglob("*")):
-        if name == MANIFEST or not path.is_file():
-            continue
-        one = hashlib.blake2b(digest_size=DIGEST_BYTES)
-        with path.open("rb") as stream:
-            while block := stream.read(READ_BYTES):
-                one.update(block)
-                size += len(block)
-        total.update(f"{name}\0{one.hexdigest()}\n".encode())
-        files += 1
-    return total.hexdigest(), files, size
+    # The bytes are compared, not the values written again: how numbers are written may change with a library.
+    head, seal, tail = text.rpartition(_SEAL)
+    if seal and tail != _checksum(head) + _SEALED:
+        raise ValueError("its content has changed since it was written")
+    fields = json.loads(text)
+    if seal:
+        # With a valid checksum, an unknown field is no damage but that of a later version.
+        fields = {name: value for name, value in fields.items() if name in Manifest.model_fields}
+    try:
+        manifest = Manifest.model_validate(fields)
+    except ValidationError as error:
+        fault = error.errors()[0]
+        raise ValueError(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}") from error
+    if manifest.checksum and not seal:
+        raise ValueError("its checksum is not where it was written")
+    return manifest
+
+
+def stage_of(key: str) -> str:
+    """The name of the stage in a key."""
+    found = re.match(r"(.+)-v\d+-", key)
+    return key if found is None else found[1]
+
+
+def _checksum(text: bytes) -> bytes:
+    return hashlib.blake2b(text, digest_size=DIGEST_BYTES).hexdigest().encode()
 
 
 @cache

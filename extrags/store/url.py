@@ -8,23 +8,23 @@ one key can never mix their files.
 from __future__ import annotations
 
 import datetime
-import logging
+import json
 import os
 import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from extrags.data_directories import cache_directory
-from extrags.errors import MissingDependencyError, StoreError
+from extrags.errors import DamagedArtefactError, MissingDependencyError, StoreError
 from extrags.store.canonical import Ref, digest_of
-from extrags.store.directory import private_directory, sweep_directories
-from extrags.store.manifest import MANIFEST, Manifest, content_digest
+from extrags.store.directory import DAMAGED, RECORD, private_directory, sweep_directories
+from extrags.store.integrity import Damage, find_damage, find_damaged_sizes
+from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
 
 __all__ = ["UrlBackend", "default_cache_directory"]
-
-log = logging.getLogger(__name__)
 
 
 def default_cache_directory() -> Path:
@@ -72,15 +72,25 @@ class UrlBackend:
             raise StoreError(f"the store {self.url} cannot be written: {error}") from error
 
     def read_manifest(self, key: str) -> Manifest | None:
-        """Manifest of a key; None where there is no such artefact."""
+        """Manifest of a key; None where there is no such artefact.
+
+        Raises:
+            DamagedArtefactError: when the file is no manifest, or differs from its checksum.
+            StoreError: when it cannot be read.
+        """
         name = f"{self.prefix}/{key}/{MANIFEST}"
         try:
-            return Manifest.model_validate_json(self.fs.cat_file(name))
+            return parsed_manifest(self.fs.cat_file(name))
         except FileNotFoundError:
             return None
-        except ValidationError as error:
-            log.warning("%s is not a manifest (%d faults); ignored", name, error.error_count())
-            return None
+        except ValueError as error:
+            raise DamagedArtefactError(
+                f"is not the manifest that was written: {error}",
+                file=MANIFEST,
+                stage=stage_of(key),
+                key=key,
+                store=self.url,
+            ) from error
         except OSError as error:
             raise StoreError(f"{self.url}/{key}/{MANIFEST} cannot be read: {error}") from error
 
@@ -90,28 +100,29 @@ class UrlBackend:
 
     def names(self) -> list[str]:
         """All keys, sorted; also those whose manifest is still missing."""
-        return sorted(name for name, kind in self._children(self.prefix) if kind == "directory")
+        children = self._children(self.prefix)
+        return sorted(name for name, kind in children if kind == "directory" and name != DAMAGED)
 
     def path(self, ref: Ref, manifest: Manifest) -> Path:
-        """Local directory with the artefact's files; downloaded at the first call, verified by the digest."""
-        target = self.local / f"{manifest.key}.{manifest.digest}"
+        """Local directory with the artefact's files; downloaded at the first call, verified by the digest.
+
+        Raises:
+            DamagedArtefactError: when the remote files are not those that were stored.
+        """
+        target = self._copy_of(manifest)
         if target.is_dir():
             return target
-        with private_directory(self.scratch, manifest.key) as private:
-            scratch = private / "files"
-            scratch.mkdir()
-            source = f"{self.prefix}/{manifest.key}/{manifest.data}"
-            for name in self.fs.find(source):
-                relative = str(name).removeprefix(source).lstrip("/")
-                (scratch / relative).parent.mkdir(parents=True, exist_ok=True)
-                self.fs.get_file(name, str(scratch / relative))
-            digest, _, _ = content_digest(scratch)
-            if digest != manifest.digest:
-                raise StoreError(
-                    f"{self.url}/{manifest.key} is damaged: its files have digest {digest}, "
-                    f"the manifest says {manifest.digest}"
+        with self._downloaded(manifest) as scratch:
+            damage = find_damage(scratch, manifest, "all")
+            if damage is not None:
+                raise DamagedArtefactError(
+                    damage.problem,
+                    file=damage.file,
+                    stage=manifest.stage,
+                    key=manifest.key,
+                    store=self.url,
                 )
-            (scratch / MANIFEST).write_text(manifest.model_dump_json(indent=1))
+            (scratch / MANIFEST).write_bytes(manifest_text(manifest))
             self.local.mkdir(parents=True, exist_ok=True)
             try:
                 scratch.rename(target)
@@ -120,9 +131,89 @@ class UrlBackend:
                     raise
         return target
 
+    def drop_copy(self, manifest: Manifest) -> bool:
+        """Remove the local copy of an artefact, to be downloaded again; whether there was one."""
+        aside = self.scratch / f"{manifest.key}.{secrets.token_hex(4)}.removed"
+        self.scratch.mkdir(parents=True, exist_ok=True)
+        try:
+            self._copy_of(manifest).rename(aside)
+        except FileNotFoundError:
+            return False
+        shutil.rmtree(aside, ignore_errors=True)
+        return True
+
+    def damaged_sizes(self, manifest: Manifest) -> Damage | None:
+        """Whether files are missing, truncated or too many; with a local copy, that is what is looked at."""
+        copy = self._copy_of(manifest)
+        if copy.is_dir() and find_damage(copy, manifest, "sizes") is None:
+            return None
+        source = f"{self.prefix}/{manifest.key}/{manifest.data}"
+        self.fs.invalidate_cache(source)
+        found = self.fs.find(source, detail=True)
+        sizes = {
+            str(name).removeprefix(source).lstrip("/"): int(about["size"]) for name, about in found.items()
+        }
+        return find_damaged_sizes(sizes, manifest)
+
+    def examine(self, manifest: Manifest) -> Damage | None:
+        """Whether the remote files differ from those that were stored; downloads all of them."""
+        with self._downloaded(manifest) as scratch:
+            return find_damage(scratch, manifest, "all")
+
+    def set_aside(self, key: str, record: dict[str, Any]) -> str | None:
+        """Move an artefact below `damaged/`, with a record of what is wrong; None when it is gone already.
+
+        Its manifest goes first, so that it disappears atomically.
+        """
+        place = f"{self.prefix}/{DAMAGED}/{key}.{secrets.token_hex(4)}"
+        manifest = f"{self.prefix}/{key}/{MANIFEST}"
+        try:
+            self.fs.pipe_file(f"{place}/artefact/{MANIFEST}", self.fs.cat_file(manifest))
+            self.fs.rm_file(manifest)
+        except FileNotFoundError:
+            return None
+        self.fs.pipe_file(f"{place}/{RECORD}", json.dumps(record, indent=1).encode())
+        for name in self.fs.find(f"{self.prefix}/{key}"):
+            relative = str(name).removeprefix(f"{self.prefix}/{key}").lstrip("/")
+            self.fs.mv(str(name), f"{place}/artefact/{relative}")
+        return f"{self.url}/{DAMAGED}/{place.rsplit('/', 1)[-1]}"
+
+    def remove_damaged(self) -> list[str]:
+        """Remove what was set aside; returns the names."""
+        place = f"{self.prefix}/{DAMAGED}"
+        names = sorted(name for name, _ in self._children(place))
+        if names:
+            self.fs.rm(place, recursive=True)
+        return [f"{DAMAGED}/{name}" for name in names]
+
+    def _copy_of(self, manifest: Manifest) -> Path:
+        return self.local / f"{manifest.key}.{manifest.digest}"
+
+    @contextmanager
+    def _downloaded(self, manifest: Manifest) -> Iterator[Path]:
+        """The remote files in a scratch directory that is removed at the end of the block."""
+        with private_directory(self.scratch, manifest.key) as private:
+            scratch = private / "files"
+            scratch.mkdir()
+            source = f"{self.prefix}/{manifest.key}/{manifest.data}"
+            self.fs.invalidate_cache(source)
+            for name in self.fs.find(source):
+                relative = str(name).removeprefix(source).lstrip("/")
+                (scratch / relative).parent.mkdir(parents=True, exist_ok=True)
+                self.fs.get_file(name, str(scratch / relative))
+            yield scratch
+
+    def _intact(self, key: str) -> Manifest | None:
+        """Manifest of an artefact whose files are all as they were stored, or None."""
+        try:
+            present = self.read_manifest(key)
+        except DamagedArtefactError:
+            return None
+        return None if present is None or self.examine(present) is not None else present
+
     def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
         """Upload the files, then the manifest."""
-        present = self.read_manifest(manifest.key)
+        present = self._intact(manifest.key)
         if present is not None and present.digest == manifest.digest:
             return present
         attempt = secrets.token_hex(8)
@@ -132,9 +223,7 @@ class UrlBackend:
                 if path.is_file():
                     name = path.relative_to(scratch).as_posix()
                     self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{attempt}/{name}", path.read_bytes())
-            self.fs.pipe_file(
-                f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest.model_dump_json(indent=1).encode()
-            )
+            self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest_text(manifest))
         except OSError as error:
             raise StoreError(f"the store {self.url} cannot be written: {error}") from error
         return manifest
@@ -157,7 +246,10 @@ class UrlBackend:
         removed = sweep_directories(self.scratch)
         limit = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=older_than_hours)
         for key in self.names():
-            manifest = self.read_manifest(key)
+            try:
+                manifest = self.read_manifest(key)
+            except DamagedArtefactError:
+                continue  # Which attempt it named is not known; `set_aside` moves them all.
             for attempt, kind in self._children(f"{self.prefix}/{key}"):
                 if kind != "directory" or (manifest is not None and attempt == manifest.data):
                     continue

@@ -1,26 +1,42 @@
-"""`cache ls`, `cache rm`, `cache gc`."""
+"""`cache ls`, `cache verify`, `cache rm`, `cache gc`."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from extrags.errors import DamagedArtefactError, StoreError
 from flows.commands.common import store_root, write_json
 from flows.commands.options import Parser, add_json, add_store, add_verb
 
 if TYPE_CHECKING:
-    from extrags.store import Manifest, Ref, Store
+    from extrags.store import Store
 
-__all__ = ["add_arguments", "gc", "ls", "rm"]
+__all__ = ["add_arguments", "gc", "ls", "rm", "verify"]
 
 
 def add_arguments(parser: Parser) -> None:
     """The verbs below `extrags cache`."""
     parser.description = "Look into the artefact store and clean it."
-    verbs = parser.add_subparsers(metavar="ls|rm|gc", required=True, parser_class=Parser)
+    verbs = parser.add_subparsers(metavar="ls|verify|rm|gc", required=True, parser_class=Parser)
     made = add_verb(verbs, "ls", ls, "list artefacts")
     made.add_argument("pattern", nargs="?", default="*", help="shell pattern over key, stage or sequence")
     made.add_argument("--verify", action="store_true", help="read every file and compare digests")
+    add_store(made)
+    add_json(made)
+    made = add_verb(
+        verbs,
+        "verify",
+        verify,
+        "read every file of the store and say which artefacts are damaged",
+        description="Compare every file of the store with what was stored; on an object store this downloads "
+        "all of them. Exit code 1 when an artefact is damaged.",
+    )
+    made.add_argument(
+        "--repair", action="store_true", help="set damaged artefacts aside; the next run makes them anew"
+    )
     add_store(made)
     add_json(made)
     made = add_verb(verbs, "rm", rm, "remove artefacts")
@@ -33,8 +49,8 @@ def add_arguments(parser: Parser) -> None:
         "gc",
         gc,
         "remove what can never be used again",
-        description="Remove what killed runs left, debugging files of failures, and artefacts of former "
-        "versions of their stage.",
+        description="Remove what killed runs left, debugging files of failures, damaged artefacts that were "
+        "set aside, and artefacts of former versions of their stage.",
     )
     add_store(made)
 
@@ -48,7 +64,7 @@ def ls(given: argparse.Namespace) -> int:
 
     store = Store(store_root(given))
     manifests = store.ls(given.pattern)
-    damaged = [item.key for item in manifests if given.verify and not store.verify(_ref(store, item))]
+    damaged = [item.key for item in manifests if given.verify and store.examine(item.key)]
     if given.json != "-":
         table = Table(box=None, pad_edge=False, header_style="bold")
         table.add_column("stage", no_wrap=True)
@@ -68,6 +84,68 @@ def ls(given: argparse.Namespace) -> int:
     rows = [item.model_dump(mode="json") | {"damaged": item.key in damaged} for item in manifests]
     write_json(rows, given.json)
     return 1 if damaged else 0
+
+
+def verify(given: argparse.Namespace) -> int:
+    """`extrags cache verify`; exit code 1 when an artefact is damaged, also if it is set aside.
+
+    Raises:
+        StoreError: when there is no such store.
+    """
+    from rich.markup import escape
+    from rich.table import Table
+
+    from extrags.store import Store
+    from flows.terminal import console
+
+    store = Store(store_root(given))
+    if "://" not in store.root and not Path(store.root).is_dir():
+        raise StoreError(f"there is no store {store.root}")
+    checked, damaged = _examined(store)
+    aside = [store.set_aside(damage) if given.repair else None for damage in damaged]
+    if given.json != "-":
+        out = console()
+        if damaged:
+            table = Table(box=None, pad_edge=False, header_style="bold")
+            table.add_column("stage", no_wrap=True)
+            for column in ("damage", "key", *(["set aside as"] if given.repair else [])):
+                table.add_column(column, overflow="fold")
+            for damage, place in zip(damaged, aside, strict=True):
+                what = f"{damage.file}: {damage.problem}" if damage.file else damage.problem
+                cells = (damage.stage, what, damage.key, *([place or ""] if given.repair else []))
+                table.add_row(*map(escape, cells))
+            out.print(table)
+        out.print(f"{len(damaged)} of {checked} artefacts damaged in {store.root}")
+        if damaged and not given.repair:
+            out.print("with --repair they are set aside, and the next run makes them anew")
+        elif damaged:
+            out.print("the next run makes them anew; `extrags cache gc` removes what was set aside")
+    rows = [
+        {
+            "stage": damage.stage,
+            "key": damage.key,
+            "file": damage.file,
+            "problem": damage.problem,
+            "set_aside": place,
+        }
+        for damage, place in zip(damaged, aside, strict=True)
+    ]
+    write_json({"store": store.root, "artefacts": checked, "damaged": rows}, given.json)
+    return 1 if damaged else 0
+
+
+def _examined(store: Store) -> tuple[int, list[DamagedArtefactError]]:
+    """Number of artefacts, and what is wrong with some of them; with a progress bar in a terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from flows.terminal import console
+
+    keys = store.keys()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bars = Progress(*columns, console=console(error=True), transient=True, disable=not sys.stderr.isatty())
+    with bars:
+        found = [store.examine(key) for key in bars.track(keys, description="reading")]
+    return len(keys), [damage for damage in found if damage is not None]
 
 
 def rm(given: argparse.Namespace) -> int:
@@ -95,12 +173,6 @@ def gc(given: argparse.Namespace) -> int:
         print(name)
     print(f"{len(removed)} leftovers removed from {store.root}")
     return 0
-
-
-def _ref(store: Store, manifest: Manifest) -> Ref:
-    from extrags.store import Ref
-
-    return Ref(uri=store.backend.uri(manifest.key), digest=manifest.digest)
 
 
 def _size(count: int) -> str:

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from extrags.errors import ConfigError, ExtragsError, UnknownSequenceError
+from extrags.errors import ConfigError, DamagedArtefactError, ExtragsError, UnknownSequenceError
 from flows.commands.common import run_config, set_up_logging, store_root, write_json
 from flows.commands.options import Parser, add_json, add_method, add_runner
 from flows.failures import describe_error
@@ -166,7 +166,7 @@ def _from_store(
             if any(outcome.status == "failed" for outcome in outcomes):
                 return None
             page = dataset_page(outcomes, "dataset", label, runner) if until == "report" else None
-    except NotInStoreError:
+    except (NotInStoreError, DamagedArtefactError):
         return None
     return DatasetOutcome(outcomes, page)
 

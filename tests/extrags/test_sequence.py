@@ -9,7 +9,7 @@ import zarr
 
 from extrags.errors import ShapeError
 from extrags.sequence import EndoscopicSequence, Split, saturated_mask
-from extrags.store.manifest import content_digest
+from extrags.store import content_digest
 
 
 def small_sequence(frames: int = 4) -> EndoscopicSequence:

@@ -264,15 +264,14 @@ class TestStore:
 
 
 class TestDirectory:
-    def test_a_damaged_manifest_is_a_miss_and_is_replaced(
-        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
-    ) -> None:
+    def test_a_damaged_manifest_is_an_error_and_is_replaced(self, tmp_path: Path) -> None:
         store = Store(tmp_path)
         ref = put(store)
         (tmp_path / "artefacts" / "toy-v1-aa" / MANIFEST).write_text("{")
-        assert store.find("toy-v1-aa") is None
-        assert "not a manifest" in caplog.text
+        with pytest.raises(StoreError, match="not the manifest"):
+            store.find("toy-v1-aa")
         assert put(store) == ref
+        assert store.find("toy-v1-aa") == ref
 
     def test_verify_sees_a_changed_byte(self, tmp_path: Path) -> None:
         store = Store(tmp_path)

@@ -45,9 +45,7 @@ def test_clearance_is_less_where_the_surface_is_unsure(tube: Tube) -> None:
     cameras = tube.sequence.training_cameras
     mesh = fuse_surface(tube.scene, cameras)
     sure = carve(tube.scene, mesh, cameras, SMALL)
-    unsure = carve(
-        tube.scene, mesh, cameras, SMALL, surface_error_mm=np.full(len(mesh.vertices), 1.5)
-    )
+    unsure = carve(tube.scene, mesh, cameras, SMALL, surface_error_mm=np.full(len(mesh.vertices), 1.5))
     np.testing.assert_array_equal(sure.occupancy, unsure.occupancy)
     np.testing.assert_allclose(
         unsure.clearance, np.maximum(sure.clearance - 1.5, 0), atol=1e-5 * float(sure.clearance.max())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import random
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from extrags.errors import ConfigError
 from flows.benchmark import benchmark, check_methods, summary_of
 from flows.outcome import SequenceOutcome
 from flows.tables import difference_text, spread_text
+from tests.flows.damaging import flip_bit
 from tests.flows.tiny import SEQUENCE, TINY
 
 NO_LIGHT = {"no-light": {"coarse.light.enabled": False}}
@@ -113,6 +116,22 @@ class TestAgain:
         assert fine["extrags"]["metrics"] == first.metrics["final"]
         assert fine["extrags"]["seconds"] > fine["coarse"]["seconds"] > 0
         assert "the folder is empty" in Path(found["report"]).read_text()
+
+    def test_what_its_page_finds_damaged_is_made_anew(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        store, first = finished
+        shutil.copytree(Path(store) / "artefacts", tmp_path / "artefacts")
+        key = Path(first.artefacts["renders_final"]).name
+        # No stage reads the renders of a finished run; the page does, for its pictures.
+        flip_bit(tmp_path / "artefacts" / key / "renders/rgb/c/0/0/0/0", random.Random(0))
+        found = benchmark(
+            sequences=[SEQUENCE], methods=["coarse", "extrags"], settings=TINY, store=str(tmp_path)
+        )
+        assert [case["error"] for case in found["cases"]] == ["", ""]
+        assert Path(found["report"]).is_file()
+        (aside,) = (tmp_path / "damaged").iterdir()
+        assert aside.name.startswith(key)
 
     def test_a_wrong_setting_stops_it_at_once(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match=r"did you mean coarse\.iterations"):

@@ -398,6 +398,33 @@ class TestCache:
         assert main(["cache", "ls", "--verify", "--store", store]) == 1
         assert "DAMAGED" in capsys.readouterr().out
 
+    def test_verify(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "verify", "--store", store]) == 0
+        assert f"0 of 3 artefacts damaged in {store}" in capsys.readouterr().out
+        file = Path(store) / "artefacts" / "toy-v1-1" / "file"
+        file.write_text("y" * 2000)
+        assert main(["cache", "verify", "--store", store]) == 1
+        said = capsys.readouterr().out
+        assert "file: its content has changed since it was stored" in said
+        assert "1 of 3 artefacts damaged" in said
+        assert file.exists()
+
+    def test_verify_repairs(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        (Path(store) / "artefacts" / "toy-v1-1" / "file").unlink()
+        assert main(["cache", "verify", "--repair", "--store", store, "--json", "-"]) == 1
+        found = json.loads(capsys.readouterr().out)
+        (row,) = found.pop("damaged")
+        assert found == {"store": store, "artefacts": 3}
+        assert (row["stage"], row["key"], row["file"]) == ("toy", "toy-v1-1", "file")
+        assert (Path(row["set_aside"]) / "damage.json").is_file()
+        assert main(["cache", "verify", "--store", store]) == 0
+        assert "0 of 2 artefacts" in capsys.readouterr().out
+        assert Store(store).find("toy-v1-1") is None
+
+    def test_verify_wants_a_store(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "verify", "--store", str(tmp_path / "none")]) == 1
+        assert f"there is no store {tmp_path / 'none'}" in capsys.readouterr().err
+
     def test_rm(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["cache", "rm", "*-0", "phantom/2", "--store", store]) == 0
         assert "2 artefacts removed" in capsys.readouterr().out

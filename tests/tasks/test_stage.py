@@ -7,7 +7,7 @@ from pathlib import Path
 import cloudpickle
 import pytest
 
-from extrags.errors import ConfigError, DivergedError
+from extrags.errors import ConfigError, DamagedArtefactError, DivergedError
 from extrags.store import Ref, Slot, Store
 from tasks.progress import StageProgress, observed
 from tasks.stage import ArtefactRecords, StageKey, at, stage, stage_key, stage_versions
@@ -37,6 +37,25 @@ def test_a_second_call_does_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     refs = [source.fn(store=store, seed=1) for _ in range(3)]
     assert refs[0] == refs[1] == refs[2]
     assert runs.read_text() == "source\n"
+
+
+def test_a_damaged_artefact_is_made_anew(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store = str(tmp_path)
+    ref = source.fn(store=store, seed=12)
+    (tmp_path / "artefacts" / stage_key(source, {"seed": 12}) / "number").write_text("1")
+    assert source.fn(store=store, seed=12) == ref
+    assert (Store(store).open(ref) / "number").read_text() == "12"
+    assert "stage toy-source: artefact toy-source-v1-" in caplog.text
+    assert "number: has 1 bytes, expected 2" in caplog.text
+
+
+def test_a_stage_refuses_a_damaged_input(tmp_path: Path) -> None:
+    store = str(tmp_path)
+    ref = source.fn(store=store, seed=12)
+    (tmp_path / "artefacts" / stage_key(source, {"seed": 12}) / "number").write_text("13")
+    with pytest.raises(DamagedArtefactError, match="of stage toy-source is damaged: number: its content"):
+        double.fn(store=store, number=ref)
+    assert [manifest.stage for manifest in Store(store).ls()] == ["toy-source"]
 
 
 def test_lists_of_refs_stand_in_the_manifest(tmp_path: Path) -> None:
@@ -138,6 +157,10 @@ def test_records_are_the_artefacts(tmp_path: Path) -> None:
         records.read_path(key)
     ref = source.fn(store=str(tmp_path), seed=5)
     assert ref.digest.encode() in records.read_path(key)
+    (tmp_path / "artefacts" / key / "number").unlink()
+    with pytest.raises(FileNotFoundError):
+        records.read_path(key)
+    assert source.fn(store=str(tmp_path), seed=5) == ref
     Store(tmp_path).rm(key)
     with pytest.raises(FileNotFoundError):
         records.read_path(key)
