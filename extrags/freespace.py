@@ -198,8 +198,8 @@ def carve(
         mesh: its surface.
         cameras: the training views.
         config: settings.
-        surface_error_mm: expected distance of each vertex from the true surface, which clearance is reduced
-            by (`extrags.surface_error`); None for a surface from measured depth.
+        surface_error_mm: expected distance of each vertex from the true surface, by which clearance is
+            reduced (`extrags.surface_error`); None for a surface from measured depth.
 
     Returns:
         The grid, aligned with the principal axes of mesh and cameras.
@@ -369,7 +369,7 @@ def _voxels_of_mesh(
 def _nearest_error(
     vertices: Float[np.ndarray, "v 3"], error_mm: Float[np.ndarray, "v"], size: int
 ) -> Float[np.ndarray, "s s s"]:
-    """Largest error in the voxel with a vertex that is nearest to each voxel (vertices in grid coordinates)."""
+    """Largest error in the nearest voxel that holds a vertex; vertices are in grid coordinates."""
     from scipy.ndimage import distance_transform_edt
 
     largest = np.full((size, size, size), -1.0)

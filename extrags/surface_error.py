@@ -11,15 +11,15 @@ from extrags.surface import Mesh
 __all__ = ["HIDDEN_SHARE", "surface_error_mm"]
 
 HIDDEN_SHARE = 0.25
-"""A vertex behind a view's depth by more than this share is hidden there, and that depth says nothing of it."""
+"""A vertex behind a view's depth by more than this share is hidden there; that depth says nothing of it."""
 
 
 def surface_error_mm(mesh: Mesh, sequence: EndoscopicSequence) -> Float[np.ndarray, "v"] | None:
     """Expected distance of each vertex of a mesh from the true surface, in world units.
 
     A training view vouches for a vertex by its expected error there, or by the distance of its own estimate
-    from the vertex where that is more; the view that vouches best counts. A vertex that no view sees takes the
-    median of the others.
+    from the vertex where that is more; the view that vouches best counts. A vertex that no view sees takes
+    the median of the others.
 
     Args:
         mesh: surface of the scene.

@@ -32,17 +32,16 @@ def sharpened(
 ) -> Float[Tensor, "f h w"]:
     """Weighted median of depth in windows that hold an edge.
 
-    A network trained on mean errors draws a ramp where depth jumps. Gaussians that start on it hang in the
-    air, as a curtain behind every fold. The median takes one of the depths of the neighbours, which vote by
-    likeness of colour, nearness and expected error.
+    A network trained on mean errors draws a ramp where depth jumps, and Gaussians that start on it hang in
+    the air behind every fold. The median takes one of the depths of the neighbours, which vote by likeness of
+    colour, nearness and expected error.
 
     Args:
         log_depth: of all frames.
         error: expected absolute error of it.
         frames: their pictures and masks.
 
-    Source: weighted median filtering of stereo (Ma et al., "Constant time weighted median filtering for stereo
-    matching and beyond", ICCV 2013), with expected errors among the weights.
+    Source: [Ma2013], with expected errors among the weights; see docs/references.md.
     """
     return torch.stack(
         [_sharpened(log_depth[f], error[f], frames.rgb[f], frames.mask[f]) for f in range(len(frames))]

@@ -36,8 +36,8 @@ MEASURED_FRAMES = 40
 """Frames at most whose interpolated depth gives the length scale of a scene of sparse points."""
 
 BESIDE_RELIABLE_PX = 3
-"""Unsure depth starts no Gaussian so near to sure depth: it is the edge of a fold, between two surfaces. A wide
-area of unsure depth is all there is, and is kept."""
+"""Unsure depth starts no Gaussian so near to sure depth: it is the edge of a fold, between two surfaces. A
+wide area of unsure depth is all there is, and is kept."""
 
 SURFACE_OPACITY, RANDOM_OPACITY = 0.5, 0.1
 """Opacity at the start: on a known surface, and at random points, which must not hide each other."""
@@ -94,8 +94,8 @@ def starting_gaussians(
 ) -> Gaussians:
     """Gaussians from back-projected depth, from sparse points without depth, or at random without either.
 
-    Of estimated depth, pixels beside which it is surer start none: where depth jumps, an estimate lies between
-    both surfaces, and Gaussians there would hang as a curtain in front of what was never seen.
+    Unsure pixels of estimated depth beside sure ones start none: where depth jumps, an estimate lies between
+    both surfaces, and Gaussians there would hang in front of what was never seen.
 
     Each point carries the mean albedo of its pixels: the colour with light and response divided out.
     Radii follow the distance to the three nearest neighbours. Random points lie in the cameras' frusta; they

@@ -31,7 +31,8 @@ def gather_references(
     """Prepare real frames as references of a scene.
 
     Depth is the measured one where the sequence has it, or an estimate that is reliable
-    (`EndoscopicSequence.reliable_depth_mm`), else the scene's rendering where it is opaque. Without a light model, how brightness falls with distance is fitted to the views.
+    (`EndoscopicSequence.reliable_depth_mm`), else the scene's rendering where it is opaque. Without a light
+    model, how brightness falls with distance is fitted to the views.
 
     Args:
         scene: the reconstruction; needed for depth and for what each frame saw.
