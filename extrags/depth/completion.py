@@ -72,12 +72,10 @@ def completion_inputs(
     sure = mask & (stereo.agrees * stereo.seen * stereo.n_sources[:, None, None] >= SURE_AGREEMENT)
     log_scale = torch.stack([_median(log, s, m) for log, s, m in zip(stereo.fused, sure, mask, strict=True)])
     relative = (stereo.fused - log_scale[:, None, None]).clamp(-FARTHEST_LOG, FARTHEST_LOG)
-    scatter = torch.tensor([min(fit.scatter, 1.0) for fit in stereo.fits], device=relative.device)
     # Where brightness could not be fitted it predicts nothing: the median depth, with the largest scatter.
-    fitted = torch.tensor([fit.scatter < 1.0 for fit in stereo.fits], device=relative.device)
-    shading = (stereo.shading - log_scale[:, None, None]).clamp(-FARTHEST_LOG, FARTHEST_LOG)
-    shading = shading * fitted[stereo.recording][:, None, None]
-    constant = scatter[stereo.recording][:, None, None].expand_as(relative)
+    prior = (stereo.prior - log_scale[:, None, None]).clamp(-FARTHEST_LOG, FARTHEST_LOG)
+    prior = prior * (stereo.prior_scatter < 1.0)[:, None, None]
+    constant = stereo.prior_scatter.clamp_max(1.0)[:, None, None].expand_as(relative)
     sources = (stereo.n_sources / 6)[:, None, None].expand_as(relative)
     present = torch.zeros_like(relative) if points is None else (points > 0).float()
     at_points = torch.zeros_like(relative)
@@ -88,7 +86,7 @@ def completion_inputs(
     saturated = (frames.rgb.amax(dim=1) >= SATURATED).float()
     single = [
         relative,
-        shading,
+        prior,
         stereo.cost,
         stereo.margin,
         stereo.seen,

@@ -1,4 +1,4 @@
-"""Dense depth of posed frames from each other: two sweeps, the light as a prior, agreement of the views."""
+"""Dense depth of posed frames from each other: two sweeps, a prior of other cues, agreement of views."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from torch.nn import functional
 from extrags.depth import matching, native
 from extrags.depth.consistency import agreement
 from extrags.depth.frames import PosedFrames
+from extrags.depth.monocular import MonocularFit, aligned, fit_monocular
+from extrags.depth.prior import DepthPrior
 from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
 
 __all__ = ["StereoDepth", "StereoSettings", "multi_view_stereo", "sweep_around"]
@@ -24,7 +26,11 @@ COST_LEVELS = 127.5
 """Levels per unit of the costs that are kept as bytes."""
 
 SURE_AGREEMENT = 1.5
-"""Sources that must agree with a depth for the fit of the shading, together with the frame's own."""
+"""Sources that must agree with a depth for the fit of other cues, together with the frame's own."""
+
+CHUNK_VALUES = 1 << 26
+"""Costs of as many frames as have so many are made at a time on a GPU, which single frames leave idle; with
+what is made on the way that is about 2 GB."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +43,9 @@ class StereoSettings:
         best_share: share of the sources, those that match best, whose costs are averaged.
         small_step: semi-global penalty of a change by one hypothesis.
         jump: semi-global penalty of larger changes.
-        shading_weight: weight of the prior that shading gives; it is bounded, so that clear matches win.
-        shading_scatters: scatters of the shading fit at which the prior reaches its weight.
+        shading: whether what brightness predicts is part of the prior.
+        prior_weight: weight of the prior that other cues give; it is bounded, so that clear matches win.
+        prior_scatters: scatters of the cues at which the prior reaches its weight.
         refinement_hypotheses: depths of the second sweep, around the surface that the first one found.
         refinement_extent: half the width of the second sweep, in steps of the first.
         refinement_small_step: as `small_step`, in the second sweep.
@@ -51,8 +58,9 @@ class StereoSettings:
     best_share: float = 0.5
     small_step: float = 0.15
     jump: float = 1.5
-    shading_weight: float = 0.2
-    shading_scatters: float = 4.0
+    shading: bool = True
+    prior_weight: float = 0.2
+    prior_scatters: float = 4.0
     refinement_hypotheses: int = 13
     refinement_extent: float = 3.0
     refinement_small_step: float = 0.1
@@ -73,8 +81,10 @@ class StereoDepth:
         violates: share of those that see through the point, [F, H, W].
         difference: mean log-ratio to the sources' depths, bounded, [F, H, W].
         fused: mean log-depth over the frame and the sources that agree, [F, H, W].
-        shading: log-depth that brightness predicts, [F, H, W].
+        prior: log-depth that brightness predicts, together with that of a monocular network, [F, H, W].
+        prior_scatter: how far depths scatter around it, infinite where it is of no use, [F].
         fits: the fit of shading, one per recording.
+        monocular: that of the monocular network, one per recording; empty without one.
         recording: recording of each frame, [F].
         n_sources: number of sources of each frame, [F].
     """
@@ -87,8 +97,10 @@ class StereoDepth:
     violates: Float[Tensor, "f h w"]
     difference: Float[Tensor, "f h w"]
     fused: Float[Tensor, "f h w"]
-    shading: Float[Tensor, "f h w"]
+    prior: Float[Tensor, "f h w"]
+    prior_scatter: Float[Tensor, "f"]
     fits: list[ShadingFit]
+    monocular: list[MonocularFit]
     recording: Int[Tensor, "f"]
     n_sources: Int[Tensor, "f"]
 
@@ -101,7 +113,8 @@ def multi_view_stereo(
     settings: StereoSettings | None = None,
     *,
     recording: Int[Tensor, "f"] | None = None,
-    chunk: int = 1,
+    monocular: Float[Tensor, "f h w"] | None = None,
+    chunk: int | None = None,
     told: Callable[[int], None] | None = None,
 ) -> StereoDepth:
     """Depth of every frame from its sources.
@@ -113,7 +126,8 @@ def multi_view_stereo(
         far: largest depth searched, per frame.
         settings: how to search; None takes the defaults.
         recording: recording of each frame, numbered from zero: exposure and response are one recording's.
-        chunk: frames at a time.
+        monocular: inverse depth of each frame up to scale and shift, from a network; None without one.
+        chunk: frames at a time; None takes one on the processor, as many as fit on a GPU.
         told: called with the number of frames done, twice for each.
     """
     settings = StereoSettings() if settings is None else settings
@@ -123,14 +137,14 @@ def multi_view_stereo(
     steps = torch.linspace(-1, 1, settings.hypotheses, device=device)
     log_base = 0.5 * (near.log() + far.log())
     offsets = 0.5 * (far.log() - near.log())[:, None] * steps[None]
-    parts = torch.arange(n, device=device).split(chunk)
+    parts = _parts(frames, settings.hypotheses, chunk)
     kernels = native if device.type == "cpu" else matching
     costs, first = [], []
     for part in parts:
         base = log_base[part].exp()[:, None, None].expand(-1, *frames.size)
         cost = _cost(frames, part, sources, base, offsets[part], settings)
         # A byte is fine enough for what is only ranked again, and many frames are kept.
-        costs.append((cost * COST_LEVELS).round().clamp(0, 255).to(torch.uint8))
+        costs.append((cost * COST_LEVELS).round().clamp(0, 255).to(torch.uint8).cpu())
         position, _, _ = kernels.best_steps(
             cost, grey[part], small_step=settings.small_step, jump=settings.jump
         )
@@ -143,13 +157,18 @@ def multi_view_stereo(
     sure = torch.cat([a.agrees * a.seen for a in agreed]) * count[:, None, None] >= SURE_AGREEMENT
     sure &= frames.mask & (frames.rgb.amax(dim=1) < SATURATED)
     fits = fit_shading(brightness, depth.log(), sure, recording)
-    shading = torch.empty_like(brightness)
-    for g, fit in enumerate(fits):
-        shading[recording == g] = fit.log_depth(brightness[recording == g])
+    prior, monocular_fits = shading_prior(fits, brightness, recording), []
+    if monocular is not None:
+        monocular_fits = fit_monocular(monocular, depth.log(), sure, recording)
+        other = DepthPrior(*aligned(monocular_fits, monocular, recording))
+        prior = prior & other if settings.shading else other
+    prior_weight = settings.prior_weight if settings.shading or monocular is not None else 0.0
     found, matched, margins = [], [], []
     for number, part in enumerate(parts):
-        cost = costs[number].float() / COST_LEVELS
-        cost += _prior(shading[part], fits, recording[part], log_base[part], offsets[part], settings)
+        cost = costs[number].to(device).float() / COST_LEVELS
+        cost += prior.cost(
+            part, log_base[part], offsets[part], weight=prior_weight, scatters=settings.prior_scatters
+        )
         costs[number] = torch.empty(0)
         position, _, margin = kernels.best_steps(
             cost, grey[part], small_step=settings.small_step, jump=settings.jump
@@ -185,8 +204,10 @@ def multi_view_stereo(
         violates=joined("violates"),
         difference=joined("difference"),
         fused=joined("fused"),
-        shading=shading,
+        prior=prior.log_depth,
+        prior_scatter=prior.scatter,
         fits=fits,
+        monocular=monocular_fits,
         recording=recording,
         n_sources=count,
     )
@@ -213,7 +234,7 @@ def sweep_around(
     Args:
         frames: frames with poses.
         sources: what each is matched with.
-        stereo: result of `multi_view_stereo`, whose margin and shading are kept.
+        stereo: result of `multi_view_stereo`, whose margin and prior are kept.
         log_depth: logarithm of the surfaces' z-depth.
         half_width: of the range, in log-depth.
         hypotheses: depths tried in it.
@@ -224,18 +245,19 @@ def sweep_around(
     """
     settings = StereoSettings() if settings is None else settings
     kernels = native if log_depth.device.type == "cpu" else matching
-    grey, n = frames.grey, len(frames)
+    grey = frames.grey
     offsets = torch.linspace(-half_width, half_width, hypotheses, device=log_depth.device)[None]
     found, matched = [], []
-    parts = torch.arange(n, device=log_depth.device).split(1)
+    parts = _parts(frames, hypotheses, None)
     for part in parts:
-        cost = _cost(frames, part, sources, log_depth[part].exp(), offsets, settings)
+        around = offsets.expand(len(part), -1)
+        cost = _cost(frames, part, sources, log_depth[part].exp(), around, settings)
         position, _, _ = kernels.best_steps(cost, grey[part], small_step=small_step, jump=jump)
-        found.append(_log_depth(position, log_depth[part], offsets))
+        found.append(_log_depth(position, log_depth[part], around))
         nearest = position.round().long().clamp(0, hypotheses - 1)
         matched.append(cost.gather(1, nearest[:, None])[:, 0])
         if told is not None:
-            told(1)
+            told(len(part))
     new = torch.cat(found)
     depth = torch.where(frames.mask, new.exp(), 0.0)
     agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
@@ -250,6 +272,27 @@ def sweep_around(
         difference=torch.cat([a.difference for a in agreed]),
         fused=torch.cat([a.fused for a in agreed]),
     )
+
+
+def shading_prior(
+    fits: list[ShadingFit], brightness: Float[Tensor, "f h w"], recording: Int[Tensor, "f"]
+) -> DepthPrior:
+    """What brightness predicts of all frames, by their recordings' fits."""
+    log_depth = torch.empty_like(brightness)
+    for g, fit in enumerate(fits):
+        log_depth[recording == g] = fit.log_depth(brightness[recording == g])
+    scatter = torch.tensor([fit.scatter for fit in fits], device=brightness.device)[recording]
+    return DepthPrior(log_depth, scatter)
+
+
+def _parts(frames: PosedFrames, hypotheses: int, chunk: int | None) -> tuple[Tensor, ...]:
+    """Numbers of the frames that are matched together."""
+    device = frames.rgb.device
+    if chunk is None:
+        height, width = frames.size
+        chunk = 1 if device.type == "cpu" else max(1, CHUNK_VALUES // (hypotheses * height * width))
+    parts: tuple[Tensor, ...] = torch.arange(len(frames), device=device).split(chunk)
+    return parts
 
 
 def _cost(
@@ -276,22 +319,6 @@ def _cost(
 def _log_depth(position: Tensor, log_base: Tensor, offsets: Tensor) -> Tensor:
     step = (offsets[:, 1] - offsets[:, 0])[:, None, None]
     return log_base + offsets[:, 0, None, None] + position * step
-
-
-def _prior(
-    shading: Tensor,
-    fits: list[ShadingFit],
-    recording: Tensor,
-    log_base: Tensor,
-    offsets: Tensor,
-    settings: StereoSettings,
-) -> Tensor:
-    """Cost of leaving the depth that the brightness predicts, bounded; nothing where there was no fit."""
-    scatter = torch.tensor([fit.scatter for fit in fits], device=shading.device)[recording]
-    hypotheses = log_base[:, None] + offsets
-    away = (hypotheses[:, :, None, None] - shading[:, None]).abs()
-    away = away / (settings.shading_scatters * scatter[:, None, None, None])
-    return settings.shading_weight * away.clamp_max(1.5)
 
 
 def _median(log_depth: Tensor, mask: Tensor) -> Tensor:

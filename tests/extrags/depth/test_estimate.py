@@ -10,7 +10,7 @@ import pytest
 
 from extrags.config import DepthConfig
 from extrags.depth.estimate import DepthEstimate, estimate_depth
-from extrags.errors import CaptureError
+from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, subscribed
 from extrags.sequence import EndoscopicSequence, Split
 from tests.extrags.depth.withheld import true_training_depth, with_points, withheld_phantom
@@ -60,6 +60,35 @@ def test_stereo_alone_is_farther_off(withheld: EndoscopicSequence, estimate: Dep
     assert np.median(alone) < 0.1
     assert completed.mean() < 0.5 * alone.mean()
     assert plain.report["completion"] == "none"
+
+
+def test_a_gpu_gives_that_of_a_processor(device: str, specification) -> None:  # type: ignore[no-untyped-def]
+    """On the processor, torch's implementation stands in for what runs on a GPU."""
+    small = with_points(withheld_phantom(8, width=64, height=48))
+    part = small.training_part()
+    expected = estimate_depth(part, DepthConfig(device="cpu", **SETTINGS))
+    specification()
+    found = estimate_depth(part, DepthConfig(device=device, **SETTINGS))
+    assert (expected.report["device"], found.report["device"]) == ("cpu", device)
+    away = np.abs(np.log(found.depth[part.mask] / expected.depth[part.mask]))
+    # Rounding moves most depths by less than a thousandth. Where two depths match nearly equally well it
+    # decides between them: between two implementations on a processor 1.5 % of these pixels move by more than
+    # a percent.
+    assert np.median(away) < 1e-3
+    assert (away > 0.01).mean() < 0.04
+    assert relative_error(small, found).mean() == pytest.approx(
+        relative_error(small, expected).mean(), rel=0.03
+    )
+    again = estimate_depth(part, DepthConfig(device=device, **SETTINGS)) if device == "cuda" else found
+    np.testing.assert_array_equal(again.depth, found.depth)
+
+
+def test_cuda_that_is_not_there_is_refused(
+    withheld: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(ConfigError, match=r"depth\.device=cuda"):
+        estimate_depth(withheld.training_part(), DepthConfig(device="cuda"))
 
 
 def test_without_points_they_are_triangulated() -> None:
