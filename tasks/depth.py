@@ -27,7 +27,7 @@ def triangulation_settings(config: PosesConfig) -> PosesConfig:
 
 
 # The digest stands for the content of the weights; the task finds them by the settings again.
-@stage("depth", version=1)
+@stage("depth", version=2)
 def depth(
     slot: Slot, sequence: Ref, config: DepthConfig, features: PosesConfig, weights_digest: str | None
 ) -> None:

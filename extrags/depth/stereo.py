@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import torch
 from jaxtyping import Float, Int
@@ -15,7 +16,14 @@ from extrags.depth.consistency import agreement
 from extrags.depth.frames import PosedFrames
 from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
 
-__all__ = ["StereoDepth", "StereoSettings", "multi_view_stereo", "sweep_around"]
+__all__ = [
+    "SECOND_SWEEP",
+    "THIRD_SWEEP",
+    "StereoDepth",
+    "StereoSettings",
+    "multi_view_stereo",
+    "sweep_around",
+]
 
 SATURATED = 0.97
 """Brightness above which a pixel says nothing about its distance."""
@@ -25,6 +33,22 @@ COST_LEVELS = 127.5
 
 SURE_AGREEMENT = 1.5
 """Sources that must agree with a depth for the fit of the shading, together with the frame's own."""
+
+
+class SweepAround(TypedDict):
+    """How `sweep_around` searches around completed surfaces."""
+
+    half_width: float
+    hypotheses: int
+    small_step: float
+    jump: float
+
+
+SECOND_SWEEP = SweepAround(half_width=0.2, hypotheses=17, small_step=0.1, jump=0.5)
+"""After the first completion, whose result is completed once more; the practice of the network has it too."""
+
+THIRD_SWEEP = SweepAround(half_width=0.1, hypotheses=13, small_step=0.2, jump=1.0)
+"""After the second completion; its result is mixed with it."""
 
 
 @dataclass(frozen=True)
@@ -146,15 +170,18 @@ def multi_view_stereo(
     shading = torch.empty_like(brightness)
     for g, fit in enumerate(fits):
         shading[recording == g] = fit.log_depth(brightness[recording == g])
+    scatters = torch.tensor([fit.scatter for fit in fits], device=device)[recording]
     found, matched, margins = [], [], []
     for number, part in enumerate(parts):
         cost = costs[number].float() / COST_LEVELS
-        cost += _prior(shading[part], fits, recording[part], log_base[part], offsets[part], settings)
+        cost += _prior(shading[part], scatters[part], log_base[part], offsets[part], settings)
         costs[number] = torch.empty(0)
         position, _, margin = kernels.best_steps(
             cost, grey[part], small_step=settings.small_step, jump=settings.jump
         )
         margins.append(margin)
+        blind = (count[part] == 0) & ~torch.isfinite(scatters[part])
+        position = _undecided(position, settings.hypotheses, blind)
         log_depth = _log_depth(position, log_base[part][:, None, None], offsets[part])
         surface = _median(log_depth, frames.mask[part])
         step = offsets[part][:, 1] - offsets[part][:, 0]
@@ -164,6 +191,7 @@ def multi_view_stereo(
         position, _, _ = kernels.best_steps(
             cost, grey[part], small_step=settings.refinement_small_step, jump=settings.refinement_jump
         )
+        position = _undecided(position, finer.shape[1], count[part] == 0)
         found.append(_log_depth(position, surface, finer))
         nearest = position.round().long().clamp(0, finer.shape[1] - 1)
         matched.append(cost.gather(1, nearest[:, None])[:, 0])
@@ -203,6 +231,7 @@ def sweep_around(
     small_step: float,
     jump: float,
     settings: StereoSettings | None = None,
+    chunk: int = 1,
     told: Callable[[int], None] | None = None,
 ) -> StereoDepth:
     """Stereo again in a narrow range around surfaces that are nearly right.
@@ -220,22 +249,26 @@ def sweep_around(
         small_step: semi-global penalty of a change by one hypothesis.
         jump: semi-global penalty of larger changes.
         settings: windows, sources and tolerance; None takes the defaults.
+        chunk: frames at a time.
         told: called with the number of frames done.
     """
     settings = StereoSettings() if settings is None else settings
     kernels = native if log_depth.device.type == "cpu" else matching
     grey, n = frames.grey, len(frames)
-    offsets = torch.linspace(-half_width, half_width, hypotheses, device=log_depth.device)[None]
+    steps = torch.linspace(-half_width, half_width, hypotheses, device=log_depth.device)[None]
     found, matched = [], []
-    parts = torch.arange(n, device=log_depth.device).split(1)
+    count = (sources >= 0).sum(1)
+    parts = torch.arange(n, device=log_depth.device).split(chunk)
     for part in parts:
+        offsets = steps.expand(len(part), -1)
         cost = _cost(frames, part, sources, log_depth[part].exp(), offsets, settings)
         position, _, _ = kernels.best_steps(cost, grey[part], small_step=small_step, jump=jump)
+        position = _undecided(position, hypotheses, count[part] == 0)
         found.append(_log_depth(position, log_depth[part], offsets))
         nearest = position.round().long().clamp(0, hypotheses - 1)
         matched.append(cost.gather(1, nearest[:, None])[:, 0])
         if told is not None:
-            told(1)
+            told(len(part))
     new = torch.cat(found)
     depth = torch.where(frames.mask, new.exp(), 0.0)
     agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
@@ -243,7 +276,7 @@ def sweep_around(
         stereo,
         log_depth=new,
         cost=torch.cat(matched),
-        n_sources=(sources >= 0).sum(1),
+        n_sources=count,
         seen=torch.cat([a.seen for a in agreed]),
         agrees=torch.cat([a.agrees for a in agreed]),
         violates=torch.cat([a.violates for a in agreed]),
@@ -278,16 +311,19 @@ def _log_depth(position: Tensor, log_base: Tensor, offsets: Tensor) -> Tensor:
     return log_base + offsets[:, 0, None, None] + position * step
 
 
+def _undecided(position: Tensor, hypotheses: int, blind: Tensor) -> Tensor:
+    """The middle of the range for frames that nothing speaks for: of equal costs the first would win."""
+    return torch.where(blind[:, None, None], 0.5 * (hypotheses - 1), position)
+
+
 def _prior(
     shading: Tensor,
-    fits: list[ShadingFit],
-    recording: Tensor,
+    scatter: Tensor,
     log_base: Tensor,
     offsets: Tensor,
     settings: StereoSettings,
 ) -> Tensor:
     """Cost of leaving the depth that the brightness predicts, bounded; nothing where there was no fit."""
-    scatter = torch.tensor([fit.scatter for fit in fits], device=shading.device)[recording]
     hypotheses = log_base[:, None] + offsets
     away = (hypotheses[:, :, None, None] - shading[:, None]).abs()
     away = away / (settings.shading_scatters * scatter[:, None, None, None])
