@@ -2,7 +2,7 @@ r"""A small network that completes stereo: depth everywhere, with the error to e
 
 It sees the image, the depth of stereo with what tells how far to trust it, and the depth that brightness
 predicts, all relative to the frame's own median depth; it has no notion of scale. (Sparse points have a
-channel, in which it was shown better ones than triangulation gives; `estimate_depth` leaves it empty.) Its
+channel, which `estimate_depth` leaves empty: it measured no gain.) Its
 log-depth is a mixture, pixel by pixel, of stereo, shading and a value of its own,
 
 .. math:: \log d = \log d_\text{frame} + \sum_k w_k \, \ell_k + r ,
@@ -41,7 +41,7 @@ NORM_GROUPS = 8
 FARTHEST_LOG = 3.0
 """Bound of log-depths relative to the frame's median."""
 
-RGB, STEREO, SHADING, MASK, RAYS = slice(0, 3), 3, 4, 11, slice(12, 14)
+RGB, STEREO, SHADING, MASK, RAYS, POINTS, SOURCES = slice(0, 3), 3, 4, 11, slice(12, 14), slice(15, 17), 17
 """Where these channels lie; the others are listed in `completion_inputs`."""
 
 

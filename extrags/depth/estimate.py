@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,7 +22,14 @@ from extrags.depth.edges import sharpened
 from extrags.depth.frames import PosedFrames, select_sources
 from extrags.depth.monocular import MonocularPredictor, predictions
 from extrags.depth.monocular_network import load_monocular
-from extrags.depth.stereo import StereoDepth, StereoSettings, multi_view_stereo, sweep_around
+from extrags.depth.stereo import (
+    SECOND_SWEEP,
+    THIRD_SWEEP,
+    StereoDepth,
+    StereoSettings,
+    multi_view_stereo,
+    sweep_around,
+)
 from extrags.depth.weights import NONE, load_completion
 from extrags.devices import chosen_device
 from extrags.errors import CaptureError
@@ -51,9 +59,9 @@ STEREO_TRUST_ERRORS = 1.5
 ERROR_FACTOR = 1.25
 """Of the network's expected error, which is so much too small on phantoms; it saw none of them."""
 
-ALONE_ERROR = 0.35
-"""Expected relative error, at least, of a frame that no other could be matched with: the network was never
-shown such frames, and is 25 to 40 % off there while it expects 10 to 15."""
+UNKNOWN_SCALE_ERROR = 0.4
+"""Expected relative error of the scale of a frame that no other could be matched with, in a recording without
+any stereo to fit brightness to."""
 
 STEREO_GAIN = 0.4
 """Share of the network's expected error that agreeing stereo removes."""
@@ -321,29 +329,11 @@ def _completed(
     )
     sources = _sources(sequence, typical, config).to(log_depth.device)
     stereo = sweep_around(
-        frames,
-        sources,
-        stereo,
-        log_depth,
-        half_width=0.2,
-        hypotheses=17,
-        small_step=0.1,
-        jump=0.5,
-        settings=settings,
-        told=told.step,
+        frames, sources, stereo, log_depth, **SECOND_SWEEP, settings=settings, told=told.step
     )
     log_depth, error = _run_network(network, frames, stereo, told)
     stereo = sweep_around(
-        frames,
-        sources,
-        stereo,
-        log_depth,
-        half_width=0.1,
-        hypotheses=13,
-        small_step=0.2,
-        jump=1.0,
-        settings=settings,
-        told=told.step,
+        frames, sources, stereo, log_depth, **THIRD_SWEEP, settings=settings, told=told.step
     )
     agreeing = stereo.agrees * stereo.seen * stereo.n_sources[:, None, None]
     away = (stereo.fused - log_depth) / (STEREO_TRUST_ERRORS * error)
@@ -351,8 +341,23 @@ def _completed(
     weight = weight * torch.exp(-0.5 * away.square())
     mixed = log_depth + weight * (stereo.fused - log_depth)
     expected = ERROR_FACTOR * error * (1 - STEREO_GAIN * weight)
-    alone = (stereo.n_sources == 0)[:, None, None]
-    return mixed, torch.where(alone, expected.clamp_min(ALONE_ERROR), expected), stereo
+    return mixed, torch.hypot(expected, _scale_error(stereo)[:, None, None]), stereo
+
+
+def _scale_error(stereo: StereoDepth) -> Tensor:
+    """Expected relative error of the scale of each frame, [F]; zero where other frames tell it.
+
+    A frame that nothing matches has the mean intercept of its recording's fit of brightness: it is as wrong
+    as the intercepts of the other frames differ.
+    """
+    error = torch.zeros(len(stereo.n_sources))
+    for number, fit in enumerate(stereo.fits):
+        own = torch.nonzero(stereo.recording == number)[:, 0]
+        alone = stereo.n_sources[own] == 0
+        known = math.isfinite(fit.scatter) and int((~alone).sum()) >= 2
+        spread = float(fit.intercepts[~alone].std()) if known else UNKNOWN_SCALE_ERROR
+        error[own[alone]] = min(spread, UNKNOWN_SCALE_ERROR)
+    return error
 
 
 @torch.no_grad()
@@ -360,8 +365,9 @@ def _run_network(
     network: CompletionNetwork, frames: PosedFrames, stereo: StereoDepth, told: _Told
 ) -> tuple[Tensor, Tensor]:
     """Log-depth, and the expected absolute error of it."""
-    # Without sparse points: those of two views are wrong by several percent, which the network, that was
-    # shown better ones, believes too much (AbsRel .046 with them and .037 without on phantom/11).
+    # Without sparse points: those of triangulation are 6 to 7 % off in the mean, which is worse than what
+    # stereo and the network make of the pixels around them (AbsRel .034 with them and .031 without on three
+    # phantoms), and practice with points as wrong as these did not change it.
     inputs = completion_inputs(frames, stereo)
     log_depth, log_error = [], []
     for frame in range(len(frames)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import torch
 from jaxtyping import Float, Int
@@ -17,7 +18,14 @@ from extrags.depth.monocular import MonocularFit, aligned, fit_monocular
 from extrags.depth.prior import DepthPrior
 from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
 
-__all__ = ["StereoDepth", "StereoSettings", "multi_view_stereo", "sweep_around"]
+__all__ = [
+    "SECOND_SWEEP",
+    "THIRD_SWEEP",
+    "StereoDepth",
+    "StereoSettings",
+    "multi_view_stereo",
+    "sweep_around",
+]
 
 SATURATED = 0.97
 """Brightness above which a pixel says nothing about its distance."""
@@ -31,6 +39,22 @@ SURE_AGREEMENT = 1.5
 CHUNK_VALUES = 1 << 26
 """Costs of as many frames as have so many are made at a time on a GPU, which single frames leave idle; with
 what is made on the way that is about 2 GB."""
+
+
+class SweepAround(TypedDict):
+    """How `sweep_around` searches around completed surfaces."""
+
+    half_width: float
+    hypotheses: int
+    small_step: float
+    jump: float
+
+
+SECOND_SWEEP = SweepAround(half_width=0.2, hypotheses=17, small_step=0.1, jump=0.5)
+"""After the first completion, whose result is completed once more; the practice of the network has it too."""
+
+THIRD_SWEEP = SweepAround(half_width=0.1, hypotheses=13, small_step=0.2, jump=1.0)
+"""After the second completion; its result is mixed with it."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +198,9 @@ def multi_view_stereo(
             cost, grey[part], small_step=settings.small_step, jump=settings.jump
         )
         margins.append(margin)
+        unpredicted = ~torch.isfinite(prior.scatter[part]) if prior_weight > 0 else True
+        blind = (count[part] == 0) & unpredicted
+        position = _undecided(position, settings.hypotheses, blind)
         log_depth = _log_depth(position, log_base[part][:, None, None], offsets[part])
         surface = _median(log_depth, frames.mask[part])
         step = offsets[part][:, 1] - offsets[part][:, 0]
@@ -183,6 +210,7 @@ def multi_view_stereo(
         position, _, _ = kernels.best_steps(
             cost, grey[part], small_step=settings.refinement_small_step, jump=settings.refinement_jump
         )
+        position = _undecided(position, finer.shape[1], count[part] == 0)
         found.append(_log_depth(position, surface, finer))
         nearest = position.round().long().clamp(0, finer.shape[1] - 1)
         matched.append(cost.gather(1, nearest[:, None])[:, 0])
@@ -224,6 +252,7 @@ def sweep_around(
     small_step: float,
     jump: float,
     settings: StereoSettings | None = None,
+    chunk: int = 1,
     told: Callable[[int], None] | None = None,
 ) -> StereoDepth:
     """Stereo again in a narrow range around surfaces that are nearly right.
@@ -241,6 +270,7 @@ def sweep_around(
         small_step: semi-global penalty of a change by one hypothesis.
         jump: semi-global penalty of larger changes.
         settings: windows, sources and tolerance; None takes the defaults.
+        chunk: frames at a time.
         told: called with the number of frames done.
     """
     settings = StereoSettings() if settings is None else settings
@@ -253,6 +283,7 @@ def sweep_around(
         around = offsets.expand(len(part), -1)
         cost = _cost(frames, part, sources, log_depth[part].exp(), around, settings)
         position, _, _ = kernels.best_steps(cost, grey[part], small_step=small_step, jump=jump)
+        position = _undecided(position, hypotheses, (sources[part] >= 0).sum(1) == 0)
         found.append(_log_depth(position, log_depth[part], around))
         nearest = position.round().long().clamp(0, hypotheses - 1)
         matched.append(cost.gather(1, nearest[:, None])[:, 0])
@@ -265,7 +296,7 @@ def sweep_around(
         stereo,
         log_depth=new,
         cost=torch.cat(matched),
-        n_sources=(sources >= 0).sum(1),
+        n_sources=count,
         seen=torch.cat([a.seen for a in agreed]),
         agrees=torch.cat([a.agrees for a in agreed]),
         violates=torch.cat([a.violates for a in agreed]),
@@ -319,6 +350,11 @@ def _cost(
 def _log_depth(position: Tensor, log_base: Tensor, offsets: Tensor) -> Tensor:
     step = (offsets[:, 1] - offsets[:, 0])[:, None, None]
     return log_base + offsets[:, 0, None, None] + position * step
+
+
+def _undecided(position: Tensor, hypotheses: int, blind: Tensor) -> Tensor:
+    """The middle of the range for frames that nothing speaks for: of equal costs the first would win."""
+    return torch.where(blind[:, None, None], 0.5 * (hypotheses - 1), position)
 
 
 def _median(log_depth: Tensor, mask: Tensor) -> Tensor:
