@@ -103,7 +103,8 @@ def compressed(images: Float[Tensor, "f 3 h w"], loss: Float[Tensor, "f"]) -> Fl
     restored = basis.T @ (torch.round(transformed / step) * step) @ basis
     value = restored.transpose(3, 4).flatten(4, 5).flatten(2, 3)[:, :, :height, :width]
     result = torch.einsum("ij,fjhw->fihw", torch.linalg.inv(colours), value)
-    return torch.where(loss[:, None, None, None] > 0, result, images)
+    chosen: Tensor = torch.where(loss[:, None, None, None] > 0, result, images)
+    return chosen
 
 
 def _shaken(images: Tensor, shift_px: Tensor) -> Tensor:
