@@ -120,7 +120,10 @@ def _shaken(images: Tensor, shift_px: Tensor) -> Tensor:
         grid = functional.affine_grid(placed, list(flat.shape), align_corners=False)
         total += functional.grid_sample(flat, grid, padding_mode="border", align_corners=False)
     moved = shift.abs().sum(1) > 0
-    return torch.where(moved[:, None, None, None], total / SHAKE_TAPS, flat).unflatten(0, images.shape[:2])
+    result: Tensor = torch.where(moved[:, None, None, None], total / SHAKE_TAPS, flat).unflatten(
+        0, images.shape[:2]
+    )
+    return result
 
 
 def _blur(images: Tensor, sigma: Tensor) -> Tensor:
