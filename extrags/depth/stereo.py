@@ -278,12 +278,13 @@ def sweep_around(
     grey = frames.grey
     offsets = torch.linspace(-half_width, half_width, hypotheses, device=log_depth.device)[None]
     found, matched = [], []
-    parts = _parts(frames, hypotheses, None)
+    count = (sources >= 0).sum(1)
+    parts = _parts(frames, hypotheses, chunk)
     for part in parts:
         around = offsets.expand(len(part), -1)
         cost = _cost(frames, part, sources, log_depth[part].exp(), around, settings)
         position, _, _ = kernels.best_steps(cost, grey[part], small_step=small_step, jump=jump)
-        position = _undecided(position, hypotheses, (sources[part] >= 0).sum(1) == 0)
+        position = _undecided(position, hypotheses, count[part] == 0)
         found.append(_log_depth(position, log_depth[part], around))
         nearest = position.round().long().clamp(0, hypotheses - 1)
         matched.append(cost.gather(1, nearest[:, None])[:, 0])

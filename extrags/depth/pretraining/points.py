@@ -75,7 +75,8 @@ def triangulated_points(clips: Clips, scene: Cavities) -> Float[Tensor, "f h w"]
         found &= (scene.uniform(0.0, 1.0, n, MOST_PER_FRAME) < DETECTED) | (step == 0)
         rows = seeing[:, None].expand_as(index)
         result[rows[found], index[found]] = local[:, 2][found]
-    return result.unflatten(1, (height, width))
+    images: Tensor = result.unflatten(1, (height, width))
+    return images
 
 
 def _change(grey: Tensor) -> Tensor:

@@ -103,7 +103,8 @@ def compressed(images: Float[Tensor, "f 3 h w"], loss: Float[Tensor, "f"]) -> Fl
     restored = basis.T @ (torch.round(transformed / step) * step) @ basis
     value = restored.transpose(3, 4).flatten(4, 5).flatten(2, 3)[:, :, :height, :width]
     result = torch.einsum("ij,fjhw->fihw", torch.linalg.inv(colours), value)
-    return torch.where(loss[:, None, None, None] > 0, result, images)
+    chosen: Tensor = torch.where(loss[:, None, None, None] > 0, result, images)
+    return chosen
 
 
 def _shaken(images: Tensor, shift_px: Tensor) -> Tensor:
@@ -119,7 +120,10 @@ def _shaken(images: Tensor, shift_px: Tensor) -> Tensor:
         grid = functional.affine_grid(placed, list(flat.shape), align_corners=False)
         total += functional.grid_sample(flat, grid, padding_mode="border", align_corners=False)
     moved = shift.abs().sum(1) > 0
-    return torch.where(moved[:, None, None, None], total / SHAKE_TAPS, flat).unflatten(0, images.shape[:2])
+    result: Tensor = torch.where(moved[:, None, None, None], total / SHAKE_TAPS, flat).unflatten(
+        0, images.shape[:2]
+    )
+    return result
 
 
 def _blur(images: Tensor, sigma: Tensor) -> Tensor:

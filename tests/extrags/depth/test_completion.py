@@ -107,7 +107,7 @@ def test_bundled_weights_complete_unseen_cavities() -> None:
 
 
 def test_single_frames_are_told_to_be_as_wrong_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Weights that never practised single frames are .31 off here, and expect a third of that."""
+    """Weights that never practised single frames are .31 off here and expect .12."""
     monkeypatch.setattr(practice, "SINGLE_SHARE", 1.0)
     network = load_completion("bundled")
     assert network is not None

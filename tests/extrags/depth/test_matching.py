@@ -200,3 +200,12 @@ def test_sources_lie_on_both_sides_and_share_the_view() -> None:
     assert (chosen[8] == -1).all()
     still = np.repeat(poses[:1], 4, axis=0)
     assert (select_sources(still, K[:4], frames.size, np.full(4, 2.0), 2) == -1).all()
+
+
+def test_a_frame_without_sources_matches_nothing_with_both() -> None:
+    frames, _ = tilted_plane()
+    case = _case() | {"sources": torch.tensor([[1, 3], [-1, -1]])}
+    for kernels in (matching, native):
+        cost = kernels.matching_cost(frames, **case)
+        assert (cost[1] == 1).all()
+        assert cost[0].std() > 0.1
