@@ -252,7 +252,7 @@ def sweep_around(
     small_step: float,
     jump: float,
     settings: StereoSettings | None = None,
-    chunk: int = 1,
+    chunk: int | None = None,
     told: Callable[[int], None] | None = None,
 ) -> StereoDepth:
     """Stereo again in a narrow range around surfaces that are nearly right.
@@ -270,7 +270,7 @@ def sweep_around(
         small_step: semi-global penalty of a change by one hypothesis.
         jump: semi-global penalty of larger changes.
         settings: windows, sources and tolerance; None takes the defaults.
-        chunk: frames at a time.
+        chunk: as `multi_view_stereo`.
         told: called with the number of frames done.
     """
     settings = StereoSettings() if settings is None else settings
