@@ -14,7 +14,7 @@ from typing import Any
 
 from extrags.errors import DamagedArtefactError, StoreError
 from extrags.store.canonical import Ref
-from extrags.store.integrity import Damage, Depth, find_damage
+from extrags.store.integrity import Damage, Depth, find_damage, intact_manifest
 from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
 
 __all__ = ["DAMAGED", "RECORD", "DirectoryBackend", "private_directory", "sweep_directories"]
@@ -146,7 +146,7 @@ class DirectoryBackend:
                 scratch.rename(target)
                 return manifest
             except OSError:
-                present = self._intact(manifest.key)
+                present = intact_manifest(self, manifest.key)
                 if present is not None and present.digest == manifest.digest:
                     return present
                 if not target.exists():
@@ -155,14 +155,6 @@ class DirectoryBackend:
                 # the key is merely absent, which is a cache miss and never a half-written artefact.
                 self.discard(manifest.key)
         raise StoreError(f"artefact {manifest.key} is being replaced by others again and again")
-
-    def _intact(self, key: str) -> Manifest | None:
-        """Manifest of an artefact whose files are all as they were stored, or None."""
-        try:
-            present = self.read_manifest(key)
-        except DamagedArtefactError:
-            return None
-        return None if present is None or self.examine(present) is not None else present
 
     def discard(self, key: str) -> bool:
         """Remove an artefact: it is first renamed, so that it disappears atomically, then deleted."""

@@ -14,9 +14,9 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, DamagedArtefactError
 from extrags.store.canonical import DIGEST_BYTES
 from extrags.store.manifest import MANIFEST, Manifest
 
@@ -29,6 +29,7 @@ __all__ = [
     "default_depth",
     "find_damage",
     "find_damaged_sizes",
+    "intact_manifest",
     "write_checksums",
 ]
 
@@ -131,6 +132,26 @@ def find_damage(directory: Path, manifest: Manifest, depth: Depth) -> Damage | N
             if changed:
                 return Damage("its content has changed since it was stored", name)
     return None
+
+
+@runtime_checkable
+class Examinable(Protocol):
+    """Where artefacts lie, as far as their state can be asked for."""
+
+    def read_manifest(self, key: str) -> Manifest | None:
+        """Manifest of an artefact, None where there is none; raises for a damaged one."""
+
+    def examine(self, manifest: Manifest) -> Damage | None:
+        """What is wrong with an artefact's files."""
+
+
+def intact_manifest(backend: Examinable, key: str) -> Manifest | None:
+    """Manifest of an artefact whose files are all as they were stored, or None."""
+    try:
+        present = backend.read_manifest(key)
+    except DamagedArtefactError:
+        return None
+    return None if present is None or backend.examine(present) is not None else present
 
 
 def find_damaged_sizes(sizes: Mapping[str, int], manifest: Manifest) -> Damage | None:

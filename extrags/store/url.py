@@ -21,7 +21,7 @@ from extrags.data_directories import cache_directory
 from extrags.errors import DamagedArtefactError, MissingDependencyError, StoreError
 from extrags.store.canonical import Ref, digest_of
 from extrags.store.directory import DAMAGED, RECORD, private_directory, sweep_directories
-from extrags.store.integrity import Damage, find_damage, find_damaged_sizes
+from extrags.store.integrity import Damage, find_damage, find_damaged_sizes, intact_manifest
 from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
 
 __all__ = ["UrlBackend", "default_cache_directory"]
@@ -203,17 +203,9 @@ class UrlBackend:
                 self.fs.get_file(name, str(scratch / relative))
             yield scratch
 
-    def _intact(self, key: str) -> Manifest | None:
-        """Manifest of an artefact whose files are all as they were stored, or None."""
-        try:
-            present = self.read_manifest(key)
-        except DamagedArtefactError:
-            return None
-        return None if present is None or self.examine(present) is not None else present
-
     def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
         """Upload the files, then the manifest."""
-        present = self._intact(manifest.key)
+        present = intact_manifest(self, manifest.key)
         if present is not None and present.digest == manifest.digest:
             return present
         attempt = secrets.token_hex(8)
