@@ -38,7 +38,8 @@ training frames, `training` the training frames alone, with that depth where it 
 `waves` the state of the exploration, `restorer` the restorer prepared for this scene, `judgement` how much of
 the fine-tuning is kept."""
 
-StageState = Literal["ran", "cached", "skipped", "failed"]
+StageState = Literal["ran", "cached", "skipped", "failed", "interrupted"]
+"""How a stage ended. An interrupted one is announced, never returned: the run ends with it."""
 
 
 @dataclass

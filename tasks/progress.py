@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ from dataclasses import dataclass
 
 from extrags.events import Event, MetricRecorded, Progress, subscribed
 
-__all__ = ["Observer", "StageProgress", "notify", "observed", "reporting"]
+__all__ = ["Observer", "StageProgress", "interrupt_stages", "notify", "observed", "reporting"]
 
 log = logging.getLogger("extrags.progress")
 
@@ -26,7 +27,7 @@ class StageProgress:
     """Name of the sequence."""
     stage: str
     state: str
-    """`running`, or how it ended: `ran`, `cached`, `skipped`, `failed`."""
+    """`running`, or how it ended: `ran`, `cached`, `skipped`, `failed`, `interrupted`."""
     done: int = 0
     total: int = 0
     detail: str = ""
@@ -36,6 +37,7 @@ class StageProgress:
 
 Observer = Callable[[StageProgress], None]
 
+_interrupted = threading.Event()
 _observer: ContextVar[Observer | None] = ContextVar("extrags_stage_observer", default=None)
 
 
@@ -52,8 +54,15 @@ def observed(observer: Observer) -> Iterator[None]:
         _observer.reset(token)
 
 
+def interrupt_stages() -> None:
+    """Make every stage of this process end by KeyboardInterrupt at its next event, and say nothing more."""
+    _interrupted.set()
+
+
 def notify(progress: StageProgress) -> None:
-    """Send progress to the observer; without one it is logged."""
+    """Send progress to the observer; without one it is logged. Nothing is said after an interruption."""
+    if _interrupted.is_set():
+        return
     observer = _observer.get()
     if observer is not None:
         observer(progress)
@@ -75,6 +84,9 @@ def reporting(label: str, stage: str) -> Iterator[None]:
 
     def receive(event: Event) -> None:
         nonlocal quiet_until
+        if _interrupted.is_set():
+            # The thread of a stage can only end itself.
+            raise KeyboardInterrupt
         if _observer.get() is None:
             # Loops may emit thousands of events; the log gets only some of them.
             now = time.monotonic()

@@ -75,12 +75,13 @@ def benchmark(given: argparse.Namespace) -> int:
     from flows.benchmark import check_methods
     from flows.console import progress_bars
     from flows.settings import task_runner
+    from flows.temporary_server import temporary_server
 
     # Prefect would say the same in a page of its own words.
     check_methods(methods, variants, given.baseline)
     for profile in profiles:
         profile_config(profile)
-    with without_heartbeat(), progress_bars(terminal=terminal):
+    with temporary_server(), without_heartbeat(), progress_bars(terminal=terminal):
         found = flow.with_options(task_runner=task_runner(given.runner))(
             sequences=given.sequences,
             profiles=profiles,

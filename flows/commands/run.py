@@ -95,6 +95,7 @@ def execute(
     from extrags.store import Store
     from flows.environment import prepare, without_heartbeat
     from flows.methods import METHODS
+    from flows.temporary_server import temporary_server
 
     terminal = sys.stderr.isatty()
     set_up_logging(debug=given.debug, terminal=terminal)
@@ -113,7 +114,7 @@ def execute(
     from flows.console import progress_bars
     from flows.dataset import reconstruct_dataset
 
-    with without_heartbeat(), progress_bars(terminal=terminal):
+    with temporary_server(), without_heartbeat(), progress_bars(terminal=terminal):
         outcome: DatasetOutcome = reconstruct_dataset(
             sequences=sequences,
             profile=given.profile,
