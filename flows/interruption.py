@@ -67,7 +67,9 @@ class _Interruption:
             if self.signal is not None:
                 return
             self.signal = number
-            print(f"extrags: {INTERRUPTED}", file=sys.stderr, flush=True)
+            # In one piece: other threads may log at the same time.
+            sys.stderr.write(f"extrags: {INTERRUPTED}\n")
+            sys.stderr.flush()
             # What follows from the interruption is no news.
             logging.disable(logging.CRITICAL)
             progress = sys.modules.get("tasks.progress")
