@@ -21,7 +21,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -116,11 +116,9 @@ def _end_children() -> None:
     living = _descendants(os.getpid())
     for number in (signal.SIGTERM, signal.SIGKILL):
         for process in living:
-            try:
+            # It may have ended by itself.
+            with suppress(ProcessLookupError):
                 os.kill(process, number)
-            except ProcessLookupError:
-                # It has ended by itself.
-                pass
         end = time.monotonic() + CHILDREN_SECONDS
         while (living := [process for process in living if _is_running(process)]) and time.monotonic() < end:
             time.sleep(0.02)

@@ -10,9 +10,18 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
+from extrags.errors import ExtragsError
 from extrags.events import Event, MetricRecorded, Progress, subscribed
 
-__all__ = ["Observer", "StageProgress", "interrupt_stages", "notify", "observed", "reporting"]
+__all__ = [
+    "Observer",
+    "StageProgress",
+    "TimeLimitError",
+    "interrupt_stages",
+    "notify",
+    "observed",
+    "reporting",
+]
 
 log = logging.getLogger("extrags.progress")
 
@@ -36,6 +45,11 @@ class StageProgress:
 
 
 Observer = Callable[[StageProgress], None]
+
+
+class TimeLimitError(ExtragsError, TimeoutError):
+    """A stage took longer than it may."""
+
 
 _interrupted = threading.Event()
 _observer: ContextVar[Observer | None] = ContextVar("extrags_stage_observer", default=None)
@@ -78,8 +92,19 @@ def notify(progress: StageProgress) -> None:
 
 
 @contextmanager
-def reporting(label: str, stage: str) -> Iterator[None]:
-    """Convert events of the library inside the block into progress of one stage."""
+def reporting(label: str, stage: str, time_limit_s: float | None = None) -> Iterator[None]:
+    """Convert events of the library inside the block into progress of one stage.
+
+    Args:
+        label: name of the sequence.
+        stage: name of the stage.
+        time_limit_s: how long the block may take. It is looked at with each event, because the thread of a
+            stage can only end itself: a stage that emits none is not ended.
+
+    Raises:
+        TimeLimitError: from inside the block, at the first event after the limit.
+    """
+    begun = time.monotonic()
     quiet_until = 0.0
 
     def receive(event: Event) -> None:
@@ -87,6 +112,11 @@ def reporting(label: str, stage: str) -> Iterator[None]:
         if _interrupted.is_set():
             # The thread of a stage can only end itself.
             raise KeyboardInterrupt
+        taken_s = time.monotonic() - begun
+        if time_limit_s is not None and taken_s > time_limit_s:
+            raise TimeLimitError(
+                f"{stage} of {label} took {taken_s:.1f} s; a stage may take {time_limit_s:g} s (time_limit_s)"
+            )
         if _observer.get() is None:
             # Loops may emit thousands of events; the log gets only some of them.
             now = time.monotonic()
