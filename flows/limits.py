@@ -66,7 +66,7 @@ class StageLimits(BaseModel):
         """The same task, tried again after errors that can pass."""
         return task.with_options(
             retries=self.retries,
-            retry_delay_seconds=self.delays_s() or None,
+            retry_delay_seconds=self.delays_s() or 0,
             # Runs that met the same outage do not all come back at once.
             retry_jitter_factor=0.5,
             retry_condition_fn=_is_tried_again,

@@ -116,9 +116,10 @@ class PrefectRunner:
 
     def _submit(self, call: Call, label: str) -> PrefectFuture[Ref]:
         task = at(self.limits.applied_to(call.task), self.store, refresh=self.refresh)
-        return task.submit(
+        future: PrefectFuture[Ref] = task.submit(
             store=self.store, label=label, time_limit_s=self.limits.time_limit_s, **call.inputs
         )
+        return future
 
 
 @dataclass(frozen=True)
