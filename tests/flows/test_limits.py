@@ -10,7 +10,8 @@ from typing import Any
 import httpx
 import pytest
 from prefect import flow
-from prefect.states import Completed, Pending, State
+from prefect.client.schemas.objects import State
+from prefect.states import Completed, Pending
 
 from extrags.errors import (
     CaptureError,
@@ -178,12 +179,16 @@ def test_a_task_of_a_lost_worker_is_submitted_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, losses: int, submitted: int
 ) -> None:
     store = str(tmp_path / "store")
-    lost = type("Lost", (_Lost,), {"losses": losses})
-    monkeypatch.setattr(PrefectRunner, "_submit", lambda self, call, label: lost(store))
+
+    class Lost(_Lost):
+        pass
+
+    Lost.losses = losses
+    monkeypatch.setattr(PrefectRunner, "_submit", lambda self, call, label: Lost(store))
     runner = PrefectRunner(store, limits=AT_ONCE)
     if losses == 2:
         assert [result.state for result in runner.run([Call(source, {"seed": 1})], "toy")] == ["ran"]
     else:
         with pytest.raises(WorkerLostError, match="toy-source was lost"):
             runner.run([Call(source, {"seed": 1})], "toy")
-    assert lost.submitted == submitted
+    assert Lost.submitted == submitted
