@@ -13,10 +13,11 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from flows.commands.options import Parser
+from flows.interruption import interruptible
 
 __all__ = ["main", "parser"]
 
-OK, FAILED, USAGE, INTERRUPTED = 0, 1, 2, 130
+OK, FAILED, USAGE = 0, 1, 2
 
 VERBS = {
     "run": "take sequences through all stages",
@@ -46,7 +47,7 @@ EXAMPLES = """examples:
   extrags cache rm 'explore*'
 
 A sequence is DATASET/SEQUENCE[@SETTING] (see `extrags data list`) or the path of a folder or a video.
-Exit codes: 0 all well, 1 a sequence failed, 2 wrong usage."""
+Exit codes: 0 all well, 1 a sequence failed, 2 wrong usage, 130 interrupted, 143 terminated."""
 
 
 def parser(verb: str | None = None) -> Parser:
@@ -72,13 +73,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Expected errors (`ExtragsError`) are printed to standard error as their message, with a hint if there is
     one, other errors with their type and message. `--debug` shows tracebacks.
+
+    Args:
+        arguments: those of the process by default; Ctrl-C and SIGTERM then end it with one sentence
+            (`flows.interruption`).
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments is None:
+        # Signals belong to the process: they are handled where the command is the whole process.
+        with interruptible():
+            return main(sys.argv[1:])
     try:
         return _run(arguments)
-    except KeyboardInterrupt:
-        print("extrags: interrupted; what is finished stays in the store", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:
         # `extrags cache ls | head`: nothing is wrong.
         sys.stderr.close()

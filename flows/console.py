@@ -26,7 +26,13 @@ from tasks.progress import StageProgress, observed
 
 __all__ = ["print_outcomes", "print_plan", "progress_bars"]
 
-_MARKS = {"ran": "[green]✓[/]", "cached": "[cyan]=[/]", "skipped": "[dim]-[/]", "failed": "[red]✗[/]"}
+_MARKS = {
+    "ran": "[green]✓[/]",
+    "cached": "[cyan]=[/]",
+    "skipped": "[dim]-[/]",
+    "failed": "[red]✗[/]",
+    "interrupted": "[red]✗[/]",
+}
 
 
 @contextmanager

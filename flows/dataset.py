@@ -16,8 +16,9 @@ from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
 from flows.damage import again_after_damage
+from flows.limits import StageLimits
 from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
-from flows.outcome import DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
+from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
 from flows.preflight import preflight
 from flows.runners import PrefectRunner
@@ -28,6 +29,9 @@ from flows.tables import dataset_markdown
 __all__ = ["reconstruct_dataset"]
 
 log = logging.getLogger(__name__)
+
+MAX_FAILED_SHARE = 0.5
+"""When most sequences fail, it is hardly the sequences' fault."""
 
 
 @flow(name="reconstruct-dataset", flow_run_name="{name}", log_prints=False, persist_result=False)
@@ -45,11 +49,19 @@ def reconstruct_dataset(
     method: Annotated[
         MethodName, Field(description="the whole pipeline, or one it is compared with")
     ] = "extrags",
+    limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = StageLimits(),  # noqa: B008
+    max_failed_share: Annotated[
+        float, Field(ge=0, le=1, description="the run counts as failed when more of its sequences failed")
+    ] = MAX_FAILED_SHARE,
 ) -> DatasetOutcome:
     """Take every sequence through all stages, each as a flow run of its own.
 
     Returns:
         One outcome per sequence, in the order given; failures among them. The summary is an artifact.
+
+    Raises:
+        DatasetFailedError: when more than `max_failed_share` of the sequences failed; table and page have
+            been written by then.
     """
     # Invalid settings, missing models and a read-only store affect all sequences: report them once.
     check_not_pinned(method, settings or {})
@@ -68,6 +80,7 @@ def reconstruct_dataset(
             refresh=refresh,
             until=until,
             method=method,
+            limits=limits,
             return_state=True,
         )
         return outcome_of(sequence, state)
@@ -83,7 +96,7 @@ def reconstruct_dataset(
         page = None
         if until == "report":
             label = profile_label(profile, method)
-            page = dataset_page(outcomes, name, label, PrefectRunner(store, refresh))
+            page = dataset_page(outcomes, name, label, PrefectRunner(store, refresh, limits))
         return DatasetOutcome(outcomes, page)
 
     found = again_after_damage(Store(store), run_all)
@@ -92,6 +105,8 @@ def reconstruct_dataset(
         key=artifact_key("dataset", name),
         description=f"{len(sequences)} sequences, profile {profile}",
     )
+    if found.failed_share > max_failed_share:
+        raise DatasetFailedError(found, max_failed_share)
     return found
 
 

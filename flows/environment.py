@@ -28,8 +28,8 @@ def prepare(state: Path, *, debug: bool = False) -> None:
     """
     chosen = {
         "OMP_WAIT_POLICY": "passive",
-        # Without an API URL Prefect starts a temporary server for the run. Its default start-up timeout of
-        # 20 s is too short on a busy machine.
+        # Without an API URL the run gets a temporary server (`flows.temporary_server`). Prefect's start-up
+        # timeout of 20 s is too short on a busy machine.
         "PREFECT_SERVER_EPHEMERAL_ENABLED": "true",
         "PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS": "90",
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",

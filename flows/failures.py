@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from extrags.errors import ExtragsError
 
-__all__ = ["describe_error"]
+__all__ = ["describe_error", "is_connection_error"]
 
 SEE_TRACEBACK = "run again with --debug for the traceback"
 
@@ -23,7 +23,7 @@ def describe_error(error: BaseException) -> list[str]:
         if isinstance(cause, ExtragsError):
             return [_line(str(cause)), *getattr(cause, "__notes__", [])]
     for cause in _causes(error):
-        if _is_connection_error(cause):
+        if is_connection_error(cause):
             return [f"a server went away or was never there: {_named(cause)}", _server_hint()]
     return [_named(error), SEE_TRACEBACK]
 
@@ -42,9 +42,15 @@ def _line(text: str) -> str:
     return " ".join(text.split())
 
 
-def _is_connection_error(error: BaseException) -> bool:
+def is_connection_error(error: BaseException) -> bool:
+    """Whether a connection was lost or refused: to Prefect's server, a Dask scheduler or an object store."""
     # Look up the modules instead of importing them: if one is not loaded, the error cannot come from it.
-    kinds = [("httpx", "TransportError"), ("distributed.comm.core", "CommClosedError")]
+    kinds = [
+        ("httpx", "TransportError"),
+        ("distributed.comm.core", "CommClosedError"),
+        ("botocore.exceptions", "ConnectionError"),
+        ("botocore.exceptions", "HTTPClientError"),
+    ]
     loaded = [getattr(sys.modules[module], name) for module, name in kinds if module in sys.modules]
     return isinstance(error, (ConnectionError, *loaded))
 

@@ -8,7 +8,15 @@ from typing import Any, Literal
 from extrags.errors import ExtragsError
 from extrags.store import Ref
 
-__all__ = ["DatasetOutcome", "Part", "SequenceFailedError", "SequenceOutcome", "StageRow", "StageState"]
+__all__ = [
+    "DatasetFailedError",
+    "DatasetOutcome",
+    "Part",
+    "SequenceFailedError",
+    "SequenceOutcome",
+    "StageRow",
+    "StageState",
+]
 
 Part = Literal[
     "ingest",
@@ -38,7 +46,8 @@ training frames, `training` the training frames alone, with that depth where it 
 `waves` the state of the exploration, `restorer` the restorer prepared for this scene, `judgement` how much of
 the fine-tuning is kept."""
 
-StageState = Literal["ran", "cached", "skipped", "failed"]
+StageState = Literal["ran", "cached", "skipped", "failed", "interrupted"]
+"""How a stage ended. An interrupted one is announced, never returned: the run ends with it."""
 
 
 @dataclass
@@ -136,6 +145,12 @@ class DatasetOutcome:
     report: str | None = None
     """Where the page that compares them stands."""
 
+    @property
+    def failed_share(self) -> float:
+        """Share of the sequences that failed, 0 to 1."""
+        failed = sum(outcome.status == "failed" for outcome in self.sequences)
+        return failed / len(self.sequences) if self.sequences else 0.0
+
     def to_json(self, seconds: float) -> dict[str, Any]:
         """A JSON object; keys as in docs/command_line.md."""
         return {
@@ -153,3 +168,20 @@ class SequenceFailedError(ExtragsError, RuntimeError):
         failed = next((row for row in outcome.stages if row.state == "failed"), None)
         where = "" if failed is None else f" in {failed.stage}: {failed.reason}"
         super().__init__(f"{outcome.name} failed{where}")
+
+
+class DatasetFailedError(ExtragsError, RuntimeError):
+    """Too many sequences failed; `outcome` holds them all.
+
+    Args:
+        outcome: of the whole run.
+        max_failed_share: the share of its sequences that might fail.
+    """
+
+    def __init__(self, outcome: DatasetOutcome, max_failed_share: float) -> None:
+        self.outcome = outcome
+        failed = [str(SequenceFailedError(item)) for item in outcome.sequences if item.status == "failed"]
+        super().__init__(
+            f"{len(failed)} of {len(outcome.sequences)} sequences failed, more than the share of "
+            f"{max_failed_share:g} that may (max_failed_share): {'; '.join(failed)}"
+        )

@@ -7,14 +7,18 @@ artefacts exist.
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from prefect import Task
+from prefect.futures import PrefectFuture
 
 from extrags.errors import ExtragsError
 from extrags.store import Ref, Store
+from flows.limits import StageLimits
 from tasks.stage import at, stage_key
 
 __all__ = [
@@ -27,6 +31,8 @@ __all__ = [
     "StoreRunner",
     "WorkerLostError",
 ]
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -76,23 +82,28 @@ class PrefectRunner:
     Args:
         store: root of the store.
         refresh: run stages although their artefacts are there.
+        limits: retries and time limits of each task.
     """
 
     store: str
     refresh: bool = False
+    limits: StageLimits = field(default_factory=StageLimits)
 
     def run(self, calls: Sequence[Call], label: str) -> list[Result]:
-        """Submit all, wait for all."""
-        futures = [
-            at(call.task, self.store, refresh=self.refresh).submit(
-                store=self.store, label=label, **call.inputs
-            )
-            for call in calls
-        ]
+        """Submit all, wait for all; a task whose worker was lost is submitted again."""
+        futures = [self._submit(call, label) for call in calls]
         for future in futures:
             future.wait()
         results = []
-        for call, future in zip(calls, futures, strict=True):
+        for call, submitted in zip(calls, futures, strict=True):
+            future = submitted
+            for delay_s in self.limits.delays_s():
+                if future.state.is_final():
+                    break
+                log.warning("%s %s: submitted again, since its worker was lost", call.task.name, label)
+                time.sleep(delay_s)
+                future = self._submit(call, label)
+                future.wait()
             state = future.state
             if not state.is_final():
                 # Dask retries a task whose worker died and leaves Prefect's state as it was (#21638).
@@ -102,6 +113,13 @@ class PrefectRunner:
             ref = state.result()
             results.append(Result(ref, "cached" if state.name == "Cached" else "ran"))
         return results
+
+    def _submit(self, call: Call, label: str) -> PrefectFuture[Ref]:
+        task = at(self.limits.applied_to(call.task), self.store, refresh=self.refresh)
+        future: PrefectFuture[Ref] = task.submit(
+            store=self.store, label=label, time_limit_s=self.limits.time_limit_s, **call.inputs
+        )
+        return future
 
 
 @dataclass(frozen=True)

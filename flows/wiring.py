@@ -448,6 +448,9 @@ class SequenceRun(Pipeline):
             row.reason = str(error) if isinstance(error, ExtragsError) else f"{type(error).__name__}: {error}"
             self.outcome.error = error
             raise _StoppedError from error
+        except BaseException:
+            row.state = "interrupted"
+            raise
         finally:
             row.seconds += time.monotonic() - begun
             self._report_progress(row, row.state)

@@ -3,15 +3,25 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 
+from extrags.errors import ExtragsError
 from extrags.events import Event, MetricRecorded, Progress, subscribed
 
-__all__ = ["Observer", "StageProgress", "notify", "observed", "reporting"]
+__all__ = [
+    "Observer",
+    "StageProgress",
+    "TimeLimitError",
+    "interrupt_stages",
+    "notify",
+    "observed",
+    "reporting",
+]
 
 log = logging.getLogger("extrags.progress")
 
@@ -26,7 +36,7 @@ class StageProgress:
     """Name of the sequence."""
     stage: str
     state: str
-    """`running`, or how it ended: `ran`, `cached`, `skipped`, `failed`."""
+    """`running`, or how it ended: `ran`, `cached`, `skipped`, `failed`, `interrupted`."""
     done: int = 0
     total: int = 0
     detail: str = ""
@@ -36,6 +46,12 @@ class StageProgress:
 
 Observer = Callable[[StageProgress], None]
 
+
+class TimeLimitError(ExtragsError, TimeoutError):
+    """A stage took longer than it may."""
+
+
+_interrupted = threading.Event()
 _observer: ContextVar[Observer | None] = ContextVar("extrags_stage_observer", default=None)
 
 
@@ -52,8 +68,15 @@ def observed(observer: Observer) -> Iterator[None]:
         _observer.reset(token)
 
 
+def interrupt_stages() -> None:
+    """Make every stage of this process end by KeyboardInterrupt at its next event, and say nothing more."""
+    _interrupted.set()
+
+
 def notify(progress: StageProgress) -> None:
-    """Send progress to the observer; without one it is logged."""
+    """Send progress to the observer; without one it is logged. Nothing is said after an interruption."""
+    if _interrupted.is_set():
+        return
     observer = _observer.get()
     if observer is not None:
         observer(progress)
@@ -69,12 +92,31 @@ def notify(progress: StageProgress) -> None:
 
 
 @contextmanager
-def reporting(label: str, stage: str) -> Iterator[None]:
-    """Convert events of the library inside the block into progress of one stage."""
+def reporting(label: str, stage: str, time_limit_s: float | None = None) -> Iterator[None]:
+    """Convert events of the library inside the block into progress of one stage.
+
+    Args:
+        label: name of the sequence.
+        stage: name of the stage.
+        time_limit_s: how long the block may take. It is looked at with each event, because the thread of a
+            stage can only end itself: a stage that emits none is not ended.
+
+    Raises:
+        TimeLimitError: from inside the block, at the first event after the limit.
+    """
+    begun = time.monotonic()
     quiet_until = 0.0
 
     def receive(event: Event) -> None:
         nonlocal quiet_until
+        if _interrupted.is_set():
+            # The thread of a stage can only end itself.
+            raise KeyboardInterrupt
+        taken_s = time.monotonic() - begun
+        if time_limit_s is not None and taken_s > time_limit_s:
+            raise TimeLimitError(
+                f"{stage} of {label} took {taken_s:.1f} s; a stage may take {time_limit_s:g} s (time_limit_s)"
+            )
         if _observer.get() is None:
             # Loops may emit thousands of events; the log gets only some of them.
             now = time.monotonic()

@@ -39,8 +39,8 @@ __all__ = ["ArtefactRecords", "StageKey", "at", "stage", "stage_key", "stage_ver
 
 P = ParamSpec("P")
 
-NOT_IN_KEY = frozenset({"store", "label"})
-"""Parameters of every stage that do not affect the content of its artefact: store and display name."""
+NOT_IN_KEY = frozenset({"store", "label", "time_limit_s"})
+"""Parameters of every stage that do not affect the content of its artefact: store, display name, limit."""
 
 _versions: dict[str, int] = {}
 
@@ -122,8 +122,9 @@ def stage(
 
     Returns:
         A decorator. Its task takes the function's arguments by name, and in addition `store` (root of the
-        store) and `label` (display name of the sequence); it returns a `Ref`. Arguments must be refs,
-        settings or plain values, since their canonical form is the key.
+        store), `label` (display name of the sequence) and `time_limit_s` (see `tasks.progress.reporting`);
+        it returns a `Ref`. Arguments must be refs, settings or plain values, since their canonical form is
+        the key.
 
     Raises:
         ConfigError: when two stages share a name.
@@ -135,7 +136,7 @@ def stage(
         key_of = StageKey(name=name, version=version, ignore=ignore)
 
         @functools.wraps(body)
-        def run(*, store: str, label: str = "", **inputs: Any) -> Ref:
+        def run(*, store: str, label: str = "", time_limit_s: float | None = None, **inputs: Any) -> Ref:
             where = Store(store)
             bound = signature.bind(**inputs)
             bound.apply_defaults()
@@ -146,7 +147,7 @@ def stage(
                 return found
             refs, settings = _split({name: value for name, value in inputs.items() if name not in ignore})
             with (
-                reporting(label, name),
+                reporting(label, name, time_limit_s),
                 where.slot(
                     stage=name, version=version, key=key, label=label, config=settings, inputs=refs
                 ) as slot,
@@ -162,6 +163,9 @@ def stage(
         given = [
             inspect.Parameter("store", inspect.Parameter.KEYWORD_ONLY, annotation=str),
             inspect.Parameter("label", inspect.Parameter.KEYWORD_ONLY, annotation=str, default=""),
+            inspect.Parameter(
+                "time_limit_s", inspect.Parameter.KEYWORD_ONLY, annotation=float | None, default=None
+            ),
         ]
         run.__signature__ = inspect.Signature([*own, *given], return_annotation=Ref)  # type: ignore[attr-defined]
         return Task(

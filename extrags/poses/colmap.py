@@ -27,7 +27,7 @@ from extrags.poses.features import (
     world_from_camera,
     write_images,
 )
-from extrags.poses.job import PoseJob, PoseJobResult, reserve_stdout
+from extrags.poses.job import PoseJob, PoseJobResult, end_with_parent, reserve_stdout
 from extrags.poses.pairs import Pair, registration_pairs, training_pairs
 from extrags.poses.self_calibration import largest_model, map_with_unknown_lens, model_sizes
 
@@ -275,6 +275,7 @@ def _camera(pycolmap: Any, lens: Lens) -> Any:
 
 
 def _main() -> None:
+    end_with_parent()
     reserve_stdout()
     folder = Path(sys.argv[1])
     run_colmap(folder, PoseJob.load(folder)).save(folder)

@@ -23,7 +23,7 @@ from extrags.poses.features import (
     read_model,
     write_images,
 )
-from extrags.poses.job import PoseJob, PoseJobResult, reserve_stdout
+from extrags.poses.job import PoseJob, PoseJobResult, end_with_parent, reserve_stdout
 from extrags.poses.pairs import Pair, neighbouring_pairs, training_pairs
 
 __all__ = ["run_triangulation"]
@@ -181,6 +181,7 @@ def _options(pycolmap: Any, seed: int) -> Any:
 
 
 def _main() -> None:
+    end_with_parent()
     reserve_stdout()
     folder = Path(sys.argv[1])
     run_triangulation(folder, PoseJob.load(folder)).save(folder)

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +17,7 @@ import numpy as np
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
 
-__all__ = ["PoseJob", "PoseJobResult", "reserve_stdout", "run_job"]
+__all__ = ["PoseJob", "PoseJobResult", "end_with_parent", "reserve_stdout", "run_job"]
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,17 @@ def reserve_stdout() -> None:
     os.dup2(2, 1)
 
 
+def end_with_parent() -> None:
+    """End this process as soon as its standard input does: the caller has ended, killed perhaps."""
+
+    def watch() -> None:
+        while os.read(0, 1):
+            pass
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True, name="end-with-parent").start()
+
+
 def run_job(module: str, job: PoseJob, name: str, *, stage: str) -> PoseJobResult:
     """Run a job in a process of its own and pass its progress on.
 
@@ -145,10 +157,13 @@ def run_job(module: str, job: PoseJob, name: str, *, stage: str) -> PoseJobResul
             log.open("wb") as log_file,
             subprocess.Popen(
                 [sys.executable, "-m", module, scratch],
-                stdin=subprocess.DEVNULL,
+                # Nothing is written: its end tells the process that nobody waits any more.
+                stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log_file,
                 text=True,
+                # Ctrl-C is for the caller, which then ends this process.
+                start_new_session=True,
                 env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
             ) as process,
         ):

@@ -7,7 +7,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
-from flows.commands.common import items, parsed_settings, set_up_logging, store_root, write_json
+from flows.commands.common import items, parsed_settings, set_up_logging, stage_limits, store_root, write_json
 from flows.commands.options import Parser, add_json, add_runner, add_settings, add_store
 
 if TYPE_CHECKING:
@@ -75,12 +75,15 @@ def benchmark(given: argparse.Namespace) -> int:
     from flows.benchmark import check_methods
     from flows.console import progress_bars
     from flows.settings import task_runner
+    from flows.temporary_server import temporary_server
+
+    limits = stage_limits(given)
 
     # Prefect would say the same in a page of its own words.
     check_methods(methods, variants, given.baseline)
     for profile in profiles:
         profile_config(profile)
-    with without_heartbeat(), progress_bars(terminal=terminal):
+    with temporary_server(), without_heartbeat(), progress_bars(terminal=terminal):
         found = flow.with_options(task_runner=task_runner(given.runner))(
             sequences=given.sequences,
             profiles=profiles,
@@ -91,6 +94,7 @@ def benchmark(given: argparse.Namespace) -> int:
             baseline=given.baseline,
             store=root,
             name=given.name,
+            limits=limits,
         )
     print_benchmark(found, to_stderr=given.json == "-")
     write_json(found, given.json)

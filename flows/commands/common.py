@@ -17,6 +17,7 @@ from extrags.errors import ConfigError, ExtragsError, StoreError
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
     from extrags.pipeline import StageName
+    from flows.limits import StageLimits
     from flows.wiring import SequenceRun
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "parsed_settings",
     "run_config",
     "set_up_logging",
+    "stage_limits",
     "store_root",
     "write_json",
 ]
@@ -115,6 +117,21 @@ def finished_run(given: argparse.Namespace, until: StageName, otherwise: str = "
     if outcome.status == "failed":
         raise outcome.error or ExtragsError(f"{outcome.name} failed")
     return run
+
+
+def stage_limits(given: argparse.Namespace) -> StageLimits:
+    """Retries and time limits from the command line; loads Prefect.
+
+    Raises:
+        ConfigError: for a value out of range.
+    """
+    from flows.limits import StageLimits
+
+    if not 0 <= given.retries <= 10:
+        raise ConfigError(f"--retries {given.retries}: expected 0 to 10")
+    if given.stage_time_limit is not None and not given.stage_time_limit > 0:
+        raise ConfigError(f"--stage-time-limit {given.stage_time_limit:g}: expected more than 0 seconds")
+    return StageLimits(retries=given.retries, time_limit_s=given.stage_time_limit)
 
 
 def store_root(given: argparse.Namespace) -> str:

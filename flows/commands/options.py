@@ -102,12 +102,26 @@ def add_json(parser: Parser) -> None:
 
 
 def add_runner(parser: Parser) -> None:
-    """`--runner`."""
+    """`--runner`, `--retries` and `--stage-time-limit`."""
     parser.add_argument(
         "--runner",
         default="threads",
         metavar="threads|dask[:ADDRESS]",
         help="where tasks run; an address is that of a Dask scheduler that is already up",
+    )
+    parser.add_argument(
+        "--retries",
+        type=int,
+        default=2,
+        metavar="N",
+        help="further tries of a stage after an error that can pass: store, network, lost worker, I/O "
+        "(default: %(default)s)",
+    )
+    parser.add_argument(
+        "--stage-time-limit",
+        type=float,
+        metavar="SECONDS",
+        help="a stage that takes longer fails at its next progress event (default: no limit)",
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, DamagedArtefactError, ExtragsError, UnknownSequenceError
-from flows.commands.common import run_config, set_up_logging, store_root, write_json
+from flows.commands.common import run_config, set_up_logging, stage_limits, store_root, write_json
 from flows.commands.options import Parser, add_json, add_method, add_runner
 from flows.failures import describe_error
 
@@ -95,6 +95,7 @@ def execute(
     from extrags.store import Store
     from flows.environment import prepare, without_heartbeat
     from flows.methods import METHODS
+    from flows.temporary_server import temporary_server
 
     terminal = sys.stderr.isatty()
     set_up_logging(debug=given.debug, terminal=terminal)
@@ -112,20 +113,27 @@ def execute(
     preflight(config, until, METHODS[given.method].leave_out)
     from flows.console import progress_bars
     from flows.dataset import reconstruct_dataset
+    from flows.outcome import DatasetFailedError
 
-    with without_heartbeat(), progress_bars(terminal=terminal):
-        outcome: DatasetOutcome = reconstruct_dataset(
-            sequences=sequences,
-            profile=given.profile,
-            settings=given.settings,
-            seed=given.seed,
-            store=root,
-            refresh=refresh,
-            until=until,
-            runner=given.runner,
-            at_once=at_once,
-            method=given.method,
-        )
+    limits = stage_limits(given)
+    with temporary_server(), without_heartbeat(), progress_bars(terminal=terminal):
+        try:
+            outcome: DatasetOutcome = reconstruct_dataset(
+                sequences=sequences,
+                profile=given.profile,
+                settings=given.settings,
+                seed=given.seed,
+                store=root,
+                refresh=refresh,
+                until=until,
+                runner=given.runner,
+                at_once=at_once,
+                method=given.method,
+                limits=limits,
+            )
+        except DatasetFailedError as error:
+            # Said to Prefect; here each sequence is reported, and the exit code is 1 if any failed.
+            outcome = error.outcome
     if given.debug:
         for sequence in outcome.sequences:
             if sequence.error is not None:

@@ -14,7 +14,7 @@ from extrags.errors import ConfigError, StoreError
 from extrags.pipeline import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
-from flows.outcome import SequenceFailedError, SequenceOutcome
+from flows.outcome import DatasetFailedError, SequenceFailedError, SequenceOutcome
 from flows.sequence import artifact_key, reconstruct_sequence
 from flows.settings import pipeline_config, task_runner
 from tests.flows.tiny import GIVEN, SEQUENCE, TINY, without_report
@@ -97,6 +97,33 @@ class TestDataset:
         page = Path(found.report).read_text()
         assert SEQUENCE in page
         assert "empty" in page
+
+    @pytest.mark.parametrize(("allowed", "fails"), [(None, True), (1.0, False)])
+    def test_a_run_whose_sequences_all_failed_has_failed(
+        self, tmp_path: Path, allowed: float | None, fails: bool
+    ) -> None:
+        folders = [tmp_path / "empty", tmp_path / "also-empty"]
+        for folder in folders:
+            folder.mkdir()
+        share = {} if allowed is None else {"max_failed_share": allowed}
+        state = reconstruct_dataset(
+            sequences=[str(folder) for folder in folders],
+            store=str(tmp_path / "store"),
+            name=f"none-{allowed}",
+            return_state=True,
+            **share,
+        )
+        assert (state.is_failed(), state.is_completed()) == (fails, not fails)
+        # Table and page have been written all the same, and the state says what happened.
+        artifact: Any = Artifact.get(artifact_key("dataset", f"none-{allowed}"))
+        assert "also-empty" in artifact.data
+        assert [manifest.stage for manifest in Store(tmp_path / "store").ls()] == ["dataset-report"]
+        if fails:
+            assert "2 of 2 sequences failed" in state.message
+            assert "the folder is empty" in state.message
+            failure = state.result(raise_on_failure=False)
+            assert isinstance(failure, DatasetFailedError)
+            assert [outcome.status for outcome in failure.outcome.sequences] == ["failed", "failed"]
 
 
 class TestParameters:
