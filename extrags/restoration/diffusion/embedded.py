@@ -20,6 +20,7 @@ from extrags.restoration.diffusion.weights import WEIGHTS
 from extrags.restoration.protocol import Clip, Restoration
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
+from extrags.threads import in_threads
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, condition
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
@@ -123,18 +124,21 @@ class EmbeddedEnhancer:
             noise: shared by all views.
             steps: of the sampler.
         """
-        parts = []
-        # In small groups: the working set of a whole clip would not stay in the cache, and peaks add up.
-        for first in range(0, len(layers), VIEWS_AT_ONCE):
+
+        def restored_group(first: int) -> Sampled:
+            group = layers[first : first + VIEWS_AT_ONCE]
             with torch.no_grad():
-                conditioning = condition(layers[first : first + VIEWS_AT_ONCE], transfer)
+                conditioning = condition(group, transfer)
             start = noise.expand(len(conditioning.base), -1, -1, -1)
             restored = sample(
                 self.network, conditioning, start, steps=steps, half_precision=self.half_precision
             )
             rgb = self.gamut.bounded(restored.rgb)
-            features = error_features(layers[first : first + VIEWS_AT_ONCE], rgb, restored.error)
-            parts.append(replace(restored, rgb=rgb, error=self.error_model.applied(features)))
+            error = self.error_model.applied(error_features(group, rgb, restored.error))
+            return replace(restored, rgb=rgb, error=error)
+
+        # In small groups: the working set of a whole clip would not stay in the cache, and peaks add up.
+        parts = in_threads(restored_group, range(0, len(layers), VIEWS_AT_ONCE))
         return Sampled(
             torch.cat([part.rgb for part in parts]),
             torch.cat([part.depth_mm for part in parts]),

@@ -1,0 +1,87 @@
+"""Torch on several cores, with results that do not depend on their number.
+
+Torch divides an operation between its threads. Where a sum is divided, and at which element vector
+instructions give way to scalar ones, both depend on the number of threads, and so do the last bits of the
+result. Hence torch itself gets one thread, and what is independent (views, frames) is handed out whole.
+
+Torch's number of threads belongs to the calling thread (OpenMP's and MKL's do), so that neither function
+here disturbs what other threads compute.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from contextvars import copy_context
+from typing import TypeVar
+
+import torch
+
+from extrags.raster import native
+
+__all__ = ["in_threads", "one_torch_thread"]
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_worker = threading.local()
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Torch computes in the calling thread alone; also a decorator.
+
+    Results then do not depend on the number of threads. They still depend on the processor's instruction
+    set, see docs/running_at_scale.md.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def in_threads(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Apply a function to items that are independent of each other, on several cores.
+
+    There are as many threads as the kernels use (`extrags.raster.set_num_threads`), each with one thread of
+    torch: the number changes the time it takes, never the result. Called from one of these threads, it goes
+    through the items one after the other. Events, gradient mode and inference mode are the caller's.
+
+    Args:
+        function: must not change what the items share.
+        items: few and expensive rather than many and cheap.
+
+    Returns:
+        The results in the order of the items.
+
+    Raises:
+        Exception: the first in the order of the items that the function raised.
+    """
+    items = list(items)
+    workers = min(len(items), native.num_threads() if native.native_isa() else 1)
+    if workers < 2 or getattr(_worker, "busy", False):
+        with one_torch_thread():
+            return [function(item) for item in items]
+    gradients, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
+
+    def applied(item: T) -> R:
+        with torch.inference_mode(inference), torch.set_grad_enabled(gradients):
+            return function(item)
+
+    with ThreadPoolExecutor(workers, "extrags", _begin) as pool:
+        # A context can be entered once at a time: each item gets a copy.
+        futures = [pool.submit(copy_context().run, applied, item) for item in items]
+        try:
+            return [future.result() for future in futures]
+        finally:
+            for future in futures:
+                future.cancel()
+
+
+def _begin() -> None:
+    _worker.busy = True
+    torch.set_num_threads(1)
