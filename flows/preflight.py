@@ -22,13 +22,16 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
     Raises:
         WeightsError: when weights are not there; says how to get them.
         MissingDependencyError: when a package is not there; says how to install it.
-        ConfigError: when settings of the restorer do not fit each other, the model or the machine.
+        ConfigError: when settings do not fit each other, the model or the machine.
         ExtragsError: when the code a checkpoint needs does not start.
     """
     if STAGES.index(until) >= STAGES.index("depth") and config.depth.enabled and "depth" not in leave_out:
-        from tasks.weights import depth_completion_digest
+        from extrags.devices import chosen_device
+        from tasks.weights import depth_completion_digest, depth_monocular_digest
 
+        chosen_device(config.depth.device, "depth.device")
         depth_completion_digest(config.depth)
+        depth_monocular_digest(config.depth.monocular)
     if STAGES.index(until) < STAGES.index("enhance"):
         return
     # Here, because they load torch, which looking up a deployment must not.

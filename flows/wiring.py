@@ -19,7 +19,7 @@ from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner, StoreRunner
 from tasks.assess import assess, plan
 from tasks.coarse import coarse, refined_frames
-from tasks.depth import depth, depth_frames, triangulation_settings
+from tasks.depth import depth, depth_frames, keyed_settings, triangulation_settings
 from tasks.enhance import assemble, restore, train
 from tasks.evaluate import METRICS_FILE, measure, render
 from tasks.explore import NEXT, branch, explore, merge, start
@@ -31,7 +31,13 @@ from tasks.progress import StageProgress, notify
 from tasks.report import PAGE, REPORT_PARTS, report
 from tasks.surface import surface
 from tasks.uc_nerf import render_uc_nerf, uc_nerf
-from tasks.weights import Weights, depth_completion_digest, lpips_weights, restorer_digest
+from tasks.weights import (
+    Weights,
+    depth_completion_digest,
+    depth_monocular_digest,
+    lpips_weights,
+    restorer_digest,
+)
 
 __all__ = ["SequenceRun", "run_sequence"]
 
@@ -198,9 +204,12 @@ class SequenceRun(Pipeline):
             settings = self.config.depth
             inputs = {
                 "sequence": self._run_uncounted(Call(training_frames, {"sequence": self.refs["sequence"]})),
-                "config": settings,
+                "config": keyed_settings(settings),
                 "features": triangulation_settings(self.config.poses),
                 "weights_digest": depth_completion_digest(settings),
+                # The network counts by its content; where it lies is not part of the key.
+                "monocular_digest": depth_monocular_digest(settings.monocular),
+                "monocular": settings.monocular,
             }
             self.refs["depth"] = self._run_task(row, Call(depth, inputs))
             row.reason = str(self._manifest("depth").counts["summary"])

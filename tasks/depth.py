@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from extrags.config import DepthConfig, PosesConfig
+from extrags.errors import WeightsError
 from extrags.store import Ref, Slot
 from tasks.stage import stage
+from tasks.weights import depth_monocular_digest
 
-__all__ = ["depth", "depth_frames", "triangulation_settings"]
+__all__ = ["depth", "depth_frames", "keyed_settings", "triangulation_settings"]
 
 TRIANGULATION = frozenset(
     {
@@ -26,25 +28,51 @@ def triangulation_settings(config: PosesConfig) -> PosesConfig:
     return PosesConfig(**config.model_dump(include=set(TRIANGULATION)))
 
 
-# The digest stands for the content of the weights; the task finds them by the settings again.
-@stage("depth", version=2)
+def keyed_settings(config: DepthConfig) -> DepthConfig:
+    """The settings as they are part of the key: with a device, and without the folder of a model.
+
+    A device and a processor give depths that differ by rounding: under `auto` the key would hold for either,
+    so that it is settled where the key is made. cuda stays what it is where there is none: what was made on
+    another machine can be read.
+    """
+    from extrags.devices import chosen_device
+
+    device = chosen_device("auto", "depth.device").type if config.device == "auto" else config.device
+    return config.model_copy(update={"device": device, "monocular": None})
+
+
+# The digests stand for the content of weights; the task finds them by the settings again.
+@stage("depth", version=2, ignore=("monocular",))
 def depth(
-    slot: Slot, sequence: Ref, config: DepthConfig, features: PosesConfig, weights_digest: str | None
+    slot: Slot,
+    sequence: Ref,
+    config: DepthConfig,
+    features: PosesConfig,
+    weights_digest: str | None,
+    monocular_digest: str | None,
+    monocular: str | None = None,
 ) -> None:
     """Estimate the depth of the training frames; writes `depth/`.
 
     Args:
         slot: the artefact to write.
         sequence: the training frames alone, with poses.
-        config: what to use.
+        config: what to use, from `keyed_settings`.
         features: settings of features and matching, from `triangulation_settings`.
         weights_digest: content of the network's weights, for the key alone.
+        monocular_digest: content of the monocular network's folder.
+        monocular: that folder; None without.
     """
     from extrags.depth.estimate import estimate_depth
     from extrags.sequence import EndoscopicSequence
 
+    if depth_monocular_digest(monocular) != monocular_digest:
+        raise WeightsError(
+            f"the model of depth.monocular={monocular} is not the one this run began with: it changed "
+            "meanwhile, or this worker sees other files; run again"
+        )
     frames = slot.load(EndoscopicSequence, sequence)
-    estimate = estimate_depth(frames, config, features)
+    estimate = estimate_depth(frames, config.model_copy(update={"monocular": monocular}), features)
     slot.save(estimate)
     slot.counts.update(
         frames=len(frames),

@@ -17,7 +17,14 @@ if TYPE_CHECKING:
     from extrags.confidence import PerceptualDifference
     from extrags.metrics.lpips import Lpips
 
-__all__ = ["Weights", "depth_completion_digest", "lpips_by_net", "lpips_weights", "restorer_digest"]
+__all__ = [
+    "Weights",
+    "depth_completion_digest",
+    "depth_monocular_digest",
+    "lpips_by_net",
+    "lpips_weights",
+    "restorer_digest",
+]
 
 
 class Weights(BaseModel):
@@ -100,3 +107,15 @@ def depth_completion_digest(config: DepthConfig) -> str | None:
     from extrags.depth.weights import completion_digest
 
     return completion_digest(config.completion)
+
+
+def depth_monocular_digest(folder: str | None) -> str | None:
+    """Digest of the monocular depth network in a folder; None for None.
+
+    Raises:
+        WeightsError: when the folder holds none.
+        MissingDependencyError: without the package that reads it.
+    """
+    from extrags.depth.monocular_network import monocular_digest
+
+    return monocular_digest(folder)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import Field
 
 from extrags.config.base import StageConfig
@@ -24,6 +26,12 @@ class DepthConfig(StageConfig):
         "bundled",
         description="weights of the completion network: bundled, none (stereo alone), or a .safetensors file",
     )
+    monocular: str | None = Field(
+        None,
+        description="folder of a saved monocular depth network (Depth Anything, DPT), a further cue; None: "
+        "none",
+    )
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda where there is one")
     max_width: int = Field(
         256, ge=32, le=2048, description="wider frames are matched at this width, their depth is enlarged"
     )

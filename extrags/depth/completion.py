@@ -2,7 +2,7 @@ r"""A small network that completes stereo: depth everywhere, with the error to e
 
 It sees the image, the depth of stereo with what tells how far to trust it, and the depth that brightness
 predicts, all relative to the frame's own median depth; it has no notion of scale. (Sparse points have a
-channel, in which it was shown better ones than triangulation gives; `estimate_depth` leaves it empty.) Its
+channel, which `estimate_depth` leaves empty: it measured no gain.) Its
 log-depth is a mixture, pixel by pixel, of stereo, shading and a value of its own,
 
 .. math:: \log d = \log d_\text{frame} + \sum_k w_k \, \ell_k + r ,
@@ -41,7 +41,7 @@ NORM_GROUPS = 8
 FARTHEST_LOG = 3.0
 """Bound of log-depths relative to the frame's median."""
 
-RGB, STEREO, SHADING, MASK, RAYS = slice(0, 3), 3, 4, 11, slice(12, 14)
+RGB, STEREO, SHADING, MASK, RAYS, POINTS, SOURCES = slice(0, 3), 3, 4, 11, slice(12, 14), slice(15, 17), 17
 """Where these channels lie; the others are listed in `completion_inputs`."""
 
 
@@ -72,12 +72,10 @@ def completion_inputs(
     sure = mask & (stereo.agrees * stereo.seen * stereo.n_sources[:, None, None] >= SURE_AGREEMENT)
     log_scale = torch.stack([_median(log, s, m) for log, s, m in zip(stereo.fused, sure, mask, strict=True)])
     relative = (stereo.fused - log_scale[:, None, None]).clamp(-FARTHEST_LOG, FARTHEST_LOG)
-    scatter = torch.tensor([min(fit.scatter, 1.0) for fit in stereo.fits], device=relative.device)
     # Where brightness could not be fitted it predicts nothing: the median depth, with the largest scatter.
-    fitted = torch.tensor([fit.scatter < 1.0 for fit in stereo.fits], device=relative.device)
-    shading = (stereo.shading - log_scale[:, None, None]).clamp(-FARTHEST_LOG, FARTHEST_LOG)
-    shading = shading * fitted[stereo.recording][:, None, None]
-    constant = scatter[stereo.recording][:, None, None].expand_as(relative)
+    prior = (stereo.prior - log_scale[:, None, None]).clamp(-FARTHEST_LOG, FARTHEST_LOG)
+    prior = prior * (stereo.prior_scatter < 1.0)[:, None, None]
+    constant = stereo.prior_scatter.clamp_max(1.0)[:, None, None].expand_as(relative)
     sources = (stereo.n_sources / 6)[:, None, None].expand_as(relative)
     present = torch.zeros_like(relative) if points is None else (points > 0).float()
     at_points = torch.zeros_like(relative)
@@ -88,7 +86,7 @@ def completion_inputs(
     saturated = (frames.rgb.amax(dim=1) >= SATURATED).float()
     single = [
         relative,
-        shading,
+        prior,
         stereo.cost,
         stereo.margin,
         stereo.seen,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -19,8 +20,18 @@ from extrags.config.depth import DepthConfig
 from extrags.depth.completion import CompletionNetwork, completion_inputs
 from extrags.depth.edges import sharpened
 from extrags.depth.frames import PosedFrames, select_sources
-from extrags.depth.stereo import StereoDepth, StereoSettings, multi_view_stereo, sweep_around
+from extrags.depth.monocular import MonocularPredictor, predictions
+from extrags.depth.monocular_network import load_monocular
+from extrags.depth.stereo import (
+    SECOND_SWEEP,
+    THIRD_SWEEP,
+    StereoDepth,
+    StereoSettings,
+    multi_view_stereo,
+    sweep_around,
+)
 from extrags.depth.weights import NONE, load_completion
+from extrags.devices import chosen_device
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
 from extrags.poses.triangulation import triangulate_points
@@ -49,9 +60,9 @@ STEREO_TRUST_ERRORS = 1.5
 ERROR_FACTOR = 1.25
 """Of the network's expected error, which is so much too small on phantoms; it saw none of them."""
 
-ALONE_ERROR = 0.35
-"""Expected relative error, at least, of a frame that no other could be matched with: the network was never
-shown such frames, and is 25 to 40 % off there while it expects 10 to 15."""
+UNKNOWN_SCALE_ERROR = 0.4
+"""Expected relative error of the scale of a frame that no other could be matched with, in a recording without
+any stereo to fit brightness to."""
 
 STEREO_GAIN = 0.4
 """Share of the network's expected error that agreeing stereo removes."""
@@ -115,53 +126,65 @@ def estimate_depth(
     config: DepthConfig | None = None,
     poses: PosesConfig | None = None,
     *,
+    monocular: MonocularPredictor | None = None,
     stage: str = "depth",
 ) -> DepthEstimate:
     """Depth of all frames of a sequence, which should be its training part.
 
-    Points give the range to search; stereo searches it, with the depth that brightness predicts as a weak
-    prior; a network completes the result and says how wrong it expects to be.
+    Points give the range to search; stereo searches it, with the depth that brightness predicts, and a
+    monocular network where there is one, as a weak prior; a network completes the result and says how wrong
+    it expects to be.
 
     Args:
         sequence: with poses.
         config: what to use; None takes the defaults.
         poses: settings of the features that points are triangulated from; None takes the defaults.
+        monocular: a network of the caller's own; None loads that of the settings, if they name one.
         stage: named in progress events.
 
     Raises:
         CaptureError: with a single frame, or when all cameras stand in one place.
-        WeightsError: when the weights of the completion cannot be read.
+        ConfigError: when a CUDA device is asked for and there is none.
+        WeightsError: when the weights of a network cannot be read.
+        MissingDependencyError: when a monocular network is asked for without the package it needs.
     """
     config = DepthConfig() if config is None else config
+    device = chosen_device(config.device, "depth.device")
     if len(sequence) < 2:
         raise CaptureError(f"{sequence.name}: depth from other frames needs at least two, found one")
     points, points_rgb, origin = _points(sequence, config, poses)
     small = sequence.at_most_width(config.max_width)
     near, typical, far = _ranges(small, points, config)
-    frames = posed_frames(small)
-    sources = _sources(small, typical, config)
+    frames = posed_frames(small, device)
+    sources = _sources(small, typical, config).to(device)
     recording = small.recording
     told = _Told(stage, (2 if config.completion == NONE else 6) * len(sequence))
     settings = StereoSettings(
-        hypotheses=config.hypotheses,
-        radius_px=config.window_radius_px,
-        shading_weight=StereoSettings.shading_weight if config.shading else 0.0,
+        hypotheses=config.hypotheses, radius_px=config.window_radius_px, shading=config.shading
     )
-    stereo = multi_view_stereo(
-        frames,
-        sources,
-        torch.from_numpy(near).float(),
-        torch.from_numpy(far).float(),
-        settings,
-        recording=None if recording is None else torch.from_numpy(recording),
-        told=told.step,
-    )
-    network = load_completion(config.completion)
-    if network is None:
-        log_depth, error = stereo.fused, _stereo_error(stereo)
-    else:
-        log_depth, error, stereo = _completed(network, frames, small, stereo, config, settings, told)
-    log_depth = sharpened(log_depth, error, frames)
+    # Without shortcuts of single precision, and in one order: depth on a GPU is that on a processor but for
+    # rounding, and the same again.
+    exact = torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True, allow_tf32=False)
+    with exact:
+        if monocular is None and config.monocular is not None:
+            monocular = load_monocular(config.monocular, device)
+        stereo = multi_view_stereo(
+            frames,
+            sources,
+            torch.from_numpy(near).float().to(device),
+            torch.from_numpy(far).float().to(device),
+            settings,
+            recording=None if recording is None else torch.from_numpy(recording).to(device),
+            monocular=None if monocular is None else _predicted(monocular, sequence, frames),
+            told=told.step,
+        )
+        network = load_completion(config.completion)
+        if network is None:
+            log_depth, error = _with_fallback(stereo)
+        else:
+            network = network.to(device)
+            log_depth, error, stereo = _completed(network, frames, small, stereo, config, settings, told)
+        log_depth = sharpened(log_depth, error, frames)
     full = sequence.height, sequence.width
     depth = np.where(sequence.mask, np.exp(_enlarged(log_depth, *full)), 0).astype(np.float32)
     expected = np.clip(_enlarged(error, *full), CERTAIN, HOPELESS)
@@ -182,7 +205,16 @@ def estimate_depth(
             }
             for fit in stereo.fits
         ],
+        "monocular": [
+            {
+                "scatter": min(float(fit.scatter.min()), 9.0),
+                "frames_aligned": int(fit.own.sum()),
+                "pixels": fit.n_pixels,
+            }
+            for fit in stereo.monocular
+        ],
         "completion": config.completion,
+        "device": device.type,
         "median_expected_error": float(np.median(expected[sequence.mask])) if sequence.mask.any() else 1.0,
     }
     return DepthEstimate(depth, expected, points.astype(np.float64), points_rgb, report)
@@ -219,17 +251,17 @@ class _Told:
         emit(Progress(self.stage, self.done, self.total))
 
 
-def posed_frames(sequence: EndoscopicSequence) -> PosedFrames:
-    """A sequence's frames as tensors on the processor.
+def posed_frames(sequence: EndoscopicSequence, device: torch.device | str = "cpu") -> PosedFrames:
+    """A sequence's frames as tensors on a device.
 
     Raises:
         ShapeError: while the poses are unknown.
     """
     return PosedFrames(
-        rgb=torch.from_numpy(sequence.rgb).permute(0, 3, 1, 2).float() / 255,
-        mask=torch.from_numpy(sequence.mask.copy()),
-        K=torch.from_numpy(sequence.K).float(),
-        world_from_camera=torch.from_numpy(sequence.cameras.world_from_camera).float(),
+        rgb=torch.from_numpy(sequence.rgb).to(device).permute(0, 3, 1, 2).float() / 255,
+        mask=torch.from_numpy(sequence.mask.copy()).to(device),
+        K=torch.from_numpy(sequence.K).float().to(device),
+        world_from_camera=torch.from_numpy(sequence.cameras.world_from_camera).float().to(device),
     )
 
 
@@ -297,31 +329,13 @@ def _completed(
     typical = np.array(
         [float(image[mask].exp().median()) for image, mask in zip(log_depth, frames.mask, strict=True)]
     )
-    sources = _sources(sequence, typical, config)
+    sources = _sources(sequence, typical, config).to(log_depth.device)
     stereo = sweep_around(
-        frames,
-        sources,
-        stereo,
-        log_depth,
-        half_width=0.2,
-        hypotheses=17,
-        small_step=0.1,
-        jump=0.5,
-        settings=settings,
-        told=told.step,
+        frames, sources, stereo, log_depth, **SECOND_SWEEP, settings=settings, told=told.step
     )
     log_depth, error = _run_network(network, frames, stereo, told)
     stereo = sweep_around(
-        frames,
-        sources,
-        stereo,
-        log_depth,
-        half_width=0.1,
-        hypotheses=13,
-        small_step=0.2,
-        jump=1.0,
-        settings=settings,
-        told=told.step,
+        frames, sources, stereo, log_depth, **THIRD_SWEEP, settings=settings, told=told.step
     )
     agreeing = stereo.agrees * stereo.seen * stereo.n_sources[:, None, None]
     away = (stereo.fused - log_depth) / (STEREO_TRUST_ERRORS * error)
@@ -329,8 +343,23 @@ def _completed(
     weight = weight * torch.exp(-0.5 * away.square())
     mixed = log_depth + weight * (stereo.fused - log_depth)
     expected = ERROR_FACTOR * error * (1 - STEREO_GAIN * weight)
-    alone = (stereo.n_sources == 0)[:, None, None]
-    return mixed, torch.where(alone, expected.clamp_min(ALONE_ERROR), expected), stereo
+    return mixed, torch.hypot(expected, _scale_error(stereo)[:, None, None]), stereo
+
+
+def _scale_error(stereo: StereoDepth) -> Tensor:
+    """Expected relative error of the scale of each frame, [F]; zero where other frames tell it.
+
+    A frame that nothing matches has the mean intercept of its recording's fit of brightness: it is as wrong
+    as the intercepts of the other frames differ.
+    """
+    error = torch.zeros(len(stereo.n_sources))
+    for number, fit in enumerate(stereo.fits):
+        own = torch.nonzero(stereo.recording == number)[:, 0]
+        alone = stereo.n_sources[own] == 0
+        known = math.isfinite(fit.scatter) and int((~alone).sum()) >= 2
+        spread = float(fit.intercepts[~alone].std()) if known else UNKNOWN_SCALE_ERROR
+        error[own[alone]] = min(spread, UNKNOWN_SCALE_ERROR)
+    return error
 
 
 @torch.no_grad()
@@ -338,8 +367,9 @@ def _run_network(
     network: CompletionNetwork, frames: PosedFrames, stereo: StereoDepth, told: _Told
 ) -> tuple[Tensor, Tensor]:
     """Log-depth, and the expected absolute error of it."""
-    # Without sparse points: those of two views are wrong by several percent, which the network, that was
-    # shown better ones, believes too much (AbsRel .046 with them and .037 without on phantom/11).
+    # Without sparse points: those of triangulation are 6 to 7 % off in the mean, which is worse than what
+    # stereo and the network make of the pixels around them (AbsRel .034 with them and .031 without on three
+    # phantoms), and practice with points as wrong as these did not change it.
     inputs = completion_inputs(frames, stereo)
     answers = in_threads(network, inputs.channels.split(1))
     log_depth, log_error = (torch.cat(parts) for parts in zip(*answers, strict=True))
@@ -365,9 +395,27 @@ def _stereo_error(stereo: StereoDepth) -> Tensor:
     return high * (low / high) ** (stereo.agrees * stereo.seen)
 
 
+def _with_fallback(stereo: StereoDepth) -> tuple[Tensor, Tensor]:
+    """Stereo without completion; where few views confirm it, a monocular network has its say."""
+    error = _stereo_error(stereo)
+    if not stereo.monocular:
+        return stereo.fused, error
+    own, other = (1 / value.square() for value in (error, stereo.prior_scatter[:, None, None]))
+    total = own + other
+    log_depth = stereo.fused + other / total * (stereo.prior - stereo.fused)
+    return log_depth, 1 / total.sqrt()
+
+
+def _predicted(monocular: MonocularPredictor, sequence: EndoscopicSequence, frames: PosedFrames) -> Tensor:
+    """What a monocular network says, of frames in full size."""
+    device = frames.rgb.device
+    images = (torch.from_numpy(image).to(device).permute(2, 0, 1).float() / 255 for image in sequence.rgb)
+    return predictions(monocular, images, frames.size).to(device)
+
+
 def _enlarged(images: Tensor, height: int, width: int) -> np.ndarray:
     if images.shape[1:] != (height, width):
         images = functional.interpolate(
             images[:, None], size=(height, width), mode="bilinear", align_corners=False
         )[:, 0]
-    return images.numpy()
+    return images.cpu().numpy()

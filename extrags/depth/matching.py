@@ -92,6 +92,7 @@ def matching_cost(
         ranks = torch.arange(sources.shape[1], device=grey.device)
         weight = (ranks[None] < kept[:, None]).float() / kept[:, None]
         costs[:, step] = torch.einsum("bshw,bs->bhw", stacked, weight)
+    costs[~present.any(dim=1)] = NEUTRAL_COST
     return costs
 
 

@@ -1,9 +1,10 @@
-"""Dense depth of posed frames from each other: two sweeps, the light as a prior, agreement of the views."""
+"""Dense depth of posed frames from each other: two sweeps, a prior of other cues, agreement of views."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypedDict
 
 import torch
 from jaxtyping import Float, Int
@@ -13,9 +14,18 @@ from torch.nn import functional
 from extrags.depth import matching, native
 from extrags.depth.consistency import agreement
 from extrags.depth.frames import PosedFrames
+from extrags.depth.monocular import MonocularFit, aligned, fit_monocular
+from extrags.depth.prior import DepthPrior
 from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
 
-__all__ = ["StereoDepth", "StereoSettings", "multi_view_stereo", "sweep_around"]
+__all__ = [
+    "SECOND_SWEEP",
+    "THIRD_SWEEP",
+    "StereoDepth",
+    "StereoSettings",
+    "multi_view_stereo",
+    "sweep_around",
+]
 
 SATURATED = 0.97
 """Brightness above which a pixel says nothing about its distance."""
@@ -24,7 +34,27 @@ COST_LEVELS = 127.5
 """Levels per unit of the costs that are kept as bytes."""
 
 SURE_AGREEMENT = 1.5
-"""Sources that must agree with a depth for the fit of the shading, together with the frame's own."""
+"""Sources that must agree with a depth for the fit of other cues, together with the frame's own."""
+
+CHUNK_VALUES = 1 << 26
+"""Costs of as many frames as have so many are made at a time on a GPU, which single frames leave idle; with
+what is made on the way that is about 2 GB."""
+
+
+class SweepAround(TypedDict):
+    """How `sweep_around` searches around completed surfaces."""
+
+    half_width: float
+    hypotheses: int
+    small_step: float
+    jump: float
+
+
+SECOND_SWEEP = SweepAround(half_width=0.2, hypotheses=17, small_step=0.1, jump=0.5)
+"""After the first completion, whose result is completed once more; the practice of the network has it too."""
+
+THIRD_SWEEP = SweepAround(half_width=0.1, hypotheses=13, small_step=0.2, jump=1.0)
+"""After the second completion; its result is mixed with it."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +67,9 @@ class StereoSettings:
         best_share: share of the sources, those that match best, whose costs are averaged.
         small_step: semi-global penalty of a change by one hypothesis.
         jump: semi-global penalty of larger changes.
-        shading_weight: weight of the prior that shading gives; it is bounded, so that clear matches win.
-        shading_scatters: scatters of the shading fit at which the prior reaches its weight.
+        shading: whether what brightness predicts is part of the prior.
+        prior_weight: weight of the prior that other cues give; it is bounded, so that clear matches win.
+        prior_scatters: scatters of the cues at which the prior reaches its weight.
         refinement_hypotheses: depths of the second sweep, around the surface that the first one found.
         refinement_extent: half the width of the second sweep, in steps of the first.
         refinement_small_step: as `small_step`, in the second sweep.
@@ -51,8 +82,9 @@ class StereoSettings:
     best_share: float = 0.5
     small_step: float = 0.15
     jump: float = 1.5
-    shading_weight: float = 0.2
-    shading_scatters: float = 4.0
+    shading: bool = True
+    prior_weight: float = 0.2
+    prior_scatters: float = 4.0
     refinement_hypotheses: int = 13
     refinement_extent: float = 3.0
     refinement_small_step: float = 0.1
@@ -73,8 +105,10 @@ class StereoDepth:
         violates: share of those that see through the point, [F, H, W].
         difference: mean log-ratio to the sources' depths, bounded, [F, H, W].
         fused: mean log-depth over the frame and the sources that agree, [F, H, W].
-        shading: log-depth that brightness predicts, [F, H, W].
+        prior: log-depth that brightness predicts, together with that of a monocular network, [F, H, W].
+        prior_scatter: how far depths scatter around it, infinite where it is of no use, [F].
         fits: the fit of shading, one per recording.
+        monocular: that of the monocular network, one per recording; empty without one.
         recording: recording of each frame, [F].
         n_sources: number of sources of each frame, [F].
     """
@@ -87,8 +121,10 @@ class StereoDepth:
     violates: Float[Tensor, "f h w"]
     difference: Float[Tensor, "f h w"]
     fused: Float[Tensor, "f h w"]
-    shading: Float[Tensor, "f h w"]
+    prior: Float[Tensor, "f h w"]
+    prior_scatter: Float[Tensor, "f"]
     fits: list[ShadingFit]
+    monocular: list[MonocularFit]
     recording: Int[Tensor, "f"]
     n_sources: Int[Tensor, "f"]
 
@@ -101,7 +137,8 @@ def multi_view_stereo(
     settings: StereoSettings | None = None,
     *,
     recording: Int[Tensor, "f"] | None = None,
-    chunk: int = 1,
+    monocular: Float[Tensor, "f h w"] | None = None,
+    chunk: int | None = None,
     told: Callable[[int], None] | None = None,
 ) -> StereoDepth:
     """Depth of every frame from its sources.
@@ -113,7 +150,8 @@ def multi_view_stereo(
         far: largest depth searched, per frame.
         settings: how to search; None takes the defaults.
         recording: recording of each frame, numbered from zero: exposure and response are one recording's.
-        chunk: frames at a time.
+        monocular: inverse depth of each frame up to scale and shift, from a network; None without one.
+        chunk: frames at a time; None takes one on the processor, as many as fit on a GPU.
         told: called with the number of frames done, twice for each.
     """
     settings = StereoSettings() if settings is None else settings
@@ -123,14 +161,14 @@ def multi_view_stereo(
     steps = torch.linspace(-1, 1, settings.hypotheses, device=device)
     log_base = 0.5 * (near.log() + far.log())
     offsets = 0.5 * (far.log() - near.log())[:, None] * steps[None]
-    parts = torch.arange(n, device=device).split(chunk)
+    parts = _parts(frames, settings.hypotheses, chunk)
     kernels = native if device.type == "cpu" else matching
     costs, first = [], []
     for part in parts:
         base = log_base[part].exp()[:, None, None].expand(-1, *frames.size)
         cost = _cost(frames, part, sources, base, offsets[part], settings)
         # A byte is fine enough for what is only ranked again, and many frames are kept.
-        costs.append((cost * COST_LEVELS).round().clamp(0, 255).to(torch.uint8))
+        costs.append((cost * COST_LEVELS).round().clamp(0, 255).to(torch.uint8).cpu())
         position, _, _ = kernels.best_steps(
             cost, grey[part], small_step=settings.small_step, jump=settings.jump
         )
@@ -143,18 +181,26 @@ def multi_view_stereo(
     sure = torch.cat([a.agrees * a.seen for a in agreed]) * count[:, None, None] >= SURE_AGREEMENT
     sure &= frames.mask & (frames.rgb.amax(dim=1) < SATURATED)
     fits = fit_shading(brightness, depth.log(), sure, recording)
-    shading = torch.empty_like(brightness)
-    for g, fit in enumerate(fits):
-        shading[recording == g] = fit.log_depth(brightness[recording == g])
+    prior, monocular_fits = shading_prior(fits, brightness, recording), []
+    if monocular is not None:
+        monocular_fits = fit_monocular(monocular, depth.log(), sure, recording)
+        other = DepthPrior(*aligned(monocular_fits, monocular, recording))
+        prior = prior & other if settings.shading else other
+    prior_weight = settings.prior_weight if settings.shading or monocular is not None else 0.0
     found, matched, margins = [], [], []
     for number, part in enumerate(parts):
-        cost = costs[number].float() / COST_LEVELS
-        cost += _prior(shading[part], fits, recording[part], log_base[part], offsets[part], settings)
+        cost = costs[number].to(device).float() / COST_LEVELS
+        cost += prior.cost(
+            part, log_base[part], offsets[part], weight=prior_weight, scatters=settings.prior_scatters
+        )
         costs[number] = torch.empty(0)
         position, _, margin = kernels.best_steps(
             cost, grey[part], small_step=settings.small_step, jump=settings.jump
         )
         margins.append(margin)
+        unpredicted = ~torch.isfinite(prior.scatter[part]) if prior_weight > 0 else True
+        blind = (count[part] == 0) & unpredicted
+        position = _undecided(position, settings.hypotheses, blind)
         log_depth = _log_depth(position, log_base[part][:, None, None], offsets[part])
         surface = _median(log_depth, frames.mask[part])
         step = offsets[part][:, 1] - offsets[part][:, 0]
@@ -164,6 +210,7 @@ def multi_view_stereo(
         position, _, _ = kernels.best_steps(
             cost, grey[part], small_step=settings.refinement_small_step, jump=settings.refinement_jump
         )
+        position = _undecided(position, finer.shape[1], count[part] == 0)
         found.append(_log_depth(position, surface, finer))
         nearest = position.round().long().clamp(0, finer.shape[1] - 1)
         matched.append(cost.gather(1, nearest[:, None])[:, 0])
@@ -185,8 +232,10 @@ def multi_view_stereo(
         violates=joined("violates"),
         difference=joined("difference"),
         fused=joined("fused"),
-        shading=shading,
+        prior=prior.log_depth,
+        prior_scatter=prior.scatter,
         fits=fits,
+        monocular=monocular_fits,
         recording=recording,
         n_sources=count,
     )
@@ -203,6 +252,7 @@ def sweep_around(
     small_step: float,
     jump: float,
     settings: StereoSettings | None = None,
+    chunk: int | None = None,
     told: Callable[[int], None] | None = None,
 ) -> StereoDepth:
     """Stereo again in a narrow range around surfaces that are nearly right.
@@ -213,29 +263,33 @@ def sweep_around(
     Args:
         frames: frames with poses.
         sources: what each is matched with.
-        stereo: result of `multi_view_stereo`, whose margin and shading are kept.
+        stereo: result of `multi_view_stereo`, whose margin and prior are kept.
         log_depth: logarithm of the surfaces' z-depth.
         half_width: of the range, in log-depth.
         hypotheses: depths tried in it.
         small_step: semi-global penalty of a change by one hypothesis.
         jump: semi-global penalty of larger changes.
         settings: windows, sources and tolerance; None takes the defaults.
+        chunk: as `multi_view_stereo`.
         told: called with the number of frames done.
     """
     settings = StereoSettings() if settings is None else settings
     kernels = native if log_depth.device.type == "cpu" else matching
-    grey, n = frames.grey, len(frames)
+    grey = frames.grey
     offsets = torch.linspace(-half_width, half_width, hypotheses, device=log_depth.device)[None]
     found, matched = [], []
-    parts = torch.arange(n, device=log_depth.device).split(1)
+    count = (sources >= 0).sum(1)
+    parts = _parts(frames, hypotheses, chunk)
     for part in parts:
-        cost = _cost(frames, part, sources, log_depth[part].exp(), offsets, settings)
+        around = offsets.expand(len(part), -1)
+        cost = _cost(frames, part, sources, log_depth[part].exp(), around, settings)
         position, _, _ = kernels.best_steps(cost, grey[part], small_step=small_step, jump=jump)
-        found.append(_log_depth(position, log_depth[part], offsets))
+        position = _undecided(position, hypotheses, count[part] == 0)
+        found.append(_log_depth(position, log_depth[part], around))
         nearest = position.round().long().clamp(0, hypotheses - 1)
         matched.append(cost.gather(1, nearest[:, None])[:, 0])
         if told is not None:
-            told(1)
+            told(len(part))
     new = torch.cat(found)
     depth = torch.where(frames.mask, new.exp(), 0.0)
     agreed = [agreement(frames, depth, part, sources[part], tolerance=settings.tolerance) for part in parts]
@@ -243,13 +297,34 @@ def sweep_around(
         stereo,
         log_depth=new,
         cost=torch.cat(matched),
-        n_sources=(sources >= 0).sum(1),
+        n_sources=count,
         seen=torch.cat([a.seen for a in agreed]),
         agrees=torch.cat([a.agrees for a in agreed]),
         violates=torch.cat([a.violates for a in agreed]),
         difference=torch.cat([a.difference for a in agreed]),
         fused=torch.cat([a.fused for a in agreed]),
     )
+
+
+def shading_prior(
+    fits: list[ShadingFit], brightness: Float[Tensor, "f h w"], recording: Int[Tensor, "f"]
+) -> DepthPrior:
+    """What brightness predicts of all frames, by their recordings' fits."""
+    log_depth = torch.empty_like(brightness)
+    for g, fit in enumerate(fits):
+        log_depth[recording == g] = fit.log_depth(brightness[recording == g])
+    scatter = torch.tensor([fit.scatter for fit in fits], device=brightness.device)[recording]
+    return DepthPrior(log_depth, scatter)
+
+
+def _parts(frames: PosedFrames, hypotheses: int, chunk: int | None) -> tuple[Tensor, ...]:
+    """Numbers of the frames that are matched together."""
+    device = frames.rgb.device
+    if chunk is None:
+        height, width = frames.size
+        chunk = 1 if device.type == "cpu" else max(1, CHUNK_VALUES // (hypotheses * height * width))
+    parts: tuple[Tensor, ...] = torch.arange(len(frames), device=device).split(chunk)
+    return parts
 
 
 def _cost(
@@ -278,20 +353,9 @@ def _log_depth(position: Tensor, log_base: Tensor, offsets: Tensor) -> Tensor:
     return log_base + offsets[:, 0, None, None] + position * step
 
 
-def _prior(
-    shading: Tensor,
-    fits: list[ShadingFit],
-    recording: Tensor,
-    log_base: Tensor,
-    offsets: Tensor,
-    settings: StereoSettings,
-) -> Tensor:
-    """Cost of leaving the depth that the brightness predicts, bounded; nothing where there was no fit."""
-    scatter = torch.tensor([fit.scatter for fit in fits], device=shading.device)[recording]
-    hypotheses = log_base[:, None] + offsets
-    away = (hypotheses[:, :, None, None] - shading[:, None]).abs()
-    away = away / (settings.shading_scatters * scatter[:, None, None, None])
-    return settings.shading_weight * away.clamp_max(1.5)
+def _undecided(position: Tensor, hypotheses: int, blind: Tensor) -> Tensor:
+    """The middle of the range for frames that nothing speaks for: of equal costs the first would win."""
+    return torch.where(blind[:, None, None], 0.5 * (hypotheses - 1), position)
 
 
 def _median(log_depth: Tensor, mask: Tensor) -> Tensor:

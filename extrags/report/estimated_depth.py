@@ -116,6 +116,13 @@ def _facts(
                 f"{number(fit['scatter'], 2)} of log-distances that spread by {number(fit['spread'], 2)}"
             )
         facts.append((f"Shading, recording {index + 1}" if several else "Shading", words))
+    networks = report.get("monocular", [])
+    for index, fit in enumerate(networks):
+        name = f"Monocular network, recording {index + 1}" if len(networks) > 1 else "Monocular network"
+        words = (
+            f"{fit['frames_aligned']} frames aligned, scatter {number(fit['scatter'], 2)} of log-distances"
+        )
+        facts.append((name, words if fit["frames_aligned"] else "could not be aligned with stereo"))
     if truth is not None:
         known = (truth > 0) & sequence.mask[sequence.train] & (estimate.depth > 0)
         if known.any():

@@ -10,9 +10,9 @@ from typing import Any
 from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.config.backends import BACKEND_NAME, BACKENDS, BackendEntry
 from extrags.errors import ConfigError, WeightsError
+from extrags.model_files import files_fingerprint
 from extrags.restoration.description import DESCRIPTION, read_description
 from extrags.restoration.pretrained.captions import check_source
-from extrags.restoration.pretrained.fingerprint import files_fingerprint
 from extrags.restoration.protocol import Backend, Enhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence

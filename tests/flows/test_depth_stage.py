@@ -13,7 +13,7 @@ import torch
 import extrags
 from data_catalog.true_surface import true_surface
 from extrags.depth.estimate import DepthEstimate
-from extrags.errors import WeightsError
+from extrags.errors import ConfigError, WeightsError
 from extrags.pipeline import InMemoryPipeline
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
@@ -23,6 +23,7 @@ from flows.outcome import SequenceOutcome
 from flows.preflight import preflight
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.wiring import run_sequence
+from tests.extrags.depth.tiny_monocular import save_depth_anything
 from tests.flows.tiny import SEQUENCE, tiny_config
 
 WITHHELD = tiny_config(
@@ -158,6 +159,46 @@ class TestWeights:
         assert row is not None
         assert (outcome.status, row.state) == ("failed", "failed")
         assert isinstance(outcome.error, WeightsError)
+
+
+class TestMonocular:
+    def test_a_missing_folder_is_told_before_the_run(self) -> None:
+        pytest.importorskip("transformers", reason="transformers is not installed")
+        config = tiny_config(depth__monocular="no/such/folder")
+        with pytest.raises(WeightsError, match=r"depth\.monocular=no/such/folder"):
+            preflight(config, "coarse")
+        preflight(config, "poses")
+
+    def test_a_changed_model_is_another_depth_and_a_moved_one_the_same(
+        self, run: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        pytest.importorskip("transformers", reason="transformers is not installed")
+        store, plain = run
+        first, second = tmp_path / "first", tmp_path / "second"
+        save_depth_anything(first)
+
+        def outcome(folder: Path, runner: DirectRunner | StoreRunner) -> SequenceOutcome:
+            config = WITHHELD.with_overrides({"depth.monocular": str(folder)})
+            return run_sequence(SEQUENCE, config, store, runner, until="depth")
+
+        with_it = outcome(first, DirectRunner(store))
+        assert with_it.status == "ok", with_it.error
+        assert with_it.refs["depth"] != plain.refs["depth"]
+        assert Store(store).load(DepthEstimate, with_it.refs["depth"]).report["monocular"]
+        first.rename(second)
+        assert outcome(second, StoreRunner(store)).refs["depth"] == with_it.refs["depth"]
+        (second / "another.txt").write_text("changed")
+        with pytest.raises(NotInStoreError, match="depth-v"):
+            outcome(second, StoreRunner(store))
+
+
+class TestDevice:
+    def test_cuda_that_is_not_there_is_told_before_the_run(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+        config = tiny_config(depth__device="cuda")
+        with pytest.raises(ConfigError, match=r"depth\.device=cuda"):
+            preflight(config, "coarse")
+        preflight(config, "poses")
 
 
 class TestSkipped:

@@ -11,7 +11,7 @@ import pytest
 import extrags.poses
 from extrags.config import DepthConfig, PosesConfig
 from extrags.store import Ref
-from tasks.depth import TRIANGULATION, depth, triangulation_settings
+from tasks.depth import TRIANGULATION, depth, keyed_settings, triangulation_settings
 from tasks.stage import stage_key
 
 OTHER: dict[str, Any] = {
@@ -26,13 +26,17 @@ OTHER: dict[str, Any] = {
 
 def key(digest: str = "frames", weights: str | None = "weights", **settings: Any) -> str:
     poses = PosesConfig(**settings.pop("poses", {}))
+    monocular_digest = settings.pop("monocular_digest", None)
+    config = DepthConfig(**settings)
     return stage_key(
         depth,
         {
             "sequence": Ref(uri="somewhere/frames", digest=digest),
-            "config": DepthConfig(**settings),
+            "config": keyed_settings(config),
             "features": triangulation_settings(poses),
             "weights_digest": weights,
+            "monocular_digest": monocular_digest,
+            "monocular": config.monocular,
         },
     )
 
@@ -41,6 +45,19 @@ def test_frames_settings_and_weights_are_in_it() -> None:
     keys = [key(), key("others"), key(weights="others"), key(weights=None), key(hypotheses=32)]
     assert len(set(keys)) == len(keys)
     assert key() == key()
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_the_device_is_settled_before_the_key(there: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torch.cuda.is_available", lambda: there)
+    assert key(device="cuda") != key(device="cpu")
+    assert key(device="auto") == key(device="cuda" if there else "cpu")
+
+
+def test_a_monocular_network_counts_by_its_content() -> None:
+    here, there = (key(monocular=folder, monocular_digest="one") for folder in ("here", "there"))
+    assert here == there
+    assert len({here, key(), key(monocular="here", monocular_digest="other")}) == 3
 
 
 @pytest.mark.parametrize("name", sorted(TRIANGULATION))

@@ -21,6 +21,10 @@ Kind = Literal["colon", "sac", "airways", "field"]
 KINDS: tuple[Kind, ...] = ("colon", "sac", "airways", "field")
 
 
+MOVING_SHARE = 0.12
+"""Of the scenes, those whose tissue moves from frame to frame."""
+
+
 @dataclass(frozen=True)
 class Waves:
     """A random smooth function of space for each scene: a sum of plane waves.
@@ -81,11 +85,13 @@ class Cavities:
         kind: what they are like.
         scenes: C, how many.
         generator: source of randomness; its device is used.
+
+    `moment` is the time, in frames, at which all questions are answered: tissue of some scenes moves.
     """
 
     def __init__(self, kind: Kind, scenes: int, generator: torch.Generator) -> None:
         self.kind, self.scenes, self.device = kind, scenes, generator.device
-        self._generator = generator
+        self.generator = generator
         c = scenes
         self.bumps = Waves.random(generator, c, 2.0, 14.0, slope=1.3)
         self.bump_height = self.uniform(0.0, 0.06, c, 1)
@@ -97,7 +103,7 @@ class Cavities:
         self.triangle = self.uniform(0.0, 0.18, c, 1)
         self.twist = self.uniform(-0.6, 0.6, c, 1)
         self.angle_phase = self.uniform(0.0, 2 * math.pi, c, 3)
-        self.fold_height = self.uniform(0.0, 0.5, c, 1)
+        self.fold_height = self.uniform(0.0, 0.6, c, 1)
         self.fold_period = self.uniform(0.5, 1.8, c, 1)
         self.fold_width = self.uniform(0.08, 0.35, c, 1)
         self.fold_wobble = self.uniform(0.0, 0.35, c, 1)
@@ -111,10 +117,17 @@ class Cavities:
         self.relief_height = self.uniform(0.05, 0.5, c, 1)
         self.distance = self.uniform(0.7, 1.8, c, 1)
         self.instruments = self._instruments()
+        self.pulse = Waves.random(generator, c, 0.6, 3.0, slope=0.5, waves=8)
+        moving = (self.uniform(0.0, 1.0, c, 1) < MOVING_SHARE).float()
+        self.pulse_height = moving * self.uniform(0.01, 0.06, c, 1)
+        self.pulse_direction = torch.nn.functional.normalize(self.uniform(-1.0, 1.0, c, 1, 3), dim=2)
+        self.pulse_rate = self.uniform(0.2, 1.5, c, 1)
+        self.moment = 0.0
+        self.anything_moves = bool(moving.any())
 
     def uniform(self, low: float, high: float, *shape: int) -> Tensor:
         """Uniform random numbers of these bounds from the scenes' generator."""
-        return low + (high - low) * torch.rand(*shape, generator=self._generator, device=self.device)
+        return low + (high - low) * torch.rand(*shape, generator=self.generator, device=self.device)
 
     def _branches(self) -> tuple[Tensor, Tensor, Tensor]:
         """Starts, unit directions and radii of four straight tubes that leave the first one's end."""
@@ -146,7 +159,15 @@ class Cavities:
 
     def clearance(self, points: Float[Tensor, "c n 3"]) -> Float[Tensor, "c n"]:
         """Positive inside the cavity, negative behind the wall; near the wall about the distance to it."""
+        points = self.at_rest(points)
         return getattr(self, f"_{self.kind}")(points) - self.bump_height * self.bumps(points)  # type: ignore[no-any-return]
+
+    def at_rest(self, points: Float[Tensor, "c n 3"]) -> Float[Tensor, "c n 3"]:
+        """Where tissue that lies at these points now, at the time `moment`, lies when nothing moves."""
+        if not self.anything_moves:
+            return points
+        height = self.pulse_height * torch.sin(self.pulse_rate * self.moment)
+        return points + (height * self.pulse(points))[:, :, None] * self.pulse_direction
 
     def _colon(self, points: Tensor) -> Tensor:
         z = points[:, :, 2]

@@ -10,11 +10,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrags.depth.completion import completion_inputs
+from extrags.depth.completion import POINTS, CompletionInputs, CompletionNetwork, completion_inputs
 from extrags.depth.frames import PosedFrames, select_sources
 from extrags.depth.pretraining.cavities import Cavities, Kind
 from extrags.depth.pretraining.photographs import Clips, photograph
-from extrags.depth.stereo import StereoSettings, multi_view_stereo
+from extrags.depth.pretraining.points import triangulated_points
+from extrags.depth.stereo import SECOND_SWEEP, StereoDepth, StereoSettings, multi_view_stereo, sweep_around
 
 __all__ = ["SIZES", "Examples", "make_examples"]
 
@@ -22,6 +23,15 @@ SIZES: tuple[tuple[int, int], ...] = ((128, 160), (144, 144), (112, 176))
 """Heights and widths in pixels."""
 VIEWS = 7
 SOURCES = 6
+
+NETWORK_CHUNK = 56
+
+SINGLE_SHARE = 0.12
+"""Of the clips, those whose frames are matched with nothing: single images."""
+UNMATCHED_SHARE = 0.05
+"""Of the other clips' frames, those that nothing matches."""
+WRONG_SHARE, BADLY_WRONG_SHARE = 0.5, 0.1
+"""Of the clips, those whose poses are wrong, and those where they are wrong by up to four times as much."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +55,13 @@ def make_examples(
     generator: torch.Generator,
     size: tuple[int, int],
     settings: StereoSettings | None = None,
+    network: CompletionNetwork | None = None,
 ) -> Examples | None:
     """Clips of one kind of scene with their stereo; None if no clip is usable.
 
-    In half of the clips poses are slightly wrong, in a quarter the focal length is; frames have two to six
-    sources; the searched range of depths is wider than the true one by random factors.
+    In half of the clips poses are slightly wrong, in a quarter the focal length is; frames have one to six
+    sources, those of `SINGLE_SHARE` of the clips none; the searched range of depths is wider than the true
+    one by random factors.
 
     Args:
         kind: of scene.
@@ -57,30 +69,72 @@ def make_examples(
         generator: source of randomness; its device is used.
         size: height and width in pixels.
         settings: of stereo.
+        network: whose completion the second sweep runs around, as `estimate_depth` does; then there are
+            two examples of each frame, those of the first sweep before those of the second. None makes the
+            first alone.
     """
     scene = Cavities(kind, scenes, generator)
     clips = photograph(scene, generator, size, VIEWS)
     n = len(clips.depth)
     if n == 0:
         return None
-    sources, near, far = _searched(clips, scene)
-    frames = _miscalibrated(clips, scene)
-    stereo = multi_view_stereo(frames, sources, near, far, settings, recording=clips.clip, chunk=n)
-    points = _sparse_points(clips, scene)
-    inputs = completion_inputs(frames, stereo, points)
-    truth = torch.log(clips.depth.clamp_min(1e-6)) - inputs.log_scale[:, None, None]
-    known = frames.mask & (clips.depth > 0)
-    return Examples(inputs.channels.half(), torch.where(known, truth, 0.0).clamp(-4, 4).half(), known.half())
-
-
-def _searched(clips: Clips, scene: Cavities) -> tuple[Tensor, Tensor, Tensor]:
-    """Sources of each frame, and the range of depths that is searched."""
-    device = clips.depth.device
-    n, v = len(clips.depth), clips.views
     ordered = torch.where(clips.depth > 0, clips.depth, float("nan")).flatten(1)
     low, middle, high = (ordered.nanquantile(q, dim=1) for q in (0.01, 0.5, 0.99))
+    near, far = low / scene.uniform(1.1, 2.0, n), high * scene.uniform(1.1, 2.0, n)
+    frames = _miscalibrated(clips, scene)
+    allowed = _allowed_sources(scene, n, clips.views)
+    sources = _sources(clips, middle, allowed)
+    stereo = multi_view_stereo(frames, sources, near, far, settings, recording=clips.clip, chunk=n)
+    points = triangulated_points(clips, scene)
+    inputs = completion_inputs(frames, stereo, points)
+    parts = [_examples(inputs, stereo, clips)]
+    if network is not None:
+        log_depth = _completed(network, inputs)
+        inside = torch.where(frames.mask, log_depth, float("nan")).flatten(1)
+        sources = _sources(clips, inside.nanmedian(dim=1).values.exp(), allowed)
+        stereo = sweep_around(frames, sources, stereo, log_depth, **SECOND_SWEEP, settings=settings, chunk=n)
+        parts.append(_examples(completion_inputs(frames, stereo, points), stereo, clips))
+    return Examples(
+        *(torch.cat([getattr(part, f) for part in parts]) for f in ("channels", "truth", "known"))
+    )
+
+
+def _examples(inputs: CompletionInputs, stereo: StereoDepth, clips: Clips) -> Examples:
+    known = clips.frames.mask & (clips.depth > 0)
+    truth = torch.log(clips.depth.clamp_min(1e-6)) - inputs.log_scale[:, None, None]
+    # Nothing tells the scale of a single image: its depths are learned up to their own median.
+    scatter = torch.tensor([fit.scatter for fit in stereo.fits], device=truth.device)[stereo.recording]
+    blind = (stereo.n_sources == 0) & ~torch.isfinite(scatter)
+    own = torch.where(known, truth, float("nan")).flatten(1).nanmedian(dim=1).values.nan_to_num()
+    truth = truth - torch.where(blind, own, 0.0)[:, None, None]
+    truth = torch.where(known, truth, 0.0).clamp(-4, 4)
+    return Examples(inputs.channels.half(), truth.half(), known.half())
+
+
+@torch.no_grad()
+def _completed(network: CompletionNetwork, inputs: CompletionInputs) -> Tensor:
+    # Points are left out, as `estimate_depth` does.
+    channels = inputs.channels.clone()
+    channels[:, POINTS] = 0
+    found = [network(part)[0] for part in channels.split(NETWORK_CHUNK)]
+    return torch.cat(found) + inputs.log_scale[:, None, None]
+
+
+def _allowed_sources(scene: Cavities, n: int, views: int) -> Tensor:
+    """How many sources each frame may have."""
+    clips = n // views
+    allowed = 1 + (scene.uniform(0.0, 1.0, clips) * SOURCES).long().clamp_max(SOURCES - 1)
+    allowed[scene.uniform(0.0, 1.0, clips) < SINGLE_SHARE] = 0
+    allowed = allowed.repeat_interleave(views)
+    allowed[scene.uniform(0.0, 1.0, n) < UNMATCHED_SHARE] = 0
+    return allowed
+
+
+def _sources(clips: Clips, typical_depth: Tensor, allowed: Tensor) -> Tensor:
+    """Sources of each frame within its clip, at most as many as are allowed."""
+    n, v = len(clips.depth), clips.views
     poses, K = clips.frames.world_from_camera.cpu().numpy(), clips.frames.K.cpu().numpy()
-    typical = middle.cpu().numpy().astype(np.float64)
+    typical = typical_depth.cpu().numpy().astype(np.float64)
     chosen = np.full((n, SOURCES), -1, dtype=np.int64)
     for first in range(0, n, v):
         part = slice(first, first + v)
@@ -92,13 +146,9 @@ def _searched(clips: Clips, scene: Cavities) -> tuple[Tensor, Tensor, Tensor]:
             SOURCES,
         )
         chosen[part] = np.where(found >= 0, found + first, -1)
-    sources = torch.from_numpy(chosen).to(device)
-    allowed = 2 + (scene.uniform(0.0, 1.0, n // v).repeat_interleave(v) * 5).long()
-    ranks = torch.arange(SOURCES, device=device)[None]
-    sources = torch.where(ranks < allowed[:, None].clamp_max(SOURCES), sources, -1)
-    near = low / scene.uniform(1.1, 2.0, n)
-    far = high * scene.uniform(1.1, 2.0, n)
-    return sources, near, far
+    sources = torch.from_numpy(chosen).to(clips.depth.device)
+    ranks = torch.arange(SOURCES, device=sources.device)[None]
+    return torch.where(ranks < allowed[:, None], sources, -1)
 
 
 def _miscalibrated(clips: Clips, scene: Cavities) -> PosedFrames:
@@ -107,7 +157,10 @@ def _miscalibrated(clips: Clips, scene: Cavities) -> PosedFrames:
     n = len(clips.depth)
     device = clips.depth.device
     per_clip = n // v
-    amount = (scene.uniform(0.0, 1.0, per_clip) < 0.5).float() * scene.uniform(0.0, 1.0, per_clip)
+    wrong_poses = scene.uniform(0.0, 1.0, per_clip) < WRONG_SHARE
+    amount = wrong_poses.float() * scene.uniform(0.0, 1.0, per_clip)
+    badly = scene.uniform(0.0, 1.0, per_clip) < BADLY_WRONG_SHARE
+    amount = torch.where(badly, scene.uniform(1.0, 4.0, per_clip), amount)
     amount = amount.repeat_interleave(v)[:, None]
     turn = amount * math.radians(0.2) * scene.uniform(-1.0, 1.0, n, 3)
     centers = frames.world_from_camera[:, :3, 3]
@@ -126,15 +179,3 @@ def _miscalibrated(clips: Clips, scene: Cavities) -> PosedFrames:
     K = frames.K.clone()
     K[:, [0, 1], [0, 1]] *= focal.repeat_interleave(v)[:, None]
     return replace(frames, world_from_camera=poses, K=K)
-
-
-def _sparse_points(clips: Clips, scene: Cavities) -> Tensor:
-    """Depth at random pixels, a little wrong, one in thirty far off; none in a third of the clips."""
-    n, height, width = clips.depth.shape
-    v = clips.views
-    share = 0.03 * scene.uniform(0.0, 1.0, n // v).square() * (scene.uniform(0.0, 1.0, n // v) > 1 / 3)
-    chosen = scene.uniform(0.0, 1.0, n, height, width) < share.repeat_interleave(v)[:, None, None]
-    noise = torch.exp(0.02 * scene.uniform(-1.0, 1.0, n, height, width))
-    stray = scene.uniform(0.0, 1.0, n, height, width) < 1 / 30
-    noise = torch.where(stray, torch.exp(scene.uniform(-0.7, 0.7, n, height, width)), noise)
-    return torch.where(chosen & clips.frames.mask, clips.depth * noise, 0.0)

@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from extrags.depth.frames import PosedFrames
 from extrags.depth.pretraining.cavities import Cavities, Waves
+from extrags.depth.pretraining.sensor import Sensor
 
 __all__ = ["Clips", "photograph"]
 
@@ -19,6 +20,9 @@ BISECTIONS = 7
 FARTHEST = 14.0
 NEAREST_WALL = 0.12
 """Clips whose lens comes nearer to a wall are discarded."""
+
+WET_SHARE = 0.3
+"""Of the clips, those with strong gloss."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +107,10 @@ def photograph(scene: Cavities, generator: torch.Generator, size: tuple[int, int
     y = (rows.flatten() - K[:, 1, 2, None]) / K[:, 1, 1, None]
     local = torch.stack([x, y, torch.ones_like(x)], dim=2)
     mucosa, lamps = _Mucosa(scene, generator), _Lamps(scene)
-    sensor = _Sensor(scene, views)
+    sensor = Sensor(scene, views)
     images, depths, hits = [], [], []
     for view in range(views):
+        scene.moment = float(view)
         rotation, center = poses[:, view, :3, :3], poses[:, view, :3, 3]
         directions = local @ rotation.transpose(1, 2)
         z, hit = _march(scene, center, directions)
@@ -188,6 +193,10 @@ class _Lamps:
         self.around = uniform(0.0, 0.3, c, 1)
         self.shine = uniform(0.0, 0.6, c, 1) * uniform(0.0, 1.0, c, 1)
         self.sharpness = uniform(20.0, 200.0, c, 1)
+        # A wet coat mirrors the lamp in small spots far brighter than the tissue.
+        wet = uniform(0.0, 1.0, c, 1) < WET_SHARE
+        self.shine = torch.where(wet, uniform(0.5, 3.0, c, 1), self.shine)
+        self.sharpness = torch.where(wet, uniform(40.0, 500.0, c, 1), self.sharpness)
         self.fixed = (uniform(0.0, 1.0, c, 1) < 0.08).float() * uniform(0.5, 1.0, c, 1)
         self.sun = uniform(-1.0, 1.0, c, 3)
 
@@ -195,7 +204,7 @@ class _Lamps:
         self, scene: Cavities, mucosa: _Mucosa, points: Tensor, rotation: Tensor, center: Tensor
     ) -> Tensor:
         normal = _normal(scene, points)
-        albedo = mucosa.albedo(points)
+        albedo = mucosa.albedo(scene.at_rest(points))
         rods = scene.kind == "field"
         if rods:
             on_rod = scene.to_instruments(points) < 0.02
@@ -237,54 +246,3 @@ def _normal(scene: Cavities, points: Tensor) -> Tensor:
     )
     unit: Tensor = gradient / gradient.norm(dim=2, keepdim=True).clamp_min(1e-9)
     return unit
-
-
-class _Sensor:
-    """Exposure, vignetting, tone curve, blur, noise, eight bits."""
-
-    def __init__(self, scene: Cavities, views: int) -> None:
-        c, uniform = scene.scenes, scene.uniform
-        self.target = uniform(0.25, 0.6, c, 1)
-        self.drift = uniform(0.0, 0.12, c, 1) * uniform(-1.0, 1.0, c, views)
-        self.automatic = (uniform(0.0, 1.0, c, 1) < 0.3).float()
-        self.vignetting = uniform(0.0, 0.4, c)
-        self.gamma = uniform(1.0, 2.4, c)
-        self.shoulder = (uniform(0.0, 1.0, c) < 0.5).float()
-        self.noise = uniform(0.0, 0.012, c)
-        self.blur = uniform(0.0, 0.8, c)
-
-    def develop(self, radiance: Tensor, generator: torch.Generator) -> Tensor:
-        _c, _views, _, height, width = radiance.shape
-        brightness = radiance.mean(2).flatten(2)
-        per_view = brightness.kthvalue(int(0.75 * brightness.shape[2]), dim=2).values.clamp_min(1e-6)
-        common = per_view.mean(1, keepdim=True)
-        gain = (
-            self.target / (self.automatic * per_view + (1 - self.automatic) * common) * torch.exp(self.drift)
-        )
-        y = ((torch.arange(height, device=radiance.device) + 0.5) / height * 2 - 1)[:, None]
-        x = ((torch.arange(width, device=radiance.device) + 0.5) / width * 2 - 1)[None]
-        shade = 1 - self.vignetting[:, None, None] * 0.5 * (x.square() + y.square())
-        signal = radiance * gain[:, :, None, None, None] * shade[:, None, None]
-        sigma = self.noise[:, None, None, None, None] * (signal.clamp_min(0).sqrt() + 0.3)
-        curved = torch.where(
-            self.shoulder[:, None, None, None, None] > 0, 1 - torch.exp(-1.3 * signal), signal
-        )
-        blurred = _blur(curved, self.blur)
-        noisy = blurred + sigma * torch.randn(blurred.shape, generator=generator, device=blurred.device)
-        toned = noisy.clamp(1e-6, 1) ** (1 / self.gamma[:, None, None, None, None])
-        return torch.round(toned * 255) / 255
-
-
-def _blur(images: Tensor, sigma: Tensor) -> Tensor:
-    c, views, channels, height, width = images.shape
-    taps = torch.arange(-2, 3, device=images.device, dtype=torch.float32)
-    kernel = torch.exp(-0.5 * (taps / sigma.clamp_min(0.05)[:, None]).square())
-    kernel = kernel / kernel.sum(1, keepdim=True)
-    flat = images.permute(1, 2, 0, 3, 4).reshape(views * channels, c, height, width)
-    flat = functional.conv2d(
-        functional.pad(flat, (2, 2, 0, 0), mode="replicate"), kernel[:, None, None], groups=c
-    )
-    flat = functional.conv2d(
-        functional.pad(flat, (0, 0, 2, 2), mode="replicate"), kernel[:, None, :, None], groups=c
-    )
-    return flat.reshape(views, channels, c, height, width).permute(2, 0, 1, 3, 4)

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import copy
+import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from extrags.depth.completion import MASK, RAYS, RGB, STEREO, CompletionNetwork, completion_loss
+from extrags.depth.completion import MASK, RAYS, RGB, SOURCES, STEREO, CompletionNetwork, completion_loss
 from extrags.depth.pretraining.examples import Examples
 from extrags.errors import DivergedError
 
-__all__ = ["CompletionTraining", "ExampleBank", "Scores", "score", "train_completion"]
+__all__ = [
+    "CompletionTraining",
+    "ExampleBank",
+    "Scores",
+    "matched",
+    "mix_weights",
+    "score",
+    "train_completion",
+    "unmatched",
+]
 
 
 @dataclass(frozen=True)
@@ -27,6 +38,7 @@ class CompletionTraining:
         slope_weight: of the term `slope` of `completion_loss`.
         error_weight: of its term `error`.
         ema_decay: memory of the running mean of the weights, which is the result.
+        seconds: wall time after which it ends if the iterations are not done; the rate falls in time.
     """
 
     iterations: int = 20_000
@@ -35,6 +47,7 @@ class CompletionTraining:
     slope_weight: float = 1.0
     error_weight: float = 0.1
     ema_decay: float = 0.999
+    seconds: float = math.inf
 
 
 class ExampleBank:
@@ -131,13 +144,15 @@ def train_completion(
     average = copy.deepcopy(network)
     optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=1e-4)
 
-    def rate(step: int) -> float:
-        warm = min(1.0, (step + 1) / 300)
-        return warm * 0.5 * (1 + torch.cos(torch.tensor(torch.pi * step / settings.iterations)).item()) + 1e-3
-
-    schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, rate)
+    begun = time.monotonic()
     sums: dict[str, Tensor] = {}
     for iteration in range(settings.iterations):
+        spent = max(iteration / settings.iterations, (time.monotonic() - begun) / settings.seconds)
+        if spent >= 1:
+            break
+        warm = min(1.0, (iteration + 1) / 300)
+        falling = warm * 0.5 * (1 + math.cos(math.pi * spent)) + 1e-3
+        optimiser.param_groups[0]["lr"] = settings.learning_rate * falling
         channels, truth, known = bank.draw(settings.batch)
         channels = channels.contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16, enabled=half):
@@ -150,7 +165,6 @@ def train_completion(
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
-        schedule.step()
         with torch.no_grad():
             decay = min(settings.ema_decay, (iteration + 1) / (iteration + 10))
             torch._foreach_lerp_(list(average.parameters()), list(network.parameters()), 1 - decay)
@@ -164,6 +178,23 @@ def train_completion(
             if told is not None:
                 told(iteration + 1, means)
     return average
+
+
+@torch.no_grad()
+def mix_weights(network: CompletionNetwork, start: dict[str, Tensor], keep: float) -> None:
+    """Move a network's weights back towards those that its training started from.
+
+    On scenes unlike the practice of either training, the mean of both is better than both.
+
+    Args:
+        network: trained; changed in place.
+        start: weights that it started from, by name.
+        keep: share of these in the result, in [0, 1].
+
+    Source: M. Wortsman et al., "Robust fine-tuning of zero-shot models", CVPR 2022.
+    """
+    for name, value in network.state_dict().items():
+        value.lerp_(start[name].to(value), keep)
 
 
 @dataclass(frozen=True)
@@ -208,3 +239,21 @@ def score(network: CompletionNetwork, examples: list[Examples], chunk: int = 32)
         float(correlation),
         float(error.mean() / told.mean()),
     )
+
+
+def matched(examples: list[Examples]) -> list[Examples]:
+    """Those of frames that have sources."""
+    return [_chosen(group, ~_alone(group)) for group in examples]
+
+
+def unmatched(examples: list[Examples]) -> list[Examples]:
+    """Those of frames that nothing was matched with."""
+    return [_chosen(group, _alone(group)) for group in examples]
+
+
+def _alone(group: Examples) -> Tensor:
+    return group.channels[:, SOURCES].flatten(1).amax(dim=1) == 0
+
+
+def _chosen(group: Examples, rows: Tensor) -> Examples:
+    return Examples(group.channels[rows], group.truth[rows], group.known[rows])

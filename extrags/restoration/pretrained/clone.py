@@ -15,9 +15,9 @@ import numpy as np
 
 from extrags.config import CheckpointConfig
 from extrags.errors import ConfigError, ExtragsError, MissingDependencyError, WeightsError
+from extrags.model_files import files_fingerprint
 from extrags.restoration.pretrained import checkpoint_driver
 from extrags.restoration.pretrained.captions import KEY_VARIABLE
-from extrags.restoration.pretrained.fingerprint import files_fingerprint
 
 __all__ = ["Clone", "check_clone", "check_interpreter", "clone_fingerprint", "guidance_scale", "run_clone"]
 

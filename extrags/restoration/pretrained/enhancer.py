@@ -16,12 +16,12 @@ from torch import Tensor
 
 from extrags.config import CoarseConfig, EnhanceConfig, PretrainedConfig
 from extrags.errors import ConfigError, WeightsError
+from extrags.model_files import fingerprint
 from extrags.restoration.clips import keep_known
 from extrags.restoration.description import DESCRIPTION, description_fields, text_field
 from extrags.restoration.pretrained.adapter import Adapter, Window
 from extrags.restoration.pretrained.canvas import Canvas
 from extrags.restoration.pretrained.captions import caption_of
-from extrags.restoration.pretrained.fingerprint import fingerprint
 from extrags.restoration.pretrained.inputs import clip_inputs, ranked_references, window_seed
 from extrags.restoration.pretrained.model import check_device, find_model
 from extrags.restoration.pretrained.prepared import PreparedEnhancer, load_prepared

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 
 from extrags.config import PretrainedConfig
+from extrags.devices import chosen_device
 from extrags.errors import ConfigError, MissingDependencyError, WeightsError
 from extrags.restoration.pretrained.parts import missing_part
 
@@ -24,7 +25,6 @@ __all__ = [
     "PipelineRule",
     "check_device",
     "check_packages",
-    "chosen_device",
     "chosen_dtype",
     "find_model",
     "load_pipeline",
@@ -171,25 +171,13 @@ def _how_to_get(model: str, rule: PipelineRule) -> str:
     )
 
 
-def chosen_device(name: str) -> torch.device:
-    """The device a setting means.
-
-    Raises:
-        ConfigError: when cuda is asked for and there is none.
-    """
-    there = torch.cuda.is_available()
-    if name == "cuda" and not there:
-        raise ConfigError("device=cuda, but torch sees no CUDA device; use auto or cpu")
-    return torch.device("cuda" if there and name != "cpu" else "cpu")
-
-
 def check_device(settings: PretrainedConfig) -> torch.device:
     """The device a pipeline will run on.
 
     Raises:
         ConfigError: when cuda is asked for and there is none, or offload on a processor.
     """
-    device = chosen_device(settings.device)
+    device = chosen_device(settings.device, "enhance.pretrained.device")
     if settings.offload != "none" and device.type != "cuda":
         raise ConfigError(
             f"enhance.pretrained.offload={settings.offload} moves idle parts off a CUDA device; none is in "

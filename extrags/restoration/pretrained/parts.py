@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
+
+from extrags.model_files import missing_weights
 
 __all__ = ["missing_part"]
 
@@ -33,20 +34,7 @@ def missing_part(
         if not (folder / part).is_dir() or not any((folder / part).iterdir()):
             return f"{part}/"
         if part in with_weights and (folder / part / "config.json").is_file() and described[0] in STEMS:
-            missing = _missing_weights(folder / part, f"{STEMS[described[0]]}.safetensors")
+            missing = missing_weights(folder / part, f"{STEMS[described[0]]}.safetensors")
             if missing is not None:
                 return f"{part}/{missing}"
     return None
-
-
-def _missing_weights(folder: Path, name: str) -> str | None:
-    if (folder / name).is_file():
-        return None
-    shards = folder / f"{name}.index.json"
-    if not shards.is_file():
-        return name
-    try:
-        names = sorted(set(json.loads(shards.read_text())["weight_map"].values()))
-    except (ValueError, KeyError, TypeError, AttributeError):
-        return shards.name
-    return next((shard for shard in names if not (folder / shard).is_file()), None)

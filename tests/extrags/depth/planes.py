@@ -7,7 +7,7 @@ import torch
 
 from extrags.depth.frames import PosedFrames
 
-__all__ = ["inside_sphere", "tilted_plane"]
+__all__ = ["inside_sphere", "on", "tilted_plane"]
 
 
 def _texture(points: torch.Tensor) -> torch.Tensor:
@@ -57,3 +57,13 @@ def inside_sphere(views: int = 5, height: int = 40, width: int = 52) -> tuple[Po
         return (-b + torch.sqrt(b * b - a * ((centers * centers).sum(1) - 4.0))) / a
 
     return _frames(depth_of, views, height, width, 0.25)
+
+
+def on(frames: PosedFrames, device: str) -> PosedFrames:
+    """The same frames on a device."""
+    return PosedFrames(
+        frames.rgb.to(device),
+        frames.mask.to(device),
+        frames.K.to(device),
+        frames.world_from_camera.to(device),
+    )

@@ -8,10 +8,21 @@ import pytest
 import torch
 
 from extrags.depth.completion import INPUT_CHANNELS, STEREO, CompletionNetwork, completion_loss
+from extrags.depth.pretraining import examples as practice
 from extrags.depth.pretraining.cavities import KINDS, Cavities, Kind
 from extrags.depth.pretraining.examples import make_examples
 from extrags.depth.pretraining.photographs import photograph
-from extrags.depth.pretraining.training import CompletionTraining, ExampleBank, score, train_completion
+from extrags.depth.pretraining.points import triangulated_points
+from extrags.depth.pretraining.sensor import compressed
+from extrags.depth.pretraining.training import (
+    CompletionTraining,
+    ExampleBank,
+    matched,
+    mix_weights,
+    score,
+    train_completion,
+    unmatched,
+)
 from extrags.depth.stereo import StereoSettings
 from extrags.depth.weights import load_completion
 
@@ -85,10 +96,84 @@ def test_bundled_weights_complete_unseen_cavities() -> None:
     assert examples is not None
     found = score(network, [examples])
     assert found.absrel < 0.6 * found.stereo_absrel
-    assert found.rank_correlation > 0.3
+    assert found.rank_correlation > 0.2
+    assert 0.5 < found.calibration < 2
     # Blind to stereo, it is worse, and expects to be.
     channels = examples.channels.clone()
     channels[:, STEREO] = 0
     channels[:, 5:11] = 0
     blind = score(network, [replace(examples, channels=channels)])
     assert blind.absrel > found.absrel
+
+
+def test_single_frames_are_told_to_be_as_wrong_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Weights that never practised single frames are .31 off here and expect .12."""
+    monkeypatch.setattr(practice, "SINGLE_SHARE", 1.0)
+    network = load_completion("bundled")
+    assert network is not None
+    generator = torch.Generator().manual_seed(991)
+    groups = []
+    for kind in ("colon", "sac", "field"):
+        examples = make_examples(kind, 3, generator, (64, 80), StereoSettings(hypotheses=16))
+        assert examples is not None
+        assert not len(matched([examples])[0].truth)
+        groups += unmatched([examples])
+    found = score(network, groups)
+    assert found.absrel < 0.25
+    assert 0.5 < found.calibration < 2
+
+
+def test_the_second_sweep_is_practised_too() -> None:
+    settings = StereoSettings(hypotheses=16, refinement_hypotheses=5)
+    made = [
+        make_examples("sac", 2, torch.Generator().manual_seed(3), (32, 48), settings, network)
+        for network in (None, CompletionNetwork())
+    ]
+    once, twice = made
+    assert once is not None
+    assert twice is not None
+    frames = len(once.truth)
+    assert len(twice.truth) == 2 * frames
+    assert torch.equal(twice.channels[:frames], once.channels)
+    assert not torch.equal(twice.channels[frames:, STEREO], once.channels[:, STEREO])
+
+
+def test_points_lie_on_the_surface_but_for_their_error() -> None:
+    generator = torch.Generator().manual_seed(8)
+    scene = Cavities("field", 6, generator)
+    clips = photograph(scene, generator, (48, 64), 5)
+    points = triangulated_points(clips, scene)
+    there = (points > 0) & clips.frames.mask
+    assert there.sum() > 100
+    assert not points[~clips.frames.mask].any()
+    error = torch.log(points[there] / clips.depth[there]).abs()
+    assert 0.002 < float(error.median()) < 0.1
+
+
+def test_tissue_moves_in_some_scenes() -> None:
+    scene = Cavities("sac", 40, torch.Generator().manual_seed(2))
+    points = torch.rand(40, 5, 3, generator=torch.Generator().manual_seed(3))
+    still = scene.pulse_height[:, 0] == 0
+    assert 0 < int((~still).sum()) < 20
+    scene.moment = 2.0
+    moved = (scene.at_rest(points) - points).norm(dim=2).amax(dim=1)
+    assert not moved[still].any()
+    assert (moved[~still] > 0).all()
+
+
+def test_compression_spoils_only_what_is_compressed() -> None:
+    images = torch.rand(3, 3, 20, 28, generator=torch.Generator().manual_seed(4))
+    loss = torch.tensor([0.0, 0.2, 1.0])
+    wrong = (compressed(images, loss) - images).abs().mean(dim=(1, 2, 3))
+    assert wrong[0] == 0
+    assert 0 < wrong[1] < wrong[2] < 0.3
+    flat = torch.full((1, 3, 16, 16), 0.5)
+    assert torch.allclose(compressed(flat, torch.tensor([1.0])), flat, atol=0.02)
+
+
+def test_weights_move_back_towards_the_start() -> None:
+    network, start = CompletionNetwork(), CompletionNetwork().state_dict()
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    mix_weights(network, start, 0.25)
+    for name, value in network.state_dict().items():
+        assert torch.allclose(value, 0.75 * before[name] + 0.25 * start[name], atol=1e-6)

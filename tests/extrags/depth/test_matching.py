@@ -13,7 +13,7 @@ from extrags.depth.stereo import StereoSettings, multi_view_stereo, sweep_around
 from extrags.raster import native as raster_native
 from extrags.raster.native import compiled_kernels
 from extrags.raster.native import set_num_threads as set_threads
-from tests.extrags.depth.planes import inside_sphere, tilted_plane
+from tests.extrags.depth.planes import inside_sphere, on, tilted_plane
 
 ISAS = raster_native.usable_isas()
 
@@ -73,6 +73,23 @@ def test_costs_do_not_depend_on_threads_or_instructions() -> None:
         assert torch.equal(results[0], other)
 
 
+def test_torch_gives_these_costs_on_every_device(device: str) -> None:
+    frames, _ = tilted_plane()
+    frames.mask[1, :7, :9] = False
+    expected = matching.matching_cost(frames, **_case(), radius_px=2)
+    there = {name: value.to(device) for name, value in _case().items()}
+    found = matching.matching_cost(on(frames, device), **there, radius_px=2)
+    assert found.device.type == device
+    # As between the processor's two implementations.
+    assert (found.cpu() - expected).abs().max() < 2e-3
+    assert (found.cpu() - expected).abs().mean() < 2e-6
+    # The same costs, so that no nearly equal ones change their order.
+    grey = frames.grey[[2, 0]]
+    steps = matching.best_steps(expected.to(device), grey.to(device), small_step=0.1, jump=0.6)
+    for one, other in zip(steps, matching.best_steps(expected, grey, small_step=0.1, jump=0.6), strict=True):
+        assert (one.cpu() - other).abs().max() < 1e-4
+
+
 def test_a_reference_without_sources_costs_the_same_everywhere(isa: str) -> None:
     frames, _depth = tilted_plane()
     case = {**_case(), "sources": torch.full((2, 4), -1)}
@@ -128,11 +145,12 @@ def test_sub_step_finds_the_vertex_of_a_parabola() -> None:
 
 
 @pytest.mark.parametrize("surface", [tilted_plane, inside_sphere])
-def test_stereo_finds_a_textured_surface(surface) -> None:  # type: ignore[no-untyped-def]
+def test_stereo_finds_a_textured_surface(surface, device: str) -> None:  # type: ignore[no-untyped-def]
     frames, depth = surface()
     poses, K = frames.world_from_camera.double().numpy(), frames.K.double().numpy()
-    sources = torch.from_numpy(select_sources(poses, K, frames.size, np.full(5, 2.0), 3))
-    near, far = torch.full((5,), 0.8), torch.full((5,), 5.0)
+    sources = torch.from_numpy(select_sources(poses, K, frames.size, np.full(5, 2.0), 3)).to(device)
+    near, far = torch.full((5,), 0.8, device=device), torch.full((5,), 5.0, device=device)
+    frames, depth = on(frames, device), depth.to(device)
     stereo = multi_view_stereo(frames, sources, near, far, StereoSettings(hypotheses=48, radius_px=2))
     inner = (slice(None), slice(4, -4), slice(4, -4))
     error = (stereo.log_depth - depth.log()).abs()[inner]
@@ -144,6 +162,19 @@ def test_stereo_finds_a_textured_surface(surface) -> None:  # type: ignore[no-un
         frames, sources, stereo, depth.log() + 0.03, half_width=0.1, hypotheses=13, small_step=0.1, jump=0.5
     )
     assert (again.log_depth - depth.log()).abs()[inner].median() < 0.03
+
+
+def test_frames_matched_together_are_those_matched_alone(specification) -> None:  # type: ignore[no-untyped-def]
+    specification()
+    frames, _ = tilted_plane()
+    sources = torch.tensor([[1, 2], [0, 2], [1, 3], [2, 4], [3, -1]])
+    near, far = torch.linspace(0.8, 1.2, 5), torch.full((5,), 5.0)
+    settings = StereoSettings(hypotheses=24, radius_px=2)
+    alone = multi_view_stereo(frames, sources, near, far, settings, chunk=1)
+    together = multi_view_stereo(frames, sources, near, far, settings, chunk=3)
+    # torch sums windows of several images in another order than those of one.
+    assert (alone.log_depth - together.log_depth).abs().median() < 1e-6
+    assert ((alone.log_depth - together.log_depth).abs() > 1e-3).float().mean() < 0.01
 
 
 def test_agreement_of_true_depths_and_of_wrong_ones() -> None:
@@ -169,3 +200,12 @@ def test_sources_lie_on_both_sides_and_share_the_view() -> None:
     assert (chosen[8] == -1).all()
     still = np.repeat(poses[:1], 4, axis=0)
     assert (select_sources(still, K[:4], frames.size, np.full(4, 2.0), 2) == -1).all()
+
+
+def test_a_frame_without_sources_matches_nothing_with_both() -> None:
+    frames, _ = tilted_plane()
+    case = _case() | {"sources": torch.tensor([[1, 3], [-1, -1]])}
+    for kernels in (matching, native):
+        cost = kernels.matching_cost(frames, **case)
+        assert (cost[1] == 1).all()
+        assert cost[0].std() > 0.1

@@ -90,6 +90,21 @@ def test_no_relation_of_brightness_and_no_network(sequence: EndoscopicSequence, 
     assert "a network trained" not in text
 
 
+def test_a_monocular_network_is_told(sequence: EndoscopicSequence, estimate: Estimate) -> None:
+    fits = [
+        {"scatter": 0.12, "frames_aligned": 4, "pixels": 900},
+        {"scatter": 9.0, "frames_aligned": 0, "pixels": 0},
+    ]
+    told = replace(estimate, report={**estimate.report, "monocular": fits})
+    text = Page(
+        build_report(
+            ReportInputs(name="tube", sequence=sequence.without_training_depth(), depth=told), CONFIG
+        )
+    ).text
+    assert "recording 1 4 frames aligned, scatter 0.12 of log-distances" in text
+    assert "recording 2 could not be aligned with stereo" in text
+
+
 def test_measured_depth_has_no_section(inputs: ReportInputs) -> None:
     assert "estimated-depth" not in Page(build_report(inputs, CONFIG)).ids
 

@@ -16,10 +16,10 @@ import pytest
 from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, EnhanceConfig, PretrainedConfig
 from extrags.errors import ConfigError, MissingDependencyError, WeightsError
+from extrags.model_files import fingerprint
 from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.clips import make_pseudo_observations, render_clips
 from extrags.restoration.pretrained.enhancer import PretrainedEnhancer
-from extrags.restoration.pretrained.fingerprint import fingerprint
 from extrags.restoration.pretrained.inputs import clip_inputs, ranked_references, window_seed
 from extrags.restoration.pretrained.model import find_model, require_diffusers
 from extrags.restoration.pretrained.real_views import RealViews
