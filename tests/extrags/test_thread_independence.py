@@ -26,7 +26,7 @@ from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.trajectories import restore_batch
 from extrags.training.finetuning import finetune
 from tests.extrags.depth.withheld import with_points, withheld_phantom
-from tests.extrags.lit_tube import Tube, tube_cameras
+from tests.extrags.lit_tube import build_tube, tube_cameras
 from tests.extrags.random_lpips import random_weights
 
 COARSE = CoarseConfig(iterations=20, max_points=300, densify=DensifyConfig(max_gaussians=500))
@@ -49,22 +49,22 @@ FROM_NOTHING = ENHANCE.model_copy(
         "judge": False,
     }
 )
-FINETUNE = FinetuneConfig(iterations=20, judge=JudgeConfig(iterations_share=1.0, views=4, max_width=64))
-TRAJECTORIES = [tube_cameras(6, offset_mm=3.0, start_mm=start, turn=0.4) for start in (0.0, 4.0)]
+FINETUNE = FinetuneConfig(iterations=20, judge=JudgeConfig(iterations_share=1.0, views=4, max_width=192))
+ENLARGED = 3
+"""Images of the usual size are too small for torch to divide much of the work."""
+TRAJECTORIES = [
+    tube_cameras(6, offset_mm=3.0, start_mm=start, turn=0.4, enlarged=ENLARGED) for start in (0.0, 4.0)
+]
 MEASURE = PerceptualDifference(Lpips("alex", random_weights("alex")))
 
 Arrays = dict[str, np.ndarray]
 
 
 class Stages:
-    """Tiny stages, each with what the one before it made on one thread.
+    """Tiny stages, each with what the one before it made on one thread."""
 
-    Args:
-        tube: the scene.
-    """
-
-    def __init__(self, tube: Tube) -> None:
-        self.tube = tube
+    def __init__(self) -> None:
+        self.tube = build_tube(enlarged=ENLARGED)
         with threads(1):
             self.enhancer = self._restorer(ENHANCE.model_copy(update={"judge": False}))
             self.pseudo_views = self._restored()
@@ -143,8 +143,8 @@ def threads(count: int) -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def stages(tube: Tube) -> Stages:
-    return Stages(tube)
+def stages() -> Stages:
+    return Stages()
 
 
 @pytest.mark.parametrize("count", [2, 4])
