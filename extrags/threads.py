@@ -21,12 +21,27 @@ import torch
 
 from extrags.raster import native
 
-__all__ = ["in_threads", "one_torch_thread"]
+__all__ = ["in_threads", "one_torch_thread", "torch_threads"]
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 _worker = threading.local()
+
+
+@contextmanager
+def torch_threads(count: int) -> Iterator[None]:
+    """Torch divides the calling thread's work by `count`, whatever the number of cores.
+
+    Args:
+        count: part of what decides on the result.
+    """
+    before = torch.get_num_threads()  # Before anything is set, see `_begin`.
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextmanager
@@ -36,12 +51,8 @@ def one_torch_thread() -> Iterator[None]:
     Results then do not depend on the number of threads. They still depend on the processor's instruction
     set, see docs/running_at_scale.md.
     """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
+    with torch_threads(1):
         yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def in_threads(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
@@ -84,4 +95,7 @@ def in_threads(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
 def _begin() -> None:
     _worker.busy = True
+    # A new thread takes, at its first operation, the number that any thread set last, even if it has set one of
+    # its own before; not if it has asked for the number.
+    torch.get_num_threads()
     torch.set_num_threads(1)

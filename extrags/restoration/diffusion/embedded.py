@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, cond
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["EmbeddedEnhancer", "has_fast_half_precision"]
+__all__ = ["EmbeddedEnhancer", "chosen_precision", "has_fast_half_precision"]
 
 FORMAT = 2
 """Raised when a saved restorer cannot be read by newer code."""
@@ -37,6 +37,13 @@ VIEWS_AT_ONCE = 4
 def has_fast_half_precision() -> bool:
     """Whether this processor computes bfloat16 convolutions faster than float32 ones."""
     return bool(torch.cpu._is_avx512_bf16_supported())
+
+
+def chosen_precision(config: EnhanceConfig) -> Literal["float32", "bfloat16"]:
+    """The precision that the settings mean on this processor."""
+    if config.precision != "auto":
+        return config.precision
+    return "bfloat16" if has_fast_half_precision() else "float32"
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ class EmbeddedEnhancer:
             steps=1 if self.deterministic else steps,
             samples=1 if self.deterministic else config.samples,
             seed=config.seed,
-            half_precision=_half_precision(config),
+            half_precision=chosen_precision(config) == "bfloat16",
             gamut=gamut,
         )
 
@@ -251,9 +258,3 @@ class EmbeddedEnhancer:
         except (OSError, RuntimeError, SafetensorError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return enhancer
-
-
-def _half_precision(config: EnhanceConfig) -> bool:
-    if config.precision == "auto":
-        return has_fast_half_precision()
-    return config.precision == "bfloat16"
