@@ -29,6 +29,30 @@ R = TypeVar("R")
 _worker = threading.local()
 
 
+class _Budget:
+    """Threads at work in this process: stages that run side by side share them."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._taken = 0
+
+    @contextmanager
+    def take(self, wanted: int) -> Iterator[int]:
+        """As many as are left of the kernels' number, `wanted` at most; 0 where only one is left."""
+        with self._lock:
+            left = (native.num_threads() if native.native_isa() else 1) - self._taken
+            count = min(wanted, left) if min(wanted, left) > 1 else 0
+            self._taken += count
+        try:
+            yield count
+        finally:
+            with self._lock:
+                self._taken -= count
+
+
+_budget = _Budget()
+
+
 @contextmanager
 def torch_threads(count: int) -> Iterator[None]:
     """Torch divides the calling thread's work by `count`, whatever the number of cores.
@@ -58,9 +82,10 @@ def one_torch_thread() -> Iterator[None]:
 def in_threads(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """Apply a function to items that are independent of each other, on several cores.
 
-    There are as many threads as the kernels use (`extrags.raster.set_num_threads`), each with one thread of
-    torch: the number changes the time it takes, never the result. Called from one of these threads, it goes
-    through the items one after the other. Events, gradient mode and inference mode are the caller's.
+    There are as many threads as the kernels use (`extrags.raster.set_num_threads`), together with those of
+    other calls, each with one thread of torch: the number changes the time it takes, never the result.
+    Called from one of these threads, it goes through the items one after the other. Events, gradient mode
+    and inference mode are the caller's.
 
     Args:
         function: must not change what the items share.
@@ -73,10 +98,14 @@ def in_threads(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
         Exception: the first in the order of the items that the function raised.
     """
     items = list(items)
-    workers = min(len(items), native.num_threads() if native.native_isa() else 1)
-    if workers < 2 or getattr(_worker, "busy", False):
-        with one_torch_thread():
-            return [function(item) for item in items]
+    with _budget.take(0 if getattr(_worker, "busy", False) else len(items)) as workers:
+        if workers > 0:
+            return _on_workers(workers, function, items)
+    with one_torch_thread():
+        return [function(item) for item in items]
+
+
+def _on_workers(workers: int, function: Callable[[T], R], items: list[T]) -> list[R]:
     gradients, inference = torch.is_grad_enabled(), torch.is_inference_mode_enabled()
 
     def applied(item: T) -> R:
@@ -95,7 +124,7 @@ def in_threads(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
 def _begin() -> None:
     _worker.busy = True
-    # A new thread takes, at its first operation, the number that any thread set last, even if it has set one of
-    # its own before; not if it has asked for the number.
+    # At its first operation a new thread takes the number that any thread set last, even if it has set one
+    # of its own before; not if it has asked for the number.
     torch.get_num_threads()
     torch.set_num_threads(1)

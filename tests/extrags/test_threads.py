@@ -100,6 +100,22 @@ class TestInThreads:
 
         assert all(len(found) == 1 for found in in_threads(names, range(3)))
 
+    def test_calls_side_by_side_share_the_threads(self) -> None:
+        found: list[set[str]] = []
+
+        def beside(item: int) -> None:
+            if item == 0:
+                names = threading.Thread(
+                    target=lambda: found.append(
+                        set(in_threads(lambda _: threading.current_thread().name, range(3)))
+                    )
+                )
+                names.start()
+                names.join()
+
+        in_threads(beside, range(4))
+        assert len(found[0]) == 1
+
     def test_gradient_mode_and_events_are_the_callers(self) -> None:
         def work(item: int) -> tuple[bool, bool]:
             emit(MetricRecorded("test", "item", float(item)))
