@@ -16,12 +16,13 @@ from extrags.config import EvaluateConfig, IouSet
 from extrags.errors import ShapeError, WeightsError
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.perceptual import perceptual_map
+from extrags.threads import in_threads
 
 __all__ = ["PerceptualDifference", "gaussian_iou", "image_confidence", "pixel_confidence"]
 
 LPIPS_SCALE = 0.25
 """LPIPS at which the confidence reaches 1 - 1/e. Strong local changes have an LPIPS of 0.3 to 1."""
-VIEWS_AT_ONCE = 8
+VIEWS_AT_ONCE = 4
 
 
 def gaussian_iou(
@@ -145,17 +146,17 @@ def pixel_confidence(
     """
     if rendered.shape != restored.shape:
         raise ShapeError(f"images {rendered.shape} and {restored.shape} do not fit")
-    maps = []
-    for start in range(0, len(rendered), VIEWS_AT_ONCE):
+
+    def confidence(start: int) -> Tensor:
         first = torch.from_numpy(np.ascontiguousarray(rendered[start : start + VIEWS_AT_ONCE]))
         second = torch.from_numpy(np.ascontiguousarray(restored[start : start + VIEWS_AT_ONCE]))
         with torch.no_grad():
             if measure.lpips is None:
-                maps.append(perceptual_map(first, second).clamp(0, 1))
-                continue
+                return perceptual_map(first, second).clamp(0, 1)
             distance = measure.lpips.distance_map(first, second)
-            bounded = (1 - torch.exp(-distance / LPIPS_SCALE)).clamp(0, 1)
-            maps.append(distance if measure.raw else bounded)
+            return distance if measure.raw else (1 - torch.exp(-distance / LPIPS_SCALE)).clamp(0, 1)
+
+    maps = in_threads(confidence, range(0, len(rendered), VIEWS_AT_ONCE))
     if not maps:
         return np.zeros(rendered.shape[:3], np.float32)
     return np.asarray(torch.cat(maps).numpy(), dtype=np.float32)

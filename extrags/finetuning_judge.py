@@ -31,6 +31,7 @@ from extrags.restoration.trajectories import restore_batch
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.store.storable import Storable
+from extrags.threads import one_torch_thread
 from extrags.training.finetuning import finetune
 from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene
 
@@ -117,6 +118,7 @@ class Judgement(Storable):
         return cls(values["amount"], values["reason"], trials, tuple(values["left_out"]))
 
 
+@one_torch_thread()
 def judge_finetuning(
     scene: Scene,
     sequence: EndoscopicSequence,

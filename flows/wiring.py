@@ -19,8 +19,10 @@ from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner, StoreRunner
 from tasks.assess import assess, plan
 from tasks.coarse import coarse, refined_frames
-from tasks.depth import depth, depth_frames, keyed_settings, triangulation_settings
+from tasks.depth import depth, depth_frames, triangulation_settings
+from tasks.depth import keyed_settings as keyed_depth_settings
 from tasks.enhance import assemble, restore, train
+from tasks.enhance import keyed_settings as keyed_enhance_settings
 from tasks.evaluate import METRICS_FILE, measure, render
 from tasks.explore import NEXT, branch, explore, merge, start
 from tasks.finetune import finetune, judge
@@ -204,7 +206,7 @@ class SequenceRun(Pipeline):
             settings = self.config.depth
             inputs = {
                 "sequence": self._run_uncounted(Call(training_frames, {"sequence": self.refs["sequence"]})),
-                "config": keyed_settings(settings),
+                "config": keyed_depth_settings(settings),
                 "features": triangulation_settings(self.config.poses),
                 "weights_digest": depth_completion_digest(settings),
                 # The network counts by its content; where it lies is not part of the key.
@@ -288,7 +290,7 @@ class SequenceRun(Pipeline):
     def enhance(self) -> None:
         """The restorer, and the virtual views it restores in batches."""
         with self._stage("enhance") as row:
-            settings = self.config.enhance
+            settings = keyed_enhance_settings(self.config.enhance)
             inputs = {
                 **self._scene_inputs(),
                 "config": settings,
@@ -322,7 +324,7 @@ class SequenceRun(Pipeline):
                 "explore": self.refs.get("explore"),
                 "restorer": self.refs.get("restorer"),
                 "config": settings,
-                "enhance": self.config.enhance,
+                "enhance": keyed_enhance_settings(self.config.enhance),
                 "coarse": coarse,
                 "weights_digest": weights.digest,
                 "weights": weights,

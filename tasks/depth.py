@@ -42,7 +42,7 @@ def keyed_settings(config: DepthConfig) -> DepthConfig:
 
 
 # The digests stand for the content of weights; the task finds them by the settings again.
-@stage("depth", version=2, ignore=("monocular",))
+@stage("depth", version=3, ignore=("monocular",))
 def depth(
     slot: Slot,
     sequence: Ref,

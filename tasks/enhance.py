@@ -8,13 +8,35 @@ from extrags.store import Ref, Slot
 from tasks.stage import stage
 from tasks.weights import Weights, restorer_digest
 
-__all__ = ["assemble", "restore", "train"]
+__all__ = ["assemble", "keyed_settings", "restore", "train"]
 
 RESTORER = "restorer"
 
 
+def keyed_settings(config: EnhanceConfig) -> EnhanceConfig:
+    """The settings as they are part of the key: what `auto` leaves to the machine is settled.
+
+    bfloat16 and float32, a device and a processor give different views: under `auto` one key would hold for
+    all of them. Settings that the backend does not read stay as they are, so that machines share its views.
+    """
+    from extrags.devices import chosen_device
+    from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, chosen_precision
+
+    if config.backend == EmbeddedEnhancer.name:
+        return config.model_copy(update={"precision": chosen_precision(config)})
+    if config.backend == "classical":
+        return config
+    # Of a backend of another program nobody knows which of these it reads.
+    settled = {}
+    for name, part in (("pretrained", config.pretrained), ("checkpoint", config.checkpoint)):
+        if part.device == "auto":
+            device = chosen_device("auto", f"enhance.{name}.device").type
+            settled[name] = part.model_copy(update={"device": device})
+    return config.model_copy(update=settled)
+
+
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=5)
+@stage("enhance-train", version=6)
 def train(
     slot: Slot,
     scene: Ref,
@@ -38,7 +60,7 @@ def train(
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=4, ignore=("weights",))
+@stage("enhance-restore", version=5, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,

@@ -14,7 +14,7 @@ __all__ = ["finetune", "judge"]
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("finetune-judge", version=4, ignore=("weights",))
+@stage("finetune-judge", version=5, ignore=("weights",))
 def judge(
     slot: Slot,
     scene: Ref,

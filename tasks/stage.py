@@ -31,6 +31,7 @@ from pydantic import BaseModel
 
 from extrags.errors import ConfigError
 from extrags.store import Ref, Slot, Store, canonical, digest_of
+from extrags.threads import one_torch_thread
 from tasks.locks import FlockManager
 from tasks.memory import peak_memory
 from tasks.progress import reporting
@@ -152,7 +153,8 @@ def stage(
                     stage=name, version=version, key=key, label=label, config=settings, inputs=refs
                 ) as slot,
             ):
-                with peak_memory() as peak:
+                # Workers with other numbers of threads share the store.
+                with peak_memory() as peak, one_torch_thread():
                     body(slot, **inputs)  # type: ignore[call-arg]
                 slot.counts["peak_mib"] = peak.mib
             return slot.ref

@@ -63,6 +63,13 @@ class PretrainedConfig(StageConfig):
     revision: str | None = Field(None, description="commit, tag or branch of a hub id")
     local_files_only: bool = Field(True, description="False: a hub id may be downloaded")
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda where there is one")
+    threads: int = Field(
+        4,
+        ge=1,
+        le=64,
+        description="threads of torch on a processor, however many cores it has: results depend on them "
+        "by rounding",
+    )
     dtype: Literal["auto", "float32", "bfloat16", "float16"] = Field(
         "auto", description="auto: bfloat16 on cuda, float32 on a processor"
     )
@@ -100,6 +107,13 @@ class CheckpointConfig(StageConfig):
         False, description="load a checkpoint that holds more than tensors; it can run any code"
     )
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: cuda where there is one")
+    threads: int = Field(
+        4,
+        ge=1,
+        le=64,
+        description="threads of torch on a processor, however many cores it has: results depend on them "
+        "by rounding",
+    )
     steps: int = Field(50, ge=1, description="DDIM steps")
     eta: float = Field(1.0, ge=0, le=1, description="of DDIM; 1 is ancestral sampling")
     guidance_scale: float | None = Field(

@@ -16,6 +16,7 @@ from extrags.restoration.pretrained.captions import check_source
 from extrags.restoration.protocol import Backend, Enhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.threads import one_torch_thread
 
 __all__ = [
     "backend_of",
@@ -113,6 +114,7 @@ def restorer_digest(config: EnhanceConfig) -> str | None:
     return hashlib.blake2b(parts.encode(), digest_size=16).hexdigest()
 
 
+@one_torch_thread()
 def train_enhancer(
     scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
 ) -> Enhancer:

@@ -14,6 +14,7 @@ from extrags.restoration.clips import choose_views, make_pseudo_observations
 from extrags.restoration.protocol import Enhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.threads import one_torch_thread
 from extrags.view_synthesis.gather import gather_references
 
 __all__ = ["restore", "restore_batch"]
@@ -57,6 +58,7 @@ def restore(
     return PseudoViews.concatenated(parts).quantised()
 
 
+@one_torch_thread()
 def restore_batch(
     scene: Scene,
     sequence: EndoscopicSequence,

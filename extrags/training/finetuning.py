@@ -15,6 +15,7 @@ from extrags.gaussians import Gaussians
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.threads import one_torch_thread
 from extrags.thresholds import HOLE_ALPHA
 from extrags.training.frame_weights import weighted_views
 from extrags.training.optimise import TrainingResult, optimise
@@ -55,6 +56,7 @@ HOLE_STRIDE_PX = 2
 """Hole pixels are taken on a grid of this step; thinning would drop most of them anyway."""
 
 
+@one_torch_thread()
 def finetune(
     scene: Scene,
     sequence: EndoscopicSequence,

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -15,6 +14,7 @@ from extrags.errors import DivergedError
 from extrags.events import Progress, emit
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
+from extrags.threads import one_torch_thread
 from extrags.training.footprint import APPLIED_EVERY, SmallestFootprint
 from extrags.training.frame_weights import FrameWeights
 from extrags.training.pose_refinement import PoseRefinement, RefinedPoses
@@ -78,7 +78,8 @@ def optimise(
     )
     history: list[dict[str, float]] = []
     last_good = scene.detached()
-    with _one_torch_thread():
+    # Torch has only small arrays to handle here: its threads would cost more than they bring.
+    with one_torch_thread():
         for iteration in range(schedule.iterations):
             view = draw(iteration)
             adam.learning_rates = schedule.learning_rates(iteration)
@@ -109,17 +110,6 @@ def optimise(
         raise DivergedError(_account(schedule, schedule.iterations, adam.parameters), last_good)
     found = Scene(Gaussians(**adam.parameters), step.light).detached()
     return TrainingResult(found, history, None if poses is None else poses.refined())
-
-
-@contextmanager
-def _one_torch_thread() -> Iterator[None]:
-    """Torch has only small arrays to handle here: its threads would cost more than they bring."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _psnr(observation: Observation, view: View) -> float:

@@ -19,6 +19,7 @@ from extrags.config import ReferenceChoice
 from extrags.errors import ShapeError
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.scene import Scene
+from extrags.threads import in_threads
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.filling import completed_depth, push_pull
 from extrags.view_synthesis.references import SEEN_WEIGHT, LightTransfer, ReferenceViews
@@ -159,11 +160,12 @@ def observe_views(
         reference: which of them comes first, as `warp_references`.
         exposure: gain of each view; None is 1.
     """
-    gains = [None if exposure is None else exposure[[view]] for view in range(len(cameras))]
-    parts = [
-        _observe_one(scene, references, cameras[view], count, reference, gain)
-        for view, gain in enumerate(gains)
-    ]
+
+    def observe(view: int) -> Observation:
+        gain = None if exposure is None else exposure[[view]]
+        return _observe_one(scene, references, cameras[view], count, reference, gain)
+
+    parts = in_threads(observe, range(len(cameras)))
     return Observation(
         Layers(torch.cat([part.layers.data for part in parts])),
         torch.cat([part.reference for part in parts]),

@@ -46,15 +46,18 @@ def cast_tube(cameras: Cameras, light: NearFieldLight | None) -> tuple[np.ndarra
     return rgb.clip(0, 1), depth
 
 
-def tube_cameras(n: int, *, offset_mm: float = 2.0, start_mm: float = 0.0, turn: float = 0.0) -> Cameras:
+def tube_cameras(
+    n: int, *, offset_mm: float = 2.0, start_mm: float = 0.0, turn: float = 0.0, enlarged: int = 1
+) -> Cameras:
     poses = []
     for i in range(n):
         z = start_mm + 2.5 * i
         center = np.array([offset_mm * np.sin(0.8 * i), offset_mm * np.cos(0.8 * i), z])
         target = center + np.array([14 * np.sin(0.3 * i + turn), 6 * np.cos(0.5 * i), 18.0])
         poses.append(look_at(center, target, np.array([0.0, -1.0, 0.0])))
-    K = np.array([[34.0, 0, WIDTH / 2], [0, 34.0, HEIGHT / 2], [0, 0, 1]])
-    return Cameras(np.tile(K, (n, 1, 1)), np.stack(poses), WIDTH, HEIGHT)
+    width, height = enlarged * WIDTH, enlarged * HEIGHT
+    K = np.array([[34.0 * enlarged, 0, width / 2], [0, 34.0 * enlarged, height / 2], [0, 0, 1]])
+    return Cameras(np.tile(K, (n, 1, 1)), np.stack(poses), width, height)
 
 
 def exact_references(cameras: Cameras, light: NearFieldLight | None) -> ReferenceViews:
@@ -80,11 +83,11 @@ class Tube:
     references: ReferenceViews
 
 
-def build_tube() -> Tube:
+def build_tube(*, enlarged: int = 1) -> Tube:
     """Twelve exact frames of a tube, and a scene of 5000 flat Gaussians with a gap in its wall."""
     frames = 12
     light = tube_light(frames)
-    cameras = tube_cameras(frames)
+    cameras = tube_cameras(frames, enlarged=enlarged)
     rgb, depth = cast_tube(cameras, light)
     generator = np.random.default_rng(5)
     angle, along = generator.uniform(-np.pi, np.pi, 5000), generator.uniform(-2, 75, 5000)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -20,9 +18,10 @@ from extrags.baselines.uc_nerf.stereo import EncodedViews, PosedImages, StereoNe
 from extrags.cameras import Cameras, rotation_angle_deg
 from extrags.config import UcNerfConfig
 from extrags.store.storable import Storable
+from extrags.threads import one_torch_thread
 from extrags.zarr_io import open_group, read_array, write_array, write_frames
 
-__all__ = ["UcNerf", "UcNerfNetwork", "nearest_views", "one_torch_thread"]
+__all__ = ["UcNerf", "UcNerfNetwork", "nearest_views"]
 
 RAYS_PER_BATCH = 4096
 """Rays rendered at once; limits the memory."""
@@ -168,17 +167,6 @@ def nearest_views(camera: Cameras, cameras: Cameras, scale: float) -> np.ndarray
         rotation_angle_deg(np.repeat(pose, len(cameras), 0), cameras.world_from_camera[:, :3, :3])
     )
     return np.argsort(distance + angle, kind="stable")
-
-
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
-    """Sums of torch are split between its threads: with one, results do not depend on their number."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _joined(parts: list[RayColors]) -> RayColors:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from extrags.baselines.uc_nerf.field import RayColors, Rays, sample_depths
-from extrags.baselines.uc_nerf.scene import UcNerf, UcNerfNetwork, nearest_views, one_torch_thread
+from extrags.baselines.uc_nerf.scene import UcNerf, UcNerfNetwork, nearest_views
 from extrags.baselines.uc_nerf.stereo import (
     DepthPrior,
     EncodedViews,
@@ -26,6 +26,7 @@ from extrags.config import UcNerfConfig
 from extrags.errors import CaptureError, DivergedError
 from extrags.events import Progress, emit
 from extrags.sequence import EndoscopicSequence
+from extrags.threads import one_torch_thread
 from extrags.training.random_start import depth_range
 from extrags.training.views import View, epochs, real_views
 

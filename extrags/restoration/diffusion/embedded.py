@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,11 +20,12 @@ from extrags.restoration.diffusion.weights import WEIGHTS
 from extrags.restoration.protocol import Clip, Restoration
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
+from extrags.threads import in_threads
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, condition
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["EmbeddedEnhancer", "has_fast_half_precision"]
+__all__ = ["EmbeddedEnhancer", "chosen_precision", "has_fast_half_precision"]
 
 FORMAT = 2
 """Raised when a saved restorer cannot be read by newer code."""
@@ -36,6 +37,13 @@ VIEWS_AT_ONCE = 4
 def has_fast_half_precision() -> bool:
     """Whether this processor computes bfloat16 convolutions faster than float32 ones."""
     return bool(torch.cpu._is_avx512_bf16_supported())
+
+
+def chosen_precision(config: EnhanceConfig) -> Literal["float32", "bfloat16"]:
+    """The precision that the settings mean on this processor."""
+    if config.precision != "auto":
+        return config.precision
+    return "bfloat16" if has_fast_half_precision() else "float32"
 
 
 @dataclass(frozen=True)
@@ -76,7 +84,7 @@ class EmbeddedEnhancer:
             steps=1 if self.deterministic else steps,
             samples=1 if self.deterministic else config.samples,
             seed=config.seed,
-            half_precision=_half_precision(config),
+            half_precision=chosen_precision(config) == "bfloat16",
             gamut=gamut,
         )
 
@@ -123,18 +131,21 @@ class EmbeddedEnhancer:
             noise: shared by all views.
             steps: of the sampler.
         """
-        parts = []
-        # In small groups: the working set of a whole clip would not stay in the cache, and peaks add up.
-        for first in range(0, len(layers), VIEWS_AT_ONCE):
+
+        def restored_group(first: int) -> Sampled:
+            group = layers[first : first + VIEWS_AT_ONCE]
             with torch.no_grad():
-                conditioning = condition(layers[first : first + VIEWS_AT_ONCE], transfer)
+                conditioning = condition(group, transfer)
             start = noise.expand(len(conditioning.base), -1, -1, -1)
             restored = sample(
                 self.network, conditioning, start, steps=steps, half_precision=self.half_precision
             )
             rgb = self.gamut.bounded(restored.rgb)
-            features = error_features(layers[first : first + VIEWS_AT_ONCE], rgb, restored.error)
-            parts.append(replace(restored, rgb=rgb, error=self.error_model.applied(features)))
+            error = self.error_model.applied(error_features(group, rgb, restored.error))
+            return replace(restored, rgb=rgb, error=error)
+
+        # In small groups: the working set of a whole clip would not stay in the cache, and peaks add up.
+        parts = in_threads(restored_group, range(0, len(layers), VIEWS_AT_ONCE))
         return Sampled(
             torch.cat([part.rgb for part in parts]),
             torch.cat([part.depth_mm for part in parts]),
@@ -247,9 +258,3 @@ class EmbeddedEnhancer:
         except (OSError, RuntimeError, SafetensorError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return enhancer
-
-
-def _half_precision(config: EnhanceConfig) -> bool:
-    if config.precision == "auto":
-        return has_fast_half_precision()
-    return config.precision == "bfloat16"

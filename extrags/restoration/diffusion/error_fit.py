@@ -13,6 +13,7 @@ from extrags.restoration.diffusion.validation import validation_pairs
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.uncertainty.calibration import Calibration, cell_means
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
+from extrags.threads import in_threads
 from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["cell_errors", "with_calibration", "with_error_model"]
@@ -76,13 +77,15 @@ def cell_errors(
         pairs: with the truth.
         transfer: how brightness changes with distance.
     """
-    expected, true = [], []
-    for view in range(len(pairs)):
+
+    def errors(view: int) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
         noise = enhancer.noise(pairs.size, view, 0)
         restored = enhancer.restored_layers(pairs.layers[view], transfer, noise, steps=enhancer.steps)
         weight = pairs.weight[view : view + 1]
         error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
         predicted, share = cell_means(restored.error, weight)
-        expected.append(predicted[share > MIN_VALID_SHARE])
-        true.append(cell_means(error, weight)[0][share > MIN_VALID_SHARE])
+        counted = share > MIN_VALID_SHARE
+        return predicted[counted], cell_means(error, weight)[0][counted]
+
+    expected, true = zip(*in_threads(errors, range(len(pairs))), strict=True)
     return np.concatenate(expected), np.concatenate(true)

@@ -19,6 +19,7 @@ from extrags.restoration.diffusion.rectified_flow import TrainingSettings, train
 from extrags.restoration.diffusion.validation import validation_pairs, validation_scores
 from extrags.restoration.training_data.augmentation import CropSampler
 from extrags.restoration.training_data.pairs import Pairs
+from extrags.threads import one_torch_thread
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
@@ -34,6 +35,7 @@ MIN_GAIN_DB = 0.1
 Scores = dict[str, dict[str, float]]
 
 
+@one_torch_thread()
 def train_on_scene(
     pairs: Pairs,
     transfer: LightTransfer,
@@ -45,7 +47,7 @@ def train_on_scene(
     """Train on a scene's pairs, and keep the training only where the validation pairs show a gain.
 
     With `start`, its network is fine-tuned; without a gain on the validation pairs, its weights are kept
-    unchanged. The same pairs and settings give the same weights, for one number of threads.
+    unchanged. The same pairs and settings give the same weights, whatever the number of threads.
 
     Args:
         pairs: training and validation pairs of the scene.

@@ -10,6 +10,7 @@ from torch import Tensor
 from extrags.metrics.image import psnr_per_image, ssim_map
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.training_data.pairs import Pairs
+from extrags.threads import in_threads
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import condition
 from extrags.view_synthesis.references import LightTransfer
@@ -40,13 +41,12 @@ def validation_scores(
         conditioning = condition(chosen.layers, transfer)
     images = {"none": chosen.layers.get("rendered").clamp(0, 1), "classical": conditioning.base}
     for steps in candidates:
-        parts = [
-            enhancer.restored_layers(
-                chosen.layers[view], transfer, enhancer.noise(chosen.size, view, 0), steps=steps
-            ).rgb
-            for view in range(len(chosen))
-        ]
-        images[f"embedded_{steps}"] = torch.cat(parts)
+
+        def restored(view: int, steps: int = steps) -> Tensor:
+            noise = enhancer.noise(chosen.size, view, 0)
+            return enhancer.restored_layers(chosen.layers[view], transfer, noise, steps=steps).rgb
+
+        images[f"embedded_{steps}"] = torch.cat(in_threads(restored, range(len(chosen))))
     return {name: _score(image, chosen) for name, image in images.items()}
 
 

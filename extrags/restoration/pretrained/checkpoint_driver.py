@@ -81,6 +81,7 @@ def _run(settings: Any, request: str, result: str) -> None:
     with numpy.load(request) as archive:
         frames, unknown, poses = (torch.from_numpy(archive[name]) for name in ("frames", "unknown", "poses"))
         seeds = archive["seeds"].tolist()
+    torch.set_num_threads(settings["threads"])
     device = torch.device(_device(settings["device"], torch))
     model, half = _model(settings, device, torch)
     restore = _enhanced if settings["interface"] == "enhancer" else _inpainted

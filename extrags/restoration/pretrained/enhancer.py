@@ -30,6 +30,7 @@ from extrags.restoration.pretrained.windows import cross_faded, padded_to, plan_
 from extrags.restoration.protocol import Clip, Restoration
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.threads import torch_threads
 
 __all__ = ["DiffusersBackend", "PretrainedEnhancer"]
 
@@ -71,7 +72,7 @@ class PretrainedEnhancer(PreparedEnhancer):
             ConfigError: when a setting does not fit the machine, or leaves nothing to do.
             NonFiniteError: when the pipeline returns NaN.
         """
-        with _LOCK:
+        with _LOCK, torch_threads(self.settings.threads):
             adapter = self._opened()
             rgb = self._restored(adapter, clip)
         provenance = {
