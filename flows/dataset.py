@@ -20,10 +20,12 @@ from flows.methods import METHODS, MethodName, check_not_pinned, method_config, 
 from flows.outcome import DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
 from flows.preflight import preflight
+from flows.run_page import run_page
 from flows.runners import PrefectRunner
-from flows.sequence import artifact_key, open_store, reconstruct_sequence
+from flows.sequence import open_store, reconstruct_sequence
 from flows.settings import DEFAULT_STORE, task_runner
 from flows.tables import dataset_markdown
+from tasks.run_page import artifact_key, attempt
 
 __all__ = ["reconstruct_dataset"]
 
@@ -70,9 +72,12 @@ def reconstruct_dataset(
             method=method,
             return_state=True,
         )
-        return outcome_of(sequence, state)
+        outcome = outcome_of(sequence, state)
+        page.sequence_ended(outcome, store)
+        return outcome
 
     def run_all() -> DatasetOutcome:
+        page.restart()
         if at_once == 1:
             outcomes = [reconstruct(sequence) for sequence in sequences]
         else:
@@ -80,17 +85,22 @@ def reconstruct_dataset(
                 # Flow and observer are in context variables, which threads do not inherit.
                 futures = [pool.submit(copy_context().run, reconstruct, sequence) for sequence in sequences]
                 outcomes = [future.result() for future in futures]
-        page = None
+        report = None
         if until == "report":
             label = profile_label(profile, method)
-            page = dataset_page(outcomes, name, label, PrefectRunner(store, refresh))
-        return DatasetOutcome(outcomes, page)
+            report = dataset_page(outcomes, name, label, PrefectRunner(store, refresh))
+        return DatasetOutcome(outcomes, report)
 
-    found = again_after_damage(Store(store), run_all)
-    create_markdown_artifact(
-        dataset_markdown(found.sequences),
-        key=artifact_key("dataset", name),
-        description=f"{len(sequences)} sequences, profile {profile}",
+    with run_page(name, config, until, sequences=len(sequences), bars=False) as page:
+        found = again_after_damage(Store(store), run_all)
+        if found.report is not None:
+            page.link(found.report, artifact_key("report", name), f"Report of {name}")
+    attempt(
+        lambda: create_markdown_artifact(
+            dataset_markdown(found.sequences),
+            key=artifact_key("dataset", name),
+            description=f"{len(sequences)} sequences, profile {profile}",
+        )
     )
     return found
 

@@ -11,7 +11,15 @@ from dataclasses import dataclass
 
 from extrags.events import Event, MetricRecorded, Progress, subscribed
 
-__all__ = ["Observer", "StageProgress", "notify", "observed", "reporting"]
+__all__ = [
+    "Observer",
+    "StageProgress",
+    "current_observer",
+    "log_progress",
+    "notify",
+    "observed",
+    "reporting",
+]
 
 log = logging.getLogger("extrags.progress")
 
@@ -58,6 +66,16 @@ def notify(progress: StageProgress) -> None:
     if observer is not None:
         observer(progress)
         return
+    log_progress(progress)
+
+
+def current_observer() -> Observer | None:
+    """Who is told of the progress of stages here; None where it is logged."""
+    return _observer.get()
+
+
+def log_progress(progress: StageProgress) -> None:
+    """One line in the log."""
     words = [progress.label, f"{progress.stage}:"]
     if progress.state != "running":
         words += [progress.state, f"in {progress.seconds:.1f} s"]
