@@ -47,7 +47,7 @@ def preview(outcome: SequenceOutcome, store: Store) -> tuple[str, str] | None:
     shown, words = [_tile(as_uint8(np.asarray(frames["rgb"][frame])))], ["recorded"]
     for part, word in (("renders_coarse", "coarse scene"), ("renders_final", "final scene")):
         if part in outcome.refs:
-            renders = _group(store.open(outcome.refs[part]) / RenderedViews.stored_as)  # type: ignore[index]
+            renders = _group(store.open(outcome.refs[part]) / RenderedViews.stored_as)
             shown.append(_tile(as_uint8(np.asarray(renders["rgb"][view]))))
             words.append(word)
     height = min(tile.shape[0] for tile in shown)

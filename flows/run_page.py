@@ -86,6 +86,9 @@ class SequenceEstimate:
 
     def receive(self, progress: StageProgress, now: float) -> None:
         """Take note of a step or the end of a stage."""
+        if self.failed:
+            # What is skipped now is not done.
+            return
         if progress.state != "running":
             self.ended[progress.stage] = progress
             self.stage, self.newest = "", None
@@ -103,6 +106,11 @@ class SequenceEstimate:
             if progress.total and progress.stage != "enhance-restore":
                 self._task_share = max(self._task_share or 0.0, min(1.0, progress.done / progress.total))
 
+    @property
+    def failed(self) -> bool:
+        """Whether a stage failed; nothing comes after it."""
+        return any(row.state == "failed" for row in self.ended.values())
+
     def _begin(self, progress: StageProgress, now: float) -> None:
         self.stage, self.newest = progress.stage, progress
         self._begun = self._task_begun = now
@@ -112,7 +120,8 @@ class SequenceEstimate:
     def share(self, now: float) -> float:
         """Of the expected time that stages to be run take, in [0, 1]."""
         whole = sum(self._seconds(stage) for stage in self._stages())
-        done = sum(self._seconds(stage) for stage in self._stages() if stage in self.ended)
+        well = [stage for stage, row in self.ended.items() if row.state in ("ran", "cached")]
+        done = sum(self._seconds(stage) for stage in self._stages() if stage in well)
         return min(1.0, (done + self._stage_done(now)) / whole) if whole else 1.0
 
     def seconds_left(self, now: float) -> float | None:
@@ -190,6 +199,7 @@ class RunPage:
         self._begun = time.monotonic()
         self._estimates: dict[str, SequenceEstimate] = {}
         self._ended = self._failed = 0
+        self._failed_share = 0.0
         self._ran_seconds: list[float] = []
         self._started_at: dict[str, float] = {}
 
@@ -219,8 +229,10 @@ class RunPage:
         now = time.monotonic()
         with self._guard:
             self._ended += 1
-            self._failed += outcome.status == "failed"
-            self._estimates.pop(outcome.name, None)
+            estimate = self._estimates.pop(outcome.name, None)
+            if outcome.status == "failed":
+                self._failed += 1
+                self._failed_share = 0.0 if estimate is None else estimate.share(now)
             begun = self._started_at.pop(outcome.name, now)
             if any(row.state == "ran" for row in outcome.stages):
                 self._ran_seconds.append(now - begun)
@@ -251,11 +263,14 @@ class RunPage:
         """The last word, and everything sent."""
         took = duration_text(time.monotonic() - self._begun)
         with self._guard:
-            whole = self._ended >= self._sequences
-            share = 1.0 if whole else self._share(time.monotonic())
-            words = f"ended after {took}" if not whole else f"done in {took}"
-            if self._failed:
-                words += f"; {self._failed} of {self._sequences} failed"
+            if self._failed == self._sequences == 1:
+                share, words = self._failed_share, f"failed after {took}"
+            elif self._ended >= self._sequences:
+                share, words = 1.0, f"done in {took}"
+                if self._failed:
+                    words += f"; {self._failed} of {self._sequences} failed"
+            else:
+                share, words = self._share(time.monotonic()), f"ended after {took}"
         self.sender.progress(self._key, 100 * share, f"{self._name}: {words}")
         self.sender.close(wait=wait)
 

@@ -81,7 +81,7 @@ def log_progress(progress: StageProgress) -> None:
         words += [progress.state, f"in {progress.seconds:.1f} s"]
     elif progress.total:
         words.append(f"{progress.done}/{progress.total}")
-    else:
+    elif not progress.detail:
         words.append("starts")
     log.info("%s", " ".join([*words, progress.detail]).rstrip())
 

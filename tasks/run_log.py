@@ -97,6 +97,7 @@ def _enter(flow_run_id: UUID | None) -> None:
                 handler = RunLogHandler(flow_run_id)
                 logger.addHandler(handler)
             _undo.append((logger, before, handler))
+        # It stays: Prefect says how a task in a worker process ended after the stage has left the log.
         logging.getLogger(TASK_RUNS).addFilter(_named)
 
 
@@ -112,4 +113,3 @@ def _leave() -> None:
                 # Not closed: that would wait for the server, once per logger.
                 logger.removeHandler(handler)
         _undo.clear()
-        logging.getLogger(TASK_RUNS).removeFilter(_named)

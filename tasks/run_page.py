@@ -245,8 +245,8 @@ class ProgressLog:
 
 
 def rate_left(first_done: int, done: int, total: int, elapsed_s: float) -> float | None:
-    """Seconds that the rest takes at the rate so far; None before there is one."""
-    if done <= first_done or elapsed_s <= 0:
+    """Seconds that the rest takes at the rate so far; None before there is one, or after the end."""
+    if done <= first_done or done >= total or elapsed_s <= 0:
         return None
     return (total - done) * elapsed_s / (done - first_done)
 

@@ -232,6 +232,14 @@ class TestEstimate:
         assert estimate.share(60.0) == 1.0
         assert estimate.seconds_left(60.0) == 0.0
 
+    def test_a_failure_keeps_its_share(self) -> None:
+        estimate = SequenceEstimate(EXPECTED_SECONDS, until="coarse")
+        estimate.receive(step("ingest"), 0.0)
+        estimate.receive(step("ingest", "failed", seconds=1.0), 1.0)
+        for skipped in ("poses", "depth", "coarse"):
+            estimate.receive(step(skipped, "skipped"), 1.0)
+        assert estimate.share(1.0) == 0.0
+
     def test_shares_never_fall(self) -> None:
         estimate = SequenceEstimate(EXPECTED_SECONDS)
         shares, now = [], 0.0
