@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Annotated, Any
 
 from prefect import flow
@@ -20,12 +21,14 @@ from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
 from flows.pages import benchmark_page
 from flows.preflight import preflight
+from flows.run_page import run_page
 from flows.runners import PrefectRunner, Runner
-from flows.sequence import artifact_key, open_store
+from flows.sequence import open_store
 from flows.settings import DEFAULT_STORE
 from flows.tables import benchmark_markdown
 from flows.wiring import run_sequence
 from tasks.evaluate import METRICS_FILE
+from tasks.run_page import artifact_key, attempt
 
 __all__ = ["Case", "benchmark", "case_of", "check_methods", "run_method"]
 
@@ -99,21 +102,25 @@ def benchmark(
     words = {method: summary_of(method, variants or {}) for method in wanted}
 
     def run_all() -> tuple[list[dict[str, Any]], str]:
-        found = [
-            run_method(method, sequence, profile, seed, settings, store, runner, variants=variants)
-            for sequence in sequences
-            for profile in profiles
-            for seed in seeds
-            for method in wanted
-        ]
+        page.restart()
+        found = []
+        for sequence, profile, seed, method in product(sequences, profiles, seeds, wanted):
+            case = run_method(method, sequence, profile, seed, settings, store, runner, variants=variants)
+            page.sequence_ended(case.outcome, store)
+            found.append(case)
         cases = [case_of(case) for case in found]
         return cases, benchmark_page([case.outcome for case in found], cases, words, baseline, name, runner)
 
-    cases, page = again_after_damage(Store(store), run_all)
-    create_markdown_artifact(
-        benchmark_markdown(cases, baseline),
-        key=artifact_key("benchmark", name),
-        description=f"{len(cases)} runs",
+    runs = len(sequences) * len(profiles) * len(seeds) * len(wanted)
+    with run_page(name, config, "evaluate", sequences=runs) as page:
+        cases, report = again_after_damage(Store(store), run_all)
+        page.link(report, artifact_key("report", name), f"Report of {name}")
+    attempt(
+        lambda: create_markdown_artifact(
+            benchmark_markdown(cases, baseline),
+            key=artifact_key("benchmark", name),
+            description=f"{len(cases)} runs",
+        )
     )
     # Here, because they load torch and the kernels, which looking up a deployment must not.
     from extrags.metrics.comparison import compare_runs
@@ -123,7 +130,7 @@ def benchmark(
         "machine": machine(),
         "cases": cases,
         "comparison": compare_runs(cases, baseline),
-        "report": page,
+        "report": report,
     }
 
 

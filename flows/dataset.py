@@ -21,10 +21,12 @@ from flows.methods import METHODS, MethodName, check_not_pinned, method_config, 
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
 from flows.preflight import preflight
+from flows.run_page import run_page
 from flows.runners import PrefectRunner
-from flows.sequence import artifact_key, open_store, reconstruct_sequence
+from flows.sequence import open_store, reconstruct_sequence
 from flows.settings import DEFAULT_STORE, task_runner
 from flows.tables import dataset_markdown
+from tasks.run_page import artifact_key, attempt
 
 __all__ = ["reconstruct_dataset"]
 
@@ -83,9 +85,12 @@ def reconstruct_dataset(
             limits=limits,
             return_state=True,
         )
-        return outcome_of(sequence, state)
+        outcome = outcome_of(sequence, state)
+        page.sequence_ended(outcome, store)
+        return outcome
 
     def run_all() -> DatasetOutcome:
+        page.restart()
         if at_once == 1:
             outcomes = [reconstruct(sequence) for sequence in sequences]
         else:
@@ -93,17 +98,22 @@ def reconstruct_dataset(
                 # Flow and observer are in context variables, which threads do not inherit.
                 futures = [pool.submit(copy_context().run, reconstruct, sequence) for sequence in sequences]
                 outcomes = [future.result() for future in futures]
-        page = None
+        report = None
         if until == "report":
             label = profile_label(profile, method)
-            page = dataset_page(outcomes, name, label, PrefectRunner(store, refresh, limits))
-        return DatasetOutcome(outcomes, page)
+            report = dataset_page(outcomes, name, label, PrefectRunner(store, refresh, limits))
+        return DatasetOutcome(outcomes, report)
 
-    found = again_after_damage(Store(store), run_all)
-    create_markdown_artifact(
-        dataset_markdown(found.sequences),
-        key=artifact_key("dataset", name),
-        description=f"{len(sequences)} sequences, profile {profile}",
+    with run_page(name, config, until, sequences=len(sequences), bars=False) as page:
+        found = again_after_damage(Store(store), run_all)
+        if found.report is not None:
+            page.link(found.report, artifact_key("report", name), f"Report of {name}")
+    attempt(
+        lambda: create_markdown_artifact(
+            dataset_markdown(found.sequences),
+            key=artifact_key("dataset", name),
+            description=f"{len(sequences)} sequences, profile {profile}",
+        )
     )
     if found.failed_share > max_failed_share:
         raise DatasetFailedError(found, max_failed_share)

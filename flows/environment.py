@@ -35,7 +35,6 @@ def prepare(state: Path, *, debug: bool = False) -> None:
         "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
         "DO_NOT_TRACK": "1",
         "PREFECT_CLI_PROMPT": "false",
-        "PREFECT_LOGGING_TO_API_ENABLED": "false",
         # Failures are reported by `flows.failures`; Prefect would add a traceback for each.
         "PREFECT_LOGGING_LEVEL": "INFO" if debug else "CRITICAL",
         "PREFECT_SERVER_LOGGING_LEVEL": "WARNING" if debug else "CRITICAL",
@@ -46,6 +45,10 @@ def prepare(state: Path, *, debug: bool = False) -> None:
             home.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StoreError(f"the store {state} cannot be written: {error.strerror or error}") from error
+        # Nobody looks at the page of a run on a server that goes with it.
+        # (The variable is `tasks.run_page.PAGE_VARIABLE`, which imports Prefect.)
+        chosen["PREFECT_LOGGING_TO_API_ENABLED"] = "false"
+        chosen["EXTRAGS_RUN_PAGE"] = "0"
         chosen["PREFECT_HOME"] = str(home)
     for name, value in chosen.items():
         os.environ.setdefault(name, value)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from typing import Annotated, Any
 
 from prefect import flow
@@ -17,13 +16,15 @@ from flows.limits import StageLimits
 from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
 from flows.outcome import SequenceFailedError, SequenceOutcome
 from flows.preflight import preflight
+from flows.run_page import run_page
 from flows.runners import PrefectRunner
 from flows.settings import DEFAULT_STORE
 from flows.tables import sequence_markdown
 from flows.wiring import run_sequence
 from tasks.locks import sweep_locks
+from tasks.run_page import artifact_key, attempt
 
-__all__ = ["artifact_key", "open_store", "reconstruct_sequence"]
+__all__ = ["open_store", "reconstruct_sequence"]
 
 log = logging.getLogger(__name__)
 
@@ -54,21 +55,25 @@ def reconstruct_sequence(
     """
     check_not_pinned(method, settings or {})
     config = method_config(method, profile, settings, seed)
-    open_store(store)
-    preflight(config, until, METHODS[method].leave_out)
-    outcome = run_sequence(
-        sequence,
-        config,
-        store,
-        PrefectRunner(store, refresh, limits),
-        profile=profile_label(profile, method),
-        until=until,
-        leave_out=METHODS[method].leave_out,
-    )
-    create_markdown_artifact(
-        sequence_markdown(outcome),
-        key=artifact_key("sequence", sequence),
-        description=f"{sequence}, profile {profile}",
+    with run_page(sequence, config, until) as page:
+        open_store(store)
+        preflight(config, until, METHODS[method].leave_out)
+        outcome = run_sequence(
+            sequence,
+            config,
+            store,
+            PrefectRunner(store, refresh, limits),
+            profile=profile_label(profile, method),
+            until=until,
+            leave_out=METHODS[method].leave_out,
+        )
+        page.sequence_ended(outcome, store)
+    attempt(
+        lambda: create_markdown_artifact(
+            sequence_markdown(outcome),
+            key=artifact_key("sequence", sequence),
+            description=f"{sequence}, profile {profile}",
+        )
     )
     if outcome.status == "failed":
         raise SequenceFailedError(outcome) from outcome.error
@@ -86,8 +91,3 @@ def open_store(root: str) -> Store:
     for name in [*store.sweep(), *sweep_locks(store.locks)]:
         log.info("removed what a killed run left: %s", name)
     return store
-
-
-def artifact_key(kind: str, name: str) -> str:
-    """A key as Prefect wants it: lower-case letters, digits and dashes."""
-    return f"{kind}-{re.sub(r'[^a-z0-9]+', '-', name.lower()).strip('-')}"

@@ -17,7 +17,9 @@ __all__ = [
     "Observer",
     "StageProgress",
     "TimeLimitError",
+    "current_observer",
     "interrupt_stages",
+    "log_progress",
     "notify",
     "observed",
     "reporting",
@@ -81,12 +83,22 @@ def notify(progress: StageProgress) -> None:
     if observer is not None:
         observer(progress)
         return
+    log_progress(progress)
+
+
+def current_observer() -> Observer | None:
+    """Who is told of the progress of stages here; None where it is logged."""
+    return _observer.get()
+
+
+def log_progress(progress: StageProgress) -> None:
+    """One line in the log."""
     words = [progress.label, f"{progress.stage}:"]
     if progress.state != "running":
         words += [progress.state, f"in {progress.seconds:.1f} s"]
     elif progress.total:
         words.append(f"{progress.done}/{progress.total}")
-    else:
+    elif not progress.detail:
         words.append("starts")
     log.info("%s", " ".join([*words, progress.detail]).rstrip())
 

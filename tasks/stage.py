@@ -35,6 +35,8 @@ from extrags.threads import one_torch_thread
 from tasks.locks import FlockManager
 from tasks.memory import peak_memory
 from tasks.progress import reporting
+from tasks.run_log import run_log
+from tasks.run_page import stage_page
 
 __all__ = ["ArtefactRecords", "StageKey", "at", "stage", "stage_key", "stage_versions"]
 
@@ -148,6 +150,8 @@ def stage(
                 return found
             refs, settings = _split({name: value for name, value in inputs.items() if name not in ignore})
             with (
+                run_log(),
+                stage_page(),
                 reporting(label, name, time_limit_s),
                 where.slot(
                     stage=name, version=version, key=key, label=label, config=settings, inputs=refs

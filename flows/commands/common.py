@@ -163,11 +163,10 @@ def write_json(value: Any, target: str | None) -> None:
 
 def set_up_logging(*, debug: bool, terminal: bool) -> None:
     """Log lines to standard error: everything with `debug`, progress where there is no terminal."""
-    logging.basicConfig(
-        level=logging.INFO if debug or not terminal else logging.WARNING,
-        format="%(asctime)s %(message)s",
-        datefmt="%H:%M:%S",
-        stream=sys.stderr,
-    )
+    level = logging.INFO if debug or not terminal else logging.WARNING
+    handler = logging.StreamHandler(sys.stderr)
+    # The handler's as well as the loggers': a run on a lasting server sends more to its log than is shown.
+    handler.setLevel(level)
+    logging.basicConfig(level=level, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=[handler])
     for noisy in ("httpx", "httpcore", "prefect", "distributed", "distributed.scheduler", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING if debug else logging.CRITICAL)

@@ -15,8 +15,9 @@ from extrags.pipeline import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
 from flows.outcome import DatasetFailedError, SequenceFailedError, SequenceOutcome
-from flows.sequence import artifact_key, reconstruct_sequence
+from flows.sequence import reconstruct_sequence
 from flows.settings import pipeline_config, task_runner
+from tasks.run_page import artifact_key
 from tests.flows.tiny import GIVEN, SEQUENCE, TINY, without_report
 
 REPOSITORY = Path(__file__).parents[2]
