@@ -9,7 +9,7 @@ from tasks.stage import stage
 __all__ = ["poses"]
 
 
-@stage("poses", version=4)
+@stage("poses", version=5)
 def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
     """Estimate poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
 

@@ -27,6 +27,11 @@ class PosesConfig(StageConfig):
     min_registered_share: float = Field(
         0.5, gt=0, le=1, description="fewer registered training frames are an error"
     )
+    lenient_retry: bool = Field(
+        True,
+        description="where COLMAP registers too few training frames and there is no depth to align them "
+        "by, try again with guided matching and lower thresholds: poses are less exact then",
+    )
     fallback: Literal["auto", "never", "rgbd"] = Field(
         "auto",
         description="auto: where COLMAP fails and depth is there, frames are aligned by colour and depth; "

@@ -116,6 +116,10 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     depth of the pixels, interpolated between the points that a frame observes, becomes that. COLMAP runs in
     a process of its own.
 
+    Where that registers too few training frames, and no depth is there to align them by, a second attempt
+    with guided matching and lower thresholds is made (`config.lenient_retry`), and taken if it registers
+    more.
+
     *An unknown lens* (`sequence.intrinsics` is `guessed`, see `PosesConfig.refine_intrinsics`): focal
     length and radial distortion are estimated with the map (`extrags.poses.self_calibration`), and the
     guess is kept, with a warning, where the frames do not determine them.
@@ -153,9 +157,24 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     unknown_lens = _estimates_lens(sequence, config)
     # The lenses that are tried have one focal length.
     seen = sequence.with_square_pixels() if unknown_lens else sequence
-    result = _run(_job(seen, config, unknown_lens=unknown_lens), sequence.name)
+    job = _job(seen, config, unknown_lens=unknown_lens)
+    result = _run(job, sequence.name)
     registered = np.isfinite(result.world_from_camera).all((1, 2))
     report = colmap_report(sequence, result, registered)
+    no_depth = sequence.depth_mm is None or config.fallback == "never"
+    if config.lenient_retry and no_depth and not _enough(report, config):
+        _LOG.warning(
+            "%s: COLMAP registered %d of %d training frames; trying again with guided matching and lower "
+            "thresholds, which makes less exact poses",
+            sequence.name,
+            report["registered_train"],
+            report["n_train"],
+        )
+        again = _run(replace(job, lenient=True), sequence.name)
+        registered_again = np.isfinite(again.world_from_camera).all((1, 2))
+        report_again = colmap_report(sequence, again, registered_again)
+        if report_again["registered_train"] > report["registered_train"]:
+            result, registered, report = again, registered_again, report_again | {"lenient": True}
     calibration = None
     if "calibration" in report:
         calibration = LensCalibration.from_json(report["calibration"])

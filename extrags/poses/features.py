@@ -34,6 +34,9 @@ __all__ = [
 
 MASK_EROSION_SHARE = 0.01
 """Features this near (in image widths) to masked-out pixels belong to the edge, which moves along."""
+LENIENT_PAIR_INLIERS = 12
+"""Matches that verify a pair at the second attempt; COLMAP asks for 15."""
+
 PAIRS_PER_CALL = 100
 _IMAGES_PER_CALL = 16
 
@@ -117,14 +120,28 @@ def extract(pycolmap: Any, folder: Path, job: PoseJob, frames: np.ndarray, told:
 
 
 def match(
-    pycolmap: Any, folder: Path, pairs: list[Pair], seed: int, told: Told | None, *, verify: bool = True
+    pycolmap: Any,
+    folder: Path,
+    pairs: list[Pair],
+    seed: int,
+    told: Told | None,
+    *,
+    verify: bool = True,
+    lenient: bool = False,
 ) -> None:
-    """Matches of pairs of frames, and with `verify` the two-view geometry that RANSAC finds in them."""
+    """Matches of pairs of frames, and with `verify` the two-view geometry that RANSAC finds in them.
+
+    With `lenient` features are matched once more along the epipolar lines of the geometry that was found, and
+    fewer of them verify a pair.
+    """
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
+    matching.guided_matching = lenient
     matching.skip_geometric_verification = not verify
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
+    if lenient:
+        verification.min_num_inliers = LENIENT_PAIR_INLIERS
     pairing = pycolmap.ImportedPairingOptions()
     listed = folder / "pairs.txt"
     for start in range(0, len(pairs), PAIRS_PER_CALL):

@@ -34,6 +34,7 @@ class PoseJob:
         settings: fields of `PosesConfig`.
         unknown_lens: whether `K`, then the same for all frames, is a guess and the lens is to be estimated.
         world_from_camera: known poses, [F, 4, 4]; None where they are to be found.
+        lenient: whether this is the second attempt, with guided matching and lower thresholds.
     """
 
     rgb: np.ndarray
@@ -45,6 +46,7 @@ class PoseJob:
     settings: dict[str, Any]
     unknown_lens: bool = False
     world_from_camera: np.ndarray | None = None
+    lenient: bool = False
 
     def save(self, folder: Path) -> None:
         """Write the job."""
@@ -61,7 +63,11 @@ class PoseJob:
             train=self.train,
             test=self.test,
         )
-        content = {"settings": self.settings, "unknown_lens": self.unknown_lens}
+        content = {
+            "settings": self.settings,
+            "unknown_lens": self.unknown_lens,
+            "lenient": self.lenient,
+        }
         (folder / "job.json").write_text(json.dumps(content))
 
     @classmethod

@@ -140,8 +140,12 @@ class TestProgress:
 
 @pytest.mark.usefixtures("prefect_server")
 class TestLog:
-    def test_the_librarys_lines_reach_the_runs_log(self, tmp_path: Path) -> None:
-        with temporary_settings({PREFECT_LOGGING_TO_API_ENABLED: True}):
+    def test_the_librarys_lines_reach_the_runs_log(
+        self, tmp_path: Path, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        # Prefect's own level, which another test's command line may have raised in this process.
+        level = caplog.at_level(logging.INFO, logger="prefect.task_runs")
+        with level, temporary_settings({PREFECT_LOGGING_TO_API_ENABLED: True}):
             run_id, _ = toy_page(str(tmp_path / "store"), seed=7)
             lines = log_lines_of(run_id)
         assert (logging.INFO, "the library speaks, seed 7") in lines

@@ -18,7 +18,7 @@ from extrags.errors import CaptureError, ShapeError
 from extrags.events import Event, Progress, subscribed
 from extrags.metrics.pose import absolute_trajectory_error
 from extrags.poses import PoseEstimate, estimate_poses, with_estimated_poses
-from extrags.poses.job import PoseJobResult
+from extrags.poses.job import PoseJob, PoseJobResult
 from extrags.sequence import EndoscopicSequence
 from tests.extrags.poses.textured_room import HALF_SIZE_MM, room_sequence, turning_room
 
@@ -294,6 +294,38 @@ def test_a_scope_that_only_turns(
     ):
         with pytest.raises(CaptureError, match=f"too little parallax.*{instead}"):
             estimate_poses(replace(turning, depth_mm=None), CONFIG.model_copy(update={"fallback": fallback}))
+
+
+def test_a_second_attempt_is_lenient_and_counts_where_it_registers_more(
+    run: Run, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    jobs: list[PoseJob] = []
+    complete = estimate_module._run(estimate_module._job(run.sequence, CONFIG), "arc")
+    count = len(run.sequence)
+    none = replace(
+        complete,
+        world_from_camera=np.full((count, 4, 4), np.nan),
+        report=complete.report | {"registrations": {}},
+    )
+
+    def attempts(job: PoseJob, _: str) -> PoseJobResult:
+        jobs.append(job)
+        return complete if job.lenient else none
+
+    monkeypatch.setattr(estimate_module, "_run", attempts)
+    hidden = replace(run.sequence, depth_mm=None)
+    found = estimate_poses(hidden, CONFIG)
+    assert [job.lenient for job in jobs] == [False, True]
+    assert found.report["lenient"]
+    assert "trying again with guided matching" in caplog.text
+    np.testing.assert_array_equal(found.registered, run.estimate.registered)
+    with pytest.raises(CaptureError, match="for 0 of 7 training frames"):
+        estimate_poses(hidden, CONFIG.model_copy(update={"lenient_retry": False}))
+    assert len(jobs) == 3
+    # Depth to align frames by is better than bad matches.
+    monkeypatch.setattr(estimate_module, "_by_depth", lambda *_: found)
+    assert estimate_poses(run.sequence, CONFIG.model_copy(update={"fallback": "auto"})) is found
+    assert not jobs[-1].lenient
 
 
 def test_depth_steps_in_where_colmap_fails(
