@@ -352,7 +352,7 @@ def _scale_error(stereo: StereoDepth) -> Tensor:
     A frame that nothing matches has the mean intercept of its recording's fit of brightness: it is as wrong
     as the intercepts of the other frames differ.
     """
-    error = torch.zeros(len(stereo.n_sources))
+    error = torch.zeros(len(stereo.n_sources), device=stereo.n_sources.device)
     for number, fit in enumerate(stereo.fits):
         own = torch.nonzero(stereo.recording == number)[:, 0]
         alone = stereo.n_sources[own] == 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -17,6 +19,6 @@ def device(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture
-def specification(monkeypatch: pytest.MonkeyPatch):  # type: ignore[no-untyped-def]
+def specification(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Call it: from then on the processor, too, does what a GPU does."""
     return lambda: monkeypatch.setattr(stereo, "native", matching)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,7 +63,7 @@ def test_stereo_alone_is_farther_off(withheld: EndoscopicSequence, estimate: Dep
     assert plain.report["completion"] == "none"
 
 
-def test_a_gpu_gives_that_of_a_processor(device: str, specification) -> None:  # type: ignore[no-untyped-def]
+def test_a_gpu_gives_that_of_a_processor(device: str, specification: Callable[[], None]) -> None:
     """On the processor, torch's implementation stands in for what runs on a GPU."""
     small = with_points(withheld_phantom(8, width=64, height=48))
     part = small.training_part()

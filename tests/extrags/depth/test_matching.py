@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 import torch
@@ -164,7 +166,7 @@ def test_stereo_finds_a_textured_surface(surface, device: str) -> None:  # type:
     assert (again.log_depth - depth.log()).abs()[inner].median() < 0.03
 
 
-def test_frames_matched_together_are_those_matched_alone(specification) -> None:  # type: ignore[no-untyped-def]
+def test_frames_matched_together_are_those_matched_alone(specification: Callable[[], None]) -> None:
     specification()
     frames, _ = tilted_plane()
     sources = torch.tensor([[1, 2], [0, 2], [1, 3], [2, 4], [3, -1]])
