@@ -16,7 +16,7 @@ from extrags.errors import ConfigError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.store import Store
 from flows.damage import again_after_damage
-from flows.limits import StageLimits
+from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
 from flows.pages import benchmark_page
@@ -73,7 +73,7 @@ def benchmark(
     ] = None,
     store: Annotated[str, Field(description="directory or URL of the artefact store")] = DEFAULT_STORE,
     name: Annotated[str, Field(description="name of this run, for its table and page")] = "benchmark",
-    limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = StageLimits(),  # noqa: B008
+    limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = DEFAULT_LIMITS,
 ) -> dict[str, Any]:
     """Measure every combination, and compare the methods pair by pair.
 

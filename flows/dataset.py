@@ -16,7 +16,7 @@ from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
 from flows.damage import again_after_damage
-from flows.limits import StageLimits
+from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
@@ -51,7 +51,7 @@ def reconstruct_dataset(
     method: Annotated[
         MethodName, Field(description="the whole pipeline, or one it is compared with")
     ] = "extrags",
-    limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = StageLimits(),  # noqa: B008
+    limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = DEFAULT_LIMITS,
     max_failed_share: Annotated[
         float, Field(ge=0, le=1, description="the run counts as failed when more of its sequences failed")
     ] = MAX_FAILED_SHARE,

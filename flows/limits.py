@@ -14,7 +14,7 @@ from extrags.errors import ExtragsError, StoreError
 from extrags.store import Ref
 from flows.failures import is_connection_error
 
-__all__ = ["StageLimits", "can_pass"]
+__all__ = ["DEFAULT_LIMITS", "StageLimits", "can_pass"]
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +71,10 @@ class StageLimits(BaseModel):
             retry_jitter_factor=0.5,
             retry_condition_fn=_is_tried_again,
         )
+
+
+DEFAULT_LIMITS = StageLimits()
+"""Two more tries, and no limit of time."""
 
 
 def can_pass(error: BaseException) -> bool:

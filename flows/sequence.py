@@ -12,7 +12,7 @@ from pydantic import Field
 from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
-from flows.limits import StageLimits
+from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
 from flows.outcome import SequenceFailedError, SequenceOutcome
 from flows.preflight import preflight
@@ -43,7 +43,7 @@ def reconstruct_sequence(
     method: Annotated[
         MethodName, Field(description="the whole pipeline, or one it is compared with")
     ] = "extrags",
-    limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = StageLimits(),  # noqa: B008
+    limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = DEFAULT_LIMITS,
 ) -> SequenceOutcome:
     """Reconstruct, explore, restore and evaluate one sequence.
 
