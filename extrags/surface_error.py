@@ -19,7 +19,7 @@ def surface_error_mm(mesh: Mesh, sequence: EndoscopicSequence) -> Float[np.ndarr
 
     A training view vouches for a vertex by its expected error there, or by the distance of its own estimate
     from the vertex where that is more; the view that vouches best counts. A vertex that no view sees takes
-    the median of the others.
+    the median of the others; where none sees any, all errors are infinite.
 
     Args:
         mesh: surface of the scene.
@@ -43,4 +43,4 @@ def surface_error_mm(mesh: Mesh, sequence: EndoscopicSequence) -> Float[np.ndarr
         speaks = (depth > 0) & (z[inside] <= (1 + HIDDEN_SHARE) * depth)
         error[inside] = np.where(speaks, np.minimum(error[inside], np.maximum(expected, away)), error[inside])
     known = np.isfinite(error)
-    return np.where(known, error, np.median(error[known]) if known.any() else 0.0)
+    return np.where(known, error, np.median(error[known]) if known.any() else np.inf)

@@ -37,6 +37,11 @@ def test_the_surest_view_vouches_and_disagreement_counts(tube: Tube) -> None:
     assert all_unsure.shape == (len(mesh.vertices),)
     assert np.median(one_sure) < np.median(all_unsure)
     assert (one_sure <= all_unsure).mean() > 0.99
+    # Behind all that was seen: nobody vouches for it, and it counts as no measured surface.
+    nearer = replace(sequence, depth_mm=0.01 * sequence.depth_mm, depth_error=error)
+    unseen = surface_error_mm(mesh, nearer)
+    assert unseen is not None
+    assert np.isinf(unseen).all()
     # Estimates twice as far as the mesh vouch for nothing nearer than their distance from it.
     assert np.median(elsewhere) > 3 * np.median(all_unsure)
 
