@@ -33,13 +33,13 @@ def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, r
     """
     parts: dict[str, Part] = {"coarse": "metrics_coarse", "final": "metrics_final"}
     metrics = {
-        f"{outcome.name} {which}": outcome.refs[part]
+        f"{outcome.title} {which}": outcome.refs[part]
         for outcome in outcomes
         for which, part in parts.items()
         if part in outcome.refs
     }
     failures = {
-        outcome.name: next(
+        outcome.title: next(
             (f"{row.stage}: {row.reason}" for row in outcome.stages if row.state == "failed"), "failed"
         )
         for outcome in outcomes
@@ -48,7 +48,7 @@ def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, r
     inputs = {
         "name": name,
         "profile": profile,
-        "sequences": [outcome.name for outcome in outcomes],
+        "sequences": [outcome.title for outcome in outcomes],
         "metrics": metrics,
         "failures": failures,
         "rows": [outcome.to_json() for outcome in outcomes],

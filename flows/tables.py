@@ -87,7 +87,7 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
         failed = next((row for row in outcome.stages if row.state == "failed"), None)
         rows.append(
             [
-                outcome.name,
+                outcome.title,
                 outcome.status,
                 f"{outcome.seconds:.1f}",
                 *(f"{figure(name, coarse.get(name))} → {figure(name, final.get(name))}" for name in columns),
