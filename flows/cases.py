@@ -1,4 +1,4 @@
-"""The runs of a dataset: sequences times methods, seeds and settings; how each ended, as the store tells."""
+"""The runs of a dataset: sequences times methods, seeds and settings; which of them are to be run."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from extrags import __version__
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
 from extrags.pipeline import StageName
-from extrags.store import Store, digest_of, read_records, write_record
-from flows.methods import METHODS, check_not_pinned, method_config
+from extrags.store import Store, digest_of, write_record
+from flows.methods import METHODS, check_not_pinned, method_config, pinned_settings
 from flows.outcome import SequenceOutcome, StageRow
+from flows.outcome_records import OUTCOME, OutcomeRecord, outcome_records, setting_text
 from flows.run_page import expected_seconds
 from flows.runners import NotInStoreError, StoreRunner
 from flows.selection import Chosen
@@ -24,15 +25,12 @@ from tasks.progress import observed
 
 __all__ = [
     "Only",
-    "OutcomeRecord",
     "SequenceCase",
     "cases_of",
     "matrix_points",
-    "outcome_records",
     "record_outcome",
     "record_outcome_quietly",
     "selected",
-    "setting_text",
 ]
 
 log = logging.getLogger(__name__)
@@ -40,13 +38,6 @@ log = logging.getLogger(__name__)
 Only = Literal["failed", "changed", "missing"]
 """Which cases of a run are taken: those whose last run failed; those of which something would be made; those
 that have never been run to their end."""
-
-OUTCOME = "outcome."
-"""Begin of the names of these records."""
-
-OutcomeRecord = dict[str, Any]
-"""`{sequence, method, profile, seed, variant, until, status, stage, reason, ended, seconds, config, stages,
-metrics, extrags}` of the last run of a case that came to an end."""
 
 
 @dataclass(frozen=True)
@@ -116,11 +107,6 @@ def matrix_points(matrix: Mapping[str, Sequence[Any]] | None) -> list[dict[str, 
     return [dict(zip(matrix, point, strict=True)) for point in product(*matrix.values())]
 
 
-def setting_text(settings: Mapping[str, Any]) -> str:
-    """Settings in words: `coarse.iterations = 500, coarse.seed = 1`."""
-    return ", ".join(f"{name} = {value}" for name, value in settings.items())
-
-
 def cases_of(
     chosen: Sequence[Chosen],
     *,
@@ -131,6 +117,9 @@ def cases_of(
     matrix: Mapping[str, Sequence[Any]] | None = None,
 ) -> list[SequenceCase]:
     """Every sequence with every method, seed and point of the matrix.
+
+    Of several methods, each takes the settings that it does not set itself, as in a benchmark; a matrix
+    must have an effect on all of them.
 
     Raises:
         ConfigError: for a method or seed that is there twice; for wrong settings, once for all sequences that
@@ -148,9 +137,11 @@ def cases_of(
             *([f"seed {seed}"] if len(seeds) > 1 else []),
             *([setting_text(point)] if point else []),
         ]
-        case = SequenceCase(
-            item.name, method, profile, seed, {**settings, **item.settings}, point, ", ".join(words)
-        )
+        own = {**settings, **item.settings}
+        if len(methods) > 1:
+            pinned = pinned_settings(method) - {"coarse.train_on"}  # Refused whatever the method.
+            own = {name: value for name, value in own.items() if name not in pinned}
+        case = SequenceCase(item.name, method, profile, seed, own, point, ", ".join(words))
         same = digest_of([method, seed, dict(case.settings), point])
         if same not in checked:
             checked.add(same)
@@ -261,12 +252,3 @@ def _stage_record(row: StageRow, expected: float) -> dict[str, Any]:
         "expected": round(expected, 3),
         "artefacts": row.made,
     }
-
-
-def outcome_records(store: Store) -> dict[str, OutcomeRecord]:
-    """How the last run of each case ended, by the name of its record.
-
-    Raises:
-        StoreError: when the store cannot be read.
-    """
-    return read_records(store, OUTCOME)

@@ -12,8 +12,9 @@ from extrags.config import PipelineConfig
 from extrags.errors import ExtragsError
 from extrags.pipeline import STAGES, StageName
 from extrags.store import Store, digest_of
-from flows.cases import OutcomeRecord, SequenceCase, outcome_records
+from flows.cases import SequenceCase
 from flows.methods import METHODS
+from flows.outcome_records import OutcomeRecord, outcome_records
 from flows.run_page import expected_seconds
 from tasks.run_page import duration_text
 

@@ -64,6 +64,7 @@ def benchmark_page(
     baseline: str,
     name: str,
     runner: Runner,
+    history: Mapping[str, Any] | None = None,
 ) -> str:
     """Make the page of a benchmark.
 
@@ -77,6 +78,7 @@ def benchmark_page(
         baseline: method the others are compared with.
         name: title.
         runner: how artefacts are made.
+        history: `{trend, regressions}` (`flows.history`).
 
     Returns:
         Where it stands.
@@ -105,6 +107,7 @@ def benchmark_page(
         "renders": {index: outcomes[int(index)].final_renders for index in shown},
         "views": COMPARED_VIEWS,
         "rows": [{key: case[key] for key in ("seconds", "peak_mib")} for case in cases],
+        "history": dict(history or {}),
     }
     (page,) = runner.run([Call(benchmark_report, inputs)], name)
     return f"{page.ref.uri}/{PAGE}"
