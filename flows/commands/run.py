@@ -239,7 +239,8 @@ def execute(
         first = next((case for case in cases if case.method == method), None)
         if first is not None:
             preflight(first.config(), until, METHODS[method].leave_out)
-    if len(cases) > 1:
+    if terminal and len(cases) > 1:
+        # Elsewhere it is a line of the log.
         expected = expectations(cases, root, until, refresh=refresh)
         print(f"extrags: {expected_words(expected, at_once)}", file=sys.stderr)
     from flows.console import progress_bars
