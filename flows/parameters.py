@@ -45,7 +45,8 @@ def _value(setting: Setting) -> JsonSchemaValue:
     schema = TypeAdapter(kind).json_schema()
     if schema.get("type") == "string" and setting.choices:
         schema["enum"] = setting.choices
-    return {**schema, "description": f"{setting.description} ({setting.expected})"}
+    # Inside `allOf`, because Prefect takes whatever has a type of its own for something that may be null.
+    return {"allOf": [schema], "description": f"{setting.description} ({setting.expected})"}
 
 
 @cache

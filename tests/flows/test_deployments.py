@@ -247,10 +247,10 @@ def call(command: list[str], folder: Path, environment: dict[str, str]) -> subpr
 
 
 def run_deployment(
-    environment: dict[str, str], name: str, **parameters: Any
+    environment: dict[str, str], of: str, /, **parameters: Any
 ) -> subprocess.CompletedProcess[str]:
     given = [part for key, value in parameters.items() for part in ("--param", f"{key}={json.dumps(value)}")]
-    return call([prefect(), "deployment", "run", name, *given], REPOSITORY, environment)
+    return call([prefect(), "deployment", "run", of, *given], REPOSITORY, environment)
 
 
 def is_up(environment: dict[str, str]) -> bool:
