@@ -59,9 +59,10 @@ def entry(
     return {**made, "when": f"2026-01-{day:02d}T04:00:00+00:00"}
 
 
-class TestRegressions:
-    before = [entry(day=day, psnr=20 + day / 100) for day in range(1, 6)]
+BEFORE = [entry(day=day, psnr=20 + day / 100) for day in range(1, 6)]
 
+
+class TestRegressions:
     @pytest.mark.parametrize(
         ("now", "worse"),
         [
@@ -77,18 +78,18 @@ class TestRegressions:
         ],
     )
     def test_against_the_median_of_the_runs_before(self, now: dict[str, Any], worse: list[str]) -> None:
-        found = regressions(now, self.before, Tolerance())
+        found = regressions(now, BEFORE, Tolerance())
         assert len(found) == len(worse)
         assert all(line.startswith(begin) for line, begin in zip(found, worse, strict=True))
 
     def test_nothing_is_judged_by_a_single_run(self) -> None:
-        assert regressions(entry(psnr=10, seconds=900), self.before[:1], Tolerance()) == []
-        assert regressions(entry(psnr=10), self.before[:1], Tolerance(at_least=1)) != []
+        assert regressions(entry(psnr=10, seconds=900), BEFORE[:1], Tolerance()) == []
+        assert regressions(entry(psnr=10), BEFORE[:1], Tolerance(at_least=1)) != []
 
     def test_the_last_runs_count(self) -> None:
         slow = [entry(day=day, seconds=300) for day in range(6, 9)]
-        assert regressions(entry(seconds=300), [*self.before, *slow], Tolerance(runs=3)) == []
-        assert regressions(entry(seconds=300), [*self.before, *slow], Tolerance(runs=8)) != []
+        assert regressions(entry(seconds=300), [*BEFORE, *slow], Tolerance(runs=3)) == []
+        assert regressions(entry(seconds=300), [*BEFORE, *slow], Tolerance(runs=8)) != []
 
     def test_run_times_of_other_machines_say_nothing_errors_do(self) -> None:
         elsewhere = [entry(day=day, machine={"processor": "another"}) for day in range(1, 6)]
@@ -167,29 +168,31 @@ class TestFlow:
             "name": "weekly",
         }
         first = benchmark(**given, refresh=True)
-        started = {item.key: item.seconds for item in store.ls("coarse*")}
-        second = benchmark(**given, refresh=True, tolerance=Tolerance(at_least=1, seconds=60))
-        # The bits are the same, the seconds are those of now.
-        assert first["cases"][0]["metrics"] == second["cases"][0]["metrics"]
-        assert {item.key: item.seconds for item in store.ls("coarse*")} != started
-        assert first["cases"][0]["seconds"] != second["cases"][0]["seconds"]
-        assert "2 runs that measured anew" in Path(second["report"]).read_text()
-        # From the store: nothing was measured, nothing is added.
-        third = benchmark(**given)
-        assert third["cases"][0]["seconds"] == second["cases"][0]["seconds"]
-        assert len(history_of(store, "weekly")) == 2
-        # Were the runs before much better, this one would be a regression: its run fails.
-        (last,) = history_of(store, "weekly")[-1:]
+        seconds = {item.key: item.seconds for item in store.ls("coarse*")}
+        assert first["regressions"] == []
+        # Were the runs before much better, the next one would be a regression: its run fails.
+        (last,) = history_of(store, "weekly")
         for case in last["cases"]:
             case["figures"] = {name: value + 3 for name, value in case["figures"].items()}
-        for day in (27, 28, 29):
-            append_history(store, {**last, "when": f"2099-01-{day}T00:00:00+00:00"})
-        state = benchmark(**given, refresh=True, tolerance=Tolerance(seconds=60), return_state=True)
+        for day in (1, 2, 3):
+            append_history(store, {**last, "when": f"2026-01-{day:02d}T00:00:00+00:00"})
+        state = benchmark(**given, refresh=True, tolerance=Tolerance(seconds=600), return_state=True)
         assert state.is_failed()
         error = state.result(raise_on_failure=False)
         assert isinstance(error, BenchmarkRegressedError)
-        assert "3.00 dB below the median" in str(error)
-        assert len(history_of(store, "weekly")) == 6
+        assert len(error.found) == 1
+        assert "3.00 dB below the median" in error.found[0]
+        # The bits are the same, the seconds are those of now.
+        found = history_of(store, "weekly")
+        assert len(found) == 5
+        assert found[-1]["cases"][0]["figures"] == found[-2]["cases"][0]["figures"]
+        assert {item.key: item.seconds for item in store.ls("coarse*")} != seconds
+        page = str(error).rpartition("page: ")[2]
+        assert "5 runs that measured anew" in Path(page).read_text()
+        # From the store: nothing is measured, nothing is added.
+        again = benchmark(**given)
+        assert again["cases"][0]["seconds"] == found[-1]["cases"][0]["seconds"]
+        assert len(history_of(store, "weekly")) == 5
 
     def test_a_tolerance_needs_a_measurement(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="needs refresh"):
