@@ -14,18 +14,29 @@ from pydantic import Field
 from extrags.config import ProfileName
 from extrags.errors import ConfigError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
-from extrags.store import Store
+from extrags.store import Store, digest_of
 from flows.damage import again_after_damage
+from flows.history import (
+    BenchmarkRegressedError,
+    Tolerance,
+    append_history,
+    history_entry,
+    history_of,
+    regressions,
+    trend,
+)
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
 from flows.pages import benchmark_page
+from flows.parameters import Sequences, Settings, StoreRoot, Variants
 from flows.preflight import preflight
 from flows.run_page import run_page
 from flows.runners import PrefectRunner, Runner
+from flows.selection import chosen_sequences
 from flows.sequence import open_store
-from flows.settings import DEFAULT_STORE
-from flows.tables import benchmark_markdown
+from flows.settings import run_store
+from flows.tables import benchmark_markdown, regressions_markdown
 from flows.wiring import run_sequence
 from tasks.evaluate import METRICS_FILE
 from tasks.run_page import artifact_key, attempt
@@ -45,11 +56,15 @@ class Case:
     profile: str
     seed: int
     outcome: SequenceOutcome
+    settings: str = ""
+    """Digest of all settings but the seed."""
 
 
 @flow(name="benchmark", flow_run_name="{name}", log_prints=False, persist_result=False)
 def benchmark(
-    sequences: Annotated[list[str], Field(min_length=1, description="names or paths")],
+    sequences: Annotated[
+        Sequences, Field(min_length=1, description="names, paths, patterns, or @FILE for a manifest")
+    ],
     profiles: Annotated[list[ProfileName], Field(min_length=1, description="named settings")] = ["quick"],  # noqa: B006
     methods: Annotated[list[MethodName], Field(min_length=1, description="what to compare")] = [  # noqa: B006
         "coarse",
@@ -57,11 +72,10 @@ def benchmark(
     ],
     seeds: Annotated[list[int], Field(min_length=1, description="one run per seed")] = [0],  # noqa: B006
     settings: Annotated[
-        dict[str, Any] | None,
-        Field(description="overrides for all runs; they do not reach what a method pins"),
+        Settings, Field(description="overrides for all runs; they do not reach what a method pins")
     ] = None,
     variants: Annotated[
-        dict[str, dict[str, Any]] | None,
+        Variants,
         Field(
             description='further methods by name, e.g. {"no-light": {"coarse.light.enabled": false}}: '
             "`coarse`, or the method under the key `method`, with other settings"
@@ -71,28 +85,48 @@ def benchmark(
         str | None,
         Field(description="method the others are compared with; 3dgs if it is there, else the first"),
     ] = None,
-    store: Annotated[str, Field(description="directory or URL of the artefact store")] = DEFAULT_STORE,
+    store: Annotated[
+        StoreRoot, Field(description="directory or URL of the artefact store; EXTRAGS_STORE by default")
+    ] = None,
     name: Annotated[str, Field(description="name of this run, for its table and page")] = "benchmark",
     limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = DEFAULT_LIMITS,
+    refresh: Annotated[
+        bool, Field(description="make everything anew, so that times are those of now; adds to the history")
+    ] = False,
+    tolerance: Annotated[
+        Tolerance | None,
+        Field(
+            description="how much worse than the runs before it may be; without, it is not held against them"
+        ),
+    ] = None,
 ) -> dict[str, Any]:
     """Measure every combination, and compare the methods pair by pair.
 
-    Artefacts in the store are reused, with the time that was measured when they were computed; delete them
-    (`extrags cache rm`) to measure again. A run that fails does not stop the others.
+    Artefacts in the store are reused, with the time that was measured when they were computed. With `refresh`
+    everything is made anew, once; figures and times are added to the history in the store, which the page
+    shows as a trend. A run that fails does not stop the others.
 
     Returns:
         `{machine, cases: [{method, profile, sequence, setting, seed, seconds, peak_mib, metrics, ...}],
-        comparison, report}`; `metrics` is None for a failed run, whose `error` says why. `comparison` is
+        comparison, regressions, report}`; `metrics` is None for a failed run, whose `error` says why.
+        `comparison` is
         `extrags.metrics.comparison.compare_runs`; beside `report` stand `per_view.json` and
         `comparison.json`.
 
     Raises:
-        ConfigError: for an unknown method or baseline, or a setting that is wrong.
+        ConfigError: for an unknown method or baseline, a setting that is wrong, or a tolerance for what is
+            not measured anew.
+        BenchmarkRegressedError: when it is worse than the runs before by more than `tolerance`; page, tables
+            and history have been written by then.
         ExtragsError: when a model, weights or a package that the settings name is not there.
     """
+    if tolerance is not None and not refresh:
+        raise ConfigError("a tolerance needs refresh: what is taken from the store is as good as it was")
     baseline = check_methods(methods, variants or {}, baseline)
+    store = run_store(store)
+    chosen = chosen_sequences(sequences)
     open_store(store)
-    runner = PrefectRunner(store, limits=limits)
+    runner = PrefectRunner(store, refresh, limits)
     wanted = [*methods, *(variants or {})]
     for method in wanted:
         for profile in profiles:
@@ -100,36 +134,50 @@ def benchmark(
             config = _config_of(method, profile, settings, variants or {}, 0)
             preflight(config, "evaluate", METHODS[_variant(method, variants or {})[0]].leave_out)
     words = {method: summary_of(method, variants or {}) for method in wanted}
+    # Here and below, because they load torch and the kernels, which looking up a deployment must not.
+    from extrags.raster.bench import machine
 
-    def run_all() -> tuple[list[dict[str, Any]], str]:
+    about = machine()
+    earlier = history_of(Store(store), name) if refresh else []
+
+    def run_all() -> tuple[list[dict[str, Any]], dict[str, Any], list[str], str]:
         page.restart()
         found = []
-        for sequence, profile, seed, method in product(sequences, profiles, seeds, wanted):
-            case = run_method(method, sequence, profile, seed, settings, store, runner, variants=variants)
+        for item, profile, seed, method in product(chosen, profiles, seeds, wanted):
+            own = {**(settings or {}), **item.settings} or None
+            case = run_method(method, item.name, profile, seed, own, store, runner, variants=variants)
             page.sequence_ended(case.outcome, store)
             found.append(case)
         cases = [case_of(case) for case in found]
-        return cases, benchmark_page([case.outcome for case in found], cases, words, baseline, name, runner)
+        entry = history_entry(name, cases, [case.settings for case in found], about)
+        worse = [] if tolerance is None else regressions(entry, earlier, tolerance)
+        history = {"trend": trend([*earlier, entry]), "regressions": worse} if refresh else {}
+        outcomes = [case.outcome for case in found]
+        report = benchmark_page(outcomes, cases, words, baseline, name, runner, history)
+        return cases, entry, worse, report
 
-    runs = len(sequences) * len(profiles) * len(seeds) * len(wanted)
+    runs = len(chosen) * len(profiles) * len(seeds) * len(wanted)
     with run_page(name, config, "evaluate", sequences=runs) as page:
-        cases, report = again_after_damage(Store(store), run_all)
+        cases, entry, worse, report = again_after_damage(Store(store), run_all)
         page.link(report, artifact_key("report", name), f"Report of {name}")
+    if refresh:
+        append_history(Store(store), entry)
     attempt(
         lambda: create_markdown_artifact(
-            benchmark_markdown(cases, baseline),
+            benchmark_markdown(cases, baseline) + regressions_markdown(worse),
             key=artifact_key("benchmark", name),
             description=f"{len(cases)} runs",
         )
     )
-    # Here, because they load torch and the kernels, which looking up a deployment must not.
+    if worse:
+        raise BenchmarkRegressedError(name, worse, report)
     from extrags.metrics.comparison import compare_runs
-    from extrags.raster.bench import machine
 
     return {
-        "machine": machine(),
+        "machine": about,
         "cases": cases,
         "comparison": compare_runs(cases, baseline),
+        "regressions": worse,
         "report": report,
     }
 
@@ -208,7 +256,8 @@ def run_method(
         until="evaluate",
         leave_out=METHODS[base].leave_out or None,
     )
-    return Case(method, profile, seed, outcome)
+    # Seeds are repetitions of the same: their means are compared over time.
+    return Case(method, profile, seed, outcome, digest_of(config.with_seed(0)))
 
 
 def case_of(case: Case) -> dict[str, Any]:

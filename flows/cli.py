@@ -21,6 +21,8 @@ OK, FAILED, USAGE = 0, 1, 2
 
 VERBS = {
     "run": "take sequences through all stages",
+    "status": "show every sequence by every stage, from the store alone",
+    "serve": "run the deployments on this machine, on demand and on schedule",
     "plan": "measure a scene and say which stages it needs, and why",
     "report": "build the page of a finished run again, from the store",
     "export": "write a reconstructed scene as PLY, or a sequence as COLMAP model or transforms.json",
@@ -38,7 +40,9 @@ EXAMPLES = """examples:
   extrags run phantom/0@sparse --profile quick
   extrags run phantom/0@sparse phantom/0@distanced --seed 1 --json results.json
   extrags run frames/ --coarse.iterations 500 --enhance.backend classical
+  extrags run 'phantom/[0-3]@sparse' --methods 3dgs,extrags --seeds 0,1 --only failed
   extrags run --help-settings coarse.light
+  extrags status 'phantom/*'
   extrags plan phantom/0@sparse
   extrags evaluate phantom/0@sparse --renders my_renders/ --json -
   extrags benchmark phantom/0@sparse phantom/1@sparse --methods 3dgs,coarse --seeds 0,1,2

@@ -113,7 +113,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
         coarse, final = (outcome.metrics.get(which) or {} for which in ("coarse", "final"))
         colour = "green" if outcome.status == "ok" else "red"
         table.add_row(
-            outcome.name,
+            escape(outcome.title),
             f"[{colour}]{outcome.status}[/]",
             counts,
             *(_change(name, coarse.get(name), final.get(name)) for name in columns),
@@ -122,7 +122,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     for outcome in run.sequences:
         for row in outcome.stages:
             if row.state == "failed":
-                out.print(f"[red]{outcome.name} failed in {row.stage}:[/] {escape(row.reason)}")
+                out.print(f"[red]{escape(outcome.title)} failed in {row.stage}:[/] {escape(row.reason)}")
         if outcome.report:
             out.print(f"report: {outcome.report}", soft_wrap=True)
     if run.report and len(run.sequences) > 1:

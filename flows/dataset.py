@@ -15,16 +15,20 @@ from pydantic import Field
 from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
+from flows.cases import Only, SequenceCase, cases_of, record_outcome_quietly, selected
 from flows.damage import again_after_damage
+from flows.expectation import expectations, expected_words, longest_first
 from flows.limits import DEFAULT_LIMITS, StageLimits
-from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
+from flows.methods import METHODS, MethodName, profile_label
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
 from flows.pages import dataset_page
+from flows.parameters import Matrix, Sequences, Settings, StoreRoot
 from flows.preflight import preflight
 from flows.run_page import run_page
 from flows.runners import PrefectRunner
+from flows.selection import chosen_sequences
 from flows.sequence import open_store, reconstruct_sequence
-from flows.settings import DEFAULT_STORE, task_runner
+from flows.settings import run_store, task_runner
 from flows.tables import dataset_markdown
 from tasks.run_page import artifact_key, attempt
 
@@ -38,11 +42,15 @@ MAX_FAILED_SHARE = 0.5
 
 @flow(name="reconstruct-dataset", flow_run_name="{name}", log_prints=False, persist_result=False)
 def reconstruct_dataset(
-    sequences: Annotated[list[str], Field(min_length=1, description="names or paths")],
+    sequences: Annotated[
+        Sequences, Field(min_length=1, description="names, paths, patterns, or @FILE for a manifest")
+    ],
     profile: Annotated[ProfileName, Field(description="named settings")] = "balanced",
-    settings: Annotated[dict[str, Any] | None, Field(description="overrides by dotted name")] = None,
+    settings: Annotated[Settings, Field(description="overrides by dotted name")] = None,
     seed: Annotated[int | None, Field(ge=0, description="seed of all stages")] = None,
-    store: Annotated[str, Field(description="directory or URL of the artefact store")] = DEFAULT_STORE,
+    store: Annotated[
+        StoreRoot, Field(description="directory or URL of the artefact store; EXTRAGS_STORE by default")
+    ] = None,
     refresh: Annotated[bool, Field(description="run every stage although its artefact is there")] = False,
     until: Annotated[StageName, Field(description="last stage to run")] = "report",
     runner: Annotated[str, Field(description="threads, dask or dask:ADDRESS")] = "threads",
@@ -55,56 +63,98 @@ def reconstruct_dataset(
     max_failed_share: Annotated[
         float, Field(ge=0, le=1, description="the run counts as failed when more of its sequences failed")
     ] = MAX_FAILED_SHARE,
+    only: Annotated[
+        Only | None, Field(description="only those whose last run failed, that have changed, or never ended")
+    ] = None,
+    methods: Annotated[
+        list[MethodName] | None, Field(min_length=1, description="several methods instead of one")
+    ] = None,
+    seeds: Annotated[
+        list[Annotated[int, Field(ge=0)]] | None,
+        Field(min_length=1, description="several seeds instead of one"),
+    ] = None,
+    matrix: Annotated[
+        Matrix, Field(description='several values of settings, e.g. {"coarse.iterations": [500, 1000]}')
+    ] = None,
 ) -> DatasetOutcome:
     """Take every sequence through all stages, each as a flow run of its own.
 
+    With several methods, seeds or values of settings every sequence is run with every combination. Where
+    several are in work at the same time, those that are expected to take longest come first.
+
     Returns:
-        One outcome per sequence, in the order given; failures among them. The summary is an artifact.
+        One outcome per run, in the order given; failures among them. The summary is an artifact.
 
     Raises:
+        ConfigError: for wrong settings or manifests.
+        UnknownSequenceError: for a pattern that matches nothing.
         DatasetFailedError: when more than `max_failed_share` of the sequences failed; table and page have
             been written by then.
     """
+    store = run_store(store)
     # Invalid settings, missing models and a read-only store affect all sequences: report them once.
-    check_not_pinned(method, settings or {})
-    config = method_config(method, profile, settings, seed)
+    every = cases_of(
+        chosen_sequences(sequences),
+        methods=methods or [method],
+        profile=profile,
+        seeds=seeds or [seed],
+        settings=settings or {},
+        matrix=matrix,
+    )
     open_store(store)
-    preflight(config, until, METHODS[method].leave_out)
+    for wanted in dict.fromkeys(case.method for case in every):
+        first = next(case for case in every if case.method == wanted)
+        preflight(first.config(), until, METHODS[wanted].leave_out)
+    cases = selected(every, only, store, until)
+    expected = expectations(cases, store, until, refresh=refresh)
+    if cases:
+        log.info("%s: %s", name, expected_words(expected, at_once))
+    else:
+        log.info("%s: none of %d runs is %s; nothing to do", name, len(every), only)
+        return DatasetOutcome([])
     one = reconstruct_sequence.with_options(task_runner=task_runner(runner))
 
-    def reconstruct(sequence: str) -> SequenceOutcome:
+    def reconstruct(case: SequenceCase) -> SequenceOutcome:
         state: State[Any] = one(
-            sequence=sequence,
+            sequence=case.sequence,
             profile=profile,
-            settings=settings,
-            seed=seed,
+            settings=dict(case.settings) or None,
+            seed=case.seed,
             store=store,
             refresh=refresh,
             until=until,
-            method=method,
+            method=case.method,  # type: ignore[arg-type]
             limits=limits,
+            variant=dict(case.changed) or None,
             return_state=True,
         )
-        outcome = outcome_of(sequence, state)
+        outcome = outcome_of(case.sequence, state)
+        outcome.variant = case.variant
+        if not isinstance(state.result(raise_on_failure=False), SequenceOutcome | SequenceFailedError):
+            record_outcome_quietly(Store(store), case, outcome, until, case.config())
         page.sequence_ended(outcome, store)
         return outcome
 
     def run_all() -> DatasetOutcome:
         page.restart()
         if at_once == 1:
-            outcomes = [reconstruct(sequence) for sequence in sequences]
+            outcomes = [reconstruct(case) for case in cases]
         else:
             with ThreadPoolExecutor(max_workers=at_once) as pool:
                 # Flow and observer are in context variables, which threads do not inherit.
-                futures = [pool.submit(copy_context().run, reconstruct, sequence) for sequence in sequences]
-                outcomes = [future.result() for future in futures]
+                futures = {
+                    item.case.title: pool.submit(copy_context().run, reconstruct, item.case)
+                    for item in longest_first(expected)
+                }
+                outcomes = [futures[case.title].result() for case in cases]
         report = None
         if until == "report":
-            label = profile_label(profile, method)
+            label = profile_label(profile, method if methods is None else ", ".join(methods))
             report = dataset_page(outcomes, name, label, PrefectRunner(store, refresh, limits))
         return DatasetOutcome(outcomes, report)
 
-    with run_page(name, config, until, sequences=len(sequences), bars=False) as page:
+    config = cases[0].config()
+    with run_page(name, config, until, sequences=len(cases), bars=False) as page:
         found = again_after_damage(Store(store), run_all)
         if found.report is not None:
             page.link(found.report, artifact_key("report", name), f"Report of {name}")
@@ -112,7 +162,7 @@ def reconstruct_dataset(
         lambda: create_markdown_artifact(
             dataset_markdown(found.sequences),
             key=artifact_key("dataset", name),
-            description=f"{len(sequences)} sequences, profile {profile}",
+            description=f"{len(cases)} runs, profile {profile}",
         )
     )
     if found.failed_share > max_failed_share:

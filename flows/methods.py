@@ -25,6 +25,7 @@ __all__ = [
     "gaussian_pancakes",
     "method_config",
     "paper",
+    "pinned_settings",
     "profile_label",
     "three_dgs",
 ]
@@ -371,10 +372,19 @@ def check_not_pinned(method: str, settings: Mapping[str, Any]) -> None:
     Raises:
         ConfigError: names the setting.
     """
-    pinned = _pinned(method, PipelineConfig())
+    pinned = pinned_settings(method)
     for name in settings:
         if name in pinned:
             raise ConfigError(f"the method {method} sets {name} itself; leave it out, or take another method")
+
+
+def pinned_settings(method: str) -> frozenset[str]:
+    """Names of the settings that a method sets itself.
+
+    Raises:
+        ConfigError: for an unknown method.
+    """
+    return frozenset(_pinned(method, PipelineConfig()))
 
 
 def profile_label(profile: str, method: str) -> str:

@@ -66,6 +66,8 @@ class StageRow:
     """Peak resident memory of the process while they were computed."""
     tasks: int = 0
     """Task runs it consists of."""
+    made: dict[str, int] = field(default_factory=dict)
+    """Bytes of the artefacts it consists of, by key; not in the JSON."""
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object."""
@@ -97,6 +99,13 @@ class SequenceOutcome:
     plan: dict[str, Any] | None = None
     error: Exception | None = None
     """The exception of a failed stage; only available in the process that ran it."""
+    variant: str = ""
+    """What sets it apart from other runs of the same sequence in a matrix: `3dgs, seed 1`."""
+
+    @property
+    def title(self) -> str:
+        """The sequence, and the variant where there is one."""
+        return f"{self.name} [{self.variant}]" if self.variant else self.name
 
     @property
     def artefacts(self) -> dict[str, str]:
@@ -126,6 +135,7 @@ class SequenceOutcome:
         """A JSON object; keys as in docs/command_line.md."""
         return {
             "name": self.name,
+            "variant": self.variant,
             "status": self.status,
             "seconds": round(self.seconds, 3),
             "stages": [row.to_json() for row in self.stages],
@@ -167,7 +177,7 @@ class SequenceFailedError(ExtragsError, RuntimeError):
         self.outcome = outcome
         failed = next((row for row in outcome.stages if row.state == "failed"), None)
         where = "" if failed is None else f" in {failed.stage}: {failed.reason}"
-        super().__init__(f"{outcome.name} failed{where}")
+        super().__init__(f"{outcome.title} failed{where}")
 
 
 class DatasetFailedError(ExtragsError, RuntimeError):

@@ -33,13 +33,13 @@ def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, r
     """
     parts: dict[str, Part] = {"coarse": "metrics_coarse", "final": "metrics_final"}
     metrics = {
-        f"{outcome.name} {which}": outcome.refs[part]
+        f"{outcome.title} {which}": outcome.refs[part]
         for outcome in outcomes
         for which, part in parts.items()
         if part in outcome.refs
     }
     failures = {
-        outcome.name: next(
+        outcome.title: next(
             (f"{row.stage}: {row.reason}" for row in outcome.stages if row.state == "failed"), "failed"
         )
         for outcome in outcomes
@@ -48,7 +48,7 @@ def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, r
     inputs = {
         "name": name,
         "profile": profile,
-        "sequences": [outcome.name for outcome in outcomes],
+        "sequences": [outcome.title for outcome in outcomes],
         "metrics": metrics,
         "failures": failures,
         "rows": [outcome.to_json() for outcome in outcomes],
@@ -64,6 +64,7 @@ def benchmark_page(
     baseline: str,
     name: str,
     runner: Runner,
+    history: Mapping[str, Any] | None = None,
 ) -> str:
     """Make the page of a benchmark.
 
@@ -77,6 +78,7 @@ def benchmark_page(
         baseline: method the others are compared with.
         name: title.
         runner: how artefacts are made.
+        history: `{trend, regressions}` (`flows.history`).
 
     Returns:
         Where it stands.
@@ -105,6 +107,7 @@ def benchmark_page(
         "renders": {index: outcomes[int(index)].final_renders for index in shown},
         "views": COMPARED_VIEWS,
         "rows": [{key: case[key] for key in ("seconds", "peak_mib")} for case in cases],
+        "history": dict(history or {}),
     }
     (page,) = runner.run([Call(benchmark_report, inputs)], name)
     return f"{page.ref.uri}/{PAGE}"

@@ -81,13 +81,16 @@ class PrefectRunner:
 
     Args:
         store: root of the store.
-        refresh: run stages although their artefacts are there.
+        refresh: run stages although their artefacts are there; each once, also where several runs that go
+            through this runner share it.
         limits: retries and time limits of each task.
     """
 
     store: str
     refresh: bool = False
     limits: StageLimits = field(default_factory=StageLimits)
+    _refreshed: set[str] = field(default_factory=set, repr=False, compare=False)
+    """Keys of what this runner has made anew."""
 
     def run(self, calls: Sequence[Call], label: str) -> list[Result]:
         """Submit all, wait for all; a task whose worker was lost is submitted again."""
@@ -111,11 +114,14 @@ class PrefectRunner:
                     f"the worker of {call.task.name} was lost; its task is still {state.name}"
                 )
             ref = state.result()
+            if self.refresh:
+                self._refreshed.add(stage_key(call.task, call.inputs))
             results.append(Result(ref, "cached" if state.name == "Cached" else "ran"))
         return results
 
     def _submit(self, call: Call, label: str) -> PrefectFuture[Ref]:
-        task = at(self.limits.applied_to(call.task), self.store, refresh=self.refresh)
+        refresh = self.refresh and stage_key(call.task, call.inputs) not in self._refreshed
+        task = at(self.limits.applied_to(call.task), self.store, refresh=refresh)
         future: PrefectFuture[Ref] = task.submit(
             store=self.store, label=label, time_limit_s=self.limits.time_limit_s, **call.inputs
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from typing import Annotated, Any
+from typing import Annotated
 
 from prefect import flow
 from prefect.artifacts import create_markdown_artifact
@@ -12,13 +12,15 @@ from pydantic import Field
 from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
+from flows.cases import SequenceCase, record_outcome_quietly
 from flows.limits import DEFAULT_LIMITS, StageLimits
-from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
+from flows.methods import METHODS, MethodName, profile_label
 from flows.outcome import SequenceFailedError, SequenceOutcome
+from flows.parameters import Settings, StoreRoot
 from flows.preflight import preflight
 from flows.run_page import run_page
 from flows.runners import PrefectRunner
-from flows.settings import DEFAULT_STORE
+from flows.settings import run_store
 from flows.tables import sequence_markdown
 from flows.wiring import run_sequence
 from tasks.locks import sweep_locks
@@ -31,21 +33,28 @@ log = logging.getLogger(__name__)
 
 @flow(name="reconstruct-sequence", flow_run_name="{sequence}", log_prints=False, persist_result=False)
 def reconstruct_sequence(
-    sequence: Annotated[str, Field(description="DATASET/SEQUENCE[@SETTING], or the path of a folder")],
+    sequence: Annotated[
+        str, Field(min_length=1, description="DATASET/SEQUENCE[@SETTING], or the path of a folder")
+    ],
     profile: Annotated[ProfileName, Field(description="named settings")] = "balanced",
-    settings: Annotated[
-        dict[str, Any] | None, Field(description='overrides such as {"coarse.iterations": 500}')
-    ] = None,
+    settings: Annotated[Settings, Field(description='overrides such as {"coarse.iterations": 500}')] = None,
     seed: Annotated[int | None, Field(ge=0, description="seed of all stages")] = None,
-    store: Annotated[str, Field(description="directory or URL of the artefact store")] = DEFAULT_STORE,
+    store: Annotated[
+        StoreRoot, Field(description="directory or URL of the artefact store; EXTRAGS_STORE by default")
+    ] = None,
     refresh: Annotated[bool, Field(description="run every stage although its artefact is there")] = False,
     until: Annotated[StageName, Field(description="last stage to run")] = "report",
     method: Annotated[
         MethodName, Field(description="the whole pipeline, or one it is compared with")
     ] = "extrags",
     limits: Annotated[StageLimits, Field(description="retries and time limits of stages")] = DEFAULT_LIMITS,
+    variant: Annotated[
+        Settings, Field(description="further overrides, which set this run apart from others of the sequence")
+    ] = None,
 ) -> SequenceOutcome:
     """Reconstruct, explore, restore and evaluate one sequence.
+
+    How it ended is left in the store (`flows.cases`), where `extrags status` and later runs find it.
 
     Returns:
         What was made; also as a Markdown artifact.
@@ -53,8 +62,9 @@ def reconstruct_sequence(
     Raises:
         SequenceFailedError: when a stage failed; what was finished stays in the store.
     """
-    check_not_pinned(method, settings or {})
-    config = method_config(method, profile, settings, seed)
+    case = SequenceCase(sequence, method, profile, seed, settings or {}, variant or {})
+    config = case.config()
+    store = run_store(store)
     with run_page(sequence, config, until) as page:
         open_store(store)
         preflight(config, until, METHODS[method].leave_out)
@@ -67,6 +77,7 @@ def reconstruct_sequence(
             until=until,
             leave_out=METHODS[method].leave_out,
         )
+        record_outcome_quietly(Store(store), case, outcome, until, config)
         page.sequence_ended(outcome, store)
     attempt(
         lambda: create_markdown_artifact(

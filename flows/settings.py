@@ -3,25 +3,68 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import Any
 
 from extrags.config import PipelineConfig, profile_config
+from extrags.data_directories import DATA_VARIABLE, user_directories
 from extrags.errors import ConfigError
 
 __all__ = [
     "DEFAULT_STORE",
     "default_store",
     "pipeline_config",
+    "run_store",
     "task_runner",
     "usable_cores",
 ]
 
 DEFAULT_STORE = ".extrags"
+STORE_VARIABLE = "EXTRAGS_STORE"
+
+PLACES = (STORE_VARIABLE, DATA_VARIABLE, "EXTRAGS_LPIPS_WEIGHTS", "EXTRAGS_CACHE")
+"""Variables of the environment that say where things are."""
 
 
 def default_store() -> str:
-    """Root of the store when none is named: EXTRAGS_STORE, else `.extrags` here."""
-    return os.environ.get("EXTRAGS_STORE") or DEFAULT_STORE
+    """Root of the store when the command line names none: EXTRAGS_STORE, else `.extrags` here."""
+    return os.environ.get(STORE_VARIABLE) or DEFAULT_STORE
+
+
+def run_store(named: str | None) -> str:
+    """Root of the store of a flow run, as an absolute path or a URL.
+
+    Args:
+        named: the flow's parameter; None takes EXTRAGS_STORE, else `store` in the user's data directory
+            (`~/.local/share/extrags/store`). A path is never relative to where a worker happened to be
+            started: in a deployment a relative one is refused. Called from Python, it is relative to the
+            working directory, as any path is.
+
+    Raises:
+        ConfigError: for a relative path in a deployment: of the store, or in one of the variables `PLACES`.
+    """
+    if _is_deployed():
+        for variable in PLACES:
+            _check_absolute(variable, os.environ.get(variable) or "/")
+        _check_absolute("the parameter store", named or "/")
+    root = named or os.environ.get(STORE_VARIABLE) or str(user_directories()[0] / "store")
+    return root if "://" in root else str(Path(root).expanduser().absolute())
+
+
+def _check_absolute(what: str, place: str) -> None:
+    if "://" not in place and not Path(place).expanduser().is_absolute():
+        raise ConfigError(
+            f"{what} is {place}, which is relative to where this worker was started; "
+            "give an absolute path or a URL"
+        )
+
+
+def _is_deployed() -> bool:
+    from prefect.context import FlowRunContext
+
+    context = FlowRunContext.get()
+    run = None if context is None else context.flow_run
+    return run is not None and run.deployment_id is not None
 
 
 def pipeline_config(

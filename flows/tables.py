@@ -16,6 +16,7 @@ __all__ = [
     "difference_text",
     "figure",
     "markdown_table",
+    "regressions_markdown",
     "sequence_markdown",
     "spread_text",
     "table_figures",
@@ -87,7 +88,7 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
         failed = next((row for row in outcome.stages if row.state == "failed"), None)
         rows.append(
             [
-                outcome.name,
+                outcome.title,
                 outcome.status,
                 f"{outcome.seconds:.1f}",
                 *(f"{figure(name, coarse.get(name))} → {figure(name, final.get(name))}" for name in columns),
@@ -95,6 +96,13 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
             ]
         )
     return markdown_table(["sequence", "status", "seconds", *columns, "problem"], rows)
+
+
+def regressions_markdown(found: Sequence[str]) -> str:
+    """What is worse than in earlier runs of a benchmark; empty where nothing is."""
+    if not found:
+        return ""
+    return "\n## Worse than before\n\n" + "\n".join(f"* {line}" for line in found) + "\n"
 
 
 def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:

@@ -406,6 +406,8 @@ class SequenceRun(Pipeline):
     def _run_uncounted(self, call: Call) -> Ref:
         """Run a task that is not counted in the row of its stage."""
         (result,) = self.runner.run([call], self.outcome.name)
+        manifest = self.store.manifest(result.ref)
+        self.outcome.stages[-1].made[manifest.key] = manifest.bytes
         return result.ref
 
     def _run_task(self, row: StageRow, call: Call) -> Ref:
@@ -419,6 +421,7 @@ class SequenceRun(Pipeline):
             if isinstance(peak, float):
                 row.peak_mib = max(row.peak_mib or 0.0, peak)
             row.made_seconds += manifest.seconds
+            row.made[manifest.key] = manifest.bytes
             row.tasks += 1
             if result.state == "ran":
                 row.state = "ran"

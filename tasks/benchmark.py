@@ -17,8 +17,9 @@ PER_VIEW_FILE = "per_view.json"
 """Every figure of every held-out view of every run."""
 
 
-# `rows` holds times and memory of the runs. The page shows them, but they are not part of its cache key.
-@stage("benchmark-report", version=2, ignore=("rows",))
+# `rows` holds times and memory of the runs, `history` those of earlier ones. The page shows them, but they
+# are not part of its cache key; a run that measures anew makes its page anew as well.
+@stage("benchmark-report", version=2, ignore=("rows", "history"))
 def benchmark_report(
     slot: Slot,
     name: str,
@@ -32,6 +33,7 @@ def benchmark_report(
     renders: dict[str, Ref],
     views: int,
     rows: list[dict[str, Any]],
+    history: dict[str, Any],
 ) -> None:
     """Build the page; writes `report.html`, `comparison.json` and `per_view.json`.
 
@@ -48,6 +50,7 @@ def benchmark_report(
         renders: its renders.
         views: rows of pictures per pair at most.
         rows: `{seconds, peak_mib}` of each run.
+        history: `{trend, regressions}`: see `BenchmarkInputs`; empty where nothing is on record.
     """
     from extrags.metrics.comparison import compare_runs
     from extrags.metrics.protocol import RenderedViews
@@ -73,7 +76,14 @@ def benchmark_report(
     ]
     page = build_benchmark_report(
         BenchmarkInputs(
-            name=name, runs=every, baseline=baseline, methods=methods, pictures=compared, views=views
+            name=name,
+            runs=every,
+            baseline=baseline,
+            methods=methods,
+            pictures=compared,
+            views=views,
+            history=history.get("trend", ()),
+            regressions=history.get("regressions", ()),
         )
     )
     (slot.path / PAGE).write_text(page, encoding="utf-8")

@@ -154,7 +154,13 @@ def stage(
                 stage_page(),
                 reporting(label, name, time_limit_s),
                 where.slot(
-                    stage=name, version=version, key=key, label=label, config=settings, inputs=refs
+                    stage=name,
+                    version=version,
+                    key=key,
+                    label=label,
+                    config=settings,
+                    inputs=refs,
+                    renew=_refreshing(),
                 ) as slot,
             ):
                 # Workers with other numbers of threads share the store.

@@ -40,5 +40,5 @@ def test_root_holds_only_what_belongs_there() -> None:
     assert roots <= {
         "extrags", "tasks", "flows", "data_catalog", "tests", "docs", "examples",
         "pyproject.toml", "README.md", "LICENSE", "Makefile", "CMakeLists.txt", "prefect.yaml",
-        "requirements.lock",
+        "requirements.lock", "deploy",
     }  # fmt: skip

@@ -12,6 +12,7 @@ from extrags.report.charts import method_colors, methods_chart, pairs_chart
 from extrags.report.comparison import RenderedMethod, compared_rows
 from extrags.report.encode import DataImage
 from extrags.report.page import rendered_page
+from extrags.report.trend import trend_chart
 from extrags.report.wording import count, described_metrics, duration, number, percent
 from extrags.sequence import EndoscopicSequence
 
@@ -54,6 +55,9 @@ class BenchmarkInputs:
         pictures: held-out views side by side.
         views: rows of pictures per sequence at most.
         made: when, in words; nothing is said when empty.
+        history: `{when, commit, version, methods: {METHOD: {psnr, seconds}}}` of its runs over time, the
+            oldest first and this one last.
+        regressions: what is worse than in the runs before, in words.
     """
 
     name: str
@@ -63,6 +67,8 @@ class BenchmarkInputs:
     pictures: Sequence[ComparedViews] = ()
     views: int = 4
     made: str = field(default="")
+    history: Sequence[Mapping[str, Any]] = ()
+    regressions: Sequence[str] = ()
 
 
 def build_benchmark_report(inputs: BenchmarkInputs) -> str:
@@ -108,6 +114,9 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
         ceiling_sequences=_rows(comparison["ceiling_sequences"], columns, cell=_share_cell),
         difference_chart=_difference_chart(comparison["paired_sequences"], columns, inputs.baseline),
         figure_charts=_figure_charts(measured, columns, inputs),
+        regressions=inputs.regressions,
+        history=inputs.history,
+        trend_chart=_trend_chart(inputs),
         pictures=[
             (
                 f"{pair.sequence.name}, {pair.label}",
@@ -241,6 +250,13 @@ def _figure_charts(
         alt = f"{title} on held-out views of every run, by sequence and method, and against run time"
         charts.append((chart, alt))
     return charts
+
+
+def _trend_chart(inputs: BenchmarkInputs) -> tuple[DataImage, str] | None:
+    chart = trend_chart(inputs.history, method_colors(list(inputs.methods), inputs.baseline))
+    if chart is None:
+        return None
+    return chart, f"PSNR and run time of each method over {len(inputs.history)} runs of this benchmark"
 
 
 def _by_method(

@@ -6,6 +6,7 @@ from extrags.store.artefacts import Slot, Store
 from extrags.store.canonical import Ref, canonical, digest_of
 from extrags.store.integrity import content_digest
 from extrags.store.manifest import MANIFEST, Manifest
+from extrags.store.records import in_work, read_records, write_record
 from extrags.store.storable import Storable
 
 __all__ = [
@@ -18,4 +19,7 @@ __all__ = [
     "canonical",
     "content_digest",
     "digest_of",
+    "in_work",
+    "read_records",
+    "write_record",
 ]

@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeVar
 
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, StoreError
 from extrags.store.canonical import Ref
-from extrags.store.directory import DirectoryBackend, private_directory
+from extrags.store.directory import ABOUT, DirectoryBackend, private_directory
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, write_checksums
 from extrags.store.manifest import Manifest, software_versions, stage_of
 from extrags.store.storable import Storable
@@ -355,6 +355,7 @@ class Store:
         label: str = "",
         config: Mapping[str, Any] | None = None,
         inputs: Mapping[str, Ref] | None = None,
+        renew: bool = False,
     ) -> Iterator[Slot]:
         """Write an artefact atomically: it is committed when the block ends, and discarded when it raises.
 
@@ -365,6 +366,8 @@ class Store:
             label: display name, e.g. of the sequence.
             config: settings, as JSON types.
             inputs: the input artefacts by name.
+            renew: where the same content is there already, its manifest says from now on when and how fast
+                it was made this time.
 
         Yields:
             The slot; after the block `slot.ref` is the artefact.
@@ -377,6 +380,13 @@ class Store:
         with private_directory(self.backend.scratch, key) as scratch:
             slot = Slot(scratch / "files", self)
             slot.path.mkdir()
+            about = {
+                "key": key,
+                "stage": stage,
+                "label": label,
+                "started": started.isoformat(timespec="seconds"),
+            }
+            (scratch / ABOUT).write_text(json.dumps(about), encoding="utf-8")
             try:
                 with self._blaming(slot._inputs.values()):
                     yield slot
@@ -399,6 +409,7 @@ class Store:
                         files=files,
                         bytes=size,
                     ),
+                    renew=renew,
                 )
             except Exception as error:
                 self._keep_failure(slot, key, label, error)

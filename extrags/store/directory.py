@@ -17,12 +17,25 @@ from extrags.store.canonical import Ref
 from extrags.store.integrity import Damage, Depth, find_damage, intact_manifest
 from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
 
-__all__ = ["DAMAGED", "RECORD", "DirectoryBackend", "private_directory", "sweep_directories"]
+__all__ = [
+    "ABOUT",
+    "DAMAGED",
+    "RECORD",
+    "RECORDS",
+    "DirectoryBackend",
+    "held_directories",
+    "private_directory",
+    "sweep_directories",
+]
 
 DAMAGED = "damaged"
 """Where damaged artefacts are set aside, below the root of a store."""
 RECORD = "damage.json"
 """Beside an artefact that was set aside: what is wrong with it."""
+RECORDS = "records"
+"""Where records of runs are, below the root of a store (`Store.write_record`)."""
+ABOUT = "about.json"
+"""In a scratch directory: what is being made there."""
 
 
 class DirectoryBackend:
@@ -133,10 +146,36 @@ class DirectoryBackend:
         shutil.rmtree(place, ignore_errors=True)
         return names
 
-    def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
+    def write_record(self, name: str, text: bytes) -> None:
+        """Write `records/<name>`; one that is there is replaced at once, never half."""
+        self._put(self.root / RECORDS / name, text)
+
+    def read_records(self, prefix: str) -> dict[str, bytes]:
+        """Records by name, of those whose name begins so."""
+        place = self.root / RECORDS
+        try:
+            names = sorted(entry.name for entry in os.scandir(place) if entry.name.startswith(prefix))
+        except FileNotFoundError:
+            return {}
+        found = {}
+        for name in names:
+            try:
+                found[name] = (place / name).read_bytes()
+            except FileNotFoundError:
+                continue  # Removed meanwhile.
+        return found
+
+    def _put(self, target: Path, text: bytes) -> None:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with private_directory(self.scratch, target.name) as private:
+            (private / "written").write_bytes(text)
+            (private / "written").replace(target)
+
+    def commit(self, scratch: Path, manifest: Manifest, *, renew: bool = False) -> Manifest:
         """Move a finished scratch directory into place.
 
-        If another process has committed the same content before, its artefact is kept.
+        If another process has committed the same content before, its artefact is kept; with `renew` under
+        the new manifest, which says when and how fast it was made this time.
         """
         (scratch / MANIFEST).write_bytes(manifest_text(manifest))
         target = self.artefacts / manifest.key
@@ -148,7 +187,10 @@ class DirectoryBackend:
             except OSError:
                 present = intact_manifest(self, manifest.key)
                 if present is not None and present.digest == manifest.digest:
-                    return present
+                    if not renew:
+                        return present
+                    self._put(target / MANIFEST, manifest_text(manifest))
+                    return manifest
                 if not target.exists():
                     raise
                 # Other content, or a damaged artefact: `refresh` replaces it. Between the two renames
@@ -210,6 +252,28 @@ def _claim(parent: Path, name: str) -> tuple[Path, int]:
         except (BlockingIOError, FileNotFoundError):
             pass  # Removed by a sweep after it was opened.
         os.close(lock)
+
+
+def held_directories(parent: Path) -> list[Path]:
+    """The directories below `parent` that a process has locked, i.e. works in, on this or another machine."""
+    held = []
+    try:
+        entries = sorted(entry.path for entry in os.scandir(parent) if entry.is_dir(follow_symlinks=False))
+    except FileNotFoundError:
+        return []
+    for path in entries:
+        try:
+            lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        except FileNotFoundError:
+            continue
+        try:
+            # Shared: looking must not seem to another who looks to be work.
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            held.append(Path(path))
+        finally:
+            os.close(lock)
+    return held
 
 
 def sweep_directories(parent: Path) -> list[str]:

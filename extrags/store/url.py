@@ -20,7 +20,7 @@ from typing import Any
 from extrags.data_directories import cache_directory
 from extrags.errors import DamagedArtefactError, MissingDependencyError, StoreError
 from extrags.store.canonical import Ref, digest_of
-from extrags.store.directory import DAMAGED, RECORD, private_directory, sweep_directories
+from extrags.store.directory import DAMAGED, RECORD, RECORDS, private_directory, sweep_directories
 from extrags.store.integrity import Damage, find_damage, find_damaged_sizes, intact_manifest
 from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
 
@@ -101,7 +101,9 @@ class UrlBackend:
     def names(self) -> list[str]:
         """All keys, sorted; also those whose manifest is still missing."""
         children = self._children(self.prefix)
-        return sorted(name for name, kind in children if kind == "directory" and name != DAMAGED)
+        return sorted(
+            name for name, kind in children if kind == "directory" and name not in (DAMAGED, RECORDS)
+        )
 
     def path(self, ref: Ref, manifest: Manifest) -> Path:
         """Local directory with the artefact's files; downloaded at the first call, verified by the digest.
@@ -203,10 +205,31 @@ class UrlBackend:
                 self.fs.get_file(name, str(scratch / relative))
             yield scratch
 
-    def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
-        """Upload the files, then the manifest."""
+    def write_record(self, name: str, text: bytes) -> None:
+        """Write `records/<name>` with one put, which replaces one that is there."""
+        self.fs.pipe_file(f"{self.prefix}/{RECORDS}/{name}", text)
+
+    def read_records(self, prefix: str) -> dict[str, bytes]:
+        """Records by name, of those whose name begins so."""
+        place = f"{self.prefix}/{RECORDS}"
+        names = sorted(name for name, _ in self._children(place) if name.startswith(prefix))
+        if not names:
+            return {}
+        # All at once: on an object store each costs a round trip.
+        found = self.fs.cat([f"{place}/{name}" for name in names], on_error="omit")
+        return {str(path).rsplit("/", 1)[-1]: text for path, text in found.items()}
+
+    def commit(self, scratch: Path, manifest: Manifest, *, renew: bool = False) -> Manifest:
+        """Upload the files, then the manifest.
+
+        The same content that is there already stays; with `renew` under the new manifest, which says when
+        and how fast it was made this time.
+        """
         present = intact_manifest(self, manifest.key)
         if present is not None and present.digest == manifest.digest:
+            if renew:
+                present = manifest.model_copy(update={"data": present.data})
+                self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest_text(present))
             return present
         attempt = secrets.token_hex(8)
         manifest = manifest.model_copy(update={"data": attempt})

@@ -13,6 +13,8 @@ from flows.commands.options import Parser, add_json, add_runner, add_settings, a
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from flows.history import Tolerance
+
 __all__ = ["add_arguments", "benchmark", "parsed_seeds", "parsed_variants", "print_benchmark"]
 
 
@@ -50,6 +52,23 @@ def add_arguments(parser: Parser) -> None:
         "--profiles", nargs="+", default=["quick"], metavar="PROFILE", help="named settings (default: quick)"
     )
     parser.add_argument("--name", default="benchmark", help="title of the page")
+    parser.add_argument(
+        "--refresh",
+        action="store_true",
+        help="make everything anew, so that times are those of now, and add them to the history in the store",
+    )
+    parser.add_argument(
+        "--max-psnr-loss",
+        type=float,
+        metavar="DB",
+        help="with --refresh: exit code 1 when PSNR is lower than the median of the last runs by more",
+    )
+    parser.add_argument(
+        "--max-slowdown",
+        type=float,
+        metavar="SHARE",
+        help="with --refresh: exit code 1 when run time is longer than the median of the last runs by more",
+    )
     add_settings(parser)
     add_store(parser)
     add_runner(parser)
@@ -74,6 +93,7 @@ def benchmark(given: argparse.Namespace) -> int:
     from flows.benchmark import benchmark as flow
     from flows.benchmark import check_methods
     from flows.console import progress_bars
+    from flows.selection import absolute_manifests
     from flows.settings import task_runner
     from flows.temporary_server import temporary_server
 
@@ -85,7 +105,7 @@ def benchmark(given: argparse.Namespace) -> int:
         profile_config(profile)
     with temporary_server(), without_heartbeat(), progress_bars(terminal=terminal):
         found = flow.with_options(task_runner=task_runner(given.runner))(
-            sequences=given.sequences,
+            sequences=absolute_manifests(given.sequences),
             profiles=profiles,
             methods=methods,
             seeds=seeds,
@@ -95,10 +115,31 @@ def benchmark(given: argparse.Namespace) -> int:
             store=root,
             name=given.name,
             limits=limits,
+            refresh=given.refresh,
+            tolerance=_tolerance(given),
         )
     print_benchmark(found, to_stderr=given.json == "-")
     write_json(found, given.json)
     return 1 if any(case["error"] for case in found["cases"]) else 0
+
+
+def _tolerance(given: argparse.Namespace) -> Tolerance | None:
+    """What the command line tolerates; None where it asks for no judgement.
+
+    Raises:
+        ConfigError: for a negative one, or one without `--refresh`.
+    """
+    from flows.history import Tolerance
+
+    named = {"psnr_db": given.max_psnr_loss, "seconds_share": given.max_slowdown}
+    wanted = {name: value for name, value in named.items() if value is not None}
+    if not wanted:
+        return None
+    if not given.refresh:
+        raise ConfigError("--max-psnr-loss and --max-slowdown need --refresh")
+    if any(not value >= 0 for value in wanted.values()):
+        raise ConfigError("--max-psnr-loss and --max-slowdown: expected 0 or more")
+    return Tolerance(**wanted)
 
 
 def parsed_seeds(given: list[str]) -> list[int]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from extrags.errors import DamagedArtefactError, StoreError
 from flows.commands.common import store_root, write_json
 from flows.commands.options import Parser, add_json, add_store, add_verb
+from flows.commands.status import size_text
 
 if TYPE_CHECKING:
     from extrags.store import Store
@@ -75,11 +76,11 @@ def ls(given: argparse.Namespace) -> int:
         table.add_column("key", overflow="fold")
         for item in manifests:
             mark = " [red]DAMAGED[/]" if item.key in damaged else ""
-            cost = (f"{item.seconds:.1f}", _size(item.bytes))
+            cost = (f"{item.seconds:.1f}", size_text(item.bytes))
             table.add_row(item.stage, item.label, item.started[:16], *cost, item.key + mark)
         out = console()
         out.print(table)
-        total = _size(sum(item.bytes for item in manifests))
+        total = size_text(sum(item.bytes for item in manifests))
         out.print(f"{len(manifests)} artefacts, {total}, in {store.root}")
     rows = [item.model_dump(mode="json") | {"damaged": item.key in damaged} for item in manifests]
     write_json(rows, given.json)
@@ -173,12 +174,3 @@ def gc(given: argparse.Namespace) -> int:
         print(name)
     print(f"{len(removed)} leftovers removed from {store.root}")
     return 0
-
-
-def _size(count: int) -> str:
-    value = float(count)
-    for unit in ("B", "KiB", "MiB"):
-        if value < 1024:
-            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-        value /= 1024
-    return f"{value:.1f} GiB"

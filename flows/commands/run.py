@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 import time
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
 from extrags.errors import ConfigError, DamagedArtefactError, ExtragsError, UnknownSequenceError
-from flows.commands.common import run_config, set_up_logging, stage_limits, store_root, write_json
+from flows.commands.common import items, run_config, set_up_logging, stage_limits, store_root, write_json
 from flows.commands.options import Parser, add_json, add_method, add_runner
 from flows.failures import describe_error
+from flows.outcome import DatasetFailedError, DatasetOutcome
 
 if TYPE_CHECKING:
-    from extrags.config import PipelineConfig
     from extrags.pipeline import StageName
-    from flows.outcome import DatasetOutcome
+    from flows.cases import SequenceCase
 
-__all__ = ["add_arguments", "execute", "run"]
+__all__ = ["Several", "add_arguments", "execute", "parsed_matrix", "parsed_methods", "run"]
 
 
 def add_arguments(parser: Parser) -> None:
@@ -30,7 +32,19 @@ def add_arguments(parser: Parser) -> None:
         "one sequence does not stop the others."
     )
     parser.set_defaults(command=run)
-    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    parser.add_argument(
+        "sequences",
+        nargs="*",
+        metavar="SEQUENCE",
+        help="names, paths, patterns over the catalogue's names ('c3vdv2/*@sparse'), or @FILE for a manifest",
+    )
+    parser.add_argument(
+        "--manifest",
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="take the sequences of a file: one a line, or YAML or JSON with settings of each; repeatable",
+    )
     add_method(parser)
     add_runner(parser)
     add_json(parser)
@@ -44,6 +58,28 @@ def add_arguments(parser: Parser) -> None:
         "--at-once", type=int, default=1, metavar="N", help="sequences in work at the same time (default: 1)"
     )
     parser.add_argument(
+        "--only",
+        choices=("failed", "changed", "missing"),
+        help="only sequences whose last run failed, of which something would be made, or that never ended",
+    )
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=[],
+        metavar="METHOD",
+        help="several methods instead of --method, each on every sequence",
+    )
+    parser.add_argument(
+        "--seeds", nargs="+", default=[], metavar="N", help="several seeds instead of --seed: 0,1,2"
+    )
+    parser.add_argument(
+        "--matrix",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE,VALUE",
+        help="several values of a setting, each on every sequence; repeatable: every combination is run",
+    )
+    parser.add_argument(
         "--always-flow",
         action="store_true",
         help="start a flow run even if everything is in the store already",
@@ -52,26 +88,94 @@ def add_arguments(parser: Parser) -> None:
 
 def run(given: argparse.Namespace) -> int:
     """`extrags run`."""
+    from flows.commands.benchmark import parsed_seeds
+
     if given.at_once < 1:
         raise ConfigError(f"--at-once is {given.at_once}; expected 1 or more")
+    sequences = [*given.sequences, *(f"@{file}" for file in given.manifest)]
+    if not sequences:
+        raise ConfigError(
+            "the following arguments are required: SEQUENCE or --manifest FILE (see extrags run --help)"
+        )
     begun = time.monotonic()
     outcome = execute(
-        given.sequences,
+        sequences,
         given,
         until=given.until,
         refresh=given.refresh,
         at_once=given.at_once,
         always_flow=given.always_flow,
+        several=Several(
+            only=given.only,
+            methods=tuple(parsed_methods(given.methods, given.method)),
+            seeds=tuple(parsed_seeds(given.seeds) if given.seeds else [given.seed]),
+            matrix=parsed_matrix(given.matrix),
+        ),
     )
     seconds = time.monotonic() - begun
     from flows.console import print_outcomes
 
-    print_outcomes(outcome, seconds)
+    if not outcome.sequences:
+        print(f"extrags: no sequence is {given.only}; nothing to do", file=sys.stderr)
+    else:
+        print_outcomes(outcome, seconds)
     errors = [sequence.error for sequence in outcome.sequences if sequence.error is not None]
     for hint in dict.fromkeys(hint for error in errors for hint in describe_error(error)[1:]):
         print(f"extrags: {hint}", file=sys.stderr)
     write_json(outcome.to_json(seconds), given.json)
     return 0 if all(sequence.status == "ok" for sequence in outcome.sequences) else 1
+
+
+@dataclass(frozen=True)
+class Several:
+    """What makes more, or fewer, than one run of each sequence; see `flows.dataset.reconstruct_dataset`."""
+
+    only: Literal["failed", "changed", "missing"] | None = None
+    methods: tuple[str, ...] = ()
+    seeds: tuple[int | None, ...] = ()
+    matrix: Mapping[str, list[Any]] = field(default_factory=dict)
+
+
+def parsed_methods(given: list[str], single: str) -> list[str]:
+    """`["3dgs,extrags"]` to a list of methods; without any the one of `--method`.
+
+    Raises:
+        ConfigError: for an unknown method.
+    """
+    from flows.methods import METHODS
+
+    methods = items(given) or [single]
+    for method in methods:
+        if method not in METHODS:
+            raise ConfigError(f"no method {method!r}; known: {', '.join(METHODS)}")
+    return methods
+
+
+def parsed_matrix(given: list[str]) -> dict[str, list[Any]]:
+    """`["coarse.iterations=500,1000"]` to `{"coarse.iterations": [500, 1000]}`.
+
+    Values are written as for the setting's own flag; those that hold commas themselves between brackets:
+    `enhance.channels=[8,8,16],[16,16,32]`.
+
+    Raises:
+        ConfigError: for an unknown setting, one that is there twice, or a wrong value.
+    """
+    from extrags.config import PipelineConfig
+    from extrags.config.settings import settings_of, unknown_setting
+
+    known = settings_of(PipelineConfig)
+    matrix: dict[str, list[Any]] = {}
+    for text in given:
+        name, separator, values = text.partition("=")
+        if not separator or not values:
+            raise ConfigError(f"--matrix {text}: expected NAME=VALUE,VALUE, e.g. coarse.iterations=500,1000")
+        if name not in known:
+            raise unknown_setting(name, known)
+        if name in matrix:
+            raise ConfigError(f"--matrix {name} is there twice; give all of its values at once")
+        # A comma between brackets belongs to the value.
+        matrix[name] = [known[name].parse(value) for value in re.split(r",(?![^\[]*\])", values)]
+    return matrix
 
 
 def execute(
@@ -82,53 +186,84 @@ def execute(
     refresh: bool = False,
     at_once: int = 1,
     always_flow: bool = False,
+    several: Several | None = None,
 ) -> DatasetOutcome:
     """Take sequences through stages: from the store if everything is there, else in a flow run.
 
     Raises:
-        ConfigError: for wrong settings.
-        UnknownSequenceError: for a name that is not in the catalogue.
+        ConfigError: for wrong settings or manifests.
+        UnknownSequenceError: for a name that is not in the catalogue, or a pattern that matches none.
         StoreError: for a store that cannot be written.
         WeightsError: when a model or weights that the settings name are not there.
         MissingDependencyError: when a package that the settings need is not there.
     """
     from extrags.store import Store
     from flows.environment import prepare, without_heartbeat
-    from flows.methods import METHODS
     from flows.temporary_server import temporary_server
 
     terminal = sys.stderr.isatty()
     set_up_logging(debug=given.debug, terminal=terminal)
-    root, config = store_root(given), run_config(given)
-    _check_names(sequences)
+    root = store_root(given)
+    several = several or Several(methods=(given.method,), seeds=(given.seed,))
+    if several.methods == (given.method,):
+        # Wrong usage is said before anything is made or loaded.
+        run_config(given)
     prepare(Store(root).state, debug=given.debug)
+    from flows.cases import cases_of, selected
+    from flows.expectation import expectations, expected_words
+    from flows.methods import METHODS
+    from flows.selection import absolute_manifests, chosen_sequences
+
+    chosen = chosen_sequences(sequences)
+    _check_names([item.name for item in chosen])
+    every = cases_of(
+        chosen,
+        methods=several.methods,
+        profile=given.profile,
+        seeds=several.seeds,
+        settings=given.settings,
+        matrix=several.matrix,
+    )
+    cases = selected(every, several.only, root, until)
+    if not cases:
+        return DatasetOutcome([])
     if not refresh and not always_flow:
         # Nothing to make: no need to wait for a server.
-        found = _from_store(sequences, config, root, given.profile, given.method, until)
+        found = _from_store(cases, root, until)
         if found is not None:
             return found
     # The flow looks as well; here it is said without waiting for a server.
     from flows.preflight import preflight
 
-    preflight(config, until, METHODS[given.method].leave_out)
+    for method in several.methods:
+        first = next((case for case in cases if case.method == method), None)
+        if first is not None:
+            preflight(first.config(), until, METHODS[method].leave_out)
+    if terminal and len(cases) > 1:
+        # Elsewhere it is a line of the log.
+        expected = expectations(cases, root, until, refresh=refresh)
+        print(f"extrags: {expected_words(expected, at_once)}", file=sys.stderr)
     from flows.console import progress_bars
     from flows.dataset import reconstruct_dataset
-    from flows.outcome import DatasetFailedError
 
     limits = stage_limits(given)
     with temporary_server(), without_heartbeat(), progress_bars(terminal=terminal):
         try:
             outcome: DatasetOutcome = reconstruct_dataset(
-                sequences=sequences,
+                sequences=absolute_manifests(sequences),
                 profile=given.profile,
                 settings=given.settings,
-                seed=given.seed,
                 store=root,
                 refresh=refresh,
                 until=until,
                 runner=given.runner,
                 at_once=at_once,
-                method=given.method,
+                method=several.methods[0],  # type: ignore[arg-type]
+                methods=list(several.methods) if len(several.methods) > 1 else None,  # type: ignore[arg-type]
+                seed=several.seeds[0],
+                seeds=list(several.seeds) if len(several.seeds) > 1 else None,  # type: ignore[arg-type]
+                matrix=dict(several.matrix) or None,
+                only=several.only,
                 limits=limits,
             )
         except DatasetFailedError as error:
@@ -141,12 +276,9 @@ def execute(
     return outcome
 
 
-def _from_store(
-    sequences: list[str], config: PipelineConfig, root: str, profile: str, method: str, until: StageName
-) -> DatasetOutcome | None:
+def _from_store(cases: Sequence[SequenceCase], root: str, until: StageName) -> DatasetOutcome | None:
     """Outcomes from the store alone; None as soon as anything is missing or wrong."""
     from flows.methods import METHODS, profile_label
-    from flows.outcome import DatasetOutcome
     from flows.pages import dataset_page
     from flows.runners import NotInStoreError, StoreRunner
     from flows.wiring import run_sequence
@@ -156,23 +288,24 @@ def _from_store(
         """Looking is no progress."""
 
     runner = StoreRunner(root)
-    label = profile_label(profile, method)
+    outcomes = []
     try:
         with observed(ignore):
-            outcomes = [
-                run_sequence(
-                    sequence,
-                    config,
+            for case in cases:
+                outcome = run_sequence(
+                    case.sequence,
+                    case.config(),
                     root,
                     runner,
-                    profile=label,
+                    profile=profile_label(case.profile, case.method),
                     until=until,
-                    leave_out=METHODS[method].leave_out,
+                    leave_out=METHODS[case.method].leave_out,
                 )
-                for sequence in sequences
-            ]
-            if any(outcome.status == "failed" for outcome in outcomes):
-                return None
+                if outcome.status == "failed":
+                    return None
+                outcome.variant = case.variant
+                outcomes.append(outcome)
+            label = profile_label(cases[0].profile, ", ".join(dict.fromkeys(case.method for case in cases)))
             page = dataset_page(outcomes, "dataset", label, runner) if until == "report" else None
     except (NotInStoreError, DamagedArtefactError):
         return None
@@ -190,5 +323,3 @@ def _check_names(sequences: list[str]) -> None:
             raise
         except ExtragsError:
             continue
-    if len({str(Path(sequence)) for sequence in sequences}) != len(sequences):
-        raise ConfigError("a sequence is named twice")

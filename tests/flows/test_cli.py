@@ -103,7 +103,10 @@ class TestUsage:
             ([SEQUENCE, "--set", "coarse.iterations"], "expected NAME=VALUE"),
             ([SEQUENCE, "--seed", "-1"], "the seed is -1"),
             ([SEQUENCE, "--until", "finnish"], "invalid choice: 'finnish' (choose from 'ingest', 'poses'"),
-            ([], "the following arguments are required: SEQUENCE (see extrags run --help)"),
+            (
+                [],
+                "the following arguments are required: SEQUENCE or --manifest FILE (see extrags run --help)",
+            ),
             ([SEQUENCE, "--reruns", "2"], "unknown argument --reruns"),
             ([SEQUENCE, "--sed", "2"], "did you mean --seed"),
             ([SEQUENCE, "--coarse.iteration", "2"], "did you mean --coarse.iterations"),

@@ -18,7 +18,7 @@ from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner, PrefectRunner, StoreRunner
 from flows.wiring import run_sequence
 from tests.flows.damaging import chunks_of, delete, files_of, flip_bit, trials, truncate
-from tests.flows.tiny import SEQUENCE, tiny_config, without_report
+from tests.flows.tiny import SEQUENCE, TINY, tiny_config, without_report
 
 RGB = "sequence/rgb/c/2/0/0/0"
 
@@ -102,10 +102,11 @@ def test_who_only_looks_moves_nothing(finished: tuple[str, SequenceOutcome], sto
 def test_a_run_that_is_not_whole_in_the_store_is_no_finished_run(
     finished: tuple[str, SequenceOutcome], store: Store
 ) -> None:
+    from flows.cases import SequenceCase
     from flows.commands.run import _from_store
 
     _, whole = finished
-    arguments = ([SEQUENCE], tiny_config(), store.root, "quick", "extrags", "evaluate")
+    arguments = ([SequenceCase(SEQUENCE, profile="quick", settings=TINY)], store.root, "evaluate")
     assert _from_store(*arguments) is not None
     (Path(store.root) / "artefacts" / key_of(whole, "renders_final") / "renders/rgb/c/0/0/0/0").unlink()
     assert _from_store(*arguments) is None

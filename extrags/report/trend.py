@@ -1,0 +1,58 @@
+"""The trend of a benchmark: error and run time of each method over its runs."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from extrags.report.charts import drawing_style, svg_image
+from extrags.report.encode import DataImage
+
+__all__ = ["trend_chart"]
+
+PANELS = (("psnr", "PSNR (dB)"), ("seconds", "Run time (s)"))
+
+
+def trend_chart(entries: Sequence[Mapping[str, Any]], colors: Mapping[str, str]) -> DataImage | None:
+    """PSNR and run time by date, one line per method; None for fewer than two runs.
+
+    Args:
+        entries: `{when, methods: {METHOD: {psnr, seconds}}}` of each run, the oldest first; `when` is ISO
+            8601, values may be None.
+        colors: of the methods.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+    from matplotlib.figure import Figure
+
+    if len(entries) < 2:
+        return None
+    with drawing_style():
+        figure = Figure(figsize=(9.6, 2.8), layout="constrained")
+        FigureCanvasAgg(figure)
+        axes = figure.subplots(1, len(PANELS))
+        for panel, (key, title) in zip(axes, PANELS, strict=True):
+            for method, color in colors.items():
+                found = [
+                    (datetime.datetime.fromisoformat(entry["when"]), entry["methods"][method][key])
+                    for entry in entries
+                    if entry["methods"].get(method, {}).get(key) is not None
+                ]
+                if found:
+                    panel.plot(
+                        [when for when, _ in found],
+                        [value for _, value in found],
+                        color=color,
+                        marker="o",
+                        markersize=3.5,
+                        linewidth=1.4,
+                        label=method,
+                    )
+            panel.set_title(title)
+            locator = AutoDateLocator()
+            panel.xaxis.set_major_locator(locator)
+            panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+        axes[1].set_ylim(bottom=0)
+        axes[0].legend(loc="best")
+        return svg_image(figure)

@@ -1,0 +1,254 @@
+"""The runs of a dataset: sequences times methods, seeds and settings; which of them are to be run."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any, Literal
+
+from extrags import __version__
+from extrags.config import PipelineConfig
+from extrags.errors import ConfigError, DamagedArtefactError, StoreError
+from extrags.pipeline import StageName
+from extrags.store import Store, digest_of, write_record
+from flows.methods import METHODS, check_not_pinned, method_config, pinned_settings
+from flows.outcome import SequenceOutcome, StageRow
+from flows.outcome_records import OUTCOME, OutcomeRecord, outcome_records, setting_text
+from flows.run_page import expected_seconds
+from flows.runners import NotInStoreError, StoreRunner
+from flows.selection import Chosen
+from flows.wiring import run_sequence
+from tasks.progress import observed
+
+__all__ = [
+    "Only",
+    "SequenceCase",
+    "cases_of",
+    "matrix_points",
+    "record_outcome",
+    "record_outcome_quietly",
+    "selected",
+]
+
+log = logging.getLogger(__name__)
+
+Only = Literal["failed", "changed", "missing"]
+"""Which cases of a run are taken: those whose last run failed; those of which something would be made; those
+that have never been run to their end."""
+
+
+@dataclass(frozen=True)
+class SequenceCase:
+    """One run of a sequence among those of a dataset.
+
+    Args:
+        sequence: its name.
+        method: of `flows.methods.METHODS`.
+        profile: named settings.
+        seed: of all stages; None leaves each stage's own.
+        settings: overrides, those of a manifest among them.
+        changed: what a matrix sets on top of them.
+        variant: what sets it apart from the others of its sequence, in words; empty where there are none.
+    """
+
+    sequence: str
+    method: str = "extrags"
+    profile: str = "balanced"
+    seed: int | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    changed: Mapping[str, Any] = field(default_factory=dict)
+    variant: str = ""
+
+    @property
+    def title(self) -> str:
+        """The sequence, and the variant where there is one."""
+        return f"{self.sequence} [{self.variant}]" if self.variant else self.sequence
+
+    @property
+    def record(self) -> str:
+        """Name of the record of its last run.
+
+        Settings that are the same for all runs of a sequence are not part of it: who mends them runs the
+        same case again.
+        """
+        identity = {
+            "sequence": self.sequence,
+            "method": self.method,
+            "profile": self.profile,
+            "seed": self.seed,
+            "variant": dict(self.changed),
+        }
+        return f"{OUTCOME}{digest_of(identity)}"
+
+    def config(self) -> PipelineConfig:
+        """All of its settings.
+
+        Raises:
+            ConfigError: for a setting that is wrong, or that the method sets itself.
+        """
+        overrides = {**self.settings, **self.changed}
+        check_not_pinned(self.method, overrides)
+        return method_config(self.method, self.profile, overrides, self.seed)
+
+
+def matrix_points(matrix: Mapping[str, Sequence[Any]] | None) -> list[dict[str, Any]]:
+    """Every combination of the values of a matrix; one that is empty without a matrix.
+
+    Raises:
+        ConfigError: for a setting without values, or with one twice.
+    """
+    matrix = matrix or {}
+    for name, values in matrix.items():
+        if not values or len({repr(value) for value in values}) < len(values):
+            raise ConfigError(f"the matrix needs one or more different values of {name}: {list(values)}")
+    return [dict(zip(matrix, point, strict=True)) for point in product(*matrix.values())]
+
+
+def cases_of(
+    chosen: Sequence[Chosen],
+    *,
+    methods: Sequence[str],
+    profile: str,
+    seeds: Sequence[int | None],
+    settings: Mapping[str, Any],
+    matrix: Mapping[str, Sequence[Any]] | None = None,
+) -> list[SequenceCase]:
+    """Every sequence with every method, seed and point of the matrix.
+
+    Of several methods, each takes the settings that it does not set itself, as in a benchmark; a matrix
+    must have an effect on all of them.
+
+    Raises:
+        ConfigError: for a method or seed that is there twice; for wrong settings, once for all sequences that
+            have the same.
+    """
+    for what, values in (("method", methods), ("seed", seeds)):
+        if not values or len(set(values)) < len(values):
+            raise ConfigError(f"expected one or more different {what}s: {', '.join(map(str, values))}")
+    points = matrix_points(matrix)
+    checked: set[str] = set()
+    found = []
+    for item, method, seed, point in product(chosen, methods, seeds, points):
+        words = [
+            *([method] if len(methods) > 1 else []),
+            *([f"seed {seed}"] if len(seeds) > 1 else []),
+            *([setting_text(point)] if point else []),
+        ]
+        own = {**settings, **item.settings}
+        if len(methods) > 1:
+            pinned = pinned_settings(method) - {"coarse.train_on"}  # Refused whatever the method.
+            own = {name: value for name, value in own.items() if name not in pinned}
+        case = SequenceCase(item.name, method, profile, seed, own, point, ", ".join(words))
+        same = digest_of([method, seed, dict(case.settings), point])
+        if same not in checked:
+            checked.add(same)
+            try:
+                case.config()
+            except ConfigError as error:
+                raise ConfigError(
+                    f"{case.title}: {error}" if item.settings or point else str(error)
+                ) from error
+        found.append(case)
+    return found
+
+
+def selected(
+    cases: Sequence[SequenceCase], only: Only | None, root: str, until: StageName
+) -> list[SequenceCase]:
+    """The cases that a run takes, as the store tells.
+
+    Args:
+        cases: all of them.
+        only: which; None takes all.
+        root: of the store.
+        until: last stage of the run.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    if only is None:
+        return list(cases)
+    if only == "changed":
+        return [case for case in cases if _would_run(case, root, until)]
+    records = outcome_records(Store(root))
+    if only == "failed":
+        return [case for case in cases if records.get(case.record, {}).get("status") == "failed"]
+    return [case for case in cases if case.record not in records and _would_run(case, root, until)]
+
+
+def _would_run(case: SequenceCase, root: str, until: StageName) -> bool:
+    """Whether any stage would have to be made now."""
+
+    def ignore(_: object) -> None:
+        """Looking is no progress."""
+
+    try:
+        with observed(ignore):
+            outcome = run_sequence(
+                case.sequence,
+                case.config(),
+                root,
+                StoreRunner(root),
+                profile=case.profile,
+                # The page is made anew for its texts; that is no change of the sequence.
+                until="evaluate" if until == "report" else until,
+                leave_out=METHODS[case.method].leave_out,
+            )
+    except (NotInStoreError, DamagedArtefactError):
+        return True
+    return outcome.status == "failed"
+
+
+def record_outcome(
+    store: Store, case: SequenceCase, outcome: SequenceOutcome, until: StageName, config: PipelineConfig
+) -> None:
+    """Leave in the store how a run of a case ended, in place of how the one before did.
+
+    Raises:
+        StoreError: when it cannot be written.
+    """
+    failed = next((row for row in outcome.stages if row.state == "failed"), None)
+    expected = expected_seconds(config)
+    record: OutcomeRecord = {
+        "sequence": case.sequence,
+        "method": case.method,
+        "profile": case.profile,
+        "seed": case.seed,
+        "variant": dict(case.changed),
+        "until": until,
+        "status": outcome.status,
+        "stage": None if failed is None else failed.stage,
+        "reason": "" if failed is None else failed.reason,
+        "ended": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "seconds": round(outcome.seconds, 3),
+        "config": digest_of(config),
+        "stages": [_stage_record(row, sum(expected.get(row.stage, {}).values())) for row in outcome.stages],  # type: ignore[call-overload]
+        "metrics": outcome.metrics,
+        "report": outcome.report,
+        "extrags": __version__,
+    }
+    write_record(store, case.record, record)
+
+
+def record_outcome_quietly(
+    store: Store, case: SequenceCase, outcome: SequenceOutcome, until: StageName, config: PipelineConfig
+) -> None:
+    """As `record_outcome`; a store that fails now must not hide how the run ended."""
+    try:
+        record_outcome(store, case, outcome, until, config)
+    except StoreError as error:
+        log.warning("%s: how it ended is not on record: %s", case.title, error)
+
+
+def _stage_record(row: StageRow, expected: float) -> dict[str, Any]:
+    return {
+        "stage": row.stage,
+        "state": row.state,
+        "reason": row.reason,
+        "made_seconds": round(row.made_seconds, 3),
+        "expected": round(expected, 3),
+        "artefacts": row.made,
+    }

@@ -1,0 +1,102 @@
+"""`serve`: all deployments on this machine, in one process, without a work pool."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from extrags.errors import ConfigError
+from flows.commands.common import set_up_logging, store_root
+from flows.commands.options import Parser, add_store
+
+if TYPE_CHECKING:
+    from flows.deployments import Declared
+
+__all__ = ["add_arguments", "serve"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags serve`."""
+    parser.description = (
+        "Register the deployments of prefect.yaml with the Prefect server at PREFECT_API_URL, and run what "
+        "is asked of them, each run in a process of its own. For one machine: no work pool, no worker."
+    )
+    parser.set_defaults(command=serve)
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help="deployments to serve, e.g. nightly (default: all)"
+    )
+    parser.add_argument("--file", metavar="FILE", help="where they are declared (default: those of extrags)")
+    parser.add_argument(
+        "--limit", type=int, default=1, metavar="N", help="runs at the same time (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--schedules", action="store_true", help="run them on their schedules, too; else on demand alone"
+    )
+    add_store(parser)
+
+
+def serve(given: argparse.Namespace) -> int:
+    """`extrags serve`; returns when it is interrupted.
+
+    Raises:
+        ConfigError: without a server, for an unknown name, or a file that is wrong.
+    """
+    from flows.deployments import declared_deployments, usual_file
+
+    if given.limit < 1:
+        raise ConfigError(f"--limit is {given.limit}; expected 1 or more")
+    declared = declared_deployments(Path(given.file) if given.file else usual_file())
+    known = [item.name for item in declared]
+    for name in given.names:
+        if name not in known:
+            raise ConfigError(f"no deployment {name!r}; known: {', '.join(known)}")
+    set_up_logging(debug=given.debug, terminal=False)
+    # Runs are processes with another working directory: what they find by is absolute.
+    if given.store or os.environ.get("EXTRAGS_STORE"):
+        os.environ["EXTRAGS_STORE"] = store_root(given)
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    from prefect import serve as prefect_serve
+    from prefect.settings import PREFECT_API_URL
+
+    if not PREFECT_API_URL.value():
+        raise ConfigError(
+            "extrags serve needs a Prefect server that lasts: start one (prefect server start), and set "
+            "PREFECT_API_URL to its address, http://127.0.0.1:4200/api"
+        )
+    chosen = [item for item in declared if not given.names or item.name in given.names]
+    prefect_serve(
+        *[_deployment(item, schedules=given.schedules) for item in chosen],
+        limit=given.limit,
+        # Schedules are as this command says, whatever they were before.
+        pause_on_shutdown=given.schedules,
+    )
+    return 0
+
+
+def _deployment(declared: Declared, *, schedules: bool) -> Any:
+    from prefect.client.schemas.actions import DeploymentScheduleCreate
+    from prefect.client.schemas.objects import ConcurrencyLimitConfig
+    from prefect.client.schemas.schedules import CronSchedule
+    from prefect.flows import EntrypointType
+
+    when = (
+        []
+        if declared.cron is None
+        else [
+            DeploymentScheduleCreate(
+                schedule=CronSchedule(cron=declared.cron, timezone=declared.timezone), active=schedules
+            )
+        ]
+    )
+    return declared.flow().to_deployment(
+        name=declared.name,
+        schedules=when,
+        parameters=declared.parameters,
+        description=declared.description or None,
+        tags=list(declared.tags),
+        concurrency_limit=None if declared.limit is None else ConcurrencyLimitConfig(limit=declared.limit),
+        # Found wherever a run's process is started, unlike a path.
+        entrypoint_type=EntrypointType.MODULE_PATH,
+    )

@@ -1,0 +1,175 @@
+"""How long the runs of a dataset will take, before they begin; the longest come first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+from data_catalog import Descriptor, describe
+from extrags.config import PipelineConfig
+from extrags.errors import ExtragsError
+from extrags.pipeline import STAGES, StageName
+from extrags.store import Store, digest_of
+from flows.cases import SequenceCase
+from flows.methods import METHODS
+from flows.outcome_records import OutcomeRecord, outcome_records
+from flows.run_page import expected_seconds
+from tasks.run_page import duration_text
+
+__all__ = ["Expectation", "expectations", "expected_words", "longest_first"]
+
+REFERENCE_FRAMES, REFERENCE_PIXELS = 48, 160 * 128
+"""Of the sequences that `flows.run_page.EXPECTED_SECONDS` was measured on."""
+USUAL_WIDTH = 340
+"""About the width that sources are read at where no divisor is set, in pixels."""
+PER_FRAME: frozenset[StageName] = frozenset({"ingest", "poses", "depth", "evaluate"})
+"""Stages whose time grows with the number of frames as well as with that of pixels."""
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """How long a case will take.
+
+    Args:
+        case: which.
+        seconds: expected.
+        measured: whether from an earlier run of its sequence; else from the number and size of its frames.
+    """
+
+    case: SequenceCase
+    seconds: float
+    measured: bool
+
+
+def expectations(
+    cases: Sequence[SequenceCase], root: str, until: StageName, *, refresh: bool = False
+) -> list[Expectation]:
+    """How long each case will take, in the order given.
+
+    A stage takes as long as in the last run of the same sequence, in proportion to its iterations; else what
+    its frames suggest, at the pace of the runs that are on record. Cases that are in the store with the same
+    settings take no time.
+
+    Args:
+        cases: to be run.
+        root: of the store.
+        until: last stage.
+        refresh: whether everything is made anew.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    store = Store(root)
+    records = outcome_records(store)
+    keys = set(store.keys()) if records else set()
+    pace = _pace(list(records.values()))
+    by_sequence: dict[str, list[OutcomeRecord]] = {}
+    for record in records.values():
+        by_sequence.setdefault(str(record["sequence"]), []).append(record)
+    found = []
+    for case in cases:
+        config = case.config()
+        own = records.get(case.record)
+        if not refresh and own is not None and _is_finished(own, config, until, keys):
+            found.append(Expectation(case, 0.0, measured=True))
+            continue
+        left_out = METHODS[case.method].leave_out
+        wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in left_out]
+        earlier = [*([own] if own is not None else []), *by_sequence.get(case.sequence, [])]
+        times = _measured(earlier)
+        local = _pace(earlier) or pace or 1.0
+        base = expected_seconds(config)
+        scale = {} if times else _scales(case.sequence, config)
+        seconds = 0.0
+        for stage in wanted:
+            usual = sum(base[stage].values())
+            if stage in times:
+                took, expected = times[stage]
+                seconds += took * (usual / expected if expected else 1.0)
+            elif not times or not _was_skipped(earlier, stage):
+                seconds += usual * local * scale.get(stage, 1.0)
+        found.append(Expectation(case, seconds, measured=bool(times)))
+    return found
+
+
+def longest_first(expected: Sequence[Expectation]) -> list[Expectation]:
+    """Those that take longest first: one that begins last would keep the others' workers waiting."""
+    return sorted(expected, key=lambda item: -item.seconds)
+
+
+def expected_words(expected: Sequence[Expectation], at_once: int = 1) -> str:
+    """`24 runs, about 3 h; 20 of them as measured before, 4 by their frames`."""
+    busy = [0.0] * max(1, at_once)
+    for item in longest_first(expected) if at_once > 1 else expected:
+        busy[busy.index(min(busy))] += item.seconds
+    known = sum(item.measured for item in expected)
+    words = [f"{len(expected)} {'run' if len(expected) == 1 else 'runs'}, about {duration_text(max(busy))}"]
+    if at_once > 1:
+        words.append(f"{at_once} at once")
+    guessed = len(expected) - known
+    if guessed and known:
+        words.append(f"{known} as measured in earlier runs, {guessed} by their frames")
+    else:
+        words.append("by the number and size of frames" if guessed else "as measured in earlier runs")
+    return "; ".join(words)
+
+
+def _is_finished(record: OutcomeRecord, config: PipelineConfig, until: StageName, keys: set[str]) -> bool:
+    reached = STAGES.index(record["until"]) >= STAGES.index(until)
+    return (
+        reached
+        and record["status"] == "ok"
+        and record["config"] == digest_of(config)
+        and all(key in keys for row in record["stages"] for key in row["artefacts"])
+    )
+
+
+def _measured(records: Sequence[OutcomeRecord]) -> dict[str, tuple[float, float]]:
+    """Seconds that each stage took, and that were expected of it, in the first record that has them."""
+    found: dict[str, tuple[float, float]] = {}
+    for record in records:
+        for row in record["stages"]:
+            if row["state"] in ("ran", "cached") and row["made_seconds"] > 0:
+                found.setdefault(row["stage"], (row["made_seconds"], row["expected"]))
+    return found
+
+
+def _was_skipped(records: Sequence[OutcomeRecord], stage: str) -> bool:
+    """Whether the plan left the stage out in a run of the same sequence that went well."""
+    return any(
+        row["stage"] == stage and row["state"] == "skipped"
+        for record in records
+        if record["status"] == "ok"
+        for row in record["stages"]
+    )
+
+
+def _pace(records: Sequence[OutcomeRecord]) -> float | None:
+    """Seconds per expected second, the median over records."""
+    paces = []
+    for record in records:
+        rows = [row for row in record["stages"] if row["state"] in ("ran", "cached") and row["expected"]]
+        whole = sum(row["expected"] for row in rows)
+        if whole:
+            paces.append(sum(row["made_seconds"] for row in rows) / whole)
+    return median(paces) if paces else None
+
+
+def _scales(sequence: str, config: PipelineConfig) -> Mapping[StageName, float]:
+    """By how much more frames and pixels there are than in the sequences whose times are known."""
+    try:
+        about: Descriptor = describe(sequence)
+    except ExtragsError:
+        return {}  # A path: nothing is known of it before it is read.
+    ingest: Any = config.ingest
+    frames = min(about.frames, ingest.max_frames or about.frames)
+    pixels = about.width * about.height
+    if ingest.width and ingest.height and about.format == "phantom":
+        pixels = ingest.width * ingest.height
+    elif about.format != "phantom":
+        pixels = pixels / (ingest.downscale or max(1, round(about.width / USUAL_WIDTH))) ** 2
+    by_pixels = pixels / REFERENCE_PIXELS
+    by_frames = by_pixels * frames / REFERENCE_FRAMES
+    return {stage: by_frames if stage in PER_FRAME else by_pixels for stage in STAGES}

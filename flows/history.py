@@ -1,0 +1,235 @@
+"""The history of a benchmark in the store, and what has got worse since the runs before.
+
+Every run that measured anew leaves one record, under a name of its own with its time: the history is only
+ever appended to, by any number of machines.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+import secrets
+from collections.abc import Mapping, Sequence
+from statistics import fmean, median
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from extrags import __version__
+from extrags.errors import ExtragsError
+from extrags.metrics.comparison import figure_of
+from extrags.store import Store, digest_of, read_records, write_record
+
+__all__ = [
+    "BenchmarkRegressedError",
+    "Tolerance",
+    "append_history",
+    "history_entry",
+    "history_of",
+    "regressions",
+    "trend",
+]
+
+FIGURES = ("observed.psnr", "psnr")
+"""The figure a run is judged by is the first of these that it has."""
+
+SAME_MACHINE = ("processor", "cores", "threads", "isa")
+
+
+class Tolerance(BaseModel):
+    """How much worse than before a benchmark may be before its run counts as failed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    runs: int = Field(5, ge=1, le=100, description="the median of so many last runs is what counts as before")
+    at_least: int = Field(2, ge=1, le=100, description="with fewer earlier runs nothing is judged")
+    psnr_db: float = Field(0.3, ge=0, description="PSNR that may be lost, in dB, on the mean over seeds")
+    seconds_share: float = Field(
+        0.3, ge=0, description="share by which run time may grow; runs on the same kind of machine count"
+    )
+    seconds: float = Field(5.0, ge=0, description="growth of run time that is never too much, in seconds")
+
+
+class BenchmarkRegressedError(ExtragsError, RuntimeError):
+    """A benchmark is worse than its earlier runs; `found` says in what."""
+
+    def __init__(self, name: str, found: Sequence[str], report: str) -> None:
+        self.found = list(found)
+        super().__init__(
+            f"benchmark {name} is worse than the runs before in {len(found)} respects: {'; '.join(found)}; "
+            f"page: {report}"
+        )
+
+
+def history_entry(
+    name: str, cases: Sequence[Mapping[str, Any]], settings: Sequence[str], machine: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What is kept of a run of a benchmark.
+
+    Args:
+        name: of the benchmark.
+        cases: its runs as JSON (`flows.benchmark.case_of`).
+        settings: digest of all settings of each.
+        machine: `extrags.raster.bench.machine`.
+    """
+    return {
+        "name": name,
+        "when": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "commit": machine["commit"],
+        "version": __version__,
+        "machine": {key: machine[key] for key in (*SAME_MACHINE, "load_average")},
+        "cases": [
+            {
+                **{key: case[key] for key in ("method", "profile", "sequence", "setting", "seed", "error")},
+                "settings": digest,
+                "seconds": case["seconds"],
+                "peak_mib": case["peak_mib"],
+                "figures": {
+                    figure: value
+                    for figure in FIGURES
+                    if (value := figure_of(case["metrics"], figure)) is not None
+                },
+            }
+            for case, digest in zip(cases, settings, strict=True)
+        ],
+    }
+
+
+def append_history(store: Store, entry: Mapping[str, Any]) -> str:
+    """Add an entry to the history; returns the name of its record.
+
+    Raises:
+        StoreError: when it cannot be written.
+    """
+    moment = re.sub(r"[^0-9T]", "", str(entry["when"]).partition("+")[0])
+    # Two runs may end in the same second; neither replaces the other.
+    record = f"{_prefix(str(entry['name']))}{moment}.{secrets.token_hex(4)}"
+    write_record(store, record, entry)
+    return record
+
+
+def history_of(store: Store, name: str) -> list[dict[str, Any]]:
+    """All entries of a benchmark, the oldest first.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    found = read_records(store, _prefix(name)).values()
+    return sorted((entry for entry in found if entry["name"] == name), key=lambda entry: entry["when"])
+
+
+def _prefix(name: str) -> str:
+    # The digest, because several names may come to the same letters.
+    return f"benchmark.{re.sub(r'[^a-z0-9]+', '-', name.lower())}.{digest_of(name)[:8]}."
+
+
+def regressions(
+    entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolerance: Tolerance
+) -> list[str]:
+    """What is worse in a run than in those before, in words; each names method, sequence and figures.
+
+    Compared is the mean over seeds of each method on each sequence, with the median of the last
+    `tolerance.runs` runs that had the same settings: PSNR of all of them, run time of those on the same
+    kind of machine. A case that fails now and did not before is worse, too.
+
+    Args:
+        entry: of the run.
+        earlier: entries of the runs before, the oldest first.
+        tolerance: how much may be lost.
+    """
+    found = []
+    before = [_groups(item) for item in earlier]
+    same = [_same_machine(item, entry) for item in earlier]
+    for group, now in _groups(entry).items():
+        label = _label(group)
+        past = [groups[group] for groups in before if group in groups][-tolerance.runs :]
+        good = [item for item in past if not item["error"]]
+        if now["error"]:
+            if len(good) >= tolerance.at_least:
+                found.append(f"{label} fails: {now['error']}")
+            continue
+        name = next((figure for figure in FIGURES if figure in now["figures"]), None)
+        known = [item["figures"][name] for item in good if name in item["figures"]]
+        if name is not None and len(known) >= tolerance.at_least:
+            was, value = median(known), now["figures"][name]
+            if was - value > tolerance.psnr_db:
+                found.append(
+                    f"{label}: {name} {value:.2f} dB, {was - value:.2f} dB below the median {was:.2f} of "
+                    f"{len(known)} runs (tolerance {tolerance.psnr_db:g} dB)"
+                )
+        local = [groups[group] for groups, mine in zip(before, same, strict=True) if mine and group in groups]
+        times = [item["seconds"] for item in local if not item["error"]][-tolerance.runs :]
+        if len(times) >= tolerance.at_least:
+            was, value = median(times), now["seconds"]
+            if value - was > max(tolerance.seconds_share * was, tolerance.seconds):
+                found.append(
+                    f"{label}: {value:.1f} s, {value / was - 1:.0%} above the median {was:.1f} s of "
+                    f"{len(times)} runs (tolerance {tolerance.seconds_share:.0%})"
+                )
+    return found
+
+
+def trend(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The history as a page draws it, the oldest first.
+
+    Returns:
+        `{when, commit, version, methods: {METHOD: {psnr, seconds}}}` of each entry: means over sequences
+        and seeds, over those sequences and settings that the last entry has as well; None where there are
+        none. Run times of other kinds of machines are left out.
+    """
+    if not entries:
+        return []
+    last = entries[-1]
+    wanted = set(_groups(last))
+    drawn = []
+    for entry in entries:
+        methods: dict[str, dict[str, float | None]] = {}
+        by_method: dict[str, list[dict[str, Any]]] = {}
+        for group, values in _groups(entry).items():
+            if group in wanted and not values["error"]:
+                by_method.setdefault(group[0], []).append(values)
+        for method, values_of in by_method.items():
+            psnr = [
+                next((item["figures"][figure] for figure in FIGURES if figure in item["figures"]), None)
+                for item in values_of
+            ]
+            known = [value for value in psnr if value is not None]
+            methods[method] = {
+                "psnr": fmean(known) if known else None,
+                "seconds": fmean(item["seconds"] for item in values_of)
+                if _same_machine(entry, last)
+                else None,
+            }
+        drawn.append({**{key: entry[key] for key in ("when", "commit", "version")}, "methods": methods})
+    return drawn
+
+
+def _groups(entry: Mapping[str, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
+    """Means over the seeds of each method, profile, sequence and settings (the seed apart)."""
+    grouped: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    for case in entry["cases"]:
+        group = tuple(
+            str(case[key] or "") for key in ("method", "profile", "sequence", "setting", "settings")
+        )
+        grouped.setdefault(group, []).append(case)
+    return {
+        group: {
+            "error": next((case["error"] for case in cases if case["error"]), ""),
+            "seconds": fmean(case["seconds"] for case in cases),
+            "figures": {
+                name: fmean(case["figures"][name] for case in cases)
+                for name in FIGURES
+                if all(name in case["figures"] for case in cases)
+            },
+        }
+        for group, cases in grouped.items()
+    }
+
+
+def _label(group: tuple[str, ...]) -> str:
+    method, profile, sequence, setting, _ = group
+    return f"{method} ({profile}) on {sequence}{f'@{setting}' if setting else ''}"
+
+
+def _same_machine(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    return all(one["machine"].get(key) == other["machine"].get(key) for key in SAME_MACHINE)

@@ -1,0 +1,32 @@
+"""How the last run of each sequence ended, as records in the store (`flows.cases` writes them)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from extrags.store import Store, read_records
+
+__all__ = ["OUTCOME", "OutcomeRecord", "outcome_records", "setting_text"]
+
+OUTCOME = "outcome."
+"""Begin of the names of these records."""
+
+OutcomeRecord = dict[str, Any]
+"""`{sequence, method, profile, seed, variant, until, status, stage, reason, ended, seconds, config, stages,
+metrics, report, extrags}` of the last run of a case that came to an end; of each stage
+`{stage, state, reason, made_seconds, expected, artefacts: {KEY: BYTES}}`."""
+
+
+def outcome_records(store: Store) -> dict[str, OutcomeRecord]:
+    """How the last run of each case ended, by the name of its record.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    return read_records(store, OUTCOME)
+
+
+def setting_text(settings: Mapping[str, Any]) -> str:
+    """Settings in words: `coarse.iterations = 500, coarse.seed = 1`."""
+    return ", ".join(f"{name} = {value}" for name, value in settings.items())

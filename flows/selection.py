@@ -1,0 +1,148 @@
+"""Which sequences a run takes: names, patterns and manifests become a list, each with its settings."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from data_catalog.patterns import is_pattern, matching_names
+from extrags.errors import ConfigError
+from extrags.store import digest_of
+
+__all__ = ["Chosen", "absolute_manifests", "chosen_sequences"]
+
+log = logging.getLogger(__name__)
+
+MANIFEST_MARK = "@"
+FIELDS = frozenset({"sequence", "settings"})
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """A sequence, and what a manifest sets for it alone.
+
+    Args:
+        name: as in the catalogue, or a path.
+        settings: overrides by dotted name.
+    """
+
+    name: str
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+def chosen_sequences(given: Sequence[str]) -> list[Chosen]:
+    """Expand what a user or a deployment named, in its order; what several patterns match is there once.
+
+    Args:
+        given: names, paths, patterns over the catalogue's names (`data_catalog.patterns`), and `@FILE` for
+            a manifest: a text with one of these per line, where `#` begins a comment, or a YAML or JSON
+            file with a list of names or of `{sequence: NAME, settings: {...}}`, alone or as `sequences`
+            beside `settings` for all of them.
+
+    Raises:
+        ConfigError: for a manifest that cannot be read, one sequence with different settings, or a name
+            that stands there twice.
+        UnknownSequenceError: for a pattern that matches nothing.
+        SourceNotFoundError: for a pattern whose sequences are all elsewhere.
+    """
+    found: dict[str, Chosen] = {}
+    literal: set[str] = set()
+    for item in _without_manifests(given):
+        names: Sequence[str] = [item.name]
+        if is_pattern(item.name):
+            names, elsewhere = matching_names(item.name)
+            if elsewhere:
+                log.warning(
+                    "%s: %d of %d sequences are not on this machine and left out",
+                    item.name,
+                    len(elsewhere),
+                    len(elsewhere) + len(names),
+                )
+        else:
+            place = str(Path(item.name))
+            if place in literal:
+                raise ConfigError(f"a sequence is named twice: {item.name}")
+            literal.add(place)
+        for name in names:
+            known = found.setdefault(name, Chosen(name, item.settings))
+            if digest_of(known.settings) != digest_of(item.settings):
+                raise ConfigError(f"{name} is chosen twice, with different settings")
+    if not found:
+        raise ConfigError(f"no sequence is named in {', '.join(given) or 'an empty list'}")
+    return list(found.values())
+
+
+def absolute_manifests(given: Sequence[str]) -> list[str]:
+    """The same with absolute paths of manifests, for who reads them in another directory."""
+    return [
+        f"{MANIFEST_MARK}{Path(text[1:]).expanduser().absolute()}" if text.startswith(MANIFEST_MARK) else text
+        for text in given
+    ]
+
+
+def _without_manifests(given: Sequence[str]) -> Iterator[Chosen]:
+    for text in given:
+        if text.startswith(MANIFEST_MARK):
+            yield from _manifest(Path(text[1:]).expanduser())
+        else:
+            yield Chosen(text)
+
+
+def _manifest(file: Path) -> Iterator[Chosen]:
+    try:
+        text = file.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"the manifest {file} cannot be read: {error}") from error
+    if file.suffix not in (".yaml", ".yml", ".json"):
+        # `@` cannot begin a comment: it stands within names.
+        for line in text.splitlines():
+            name = line.partition("#")[0].strip()
+            if name:
+                yield Chosen(name)
+        return
+    try:
+        content = json.loads(text) if file.suffix == ".json" else yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError) as error:
+        raise ConfigError(f"the manifest {file} is no {file.suffix[1:].upper()}: {error}") from error
+    shared: dict[str, Any] = {}
+    if isinstance(content, dict):
+        unknown = set(content) - {"sequences", "settings"}
+        if unknown:
+            raise ConfigError(
+                f"the manifest {file} has the field {sorted(map(str, unknown))[0]}; "
+                "expected sequences and settings"
+            )
+        shared = _settings(content.get("settings"), file, "settings")
+        content = content.get("sequences")
+    if not isinstance(content, list):
+        raise ConfigError(f"the manifest {file} holds no list of sequences")
+    for number, entry in enumerate(content):
+        where = f"entry {number + 1}"
+        if isinstance(entry, str):
+            entry = {"sequence": entry}
+        if (
+            not isinstance(entry, dict)
+            or not set(entry) <= FIELDS
+            or not isinstance(entry.get("sequence"), str)
+            or not entry["sequence"].strip()
+        ):
+            raise ConfigError(
+                f"the manifest {file}, {where}: expected a name, or {{sequence: NAME, settings: {{...}}}}"
+            )
+        yield Chosen(entry["sequence"].strip(), shared | _settings(entry.get("settings"), file, where))
+
+
+def _settings(given: Any, file: Path, where: str) -> dict[str, Any]:
+    if given is None:
+        return {}
+    if not isinstance(given, dict) or not all(isinstance(name, str) for name in given):
+        raise ConfigError(
+            f"the manifest {file}, {where}: expected settings by dotted name, e.g. {{coarse.iterations: 500}}"
+        )
+    return dict(given)

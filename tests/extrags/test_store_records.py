@@ -1,0 +1,130 @@
+"""Records beside the artefacts, what is in work, and manifests renewed by a refresh."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from extrags.errors import StoreError
+from extrags.store import Store, in_work, read_records, write_record
+
+HOLDS = """
+import sys, time
+from extrags.store import Store
+with Store(sys.argv[1]).slot(stage="toy", version=1, key="toy-v1-b", label="other"):
+    print("in", flush=True)
+    time.sleep(99)
+"""
+
+
+@pytest.fixture(params=["directory", "memory"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> Store:
+    if request.param == "directory":
+        return Store(tmp_path / "store")
+    return Store(f"memory://{tmp_path.name}", cache=tmp_path / "cache")
+
+
+def fill(store: Store, key: str, text: str, *, renew: bool = False) -> None:
+    with store.slot(stage="toy", version=1, key=key, label="seq", renew=renew) as slot:
+        (slot.path / "a.txt").write_text(text)
+
+
+class TestRecords:
+    def test_written_replaced_and_found_by_the_begin_of_their_names(self, store: Store) -> None:
+        assert read_records(store) == {}
+        write_record(store, "outcome.b", {"n": 1})
+        write_record(store, "outcome.a", {"n": 2})
+        write_record(store, "outcome.b", {"n": 3})
+        write_record(store, "benchmark.x", {})
+        assert list(read_records(store, "outcome.").items()) == [
+            ("outcome.a", {"n": 2}),
+            ("outcome.b", {"n": 3}),
+        ]
+
+    def test_they_are_no_artefacts_and_stay(self, store: Store) -> None:
+        fill(store, "toy-v1-a", "x")
+        write_record(store, "outcome.a", {"n": 2})
+        assert store.keys() == ["toy-v1-a"]
+        assert [manifest.key for manifest in store.ls()] == ["toy-v1-a"]
+        store.gc({"toy": 2}, older_than_hours=0.0)
+        assert store.keys() == []
+        assert read_records(store) == {"outcome.a": {"n": 2}}
+
+    def test_a_damaged_one_is_passed_over(self, store: Store, caplog: pytest.LogCaptureFixture) -> None:
+        write_record(store, "outcome.a", {"n": 2})
+        store.backend.write_record("outcome.b.json", b"{")
+        store.backend.write_record("outcome.c.json", b"3")
+        assert list(read_records(store)) == ["outcome.a"]
+        assert "outcome.b.json" in caplog.text
+
+    @pytest.mark.parametrize("name", ["", "../x", "a/b", "a b"])
+    def test_names_are_no_paths(self, store: Store, name: str) -> None:
+        with pytest.raises(StoreError, match="cannot be called"):
+            write_record(store, name, {})
+
+    def test_writers_of_one_name_never_mix(self, store: Store) -> None:
+        def write(number: int) -> None:
+            for _ in range(20):
+                write_record(store, "outcome.a", {"n": [number] * 500})
+
+        threads = [threading.Thread(target=write, args=(number,)) for number in range(4)]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            for record in read_records(store).values():
+                assert len(set(record["n"])) == 1
+        for thread in threads:
+            thread.join()
+        assert len(read_records(store)) == 1
+
+    def test_a_store_that_cannot_be_written_is_named(self, tmp_path: Path) -> None:
+        (tmp_path / "store").mkdir()
+        (tmp_path / "store" / "records").write_text("in the way")
+        with pytest.raises(StoreError, match=str(tmp_path / "store")):
+            write_record(Store(tmp_path / "store"), "outcome.a", {})
+
+
+class TestInWork:
+    def test_what_is_made_here_and_by_others(self, store: Store) -> None:
+        with store.slot(stage="toy", version=1, key="toy-v1-a", label="seq"):
+            (found,) = in_work(store)
+            assert (found["key"], found["stage"], found["label"]) == ("toy-v1-a", "toy", "seq")
+        assert in_work(store) == []
+
+    def test_a_killed_process_works_no_more(self, tmp_path: Path) -> None:
+        store = Store(tmp_path / "store")
+        command = [sys.executable, "-c", HOLDS, store.root]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == b"in\n"
+            assert [item["label"] for item in in_work(store)] == ["other"]
+            process.kill()
+        assert in_work(store) == []
+        assert len(list((tmp_path / "store" / "scratch").iterdir())) == 1, "the next run sweeps it"
+
+
+class TestRenewed:
+    def test_equal_content_made_again_says_when_it_was_made_last(self, store: Store) -> None:
+        fill(store, "toy-v1-a", "x")
+        (first,) = store.ls()
+        with store.slot(stage="toy", version=1, key="toy-v1-a", label="later", renew=True) as slot:
+            (slot.path / "a.txt").write_text("x")
+            slot.counts["n"] = 3
+        (second,) = store.ls()
+        assert (second.digest, second.label, second.counts) == (first.digest, "later", {"n": 3})
+        ref = store.find("toy-v1-a")
+        assert ref is not None
+        assert store.verify(ref)
+        assert (store.open(ref) / "a.txt").read_text() == "x"
+
+    def test_without_it_the_first_stays(self, store: Store) -> None:
+        fill(store, "toy-v1-a", "x")
+        (first,) = store.ls()
+        fill(store, "toy-v1-a", "x")
+        assert store.ls() == [first]
+        json.dumps(first.model_dump(mode="json"))

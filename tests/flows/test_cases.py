@@ -1,0 +1,196 @@
+"""The runs of a dataset: the matrix, what the store tells of the last runs, and how long they will take."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from extrags.errors import ConfigError
+from extrags.store import Store
+from flows.cases import SequenceCase, cases_of, matrix_points, record_outcome, selected
+from flows.cli import main
+from flows.dataset import reconstruct_dataset
+from flows.expectation import Expectation, expectations, expected_words, longest_first
+from flows.outcome import DatasetFailedError, SequenceOutcome, StageRow
+from flows.outcome_records import outcome_records
+from flows.selection import Chosen
+from flows.store_status import store_status
+from tests.flows.tiny import SEQUENCE, TINY
+
+
+def case(sequence: str = SEQUENCE, **more: Any) -> SequenceCase:
+    return SequenceCase(sequence, profile="quick", settings=TINY, **more)
+
+
+def leave(store: str, of: SequenceCase, *stages: StageRow, status: Any = "ok", until: Any = "coarse") -> None:
+    """Leave the record of a run."""
+    outcome = SequenceOutcome(of.sequence, status, list(stages))
+    record_outcome(Store(store), of, outcome, until, of.config())
+
+
+class TestMatrix:
+    def test_every_combination(self) -> None:
+        points = matrix_points({"coarse.iterations": [500, 1000], "coarse.seed": [0, 1]})
+        assert len(points) == 4
+        assert points[1] == {"coarse.iterations": 500, "coarse.seed": 1}
+        assert matrix_points(None) == [{}]
+
+    def test_sequences_times_methods_times_seeds_times_settings(self) -> None:
+        found = cases_of(
+            [Chosen("phantom/0@sparse"), Chosen("phantom/1@sparse", {"ingest.max_frames": 10})],
+            methods=["3dgs", "extrags"],
+            profile="quick",
+            seeds=[0, 1],
+            settings={"coarse.sh_degree": 1},
+            matrix={"coarse.iterations": [500, 1000]},
+        )
+        assert len(found) == 2 * 2 * 2 * 2
+        assert len({item.record for item in found}) == len({item.title for item in found}) == 16
+        assert found[0].title == "phantom/0@sparse [3dgs, seed 0, coarse.iterations = 500]"
+        # What plain 3DGS sets itself is not overridden, as in a benchmark.
+        assert [item.config().coarse.sh_degree for item in (found[0], found[4])] == [3, 1]
+        assert found[-1].config().ingest.max_frames == 10
+        assert found[-1].config().coarse.seed == 1
+
+    @pytest.mark.parametrize(
+        ("more", "message"),
+        [
+            ({"matrix": {"coarse.iterations": [5, 5]}}, "different values of coarse.iterations"),
+            ({"matrix": {"coarse.iterations": [0]}}, "coarse.iterations = 0.*at least 1"),
+            ({"matrix": {"coarse.sh_degree": [1]}, "methods": ["3dgs"]}, "sets coarse.sh_degree itself"),
+            ({"methods": ["3dgs", "3dgs"]}, "different methods"),
+            ({"seeds": [1, 1]}, "different seeds"),
+            ({"settings": {"coarse.iteration": 1}}, "did you mean coarse.iterations"),
+            ({"settings": {"coarse.train_on": "all"}, "methods": ["3dgs", "coarse"]}, "train_on"),
+        ],
+    )
+    def test_wrong_ones_are_refused(self, more: dict[str, Any], message: str) -> None:
+        given: dict[str, Any] = {"methods": ["coarse"], "seeds": [None], "settings": {}, **more}
+        with pytest.raises(ConfigError, match=message):
+            cases_of([Chosen(SEQUENCE)], profile="quick", **given)
+
+    def test_on_the_command_line(self) -> None:
+        from flows.commands.run import parsed_matrix, parsed_methods
+
+        assert parsed_matrix(["coarse.iterations=500,1000", "enhance.channels=[8,8,16],[4,4,8]"]) == {
+            "coarse.iterations": [500, 1000],
+            "enhance.channels": [(8, 8, 16), (4, 4, 8)],
+        }
+        assert parsed_methods(["3dgs,coarse", "extrags"], "coarse") == ["3dgs", "coarse", "extrags"]
+        assert parsed_methods([], "coarse") == ["coarse"]
+        for wrong in ("coarse.iterations", "coarse.iteration=5", "coarse.iterations=x"):
+            with pytest.raises(ConfigError):
+                parsed_matrix([wrong])
+
+
+class TestOnly:
+    def test_failed_missing_and_changed(self, finished: tuple[str, SequenceOutcome], tmp_path: Path) -> None:
+        shutil.copytree(finished[0], tmp_path / "store")
+        store = str(tmp_path / "store")
+        done, broken, new = case(), case("phantom/1@sparse"), case("phantom/2@sparse")
+        leave(store, done)
+        leave(store, broken, StageRow("ingest", "failed", reason="no"), status="failed")
+        cases = [done, broken, new]
+        assert selected(cases, None, store, "coarse") == cases
+        assert selected(cases, "failed", store, "coarse") == [broken]
+        assert selected(cases, "missing", store, "coarse") == [new]
+        assert selected(cases, "changed", store, "coarse") == [broken, new]
+        # With other settings all would be made, and what failed is still the same run.
+        other = [SequenceCase(item.sequence, profile="quick", settings={}) for item in cases]
+        assert selected(other, "changed", store, "coarse") == other
+        assert selected(other, "failed", store, "coarse") == [other[1]]
+        # What is taken away is to be made.
+        Store(store).rm("coarse*")
+        assert selected(cases, "changed", store, "coarse") == cases
+
+    def test_a_matrix_keeps_its_runs_apart(self, tmp_path: Path) -> None:
+        store = str(tmp_path)
+        points = [case(changed={"coarse.iterations": number}) for number in (60, 90)]
+        leave(store, points[1], StageRow("coarse", "failed"), status="failed")
+        assert selected(points, "failed", store, "coarse") == [points[1]]
+
+
+class TestExpected:
+    def test_by_frames_where_nothing_was_measured(self, tmp_path: Path) -> None:
+        few, many = case("phantom/0@sparse"), SequenceCase("c3vdv2/c1_cecum_t1@sparse", profile="quick")
+        found = expectations([few, many], str(tmp_path), "coarse")
+        assert not any(item.measured for item in found)
+        assert 0 < found[0].seconds < found[1].seconds
+        assert [item.case for item in longest_first(found)] == [many, few]
+
+    def test_as_measured_in_proportion_to_iterations(self, tmp_path: Path) -> None:
+        store, before = str(tmp_path), case()
+        leave(
+            store,
+            before,
+            StageRow("ingest", "ran", made_seconds=2.0),
+            StageRow("poses", "skipped"),
+            StageRow("depth", "skipped"),
+            StageRow("coarse", "ran", made_seconds=10.0, made={"coarse-v1-x": 3}),
+        )
+        twice = SequenceCase(SEQUENCE, profile="quick", settings={**TINY, "coarse.iterations": 240})
+        (same,) = expectations([before], store, "coarse", refresh=True)
+        (found,) = expectations([twice], store, "coarse")
+        assert same.measured
+        assert same.seconds == pytest.approx(12.0)
+        assert found.seconds == pytest.approx(22.0)
+        # Another sequence: by its frames, at the pace of those that were measured.
+        (other,) = expectations([case("phantom/1@sparse")], store, "coarse")
+        assert not other.measured
+        # What the record names is not in the store: it would be made.
+        assert expectations([before], store, "coarse")[0].seconds == pytest.approx(12.0)
+
+    def test_what_is_in_the_store_takes_no_time(self, tmp_path: Path) -> None:
+        store = str(tmp_path)
+        leave(store, case(), StageRow("ingest", "ran", made_seconds=2.0))
+        assert expectations([case()], store, "coarse")[0].seconds == 0
+        assert expectations([case()], store, "coarse", refresh=True)[0].seconds > 2.0
+        assert expectations([case()], store, "finetune")[0].seconds > 0
+
+    def test_in_words(self) -> None:
+        found = [Expectation(case(), 3600.0, measured=True), Expectation(case(), 600.0, measured=False)]
+        assert (
+            expected_words(found) == "2 runs, about 70 min; 1 as measured in earlier runs, 1 by their frames"
+        )
+        assert expected_words(found, 2).startswith("2 runs, about 60 min; 2 at once")
+        assert expected_words(found[:1]) == "1 run, about 60 min; as measured in earlier runs"
+
+
+@pytest.mark.usefixtures("prefect_server")
+class TestFlow:
+    def test_a_matrix_over_a_manifest_then_what_failed(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (tmp_path / "empty").mkdir()
+        (tmp_path / "night.txt").write_text(f"phantom/[0]@sparse\n{tmp_path / 'empty'}  # nothing in it\n")
+        store = str(tmp_path / "store")
+        given: dict[str, Any] = {
+            "sequences": [f"@{tmp_path / 'night.txt'}"],
+            "profile": "quick",
+            "settings": {**TINY, "ingest.max_frames": 8},
+            "matrix": {"coarse.iterations": [20, 30]},
+            "method": "coarse",
+            "until": "coarse",
+            "store": store,
+        }
+        found = reconstruct_dataset(**given, at_once=2)
+        assert [(item.title, item.status) for item in found.sequences] == [
+            ("phantom/0@sparse [coarse.iterations = 20]", "ok"),
+            ("phantom/0@sparse [coarse.iterations = 30]", "ok"),
+            (f"{tmp_path / 'empty'} [coarse.iterations = 20]", "failed"),
+            (f"{tmp_path / 'empty'} [coarse.iterations = 30]", "failed"),
+        ]
+        with pytest.raises(DatasetFailedError) as failed:
+            reconstruct_dataset(**given, only="failed")
+        assert len(failed.value.outcome.sequences) == 2
+        assert reconstruct_dataset(**given, only="missing").sequences == []
+        status = store_status(Store(store))
+        assert status.counts == {"done": 2, "failed": 2}
+        assert len(outcome_records(Store(store))) == 4
+        assert main(["status", "--store", store]) == 1
+        said = capsys.readouterr().out
+        assert "the folder is empty" in said
+        assert "4 runs: " in said

@@ -1,0 +1,284 @@
+"""Deployments on a real server: what is refused at submission, and workers that find everything anywhere."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from extrags.errors import ConfigError
+from flows.cli import main
+from flows.deployments import declared_deployments, usual_file
+from tests.flows.tiny import SEQUENCE, TINY
+
+REPOSITORY = Path(__file__).parents[2]
+PATIENCE_S = 120.0
+
+
+class TestFile:
+    def test_it_is_the_repositorys(self) -> None:
+        assert usual_file() == REPOSITORY / "prefect.yaml"
+        found = {item.name: item for item in declared_deployments(usual_file())}
+        assert {"one", "nightly", "weekly"} <= set(found)
+        assert found["nightly"].cron == "0 2 * * *"
+        assert found["weekly"].parameters["refresh"] is True
+        for item in found.values():
+            assert item.limit == 1
+            assert ":" not in item.entrypoint, "a path is found from a checkout alone"
+            assert item.flow().name
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("[", "cannot be read"),
+            ("a: 1", "declares no deployments"),
+            ("deployments: [{name: x}]", "a name and an entrypoint"),
+            ("deployments: [{name: x, entrypoint: a.b, schedules: [{interval: 3}]}]", "one schedule at most"),
+        ],
+    )
+    def test_a_wrong_one_is_refused(self, text: str, message: str, tmp_path: Path) -> None:
+        (tmp_path / "file.yaml").write_text(text)
+        with pytest.raises(ConfigError, match=message):
+            declared_deployments(tmp_path / "file.yaml")
+
+    @pytest.mark.parametrize("entrypoint", ["flows.nothing.at_all", "flows.dataset.log", "flow"])
+    def test_an_entrypoint_that_is_no_flow_is_refused(self, entrypoint: str, tmp_path: Path) -> None:
+        (tmp_path / "file.yaml").write_text(f"deployments: [{{name: x, entrypoint: {entrypoint}}}]")
+        (found,) = declared_deployments(tmp_path / "file.yaml")
+        with pytest.raises(ConfigError, match="is no flow"):
+            found.flow()
+
+
+class TestServe:
+    def test_wrong_usage(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+        monkeypatch.delenv("EXTRAGS_STORE", raising=False)
+        assert main(["serve", "nightli"]) == 2
+        assert "no deployment 'nightli'; known: one, nightly, weekly" in capsys.readouterr().err
+        assert main(["serve", "--limit", "0"]) == 2
+
+    @pytest.mark.parametrize("schedules", [False, True])
+    def test_what_it_serves(self, schedules: bool) -> None:
+        from flows.commands.serve import _deployment
+
+        made = {item.name: item for item in declared_deployments(usual_file())}
+        nightly = _deployment(made["nightly"], schedules=schedules)
+        assert [item.active for item in nightly.schedules] == [schedules]
+        assert nightly.entrypoint == "flows.dataset.reconstruct_dataset"
+        assert nightly.concurrency_limit == 1
+        assert _deployment(made["one"], schedules=schedules).schedules == []
+
+
+@contextmanager
+def process(
+    command: list[str], folder: Path, environment: dict[str, str]
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A process in a session of its own, which is ended with it."""
+    log = folder / f"{Path(command[0]).name}-{command[1]}.log"
+    with log.open("wb") as out:
+        started = subprocess.Popen(
+            command, cwd=folder, env=environment, stdout=out, stderr=subprocess.STDOUT, start_new_session=True
+        )
+    try:
+        yield started
+    except BaseException:
+        print(log.read_text(errors="replace")[-6000:])
+        raise
+    finally:
+        try:
+            os.killpg(started.pid, signal.SIGTERM)
+            started.wait(timeout=15)
+        except subprocess.TimeoutExpired:
+            os.killpg(started.pid, signal.SIGKILL)
+            started.wait()
+        except ProcessLookupError:
+            started.wait()
+
+
+def wait_for(condition: Callable[[], Any], what: str) -> Any:
+    end = time.monotonic() + PATIENCE_S
+    while time.monotonic() < end:
+        found = condition()
+        if found:
+            return found
+        time.sleep(0.25)
+    raise AssertionError(f"{what}: not within {PATIENCE_S:g} s")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("operator")
+
+
+@pytest.fixture(scope="module")
+def environment(place: Path) -> Iterator[dict[str, str]]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    environment = {
+        **{name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")},
+        "PREFECT_HOME": str(place / "home"),
+        "PREFECT_API_URL": f"http://127.0.0.1:{port}/api",
+        "PREFECT_SERVER_ANALYTICS_ENABLED": "false",
+        "DO_NOT_TRACK": "1",
+        "PREFECT_CLI_PROMPT": "false",
+        "PREFECT_CLI_COLORS": "false",
+        "OMP_NUM_THREADS": "1",
+        "OMP_WAIT_POLICY": "passive",
+        "COLUMNS": "2000",
+    }
+    environment.pop("EXTRAGS_STORE", None)
+    server = [prefect(), "server", "start", "--host", "127.0.0.1", "--port", str(port), "--no-ui"]
+    with process(server, place, environment):
+        wait_for(lambda: is_up(environment), "the server")
+        yield environment
+
+
+@pytest.fixture(scope="module")
+def deployed(place: Path, environment: dict[str, str]) -> dict[str, str]:
+    for command in (
+        ["work-pool", "create", "local", "--type", "process"],
+        ["--no-prompt", "deploy", "--all"],
+    ):
+        done = call([prefect(), *command], REPOSITORY, environment)
+        assert done.returncode == 0, done.stdout
+    return environment
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+class TestRealServer:
+    """A server, a worker and `extrags serve` as an operator starts them, each in a directory of its own."""
+
+    @pytest.mark.parametrize(
+        ("settings", "said"),
+        [
+            ({"coarse.iteration": 500}, "'coarse.iteration' is not one of ['coarse.iterations'"),
+            ({"coarse.iterations": 0}, "field \"settings['coarse.iterations']\""),
+            ({"coars.iterations": 5}, "'coars.iterations' does not match '^(ingest|poses|depth|coarse|"),
+            ({"enhance.backend": "clasical"}, "'clasical' is not one of ['embedded', 'classical'"),
+        ],
+    )
+    def test_a_wrong_setting_is_refused_before_there_is_a_run(
+        self, deployed: dict[str, str], settings: dict[str, Any], said: str
+    ) -> None:
+        before = runs_of(deployed)
+        done = run_deployment(deployed, "reconstruct-sequence/one", settings=settings)
+        assert done.returncode != 0
+        assert said in done.stdout
+        assert runs_of(deployed) == before
+
+    def test_a_relative_store_is_refused_before_there_is_a_run(self, deployed: dict[str, str]) -> None:
+        before = runs_of(deployed)
+        done = run_deployment(deployed, "reconstruct-sequence/one", store=".extrags")
+        assert done.returncode != 0
+        assert "field 'store'" in done.stdout
+        assert runs_of(deployed) == before
+
+    def test_a_worker_elsewhere_finds_store_and_data(self, deployed: dict[str, str], place: Path) -> None:
+        elsewhere = place / "worker"
+        elsewhere.mkdir()
+        environment = {**deployed, "EXTRAGS_STORE": str(place / "store")}
+        worker = [prefect(), "worker", "start", "--pool", "local", "--type", "process"]
+        with process(worker, elsewhere, environment):
+            done = run_deployment(
+                deployed, "reconstruct-sequence/one", settings=TINY, until="coarse", sequence=SEQUENCE
+            )
+            assert done.returncode == 0, done.stdout
+            assert finished(deployed, name=SEQUENCE) == "COMPLETED"
+        assert len(list((place / "store" / "artefacts").iterdir())) >= 2
+        assert len(list((place / "store" / "records").iterdir())) == 1
+        assert not list(elsewhere.rglob("artefacts"))
+
+    def test_serve_runs_them_without_a_pool(self, deployed: dict[str, str], place: Path) -> None:
+        elsewhere = place / "served"
+        elsewhere.mkdir()
+        command = [extrags(), "serve", "nightly", "--store", str(place / "served-store")]
+        with process(command, elsewhere, deployed):
+            log = elsewhere / "extrags-serve.log"
+            wait_for(lambda: "being served" in log.read_text(), "extrags serve")
+            assert [item["active"] for item in deployment(deployed, "nightly")["schedules"]] == [False]
+            done = run_deployment(
+                deployed,
+                "reconstruct-dataset/nightly",
+                settings=TINY,
+                until="coarse",
+                sequences=["phantom/[01]@sparse"],
+                name="served",
+            )
+            assert done.returncode == 0, done.stdout
+            assert finished(deployed, name="served") == "COMPLETED"
+        assert len(list((place / "served-store" / "records").iterdir())) == 2
+        said = call(
+            [extrags(), "status", "--store", str(place / "served-store"), "--json", "-"], place, deployed
+        )
+        assert json.loads(said.stdout)["counts"] == {"done": 2}
+
+
+def prefect() -> str:
+    return str(Path(sys.executable).with_name("prefect"))
+
+
+def extrags() -> str:
+    return str(Path(sys.executable).with_name("extrags"))
+
+
+def call(command: list[str], folder: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        command,
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+    )
+
+
+def run_deployment(
+    environment: dict[str, str], of: str, /, **parameters: Any
+) -> subprocess.CompletedProcess[str]:
+    given = [part for key, value in parameters.items() for part in ("--param", f"{key}={json.dumps(value)}")]
+    return call([prefect(), "deployment", "run", of, *given], REPOSITORY, environment)
+
+
+def is_up(environment: dict[str, str]) -> bool:
+    try:
+        return httpx.get(f"{environment['PREFECT_API_URL']}/health").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def asked(environment: dict[str, str], path: str, question: dict[str, Any]) -> Any:
+    return httpx.post(f"{environment['PREFECT_API_URL']}/{path}", json=question, timeout=30).json()
+
+
+def runs_of(environment: dict[str, str]) -> int:
+    return int(asked(environment, "flow_runs/count", {}))
+
+
+def deployment(environment: dict[str, str], name: str) -> dict[str, Any]:
+    (found,) = asked(environment, "deployments/filter", {"deployments": {"name": {"any_": [name]}}})
+    return dict(found)
+
+
+def finished(environment: dict[str, str], *, name: str) -> str:
+    """The type of the last state of a run."""
+
+    def state() -> str | None:
+        runs = asked(environment, "flow_runs/filter", {"flow_runs": {"name": {"any_": [name]}}})
+        types = [run["state_type"] for run in runs]
+        return types[0] if types and types[0] in ("COMPLETED", "FAILED", "CRASHED", "CANCELLED") else None
+
+    return str(wait_for(state, name))

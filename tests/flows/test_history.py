@@ -1,0 +1,199 @@
+"""The history of a benchmark: appended to, drawn, and what has got worse against the runs before."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from extrags.errors import ConfigError
+from extrags.report.benchmark import BenchmarkInputs, build_benchmark_report
+from extrags.store import Store
+from flows.benchmark import benchmark
+from flows.history import (
+    BenchmarkRegressedError,
+    Tolerance,
+    append_history,
+    history_entry,
+    history_of,
+    regressions,
+    trend,
+)
+from tests.flows.tiny import SEQUENCE, TINY
+
+MACHINE = {
+    "processor": "one",
+    "cores": 2,
+    "threads": 2,
+    "isa": "avx2",
+    "load_average": 0.5,
+    "commit": "0123456789abcdef",
+}
+
+
+def entry(
+    psnr: float | None = 20.0,
+    seconds: float = 100.0,
+    *,
+    day: int = 1,
+    machine: dict[str, Any] | None = None,
+    settings: str = "a",
+    seeds: tuple[int, ...] = (0, 1),
+) -> dict[str, Any]:
+    cases = [
+        {
+            "method": "coarse",
+            "profile": "quick",
+            "sequence": "phantom/0",
+            "setting": "sparse",
+            "seed": seed,
+            "error": "" if psnr is not None else "coarse: it diverged",
+            "seconds": seconds + seed,
+            "peak_mib": 100.0,
+            "metrics": None if psnr is None else {"psnr": psnr + seed, "observed": {"psnr": psnr + 2}},
+        }
+        for seed in seeds
+    ]
+    made = history_entry("weekly", cases, [settings] * len(cases), {**MACHINE, **(machine or {})})
+    return {**made, "when": f"2026-01-{day:02d}T04:00:00+00:00"}
+
+
+BEFORE = [entry(day=day, psnr=20 + day / 100) for day in range(1, 6)]
+
+
+class TestRegressions:
+    @pytest.mark.parametrize(
+        ("now", "worse"),
+        [
+            (entry(), []),
+            (entry(psnr=19.8), []),
+            (entry(psnr=25, seconds=10), []),
+            (entry(seconds=128), []),
+            (entry(psnr=19.5), ["coarse (quick) on phantom/0@sparse: observed.psnr 21.50 dB, 0.53 dB below"]),
+            (entry(seconds=140), ["coarse (quick) on phantom/0@sparse: 140.5 s, 40% above the median 100.5"]),
+            (entry(psnr=None), ["coarse (quick) on phantom/0@sparse fails: coarse: it diverged"]),
+            # Other settings are another benchmark.
+            (entry(psnr=10, seconds=900, settings="b"), []),
+        ],
+    )
+    def test_against_the_median_of_the_runs_before(self, now: dict[str, Any], worse: list[str]) -> None:
+        found = regressions(now, BEFORE, Tolerance())
+        assert len(found) == len(worse)
+        assert all(line.startswith(begin) for line, begin in zip(found, worse, strict=True))
+
+    def test_nothing_is_judged_by_a_single_run(self) -> None:
+        assert regressions(entry(psnr=10, seconds=900), BEFORE[:1], Tolerance()) == []
+        assert regressions(entry(psnr=10), BEFORE[:1], Tolerance(at_least=1)) != []
+
+    def test_the_last_runs_count(self) -> None:
+        slow = [entry(day=day, seconds=300) for day in range(6, 9)]
+        assert regressions(entry(seconds=300), [*BEFORE, *slow], Tolerance(runs=3)) == []
+        assert regressions(entry(seconds=300), [*BEFORE, *slow], Tolerance(runs=8)) != []
+
+    def test_run_times_of_other_machines_say_nothing_errors_do(self) -> None:
+        elsewhere = [entry(day=day, machine={"processor": "another"}) for day in range(1, 6)]
+        assert regressions(entry(seconds=900), elsewhere, Tolerance()) == []
+        assert len(regressions(entry(psnr=19, seconds=900), elsewhere, Tolerance())) == 1
+
+    def test_short_runs_may_vary_by_seconds(self) -> None:
+        quick = [entry(day=day, seconds=4) for day in range(1, 6)]
+        assert regressions(entry(seconds=8), quick, Tolerance()) == []
+        assert regressions(entry(seconds=8), quick, Tolerance(seconds=1)) != []
+
+
+class TestRecords:
+    def test_only_appended_to(self, tmp_path: Path) -> None:
+        store = Store(tmp_path)
+        names = {append_history(store, entry(day=day)) for day in (2, 1, 1)}
+        assert len(names) == 3
+        append_history(store, {**entry(day=3), "name": "weekly!"})
+        assert [item["when"][:10] for item in history_of(store, "weekly")] == [
+            "2026-01-01",
+            "2026-01-01",
+            "2026-01-02",
+        ]
+        assert len(history_of(store, "weekly!")) == 1
+        assert history_of(store, "week") == []
+
+    def test_the_trend_has_what_can_be_compared(self) -> None:
+        drawn = trend(
+            [entry(psnr=19, day=1, machine={"cores": 64}), entry(psnr=None, day=2), entry(psnr=20, day=3)]
+        )
+        assert [item["methods"].get("coarse") for item in drawn] == [
+            {"psnr": 21.0, "seconds": None},
+            None,
+            {"psnr": 22.0, "seconds": 100.5},
+        ]
+        assert trend([]) == []
+
+
+def test_the_page_shows_trend_and_regressions() -> None:
+    runs = [
+        {
+            **{key: entry()["cases"][0][key] for key in ("method", "profile", "sequence", "setting", "seed")},
+            "seconds": 3.0,
+            "peak_mib": 1.0,
+            "metrics": {"psnr": 20.0},
+            "error": "",
+        }
+    ]
+    history = trend([entry(day=1), entry(day=8, psnr=21)])
+    given: dict[str, Any] = {
+        "name": "weekly",
+        "runs": runs,
+        "baseline": "coarse",
+        "methods": {"coarse": "c"},
+    }
+    page = build_benchmark_report(BenchmarkInputs(**given, history=history, regressions=["it is <slower>"]))
+    assert "2 runs that measured anew, from 2026-01-01 (extrags " in page
+    assert "PSNR and run time of each method over 2 runs" in page
+    assert "it is &lt;slower&gt;" in page
+    assert page == build_benchmark_report(
+        BenchmarkInputs(**given, history=history, regressions=["it is <slower>"])
+    )
+    assert "a trend takes two" in build_benchmark_report(BenchmarkInputs(**given, history=history[:1]))
+    assert 'id="history"' not in build_benchmark_report(BenchmarkInputs(**given))
+
+
+@pytest.mark.usefixtures("prefect_server")
+class TestFlow:
+    def test_measured_anew_kept_and_judged(self, tmp_path: Path) -> None:
+        store = Store(tmp_path / "store")
+        given: dict[str, Any] = {
+            "sequences": [SEQUENCE],
+            "methods": ["coarse"],
+            "settings": {**TINY, "ingest.max_frames": 8, "coarse.iterations": 20},
+            "store": store.root,
+            "name": "weekly",
+        }
+        first = benchmark(**given, refresh=True)
+        seconds = {item.key: item.seconds for item in store.ls("coarse*")}
+        assert first["regressions"] == []
+        # Were the runs before much better, the next one would be a regression: its run fails.
+        (last,) = history_of(store, "weekly")
+        for case in last["cases"]:
+            case["figures"] = {name: value + 3 for name, value in case["figures"].items()}
+        for day in (1, 2, 3):
+            append_history(store, {**last, "when": f"2026-01-{day:02d}T00:00:00+00:00"})
+        state = benchmark(**given, refresh=True, tolerance=Tolerance(seconds=600), return_state=True)
+        assert state.is_failed()
+        error = state.result(raise_on_failure=False)
+        assert isinstance(error, BenchmarkRegressedError)
+        assert len(error.found) == 1
+        assert "3.00 dB below the median" in error.found[0]
+        # The bits are the same, the seconds are those of now.
+        found = history_of(store, "weekly")
+        assert len(found) == 5
+        assert found[-1]["cases"][0]["figures"] == found[-2]["cases"][0]["figures"]
+        assert {item.key: item.seconds for item in store.ls("coarse*")} != seconds
+        page = str(error).rpartition("page: ")[2]
+        assert "5 runs that measured anew" in Path(page).read_text()
+        # From the store: nothing is measured, nothing is added.
+        again = benchmark(**given)
+        assert again["cases"][0]["seconds"] == found[-1]["cases"][0]["seconds"]
+        assert len(history_of(store, "weekly")) == 5
+
+    def test_a_tolerance_needs_a_measurement(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="needs refresh"):
+            benchmark(sequences=[SEQUENCE], store=str(tmp_path), tolerance=Tolerance())

@@ -1,0 +1,97 @@
+"""Names, patterns and manifests become a list of sequences, each with its settings."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from extrags.errors import ConfigError, UnknownSequenceError
+from flows.selection import Chosen, absolute_manifests, chosen_sequences
+
+TEXT = """
+# every night
+phantom/[01]@sparse   # both
+phantom/1@distanced
+"""
+YAML = """
+settings: {coarse.iterations: 500, coarse.seed: 1}
+sequences:
+  - phantom/[01]@sparse
+  - sequence: phantom/1@distanced
+    settings: {coarse.iterations: 60}
+"""
+
+
+def names(given: list[str]) -> list[str]:
+    return [item.name for item in chosen_sequences(given)]
+
+
+def manifest(folder: Path, name: str, text: str) -> str:
+    (folder / name).write_text(text)
+    return f"@{folder / name}"
+
+
+def test_what_several_patterns_match_is_there_once(tmp_path: Path) -> None:
+    assert names(["phantom/1@sparse", "phantom/[01]@*"]) == [
+        "phantom/1@sparse",
+        "phantom/0@sparse",
+        "phantom/0@distanced",
+        "phantom/1@distanced",
+    ]
+    assert names([str(tmp_path)]) == [str(tmp_path)]
+
+
+def test_a_text_has_one_a_line(tmp_path: Path) -> None:
+    file = manifest(tmp_path, "night.txt", TEXT)
+    assert names([file]) == ["phantom/0@sparse", "phantom/1@sparse", "phantom/1@distanced"]
+    assert names([file, "phantom/2@sparse"])[-1] == "phantom/2@sparse"
+
+
+def test_yaml_and_json_have_settings(tmp_path: Path) -> None:
+    found = chosen_sequences([manifest(tmp_path, "night.yaml", YAML)])
+    assert found[0] == Chosen("phantom/0@sparse", {"coarse.iterations": 500, "coarse.seed": 1})
+    assert found[2] == Chosen("phantom/1@distanced", {"coarse.iterations": 60, "coarse.seed": 1})
+    listed = [{"sequence": "phantom/0@sparse", "settings": {"coarse.seed": 2}}, "phantom/1@sparse"]
+    found = chosen_sequences([manifest(tmp_path, "night.json", json.dumps(listed))])
+    assert found == [Chosen("phantom/0@sparse", {"coarse.seed": 2}), Chosen("phantom/1@sparse")]
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.txt", "# nothing\n", "no sequence is named"),
+        ("a.yaml", "[", "is no YAML"),
+        ("a.json", "{", "is no JSON"),
+        ("a.yaml", "3", "holds no list"),
+        ("a.yaml", "{sequence: [phantom/0@sparse]}", "has the field sequence; expected sequences"),
+        ("a.yaml", "[{name: x}]", "entry 1: expected a name"),
+        ("a.yaml", "['']", "entry 1: expected a name"),
+        ("a.yaml", "[{sequence: phantom/0@sparse, settings: 3}]", "entry 1: expected settings by dotted"),
+        ("a.yaml", "[phantom/0@sparse, phantom/0@sparse]", "named twice"),
+        (
+            "a.yaml",
+            "[phantom/*@sparse, {sequence: phantom/0@sparse, settings: {coarse.seed: 1}}]",
+            "chosen twice, with different settings",
+        ),
+    ],
+)
+def test_a_wrong_manifest_is_refused(name: str, text: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=message):
+        chosen_sequences([manifest(tmp_path, name, text)])
+
+
+def test_what_is_not_there_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        chosen_sequences([f"@{tmp_path / 'none.txt'}"])
+    with pytest.raises(UnknownSequenceError, match="near ones: phantom"):
+        chosen_sequences(["phantm/*@sparse"])
+
+
+def test_manifests_are_found_from_another_directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert absolute_manifests(["@night.txt", "phantom/0@sparse"]) == [
+        f"@{tmp_path / 'night.txt'}",
+        "phantom/0@sparse",
+    ]

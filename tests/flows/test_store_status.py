@@ -1,0 +1,103 @@
+"""One look at a whole store: done, missing, failed, running; fast, and without reading an artefact."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import time
+from pathlib import Path
+
+import pytest
+
+from extrags.errors import UnknownSequenceError
+from extrags.pipeline import STAGES
+from extrags.store import Store
+from flows.cases import SequenceCase, record_outcome
+from flows.cli import main
+from flows.outcome import SequenceOutcome, StageRow
+from flows.store_status import store_status
+from tests.flows.tiny import GIVEN, SEQUENCE, TINY, tiny_config
+
+CASE = SequenceCase(SEQUENCE, profile="quick", settings=TINY)
+
+
+@pytest.fixture
+def store(finished: tuple[str, SequenceOutcome], tmp_path: Path) -> Store:
+    root, outcome = finished
+    shutil.copytree(root, tmp_path / "store")
+    made = Store(tmp_path / "store")
+    record_outcome(made, CASE, outcome, "report", tiny_config())
+    return made
+
+
+def test_a_finished_sequence(store: Store, finished: tuple[str, SequenceOutcome]) -> None:
+    found = store_status(store)
+    (row,) = found.rows
+    assert (row.sequence, row.variant, row.state) == (SEQUENCE, "quick", "done")
+    assert {stage for stage, item in row.stages.items() if item.state == "skipped"} == set(GIVEN)
+    assert row.psnr == pytest.approx(finished[1].metrics["final"]["psnr"])
+    assert row.seconds == pytest.approx(sum(stage.made_seconds for stage in finished[1].stages), rel=1e-3)
+    assert found.unrecorded == 0
+    assert found.bytes == sum(manifest.bytes for manifest in store.ls())
+    assert found.artefacts == len(store.ls())
+
+
+def test_what_was_removed_is_missing(store: Store) -> None:
+    store.rm("finetune*")
+    (row,) = store_status(store).rows
+    assert row.state == "missing"
+    assert [stage for stage, item in row.stages.items() if item.state == "missing"] == ["finetune"]
+
+
+def test_what_is_being_made(store: Store) -> None:
+    with store.slot(stage="enhance-restore", version=1, key="enhance-restore-v1-x", label=SEQUENCE):
+        (row,) = store_status(store).rows
+        assert (row.state, row.stages["enhance"].state) == ("running", "running")
+    with store.slot(stage="ingest", version=1, key="ingest-v1-x", label="phantom/3@sparse"):
+        rows = store_status(store).rows
+        assert [(row.sequence, row.state) for row in rows][1] == ("phantom/3@sparse", "running")
+
+
+def test_a_failure_says_why(store: Store) -> None:
+    rows = [StageRow("ingest", "failed", reason="no pictures"), StageRow("poses", "skipped")]
+    broken = SequenceCase("phantom/1@sparse", method="3dgs", seed=2, changed={"coarse.seed": 1})
+    record_outcome(store, broken, SequenceOutcome(broken.sequence, "failed", rows), "coarse", tiny_config())
+    row = store_status(store).rows[1]
+    assert (row.state, row.reason) == ("failed", "ingest: no pictures")
+    assert row.variant == "balanced, 3dgs, seed 2, coarse.seed = 1"
+    assert [row.stages[stage].state for stage in STAGES[:4]] == ["failed", "skipped", "missing", "missing"]
+
+
+def test_patterns_show_what_was_never_run_as_well(store: Store) -> None:
+    rows = store_status(store, ["phantom/[01]@sparse"]).rows
+    assert [(row.sequence, row.state) for row in rows] == [
+        (SEQUENCE, "done"),
+        ("phantom/1@sparse", "missing"),
+    ]
+    with pytest.raises(UnknownSequenceError):
+        store_status(store, ["nothing/*"])
+
+
+def test_the_command(store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["status", "--store", store.root, "--json", str(tmp_path / "status.json")]) == 0
+    said = capsys.readouterr().out
+    assert SEQUENCE in said
+    assert "1 runs: 1 done" in said
+    found = json.loads((tmp_path / "status.json").read_text())
+    assert found["sequences"][0]["stages"]["coarse"]["state"] == "done"
+    assert main(["status", "--store", str(tmp_path / "none")]) == 1
+    assert "there is no store" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+def test_two_hundred_sequences_take_no_time(store: Store) -> None:
+    (record,) = (Path(store.root) / "records").iterdir()
+    text = record.read_text()
+    for number in range(200):
+        (record.parent / f"outcome.{number:04d}.json").write_text(
+            text.replace(SEQUENCE, f"phantom/{number}@distanced")
+        )
+    begun = time.monotonic()
+    assert len(store_status(store).rows) == 201
+    # 0.1 s on two cores; some patience with a busy machine.
+    assert time.monotonic() - begun < 2
