@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeVar
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, StoreError
 from extrags.store.canonical import Ref
 from extrags.store.directory import DirectoryBackend, private_directory
-from extrags.store.integrity import Damage, Depth, default_depth, find_damage, write_checksums
+from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
 from extrags.store.manifest import Manifest, software_versions, stage_of
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
@@ -380,7 +380,7 @@ class Store:
             try:
                 with self._blaming(slot._inputs.values()):
                     yield slot
-                digest, files, size = write_checksums(slot.path)
+                contents, digest, files, size = list_contents(slot.path)
                 slot._manifest = self.backend.commit(
                     slot.path,
                     Manifest(
@@ -398,6 +398,7 @@ class Store:
                         counts=slot.counts,
                         files=files,
                         bytes=size,
+                        contents=contents,
                     ),
                 )
             except Exception as error:

@@ -124,7 +124,7 @@ class TestAgain:
         shutil.copytree(Path(store) / "artefacts", tmp_path / "artefacts")
         key = Path(first.artefacts["renders_final"]).name
         # No stage reads the renders of a finished run; the page does, for its pictures.
-        flip_bit(tmp_path / "artefacts" / key / "renders/rgb/c/0/0/0/0", random.Random(0))
+        flip_bit(tmp_path / "artefacts" / key / "renders.zarr.zip", random.Random(0))
         found = benchmark(
             sequences=[SEQUENCE], methods=["coarse", "extrags"], settings=TINY, store=str(tmp_path)
         )
