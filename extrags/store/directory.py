@@ -7,8 +7,8 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,12 @@ from extrags.store.canonical import Ref
 from extrags.store.integrity import Damage, Depth, find_damage, intact_manifest
 from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
 
-__all__ = ["DAMAGED", "RECORD", "DirectoryBackend", "private_directory", "sweep_directories"]
+__all__ = ["DAMAGED", "RECORD", "RUNS", "DirectoryBackend", "private_directory", "sweep_directories"]
 
 DAMAGED = "damaged"
 """Where damaged artefacts are set aside, below the root of a store."""
+RUNS = "runs"
+"""Records of runs, below the root of a store."""
 RECORD = "damage.json"
 """Beside an artefact that was set aside: what is wrong with it."""
 
@@ -37,6 +39,10 @@ class DirectoryBackend:
         self.artefacts = root / "artefacts"
         self.scratch = root / "scratch"
         self.state = root
+
+    def exists(self) -> bool:
+        """Whether the root is a directory."""
+        return self.root.is_dir()
 
     def check_writable(self) -> None:
         """Make the directories and try one write and one rename.
@@ -93,6 +99,39 @@ class DirectoryBackend:
         """The artefact's files on the local disk."""
         return self.artefacts / manifest.key
 
+    def touch(self, key: str) -> None:
+        """Note that an artefact is used now: the time of its directory."""
+        with suppress(OSError):  # A store may be read by who cannot write it.
+            os.utime(self.artefacts / key)
+
+    def last_used(self, keys: Iterable[str]) -> dict[str, float]:
+        """When artefacts were used last, in seconds since 1970; without those that are gone."""
+        found = {}
+        for key in keys:
+            with suppress(FileNotFoundError):
+                found[key] = (self.artefacts / key).stat().st_mtime
+        return found
+
+    def write_record(self, name: str, text: bytes) -> None:
+        """Write the record of a run."""
+        place = self.root / RUNS / f"{name}.json"
+        place.parent.mkdir(parents=True, exist_ok=True)
+        scratch = place.with_name(f"{name}.{secrets.token_hex(4)}.part")
+        scratch.write_bytes(text)
+        scratch.rename(place)
+
+    def records(self) -> list[tuple[str, bytes]]:
+        """Names and texts of the records of runs."""
+        found = []
+        for place in sorted((self.root / RUNS).glob("*.json")):
+            with suppress(FileNotFoundError):
+                found.append((place.stem, place.read_bytes()))
+        return found
+
+    def remove_record(self, name: str) -> None:
+        """Remove the record of a run."""
+        (self.root / RUNS / f"{name}.json").unlink(missing_ok=True)
+
     def drop_copy(self, manifest: Manifest) -> bool:
         """There are no copies; what is read is the artefact itself."""
         return False
@@ -126,11 +165,12 @@ class DirectoryBackend:
             return None
         return str(place)
 
-    def remove_damaged(self) -> list[str]:
+    def remove_damaged(self, *, dry_run: bool = False) -> list[str]:
         """Remove what was set aside; returns the names."""
         place = self.root / DAMAGED
         names = [f"{DAMAGED}/{name}" for name in sorted(os.listdir(place))] if place.is_dir() else []
-        shutil.rmtree(place, ignore_errors=True)
+        if not dry_run:
+            shutil.rmtree(place, ignore_errors=True)
         return names
 
     def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
@@ -167,11 +207,11 @@ class DirectoryBackend:
         shutil.rmtree(aside, ignore_errors=True)
         return True
 
-    def sweep(self, older_than_hours: float) -> list[str]:
+    def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
         """Remove scratch directories of killed processes, and artefact directories without a manifest."""
-        removed = sweep_directories(self.scratch)
+        removed = sweep_directories(self.scratch, dry_run=dry_run)
         for key in self.names():
-            if not (self.artefacts / key / MANIFEST).exists() and self.discard(key):
+            if not (self.artefacts / key / MANIFEST).exists() and (dry_run or self.discard(key)):
                 removed.append(f"artefacts/{key}")
         return removed
 
@@ -212,7 +252,7 @@ def _claim(parent: Path, name: str) -> tuple[Path, int]:
         os.close(lock)
 
 
-def sweep_directories(parent: Path) -> list[str]:
+def sweep_directories(parent: Path, *, dry_run: bool = False) -> list[str]:
     """Remove the directories below `parent` that no process has locked; returns their names."""
     removed = []
     try:
@@ -229,7 +269,8 @@ def sweep_directories(parent: Path) -> list[str]:
         except BlockingIOError:
             pass
         else:
-            shutil.rmtree(parent / name, ignore_errors=True)
+            if not dry_run:
+                shutil.rmtree(parent / name, ignore_errors=True)
             removed.append(f"{parent.name}/{name}")
         finally:
             os.close(lock)

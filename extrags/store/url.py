@@ -12,15 +12,15 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from extrags.data_directories import cache_directory
 from extrags.errors import DamagedArtefactError, MissingDependencyError, StoreError
 from extrags.store.canonical import Ref, digest_of
-from extrags.store.directory import DAMAGED, RECORD, private_directory, sweep_directories
+from extrags.store.directory import DAMAGED, RECORD, RUNS, private_directory, sweep_directories
 from extrags.store.integrity import Damage, find_damage, find_damaged_sizes, intact_manifest
 from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
 
@@ -54,6 +54,19 @@ class UrlBackend:
         self.state = base / f"store-{digest_of(self.url)[:12]}"
         self.scratch = self.state / "scratch"
         self.local = self.state / "artefacts"
+
+    def exists(self) -> bool:
+        """Whether there is any object below the URL.
+
+        Raises:
+            StoreError: when the server says neither yes nor no.
+        """
+        try:
+            self.fs.invalidate_cache()
+            return bool(self.fs.exists(self.prefix))
+        except Exception as error:
+            # Each fsspec backend raises its own kinds.
+            raise StoreError(f"the store {self.url} cannot be read: {error}") from error
 
     def check_writable(self) -> None:
         """Try one write to the local cache and one to the remote store.
@@ -101,7 +114,7 @@ class UrlBackend:
     def names(self) -> list[str]:
         """All keys, sorted; also those whose manifest is still missing."""
         children = self._children(self.prefix)
-        return sorted(name for name, kind in children if kind == "directory" and name != DAMAGED)
+        return sorted(name for name, kind in children if kind == "directory" and name not in (DAMAGED, RUNS))
 
     def path(self, ref: Ref, manifest: Manifest) -> Path:
         """Local directory with the artefact's files; downloaded at the first call, verified by the digest.
@@ -130,6 +143,33 @@ class UrlBackend:
                 if not target.is_dir():  # Otherwise another process fetched it meanwhile.
                     raise
         return target
+
+    def touch(self, key: str) -> None:
+        """Nothing: an object's time cannot be changed without writing it again."""
+
+    def last_used(self, keys: Iterable[str]) -> dict[str, float]:
+        """Not known; what counts is when they were made."""
+        return {}
+
+    def write_record(self, name: str, text: bytes) -> None:
+        """Write the record of a run."""
+        self.fs.pipe_file(f"{self.prefix}/{RUNS}/{name}.json", text)
+
+    def records(self) -> list[tuple[str, bytes]]:
+        """Names and texts of the records of runs."""
+        found = []
+        for name, kind in self._children(f"{self.prefix}/{RUNS}"):
+            if kind == "file" and name.endswith(".json"):
+                with suppress(FileNotFoundError):
+                    found.append(
+                        (name.removesuffix(".json"), self.fs.cat_file(f"{self.prefix}/{RUNS}/{name}"))
+                    )
+        return found
+
+    def remove_record(self, name: str) -> None:
+        """Remove the record of a run."""
+        with suppress(FileNotFoundError):
+            self.fs.rm_file(f"{self.prefix}/{RUNS}/{name}.json")
 
     def drop_copy(self, manifest: Manifest) -> bool:
         """Remove the local copy of an artefact, to be downloaded again; whether there was one."""
@@ -178,11 +218,11 @@ class UrlBackend:
             self.fs.mv(str(name), f"{place}/artefact/{relative}")
         return f"{self.url}/{DAMAGED}/{place.rsplit('/', 1)[-1]}"
 
-    def remove_damaged(self) -> list[str]:
+    def remove_damaged(self, *, dry_run: bool = False) -> list[str]:
         """Remove what was set aside; returns the names."""
         place = f"{self.prefix}/{DAMAGED}"
         names = sorted(name for name, _ in self._children(place))
-        if names:
+        if names and not dry_run:
             self.fs.rm(place, recursive=True)
         return [f"{DAMAGED}/{name}" for name in names]
 
@@ -230,12 +270,12 @@ class UrlBackend:
                 self.fs.rm(f"{self.prefix}/{key}", recursive=True)
         return bool(found)
 
-    def sweep(self, older_than_hours: float) -> list[str]:
+    def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
         """Remove local leftovers, and remote attempts without a manifest older than `older_than_hours`.
 
         Only the age of remote files is known, not whether their writer is still running.
         """
-        removed = sweep_directories(self.scratch)
+        removed = sweep_directories(self.scratch, dry_run=dry_run)
         limit = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=older_than_hours)
         for key in self.names():
             try:
@@ -247,7 +287,8 @@ class UrlBackend:
                     continue
                 place = f"{self.prefix}/{key}/{attempt}"
                 if all(self._modified(name) <= limit for name in self.fs.find(place)):
-                    self.fs.rm(place, recursive=True)
+                    if not dry_run:
+                        self.fs.rm(place, recursive=True)
                     removed.append(f"{key}/{attempt}")
         return removed
 
