@@ -1,7 +1,7 @@
 """Storage behind an fsspec URL (S3-compatible object stores and others), which has no atomic rename.
 
 The files of each attempt go below a prefix of their own, `<key>/<attempt>/`; `<key>/manifest.json`,
-written last with a single put, names the attempt. Before that nothing is visible, and two writers of
+written last with one put, names the attempt. Before that nothing is visible, and two writers of
 one key can never mix their files.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import datetime
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator
@@ -35,12 +36,29 @@ def default_cache_directory() -> Path:
     return cache_directory()
 
 
+def _refuse_secrets(url: str) -> None:
+    """A URL is in messages, logs, references and Prefect's parameters.
+
+    Raises:
+        StoreError: for one with a password or a key in it, which the message does not repeat.
+    """
+    scheme, _, rest = url.partition("://")
+    before = rest.partition("/")[0]
+    if (":" in before.rpartition("@")[0]) or re.search(r"[?&][^=&/]*(key|secret|token|sig|pass)", rest, re.I):
+        raise StoreError(
+            f"the URL of this store ({scheme}://...) holds credentials, which would be in logs and manifests; "
+            "give them by the environment, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
+            "FSSPEC_<PROTOCOL>_<NAME>, or by a file in ~/.config/fsspec"
+        )
+
+
 class UrlBackend:
     """A store on an object store, read through a local directory."""
 
     def __init__(self, url: str, cache: Path | None) -> None:
         import fsspec
 
+        _refuse_secrets(url)
         try:
             self.fs, self.prefix = fsspec.core.url_to_fs(url)
         except ImportError as error:
@@ -104,7 +122,8 @@ class UrlBackend:
                 key=key,
                 store=self.url,
             ) from error
-        except OSError as error:
+        except Exception as error:
+            # Each fsspec backend raises its own kinds (botocore's are not OSErrors).
             raise StoreError(f"{self.url}/{key}/{MANIFEST} cannot be read: {error}") from error
 
     def uri(self, key: str) -> str:
@@ -240,7 +259,9 @@ class UrlBackend:
             for name in self.fs.find(source):
                 relative = str(name).removeprefix(source).lstrip("/")
                 (scratch / relative).parent.mkdir(parents=True, exist_ok=True)
-                self.fs.get_file(name, str(scratch / relative))
+                # What goes away meanwhile is missing then, and said to be.
+                with suppress(FileNotFoundError):
+                    self.fs.get_file(name, str(scratch / relative))
             yield scratch
 
     def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
@@ -254,21 +275,34 @@ class UrlBackend:
             for path in sorted(scratch.rglob("*")):
                 if path.is_file():
                     name = path.relative_to(scratch).as_posix()
-                    self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{attempt}/{name}", path.read_bytes())
+                    # In parts where it is large; not through the memory.
+                    self.fs.put_file(str(path), f"{self.prefix}/{manifest.key}/{attempt}/{name}")
             self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest_text(manifest))
-        except OSError as error:
+        except Exception as error:
+            # As above.
             raise StoreError(f"the store {self.url} cannot be written: {error}") from error
         return manifest
 
     def discard(self, key: str) -> bool:
-        """Remove an artefact; its manifest is deleted first, so that it disappears atomically."""
-        found = self.fs.exists(f"{self.prefix}/{key}")
-        if found:
-            if self.fs.exists(f"{self.prefix}/{key}/{MANIFEST}"):
-                self.fs.rm_file(f"{self.prefix}/{key}/{MANIFEST}")
-            if self.fs.exists(f"{self.prefix}/{key}"):
-                self.fs.rm(f"{self.prefix}/{key}", recursive=True)
-        return bool(found)
+        """Remove an artefact: its manifest first, so that it disappears atomically, then the files it names.
+
+        Files of other attempts stay, because another process may be uploading them; `sweep` removes them.
+        """
+        place = f"{self.prefix}/{key}"
+        try:
+            manifest = self.read_manifest(key)
+        except DamagedArtefactError:
+            attempts = [name for name, kind in self._children(place) if kind == "directory"]
+        else:
+            if manifest is None:
+                return False
+            attempts = [manifest.data]
+        with suppress(FileNotFoundError):
+            self.fs.rm_file(f"{place}/{MANIFEST}")
+        for attempt in attempts:
+            with suppress(FileNotFoundError):
+                self.fs.rm(f"{place}/{attempt}", recursive=True)
+        return True
 
     def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
         """Remove local leftovers, and remote attempts without a manifest older than `older_than_hours`.
