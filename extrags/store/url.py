@@ -46,7 +46,7 @@ def _refuse_secrets(url: str) -> None:
     before = rest.partition("/")[0]
     if (":" in before.rpartition("@")[0]) or re.search(r"[?&][^=&/]*(key|secret|token|sig|pass)", rest, re.I):
         raise StoreError(
-            f"the URL of this store ({scheme}://...) holds credentials, which would be in logs and manifests; "
+            f"the URL of this store ({scheme}://...) holds credentials, which would be in logs; "
             "give them by the environment, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
             "FSSPEC_<PROTOCOL>_<NAME>, or by a file in ~/.config/fsspec"
         )
