@@ -14,6 +14,7 @@ import pytest
 
 from extrags.store import Store
 from extrags.store.retention import Policy, apply_policy
+from extrags.store.runs import active_runs, runs_of
 from flows.cli import main
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
@@ -31,17 +32,18 @@ def store(finished: tuple[str, SequenceOutcome], tmp_path: Path) -> Store:
     return Store(tmp_path / "store")
 
 
-def test_a_tiny_sequence_is_few_files(finished: tuple[str, SequenceOutcome]) -> None:
-    files = [path for path in (Path(finished[0]) / "artefacts").rglob("*") if path.is_file()]
-    assert len(files) < 60
-
-
-def test_a_run_leaves_one_record_with_all_it_used(finished: tuple[str, SequenceOutcome]) -> None:
-    from extrags.store.runs import active_runs, runs_of
-
-    store = Store(finished[0])
+def test_a_tiny_sequence_is_few_files_and_one_record(finished: tuple[str, SequenceOutcome]) -> None:
+    root, whole = finished
+    store = Store(root)
     assert active_runs(store) == []
-    assert any(set(store.keys()) == run.keys for run in runs_of(store))
+    # Other tests run in this store as well.
+    parts = {Path(uri).name for uri in whole.artefacts.values()}
+    run = min((run for run in runs_of(store) if run.keys >= parts), key=lambda run: len(run.keys))
+    assert {key.partition("-v")[0] for key in run.keys} >= {"explore-branch", "finetune-judge"}
+    files = [
+        path for key in run.keys for path in (Path(root) / "artefacts" / key).rglob("*") if path.is_file()
+    ]
+    assert 40 < len(files) < 60
 
 
 @pytest.mark.parametrize(
@@ -145,5 +147,6 @@ class TestCommand:
         assert main(["cache", "usage", "--store", store.root]) == 0
         assert SEQUENCE in capsys.readouterr().out
         assert main(["cache", "usage", "--store", store.root, "--json", "-"]) == 0
-        (row,) = json.loads(capsys.readouterr().out)
-        assert (row["sequence"], row["artefacts"]) == (SEQUENCE, len(store.keys()))
+        rows = json.loads(capsys.readouterr().out)
+        assert SEQUENCE in {row["sequence"] for row in rows}
+        assert sum(row["artefacts"] for row in rows) == len(store.keys())
