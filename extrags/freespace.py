@@ -9,7 +9,6 @@ from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
-import zarr
 from jaxtyping import Bool, Float, Int, UInt8
 
 from extrags.cameras import Cameras
@@ -19,7 +18,7 @@ from extrags.events import Progress, emit
 from extrags.scene import Scene
 from extrags.store.storable import Storable
 from extrags.surface import Mesh
-from extrags.zarr_io import open_group, read_array, write_array
+from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["FREE", "OCCUPIED", "UNKNOWN", "FreeSpace", "carve", "voxel_visibility"]
 
@@ -144,22 +143,22 @@ class FreeSpace(Storable):
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group; origin, axes and voxel size are its attributes."""
-        group = open_group(path, mode="w")
-        write_array(group, "occupancy", self.occupancy)
-        write_array(group, "clearance", self.clearance)
-        group.attrs.update(
-            {
-                "origin_mm": [float(x) for x in self.origin_mm],
-                "axes": [[float(x) for x in row] for row in self.axes],
-                "voxel_mm": float(self.voxel_mm),
-                "labels": {"free": FREE, "occupied": OCCUPIED, "unknown": UNKNOWN},
-            }
-        )
+        with new_group(path) as group:
+            write_array(group, "occupancy", self.occupancy)
+            write_array(group, "clearance", self.clearance)
+            group.attrs.update(
+                {
+                    "origin_mm": [float(x) for x in self.origin_mm],
+                    "axes": [[float(x) for x in row] for row in self.axes],
+                    "voxel_mm": float(self.voxel_mm),
+                    "labels": {"free": FREE, "occupied": OCCUPIED, "unknown": UNKNOWN},
+                }
+            )
 
     @classmethod
     def load(cls, path: Path) -> FreeSpace:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         attributes: dict[str, Any] = dict(group.attrs)
         return cls(
             occupancy=read_array(group, "occupancy"),

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import zarr
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from extrags.errors import ShapeError, SourceError, SourceNotFoundError
-from extrags.zarr_io import open_group, read_array, write_array
+from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["SH_C0", "Gaussians"]
 
@@ -136,14 +135,14 @@ class Gaussians:
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group, one array per attribute."""
-        group = open_group(path, mode="w")
-        for name, value in self.parameters().items():
-            write_array(group, name, value.detach().numpy())
+        with new_group(path) as group:
+            for name, value in self.parameters().items():
+                write_array(group, name, value.detach().numpy())
 
     @classmethod
     def load(cls, path: Path) -> Gaussians:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         return cls(**{f.name: torch.from_numpy(read_array(group, f.name)) for f in fields(cls)})
 
     def write_ply(self, path: Path) -> None:

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import zarr
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -27,7 +26,7 @@ from extrags.raster.light import (
     invert_response,
     light_gain,
 )
-from extrags.zarr_io import open_group, read_array, write_array
+from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["NearFieldLight"]
 
@@ -223,15 +222,15 @@ class NearFieldLight:
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group."""
-        group = open_group(path, mode="w")
-        for name, value in self.parameters().items():
-            write_array(group, name, value.detach().numpy())
-        group.attrs["reference_distance"] = self.reference_distance
+        with new_group(path) as group:
+            for name, value in self.parameters().items():
+                write_array(group, name, value.detach().numpy())
+            group.attrs["reference_distance"] = self.reference_distance
 
     @classmethod
     def load(cls, path: Path) -> NearFieldLight:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         names = [name for name in cls.__dataclass_fields__ if name != "reference_distance"]
         values = {name: torch.from_numpy(read_array(group, name)) for name in names}
         return cls(**values, reference_distance=float(group.attrs["reference_distance"]))  # type: ignore[arg-type]

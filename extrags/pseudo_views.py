@@ -8,13 +8,12 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import zarr
 from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.store.storable import Storable
-from extrags.zarr_io import open_group, read_array, write_array, write_frames
+from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
 
 __all__ = ["PseudoViews"]
 
@@ -123,26 +122,26 @@ class PseudoViews(Storable):
 
         Where a pixel-level confidence exceeds one, all of them have 16 bits, in the same steps of 1/255.
         """
-        group = open_group(path, mode="w")
-        for name in _STEPPED:
-            write_frames(group, name, self._as_steps(name))
-        if self.expected_error is not None:
-            # 8 bits would be too coarse: expected errors are only a few steps of 1/255.
-            write_frames(group, "expected_error", self.expected_error.astype(np.float16))
-        write_frames(group, "depth_mm", self.depth_mm.astype(np.float32))
-        write_array(group, "image_confidence", self.image_confidence.astype(np.float32))
-        write_array(group, "reference", self.reference.astype(np.int64))
-        write_array(group, "clip", self.clip.astype(np.int64))
-        write_array(group, "K", self.cameras.K)
-        write_array(group, "world_from_camera", self.cameras.world_from_camera)
-        group.attrs.update(
-            {
-                "width": self.cameras.width,
-                "height": self.cameras.height,
-                "provenance": self.provenance,
-                "changed_share": self.changed_share,
-            }
-        )
+        with new_group(path) as group:
+            for name in _STEPPED:
+                write_frames(group, name, self._as_steps(name))
+            if self.expected_error is not None:
+                # 8 bits would be too coarse: expected errors are only a few steps of 1/255.
+                write_frames(group, "expected_error", self.expected_error.astype(np.float16))
+            write_frames(group, "depth_mm", self.depth_mm.astype(np.float32))
+            write_array(group, "image_confidence", self.image_confidence.astype(np.float32))
+            write_array(group, "reference", self.reference.astype(np.int64))
+            write_array(group, "clip", self.clip.astype(np.int64))
+            write_array(group, "K", self.cameras.K)
+            write_array(group, "world_from_camera", self.cameras.world_from_camera)
+            group.attrs.update(
+                {
+                    "width": self.cameras.width,
+                    "height": self.cameras.height,
+                    "provenance": self.provenance,
+                    "changed_share": self.changed_share,
+                }
+            )
 
     def _as_steps(self, name: str) -> np.ndarray:
         """An array in steps of 1/255; equal values give equal steps whatever else the array holds."""
@@ -153,7 +152,7 @@ class PseudoViews(Storable):
     @classmethod
     def load(cls, path: Path) -> PseudoViews:
         """Read what `save` wrote; values in [0, 1] come back quantised to steps of 1/255."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         attributes: Any = dict(group.attrs)
         arrays: dict[str, Any] = {name: _from_steps(read_array(group, name)) for name in _STEPPED}
         if "expected_error" in group:

@@ -17,6 +17,7 @@ from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.raster import CameraLight, Rendering, rasterize
 from extrags.store.storable import Storable
+from extrags.zarr_io import group_exists
 
 __all__ = ["Scene"]
 
@@ -118,7 +119,7 @@ class Scene(Storable):
         return Scene(self.gaussians.detached(), light)
 
     def save(self, path: Path) -> None:
-        """Write `gaussians/` and, if there is one, `light/`."""
+        """Write the groups `gaussians` and, if there is one, `light`."""
         path.mkdir(parents=True, exist_ok=True)
         self.gaussians.save(path / "gaussians")
         if self.light is not None:
@@ -127,5 +128,5 @@ class Scene(Storable):
     @classmethod
     def load(cls, path: Path) -> Scene:
         """Read what `save` wrote."""
-        light = NearFieldLight.load(path / "light") if (path / "light").exists() else None
+        light = NearFieldLight.load(path / "light") if group_exists(path / "light") else None
         return cls(Gaussians.load(path / "gaussians"), light)

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal, cast
 
 import numpy as np
-import zarr
 from jaxtyping import Bool, Float, Int, UInt8
 
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.store.storable import Storable
 from extrags.thresholds import RELIABLE_DEPTH_ERROR, SATURATED
-from extrags.zarr_io import open_group, read_array, write_array, write_frames
+from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
 
 __all__ = [
     "EndoscopicSequence",
@@ -370,43 +369,43 @@ class EndoscopicSequence(Storable):
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group; one frame per chunk for image stacks."""
-        group = open_group(path, mode="w")
-        write_frames(group, "rgb", self.rgb)
-        write_frames(group, "mask", self.mask)
-        write_array(group, "K", self.K)
-        write_array(group, "split/train", self.split.train.astype(np.int64))
-        write_array(group, "split/test", self.split.test.astype(np.int64))
-        for name in ("depth_mm", "withheld_depth_mm", "depth_error", "observed", "specular"):
-            stack = getattr(self, name)
-            if stack is not None:
-                write_frames(group, name, stack)
-        for name in ("world_from_camera", "recording", "points", "points_rgb"):
-            array = getattr(self, name)
-            if array is not None:
-                write_array(group, name, array)
-        group.attrs.update(
-            {
-                "name": self.name,
-                "metric": self.metric,
-                "frame_names": list(self.frame_names),
-                "split": {"name": self.split.name, "version": self.split.version},
-                "truth": self.truth,
-            }
-        )
-        # Written only where it differs from the default, so that older artefacts keep their digest.
-        if self.pose_source != "given":
-            group.attrs["pose_source"] = self.pose_source
-        if self.intrinsics != "given":
-            group.attrs["intrinsics"] = self.intrinsics
-        if self.focal_std_px is not None:
-            group.attrs["focal_std_px"] = self.focal_std_px
-        if self.scale_source != "source":
-            group.attrs["scale_source"] = self.scale_source
+        with new_group(path) as group:
+            write_frames(group, "rgb", self.rgb)
+            write_frames(group, "mask", self.mask)
+            write_array(group, "K", self.K)
+            write_array(group, "split/train", self.split.train.astype(np.int64))
+            write_array(group, "split/test", self.split.test.astype(np.int64))
+            for name in ("depth_mm", "withheld_depth_mm", "depth_error", "observed", "specular"):
+                stack = getattr(self, name)
+                if stack is not None:
+                    write_frames(group, name, stack)
+            for name in ("world_from_camera", "recording", "points", "points_rgb"):
+                array = getattr(self, name)
+                if array is not None:
+                    write_array(group, name, array)
+            group.attrs.update(
+                {
+                    "name": self.name,
+                    "metric": self.metric,
+                    "frame_names": list(self.frame_names),
+                    "split": {"name": self.split.name, "version": self.split.version},
+                    "truth": self.truth,
+                }
+            )
+            # Written only where it differs from the default, so that older artefacts keep their digest.
+            if self.pose_source != "given":
+                group.attrs["pose_source"] = self.pose_source
+            if self.intrinsics != "given":
+                group.attrs["intrinsics"] = self.intrinsics
+            if self.focal_std_px is not None:
+                group.attrs["focal_std_px"] = self.focal_std_px
+            if self.scale_source != "source":
+                group.attrs["scale_source"] = self.scale_source
 
     @classmethod
     def load(cls, path: Path) -> EndoscopicSequence:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         attributes = dict(group.attrs)
         split: Any = attributes["split"]
         optional = {

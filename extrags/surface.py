@@ -9,7 +9,6 @@ from typing import ClassVar, cast
 
 import numpy as np
 import torch
-import zarr
 from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras
@@ -18,7 +17,7 @@ from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
 from extrags.scene import Scene
 from extrags.store.storable import Storable
-from extrags.zarr_io import open_group, read_array, write_array
+from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["Mesh", "fuse_depth", "fuse_surface", "rendered_depth"]
 
@@ -54,14 +53,14 @@ class Mesh(Storable):
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group with `vertices` and `triangles`."""
-        group = open_group(path, mode="w")
-        write_array(group, "vertices", self.vertices.astype(np.float32))
-        write_array(group, "triangles", self.triangles.astype(np.int32))
+        with new_group(path) as group:
+            write_array(group, "vertices", self.vertices.astype(np.float32))
+            write_array(group, "triangles", self.triangles.astype(np.int32))
 
     @classmethod
     def load(cls, path: Path) -> Mesh:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         return cls(read_array(group, "vertices"), read_array(group, "triangles"))
 
     def write_ply(self, path: Path) -> None:

@@ -59,9 +59,9 @@ def preview(outcome: SequenceOutcome, store: Store) -> tuple[str, str] | None:
 
 
 def _group(path: Path) -> Any:
-    import zarr
+    from extrags.zarr_io import open_group
 
-    return zarr.open_group(str(path), mode="r")
+    return open_group(path)
 
 
 def _tile(image: np.ndarray) -> np.ndarray:

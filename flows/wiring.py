@@ -14,6 +14,7 @@ from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
 from extrags.metrics.registry import added_metrics
 from extrags.pipeline import HELD_OUT_TRAINED_ON, STAGES, Pipeline, StageName
 from extrags.store import Manifest, Ref, Store
+from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
 from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner, StoreRunner
@@ -109,6 +110,7 @@ class SequenceRun(Pipeline):
         self.runner = runner
         self.profile = profile
         self._given = config
+        self._record: RunRecord | None = None
         self._before: dict[str, StageRow] = {}
         """Rows of the attempts that met a damaged artefact."""
 
@@ -124,7 +126,8 @@ class SequenceRun(Pipeline):
             if isinstance(self.runner, StoreRunner):
                 self._attempt(until)  # Who only looks moves nothing.
             else:
-                again_after_damage(self.store, lambda: self._attempt(until))
+                with recorded_run(self.store, self.outcome.name) as self._record:
+                    again_after_damage(self.store, lambda: self._attempt(until))
         except (_StoppedError, ArtefactGoneError, DamagedArtefactError) as error:
             if not isinstance(error, _StoppedError):
                 last = self.outcome.stages[-1]
@@ -406,15 +409,22 @@ class SequenceRun(Pipeline):
     def _run_uncounted(self, call: Call) -> Ref:
         """Run a task that is not counted in the row of its stage."""
         (result,) = self.runner.run([call], self.outcome.name)
+        self._note([result.ref])
         manifest = self.store.manifest(result.ref)
         self.outcome.stages[-1].made[manifest.key] = manifest.bytes
         return result.ref
+
+    def _note(self, refs: list[Ref]) -> None:
+        """Retention keeps what a run has used."""
+        if self._record is not None:
+            self._record.add(ref.uri.rsplit("/", 1)[-1] for ref in refs)
 
     def _run_task(self, row: StageRow, call: Call) -> Ref:
         return self._run_tasks(row, [call])[0]
 
     def _run_tasks(self, row: StageRow, calls: list[Call]) -> list[Ref]:
         results = self.runner.run(calls, self.outcome.name)
+        self._note([result.ref for result in results])
         for result in results:
             manifest = self.store.manifest(result.ref)
             peak = manifest.counts.get("peak_mib")

@@ -7,6 +7,7 @@ from typing import Literal
 from extrags.config import LpipsNet
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Ref, Slot
+from extrags.zarr_io import group_exists
 from tasks.stage import stage
 from tasks.weights import Weights, lpips_by_net
 
@@ -74,7 +75,7 @@ def measure(
     result = evaluate_renders(
         slot.load(RenderedViews, renders),
         frames,
-        mesh=slot.load(Mesh, renders) if (slot.open(renders) / Mesh.stored_as).exists() else None,
+        mesh=slot.load(Mesh, renders) if group_exists(slot.open(renders) / Mesh.stored_as) else None,
         true_surface=None if frames.true_depth_mm is None else true_surface(frames),
         lpips=lpips_by_net(weights),
     )

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import zarr
 from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
@@ -39,7 +38,7 @@ from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
 from extrags.threads import in_threads, one_torch_thread
 from extrags.training.random_start import depth_range
-from extrags.zarr_io import open_group, read_array, write_array, write_frames
+from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
 
 __all__ = ["DepthEstimate", "estimate_depth", "posed_frames", "with_estimated_depth"]
 
@@ -103,17 +102,17 @@ class DepthEstimate(Storable):
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group; one frame per chunk."""
-        group = open_group(path, mode="w")
-        write_frames(group, "depth", self.depth)
-        write_frames(group, "expected_error", self.expected_error)
-        write_array(group, "points", self.points)
-        write_array(group, "points_rgb", self.points_rgb)
-        group.attrs["report"] = self.report
+        with new_group(path) as group:
+            write_frames(group, "depth", self.depth)
+            write_frames(group, "expected_error", self.expected_error)
+            write_array(group, "points", self.points)
+            write_array(group, "points_rgb", self.points_rgb)
+            group.attrs["report"] = self.report
 
     @classmethod
     def load(cls, path: Path) -> DepthEstimate:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         names = ("depth", "expected_error", "points", "points_rgb")
         report: Any = group.attrs["report"]
         depth, expected_error, points, points_rgb = (read_array(group, name) for name in names)

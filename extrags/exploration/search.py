@@ -26,7 +26,7 @@ from extrags.raster import Rendering
 from extrags.scene import Scene
 from extrags.store.storable import Storable
 from extrags.thresholds import HOLE_ALPHA
-from extrags.zarr_io import open_group, read_array, write_array
+from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["Branch", "SearchContext", "grow_branch", "known_coverage", "prepare_search"]
 
@@ -119,7 +119,11 @@ class Branch(Storable):
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group."""
-        group = open_group(path, mode="w")
+        with new_group(path) as group:
+            self.write(group)
+
+    def write(self, group: zarr.Group) -> None:
+        """Write into a group."""
         write_array(group, "poses", self.poses)
         write_array(group, "pairs", self.pairs)
         group.attrs.update(
@@ -137,7 +141,11 @@ class Branch(Storable):
     @classmethod
     def load(cls, path: Path) -> Branch:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        return cls.read(open_group(path))
+
+    @classmethod
+    def read(cls, group: zarr.Group) -> Branch:
+        """Read what `write` wrote."""
         attributes: dict[str, Any] = dict(group.attrs)
         return cls(
             anchor=attributes["anchor"],

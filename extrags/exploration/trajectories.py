@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import zarr
 from jaxtyping import Float, Int, UInt32
 
 from extrags.cameras import Cameras
@@ -26,7 +25,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
 from extrags.surface import fuse_surface
-from extrags.zarr_io import open_group, read_array, write_array
+from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["Exploration", "explore", "finish", "grow", "start_exploration"]
 
@@ -142,32 +141,32 @@ class Exploration(Storable):
         }
 
     def save(self, directory: Path) -> None:
-        """Write `trajectories/` (zarr v3) and `exploration.json` into a directory."""
+        """Write the group `trajectories` (zarr v3) and `exploration.json` into a directory."""
         directory.mkdir(parents=True, exist_ok=True)
-        group = open_group(directory / "trajectories", mode="w")
-        for name in ("trajectory", "anchors", "gains", "values", "coverage_before", "coverage_after"):
-            write_array(group, name, getattr(self, name))
-        write_array(group, "K", self.cameras.K)
-        write_array(group, "world_from_camera", self.cameras.world_from_camera)
-        group.attrs.update(
-            {
-                "width": self.cameras.width,
-                "height": self.cameras.height,
-                "moves": [list(moves) for moves in self.moves],
-                "reasons": list(self.reasons),
-                "rejected": list(self.rejected),
-                "directions": self.directions,
-                "renders": self.renders,
-                "waves": self.waves,
-            }
-        )
+        with new_group(directory / "trajectories") as group:
+            for name in ("trajectory", "anchors", "gains", "values", "coverage_before", "coverage_after"):
+                write_array(group, name, getattr(self, name))
+            write_array(group, "K", self.cameras.K)
+            write_array(group, "world_from_camera", self.cameras.world_from_camera)
+            group.attrs.update(
+                {
+                    "width": self.cameras.width,
+                    "height": self.cameras.height,
+                    "moves": [list(moves) for moves in self.moves],
+                    "reasons": list(self.reasons),
+                    "rejected": list(self.rejected),
+                    "directions": self.directions,
+                    "renders": self.renders,
+                    "waves": self.waves,
+                }
+            )
         text = json.dumps(self.summary(), indent=2)
         (directory / "exploration.json").write_text(text + "\n", encoding="utf-8")
 
     @classmethod
     def load(cls, directory: Path) -> Exploration:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(directory / "trajectories"), mode="r")
+        group = open_group(directory / "trajectories")
         attributes: dict[str, Any] = dict(group.attrs)
         arrays = {
             name: read_array(group, name)

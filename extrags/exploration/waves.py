@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import zarr
 from jaxtyping import Float, Int, UInt32
 
 from extrags.cameras import Cameras, pose_distances
@@ -20,7 +19,7 @@ from extrags.errors import ConfigError
 from extrags.exploration.coverage import PairValue, coverage_gain
 from extrags.exploration.search import Branch
 from extrags.store.storable import Storable
-from extrags.zarr_io import open_group, read_array, write_array
+from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["Merge", "WaveState", "merge_wave", "start_views"]
 
@@ -211,32 +210,32 @@ class WaveState(Storable):
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group, accepted branches inside."""
-        group = open_group(path, mode="w")
-        write_array(group, "coverage_before", self.coverage_before)
-        write_array(group, "coverage", self.coverage)
-        group.attrs.update(
-            {
-                "waiting": list(self.waiting),
-                "room": self.room,
-                "min_gain": self.min_gain,
-                "wave": self.wave,
-                "gains": list(self.gains),
-                "values": list(self.values),
-                "n_gaussians": self.value.n_gaussians,
-                "frontier_pair": self.value.frontier_pair,
-                "rejected": list(self.rejected),
-                "waves": self.waves,
-                "renders": self.renders,
-                "n_branches": len(self.branches),
-            }
-        )
-        for index, branch in enumerate(self.branches):
-            branch.save(path / f"branch_{index:04d}")
+        with new_group(path) as group:
+            write_array(group, "coverage_before", self.coverage_before)
+            write_array(group, "coverage", self.coverage)
+            group.attrs.update(
+                {
+                    "waiting": list(self.waiting),
+                    "room": self.room,
+                    "min_gain": self.min_gain,
+                    "wave": self.wave,
+                    "gains": list(self.gains),
+                    "values": list(self.values),
+                    "n_gaussians": self.value.n_gaussians,
+                    "frontier_pair": self.value.frontier_pair,
+                    "rejected": list(self.rejected),
+                    "waves": self.waves,
+                    "renders": self.renders,
+                    "n_branches": len(self.branches),
+                }
+            )
+            for index, branch in enumerate(self.branches):
+                branch.write(group.create_group(f"branch_{index:04d}"))
 
     @classmethod
     def load(cls, path: Path) -> WaveState:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         attributes: dict[str, Any] = dict(group.attrs)
         return cls(
             coverage_before=read_array(group, "coverage_before"),
@@ -247,7 +246,8 @@ class WaveState(Storable):
             min_gain=attributes["min_gain"],
             wave=attributes["wave"],
             branches=tuple(
-                Branch.load(path / f"branch_{index:04d}") for index in range(attributes["n_branches"])
+                Branch.read(group.require_group(f"branch_{index:04d}"))
+                for index in range(attributes["n_branches"])
             ),
             gains=tuple(attributes["gains"]),
             values=tuple(attributes["values"]),

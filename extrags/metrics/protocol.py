@@ -16,7 +16,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import zarr
 from jaxtyping import Float, Int
 from torch import Tensor
 
@@ -32,7 +31,7 @@ from extrags.metrics.registry import metrics as registered_metrics
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
 from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
-from extrags.zarr_io import open_group, read_array, write_frames
+from extrags.zarr_io import group_exists, new_group, open_group, read_array, write_frames
 
 __all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
 
@@ -90,10 +89,10 @@ class RenderedViews(Storable):
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group, one view per chunk."""
-        group = open_group(path, mode="w")
-        for name in ("rgb", "alpha", "depth_mm"):
-            write_frames(group, name, getattr(self, name).astype(np.float32))
-        group.attrs["n_gaussians"] = self.n_gaussians
+        with new_group(path) as group:
+            for name in ("rgb", "alpha", "depth_mm"):
+                write_frames(group, name, getattr(self, name).astype(np.float32))
+            group.attrs["n_gaussians"] = self.n_gaussians
 
     @classmethod
     def load(cls, path: Path) -> RenderedViews:
@@ -102,9 +101,9 @@ class RenderedViews(Storable):
         Raises:
             SourceNotFoundError: when the path does not exist.
         """
-        if not Path(path).exists():
+        if not group_exists(path):
             raise SourceNotFoundError("no renders here", file=path)
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         count: Any = group.attrs["n_gaussians"]
         return cls(read_array(group, "rgb"), read_array(group, "alpha"), read_array(group, "depth_mm"), count)
 

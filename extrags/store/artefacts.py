@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeVar
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, StoreError
 from extrags.store.canonical import Ref
 from extrags.store.directory import ABOUT, DirectoryBackend, private_directory
-from extrags.store.integrity import Damage, Depth, default_depth, find_damage, write_checksums
+from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
 from extrags.store.manifest import Manifest, software_versions, stage_of
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
@@ -151,6 +151,14 @@ class Store:
         """
         self.backend.check_writable()
 
+    def exists(self) -> bool:
+        """Whether there is anything at the root.
+
+        Raises:
+            StoreError: when that cannot be found out.
+        """
+        return self.backend.exists()
+
     def find(self, key: str) -> Ref | None:
         """The artefact of a key, or None.
 
@@ -163,6 +171,7 @@ class Store:
         damage = self.backend.damaged_sizes(manifest)
         if damage is not None:
             raise self._damaged(key, damage)
+        self.backend.touch(key)
         return self._ref(manifest)
 
     def find_or_set_aside(self, key: str) -> Ref | None:
@@ -208,6 +217,7 @@ class Store:
             path = self.backend.path(ref, manifest)
             damage = self._first_look(path, manifest)
             if damage is None:
+                self.backend.touch(manifest.key)
                 return path
             if not self.backend.drop_copy(manifest):
                 break
@@ -390,7 +400,7 @@ class Store:
             try:
                 with self._blaming(slot._inputs.values()):
                     yield slot
-                digest, files, size = write_checksums(slot.path)
+                contents, digest, files, size = list_contents(slot.path)
                 slot._manifest = self.backend.commit(
                     slot.path,
                     Manifest(
@@ -408,6 +418,7 @@ class Store:
                         counts=slot.counts,
                         files=files,
                         bytes=size,
+                        contents=contents,
                     ),
                     renew=renew,
                 )
@@ -464,25 +475,34 @@ class Store:
         """
         return self.backend.sweep(older_than_hours)
 
-    def gc(self, current: Mapping[str, int] | None = None, *, older_than_hours: float = 24.0) -> list[str]:
+    def gc(
+        self,
+        current: Mapping[str, int] | None = None,
+        *,
+        older_than_hours: float = 24.0,
+        dry_run: bool = False,
+    ) -> list[str]:
         """Garbage collection: `sweep`, files of failures, damaged artefacts, and those of outdated versions.
 
         Args:
             current: version of each stage; artefacts of other versions are removed. None keeps all.
             older_than_hours: as in `sweep`.
+            dry_run: remove nothing.
 
         Returns:
-            Names of what was removed.
+            Names of what was removed, or would be.
         """
-        removed = self.sweep(older_than_hours=older_than_hours)
+        removed = self.backend.sweep(older_than_hours, dry_run=dry_run)
         failures = self.state / "failed"
         if failures.is_dir():
             removed += [f"failed/{entry.name}" for entry in sorted(failures.iterdir())]
-            shutil.rmtree(failures)
-        removed += self.backend.remove_damaged()
+            if not dry_run:
+                shutil.rmtree(failures)
+        removed += self.backend.remove_damaged(dry_run=dry_run)
         for manifest in self.ls() if current is not None else []:
             wanted = current.get(manifest.stage) if current is not None else None
-            if wanted is not None and wanted != manifest.version and self.backend.discard(manifest.key):
+            outdated = wanted is not None and wanted != manifest.version
+            if outdated and (dry_run or self.backend.discard(manifest.key)):
                 removed.append(f"artefacts/{manifest.key}")
         return removed
 

@@ -7,8 +7,8 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +50,10 @@ class DirectoryBackend:
         self.artefacts = root / "artefacts"
         self.scratch = root / "scratch"
         self.state = root
+
+    def exists(self) -> bool:
+        """Whether the root is a directory."""
+        return self.root.is_dir()
 
     def check_writable(self) -> None:
         """Make the directories and try one write and one rename.
@@ -106,6 +110,19 @@ class DirectoryBackend:
         """The artefact's files on the local disk."""
         return self.artefacts / manifest.key
 
+    def touch(self, key: str) -> None:
+        """Note that an artefact is used now: the time of its directory."""
+        with suppress(OSError):  # A store may be read by who cannot write it.
+            os.utime(self.artefacts / key)
+
+    def last_used(self, keys: Iterable[str]) -> dict[str, float]:
+        """When artefacts were used last, in seconds since 1970; without those that are gone."""
+        found = {}
+        for key in keys:
+            with suppress(FileNotFoundError):
+                found[key] = (self.artefacts / key).stat().st_mtime
+        return found
+
     def drop_copy(self, manifest: Manifest) -> bool:
         """There are no copies; what is read is the artefact itself."""
         return False
@@ -139,11 +156,12 @@ class DirectoryBackend:
             return None
         return str(place)
 
-    def remove_damaged(self) -> list[str]:
+    def remove_damaged(self, *, dry_run: bool = False) -> list[str]:
         """Remove what was set aside; returns the names."""
         place = self.root / DAMAGED
         names = [f"{DAMAGED}/{name}" for name in sorted(os.listdir(place))] if place.is_dir() else []
-        shutil.rmtree(place, ignore_errors=True)
+        if not dry_run:
+            shutil.rmtree(place, ignore_errors=True)
         return names
 
     def write_record(self, name: str, text: bytes) -> None:
@@ -164,6 +182,10 @@ class DirectoryBackend:
             except FileNotFoundError:
                 continue  # Removed meanwhile.
         return found
+
+    def remove_record(self, name: str) -> None:
+        """Remove `records/<name>`, if it is there."""
+        (self.root / RECORDS / name).unlink(missing_ok=True)
 
     def _put(self, target: Path, text: bytes) -> None:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -209,11 +231,11 @@ class DirectoryBackend:
         shutil.rmtree(aside, ignore_errors=True)
         return True
 
-    def sweep(self, older_than_hours: float) -> list[str]:
+    def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
         """Remove scratch directories of killed processes, and artefact directories without a manifest."""
-        removed = sweep_directories(self.scratch)
+        removed = sweep_directories(self.scratch, dry_run=dry_run)
         for key in self.names():
-            if not (self.artefacts / key / MANIFEST).exists() and self.discard(key):
+            if not (self.artefacts / key / MANIFEST).exists() and (dry_run or self.discard(key)):
                 removed.append(f"artefacts/{key}")
         return removed
 
@@ -276,7 +298,7 @@ def held_directories(parent: Path) -> list[Path]:
     return held
 
 
-def sweep_directories(parent: Path) -> list[str]:
+def sweep_directories(parent: Path, *, dry_run: bool = False) -> list[str]:
     """Remove the directories below `parent` that no process has locked; returns their names."""
     removed = []
     try:
@@ -293,7 +315,8 @@ def sweep_directories(parent: Path) -> list[str]:
         except BlockingIOError:
             pass
         else:
-            shutil.rmtree(parent / name, ignore_errors=True)
+            if not dry_run:
+                shutil.rmtree(parent / name, ignore_errors=True)
             removed.append(f"{parent.name}/{name}")
         finally:
             os.close(lock)

@@ -1,8 +1,8 @@
 """Whether the files of an artefact are still those that were stored.
 
-`checksums.json`, beside the manifest, holds size and digest of every file. It needs no checksum of its own:
-the artefact's digest is computed from it. Number and size of files are compared on every access, contents
-once per process and artefact (`Depth`).
+The manifest holds size and digest of every file, in earlier artefacts `checksums.json` beside it. Neither
+list needs a checksum of its own: the artefact's digest is computed from it. Number and size of files are
+compared on every access, contents once per process and artefact (`Depth`).
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import errno
 import hashlib
 import json
 import os
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,11 +31,13 @@ __all__ = [
     "find_damage",
     "find_damaged_sizes",
     "intact_manifest",
-    "write_checksums",
+    "list_contents",
 ]
 
 CHECKSUMS = "checksums.json"
-"""Sizes and digests of an artefact's files, by relative name."""
+"""In earlier artefacts: sizes and digests of the files, by relative name."""
+PACKED_ARRAYS = ".zarr.zip"
+"""Ending of files that hold arrays: chunks, which have checksums of their own, and then the metadata."""
 NOT_CONTENT = frozenset({MANIFEST, CHECKSUMS})
 """Files at the top of an artefact that its digest does not cover."""
 READ_BYTES = 1 << 20
@@ -45,6 +48,9 @@ VERIFY_VARIABLE = "EXTRAGS_VERIFY"
 Depth = Literal["sizes", "metadata", "all"]
 """What is compared: number and size of files; also the contents of all files except chunks of arrays, whose
 own checksums are compared when they are read; the contents of all files."""
+
+Contents = dict[str, tuple[int, str] | tuple[int, str, int, str]]
+"""See `Manifest.contents`."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,10 @@ class Damage:
 class _File(NamedTuple):
     size: int
     digest: str
+    metadata_at: int = 0
+    """Of packed arrays: the byte where metadata begins, after the last chunk; else 0."""
+    metadata: str = ""
+    """Digest from there."""
 
 
 def default_depth() -> Depth:
@@ -83,11 +93,17 @@ def content_digest(directory: Path) -> tuple[str, int, int]:
     return _summary({name: _read(directory / name) for name in _sizes(directory)})
 
 
-def write_checksums(directory: Path) -> tuple[str, int, int]:
-    """Write `checksums.json`; returns what `content_digest` does."""
+def list_contents(directory: Path) -> tuple[Contents, str, int, int]:
+    """The files of an artefact for its manifest, and what `content_digest` returns."""
     files = {name: _read(directory / name) for name in sorted(_sizes(directory))}
-    (directory / CHECKSUMS).write_text(json.dumps(files), encoding="utf-8")
-    return _summary(files)
+    contents: Contents = {}
+    for name, file in files.items():
+        begin = _metadata_at(directory / name) if name.endswith(PACKED_ARRAYS) else 0
+        if begin:
+            contents[name] = (file.size, file.digest, begin, _read(directory / name, begin).digest)
+        else:
+            contents[name] = (file.size, file.digest)
+    return contents, *_summary(files)
 
 
 def find_damage(directory: Path, manifest: Manifest, depth: Depth) -> Damage | None:
@@ -124,7 +140,10 @@ def find_damage(directory: Path, manifest: Manifest, depth: Depth) -> Damage | N
     for name, file in listed.items():
         if depth == "all" or (depth == "metadata" and not _is_chunk(name)):
             try:
-                changed = _read(directory / name).digest != file.digest
+                if depth == "metadata" and file.metadata_at:
+                    changed = _read(directory / name, file.metadata_at).digest != file.metadata
+                else:
+                    changed = _read(directory / name).digest != file.digest
             except OSError as error:
                 if error.errno not in (errno.EIO, errno.ENOENT):
                     raise
@@ -179,7 +198,12 @@ def _as_counted(sizes: Mapping[str, int], manifest: Manifest) -> bool:
 
 
 def _checksums(directory: Path, manifest: Manifest) -> dict[str, _File] | Damage | None:
-    """What `checksums.json` holds; None without one, damage where it is not that of the manifest."""
+    """The files of an artefact; None where they were not listed, damage where the list is not its own."""
+    if manifest.contents:
+        files = {name: _File(*entry) for name, entry in manifest.contents.items()}
+        if _summary(files) != (manifest.digest, manifest.files, manifest.bytes):
+            return Damage("its list of files is not this artefact's", MANIFEST)
+        return files
     try:
         read = json.loads((directory / CHECKSUMS).read_bytes())
         files = {name: _File(int(size), str(digest)) for name, (size, digest) in read.items()}
@@ -224,10 +248,23 @@ def _sizes(directory: Path) -> dict[str, int]:
     return found
 
 
-def _read(path: Path) -> _File:
+def _metadata_at(path: Path) -> int:
+    """Where the metadata of packed arrays begins; 0 in a file that is none of ours."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            members = [(item.header_offset, item.filename.endswith("zarr.json")) for item in file.infolist()]
+    except zipfile.BadZipFile:
+        return 0
+    begin = min((at for at, is_metadata in members if is_metadata), default=0)
+    return begin if all(is_metadata or at < begin for at, is_metadata in members) else 0
+
+
+def _read(path: Path, begin: int = 0) -> _File:
+    """Size and digest of a file, from a byte on."""
     one = hashlib.blake2b(digest_size=DIGEST_BYTES)
     size = 0
     with path.open("rb") as stream:
+        stream.seek(begin)
         while block := stream.read(READ_BYTES):
             one.update(block)
             size += len(block)

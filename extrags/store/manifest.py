@@ -48,6 +48,9 @@ class Manifest(BaseModel):
     """Summary of the content: numbers of frames, Gaussians, ..."""
     files: int = 0
     bytes: int = 0
+    contents: dict[str, tuple[int, str] | tuple[int, str, int, str]] = Field(default_factory=dict)
+    """Size and digest of each file by relative name; of packed arrays also where their metadata begins, and
+    its digest. Earlier artefacts have a file `checksums.json` instead, the first ones nothing."""
     data: str = ""
     """On object stores: the prefix, below the artefact's own, that holds the files of this attempt."""
     checksum: str = ""

@@ -17,7 +17,7 @@ from extrags.errors import StoreError
 from extrags.store.artefacts import Store
 from extrags.store.directory import ABOUT, held_directories
 
-__all__ = ["in_work", "read_records", "write_record"]
+__all__ = ["in_work", "read_records", "remove_record", "write_record"]
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +67,18 @@ def read_records(store: Store, prefix: str = "") -> dict[str, dict[str, Any]]:
         except (TypeError, ValueError) as error:
             log.warning("the record %s of %s is damaged and passed over: %s", name, store.root, error)
     return found
+
+
+def remove_record(store: Store, name: str) -> None:
+    """Remove a record, if it is there.
+
+    Raises:
+        StoreError: when it cannot be removed.
+    """
+    try:
+        store.backend.remove_record(name + _SUFFIX)
+    except OSError as error:
+        raise StoreError(f"the record {name} cannot be removed from {store.root}: {error}") from error
 
 
 def in_work(store: Store) -> list[dict[str, str]]:

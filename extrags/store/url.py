@@ -1,7 +1,7 @@
 """Storage behind an fsspec URL (S3-compatible object stores and others), which has no atomic rename.
 
 The files of each attempt go below a prefix of their own, `<key>/<attempt>/`; `<key>/manifest.json`,
-written last with a single put, names the attempt. Before that nothing is visible, and two writers of
+written last with one put, names the attempt. Before that nothing is visible, and two writers of
 one key can never mix their files.
 """
 
@@ -10,10 +10,11 @@ from __future__ import annotations
 import datetime
 import json
 import os
+import re
 import secrets
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +36,29 @@ def default_cache_directory() -> Path:
     return cache_directory()
 
 
+def _refuse_secrets(url: str) -> None:
+    """A URL is in messages, logs, references and Prefect's parameters.
+
+    Raises:
+        StoreError: for one with a password or a key in it, which the message does not repeat.
+    """
+    scheme, _, rest = url.partition("://")
+    before = rest.partition("/")[0]
+    if (":" in before.rpartition("@")[0]) or re.search(r"[?&][^=&/]*(key|secret|token|sig|pass)", rest, re.I):
+        raise StoreError(
+            f"the URL of this store ({scheme}://...) holds credentials, which would be in logs; "
+            "give them by the environment, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
+            "FSSPEC_<PROTOCOL>_<NAME>, or by a file in ~/.config/fsspec"
+        )
+
+
 class UrlBackend:
     """A store on an object store, read through a local directory."""
 
     def __init__(self, url: str, cache: Path | None) -> None:
         import fsspec
 
+        _refuse_secrets(url)
         try:
             self.fs, self.prefix = fsspec.core.url_to_fs(url)
         except ImportError as error:
@@ -54,6 +72,19 @@ class UrlBackend:
         self.state = base / f"store-{digest_of(self.url)[:12]}"
         self.scratch = self.state / "scratch"
         self.local = self.state / "artefacts"
+
+    def exists(self) -> bool:
+        """Whether there is any object below the URL.
+
+        Raises:
+            StoreError: when the server says neither yes nor no.
+        """
+        try:
+            self.fs.invalidate_cache()
+            return bool(self.fs.exists(self.prefix))
+        except Exception as error:
+            # Each fsspec backend raises its own kinds.
+            raise StoreError(f"the store {self.url} cannot be read: {error}") from error
 
     def check_writable(self) -> None:
         """Try one write to the local cache and one to the remote store.
@@ -91,7 +122,8 @@ class UrlBackend:
                 key=key,
                 store=self.url,
             ) from error
-        except OSError as error:
+        except Exception as error:
+            # Each fsspec backend raises its own kinds (botocore's are not OSErrors).
             raise StoreError(f"{self.url}/{key}/{MANIFEST} cannot be read: {error}") from error
 
     def uri(self, key: str) -> str:
@@ -132,6 +164,13 @@ class UrlBackend:
                 if not target.is_dir():  # Otherwise another process fetched it meanwhile.
                     raise
         return target
+
+    def touch(self, key: str) -> None:
+        """Nothing: an object's time cannot be changed without writing it again."""
+
+    def last_used(self, keys: Iterable[str]) -> dict[str, float]:
+        """Not known; what counts is when they were made."""
+        return {}
 
     def drop_copy(self, manifest: Manifest) -> bool:
         """Remove the local copy of an artefact, to be downloaded again; whether there was one."""
@@ -180,11 +219,11 @@ class UrlBackend:
             self.fs.mv(str(name), f"{place}/artefact/{relative}")
         return f"{self.url}/{DAMAGED}/{place.rsplit('/', 1)[-1]}"
 
-    def remove_damaged(self) -> list[str]:
+    def remove_damaged(self, *, dry_run: bool = False) -> list[str]:
         """Remove what was set aside; returns the names."""
         place = f"{self.prefix}/{DAMAGED}"
         names = sorted(name for name, _ in self._children(place))
-        if names:
+        if names and not dry_run:
             self.fs.rm(place, recursive=True)
         return [f"{DAMAGED}/{name}" for name in names]
 
@@ -202,7 +241,9 @@ class UrlBackend:
             for name in self.fs.find(source):
                 relative = str(name).removeprefix(source).lstrip("/")
                 (scratch / relative).parent.mkdir(parents=True, exist_ok=True)
-                self.fs.get_file(name, str(scratch / relative))
+                # What goes away meanwhile is missing then, and said to be.
+                with suppress(FileNotFoundError):
+                    self.fs.get_file(name, str(scratch / relative))
             yield scratch
 
     def write_record(self, name: str, text: bytes) -> None:
@@ -218,6 +259,11 @@ class UrlBackend:
         # All at once: on an object store each costs a round trip.
         found = self.fs.cat([f"{place}/{name}" for name in names], on_error="omit")
         return {str(path).rsplit("/", 1)[-1]: text for path, text in found.items()}
+
+    def remove_record(self, name: str) -> None:
+        """Remove `records/<name>`, if it is there."""
+        with suppress(FileNotFoundError):
+            self.fs.rm_file(f"{self.prefix}/{RECORDS}/{name}")
 
     def commit(self, scratch: Path, manifest: Manifest, *, renew: bool = False) -> Manifest:
         """Upload the files, then the manifest.
@@ -237,28 +283,41 @@ class UrlBackend:
             for path in sorted(scratch.rglob("*")):
                 if path.is_file():
                     name = path.relative_to(scratch).as_posix()
-                    self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{attempt}/{name}", path.read_bytes())
+                    # In parts where it is large; not through the memory.
+                    self.fs.put_file(str(path), f"{self.prefix}/{manifest.key}/{attempt}/{name}")
             self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest_text(manifest))
-        except OSError as error:
+        except Exception as error:
+            # As above.
             raise StoreError(f"the store {self.url} cannot be written: {error}") from error
         return manifest
 
     def discard(self, key: str) -> bool:
-        """Remove an artefact; its manifest is deleted first, so that it disappears atomically."""
-        found = self.fs.exists(f"{self.prefix}/{key}")
-        if found:
-            if self.fs.exists(f"{self.prefix}/{key}/{MANIFEST}"):
-                self.fs.rm_file(f"{self.prefix}/{key}/{MANIFEST}")
-            if self.fs.exists(f"{self.prefix}/{key}"):
-                self.fs.rm(f"{self.prefix}/{key}", recursive=True)
-        return bool(found)
+        """Remove an artefact: its manifest first, so that it disappears atomically, then the files it names.
 
-    def sweep(self, older_than_hours: float) -> list[str]:
+        Files of other attempts stay, because another process may be uploading them; `sweep` removes them.
+        """
+        place = f"{self.prefix}/{key}"
+        try:
+            manifest = self.read_manifest(key)
+        except DamagedArtefactError:
+            attempts = [name for name, kind in self._children(place) if kind == "directory"]
+        else:
+            if manifest is None:
+                return False
+            attempts = [manifest.data]
+        with suppress(FileNotFoundError):
+            self.fs.rm_file(f"{place}/{MANIFEST}")
+        for attempt in attempts:
+            with suppress(FileNotFoundError):
+                self.fs.rm(f"{place}/{attempt}", recursive=True)
+        return True
+
+    def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
         """Remove local leftovers, and remote attempts without a manifest older than `older_than_hours`.
 
         Only the age of remote files is known, not whether their writer is still running.
         """
-        removed = sweep_directories(self.scratch)
+        removed = sweep_directories(self.scratch, dry_run=dry_run)
         limit = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=older_than_hours)
         for key in self.names():
             try:
@@ -270,7 +329,8 @@ class UrlBackend:
                     continue
                 place = f"{self.prefix}/{key}/{attempt}"
                 if all(self._modified(name) <= limit for name in self.fs.find(place)):
-                    self.fs.rm(place, recursive=True)
+                    if not dry_run:
+                        self.fs.rm(place, recursive=True)
                     removed.append(f"{key}/{attempt}")
         return removed
 

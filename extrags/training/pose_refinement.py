@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import zarr
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -25,7 +24,7 @@ from extrags.errors import ShapeError
 from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
 from extrags.training.starting import median_depth
-from extrags.zarr_io import open_group, read_array, write_array
+from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["PoseRefinement", "RefinedPoses", "with_refined_poses"]
 
@@ -56,14 +55,14 @@ class RefinedPoses(Storable):
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group."""
-        group = open_group(path, mode="w")
-        write_array(group, "world_from_camera", self.world_from_camera)
-        group.attrs.update({"mean_shift": self.mean_shift, "mean_turn_deg": self.mean_turn_deg})
+        with new_group(path) as group:
+            write_array(group, "world_from_camera", self.world_from_camera)
+            group.attrs.update({"mean_shift": self.mean_shift, "mean_turn_deg": self.mean_turn_deg})
 
     @classmethod
     def load(cls, path: Path) -> RefinedPoses:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         attributes: dict[str, Any] = dict(group.attrs)
         return cls(read_array(group, "world_from_camera"), **attributes)
 

@@ -1,13 +1,13 @@
-"""`cache ls`, `cache verify`, `cache rm`, `cache gc`."""
+"""`cache ls`, `cache usage`, `cache verify`, `cache rm`, `cache gc`."""
 
 from __future__ import annotations
 
 import argparse
+import re
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from extrags.errors import DamagedArtefactError, StoreError
+from extrags.errors import ConfigError, DamagedArtefactError, StoreError
 from flows.commands.common import store_root, write_json
 from flows.commands.options import Parser, add_json, add_store, add_verb
 from flows.commands.status import size_text
@@ -15,16 +15,22 @@ from flows.commands.status import size_text
 if TYPE_CHECKING:
     from extrags.store import Store
 
-__all__ = ["add_arguments", "gc", "ls", "rm", "verify"]
+__all__ = ["add_arguments", "age_s", "gc", "ls", "rm", "size_bytes", "usage", "verify"]
+
+SECONDS = {"h": 3600.0, "d": 86400.0, "w": 7 * 86400.0}
+BYTES = {"": 1, "KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40}
 
 
 def add_arguments(parser: Parser) -> None:
     """The verbs below `extrags cache`."""
     parser.description = "Look into the artefact store and clean it."
-    verbs = parser.add_subparsers(metavar="ls|verify|rm|gc", required=True, parser_class=Parser)
+    verbs = parser.add_subparsers(metavar="ls|usage|verify|rm|gc", required=True, parser_class=Parser)
     made = add_verb(verbs, "ls", ls, "list artefacts")
     made.add_argument("pattern", nargs="?", default="*", help="shell pattern over key, stage or sequence")
     made.add_argument("--verify", action="store_true", help="read every file and compare digests")
+    add_store(made)
+    add_json(made)
+    made = add_verb(verbs, "usage", usage, "what each sequence uses, and when it was used last")
     add_store(made)
     add_json(made)
     made = add_verb(
@@ -49,21 +55,41 @@ def add_arguments(parser: Parser) -> None:
         verbs,
         "gc",
         gc,
-        "remove what can never be used again",
+        "remove what can never be used again, and what the options say",
         description="Remove what killed runs left, debugging files of failures, damaged artefacts that were "
-        "set aside, and artefacts of former versions of their stage.",
+        "set aside, and artefacts of former versions of their stage. Each option removes more; never what a "
+        "run that is going on uses, what was used within the last ten minutes, or what a kept artefact was "
+        "made from.",
     )
+    made.add_argument("--older-than", metavar="AGE", help="not used for so long: 12h, 30d, 8w")
+    made.add_argument(
+        "--max-size", metavar="SIZE", help="least recently used, until no more is left: 500MiB, 50GiB, 1TiB"
+    )
+    made.add_argument(
+        "--keep-last", metavar="N", type=int, help="of each sequence, what its last N runs did not use"
+    )
+    made.add_argument("--unreachable", action="store_true", help="what no kept run used")
+    made.add_argument(
+        "--with-inputs",
+        action="store_true",
+        help="also what kept artefacts were made from, except by max-size",
+    )
+    made.add_argument("--dry-run", action="store_true", help="remove nothing, say what would be removed")
     add_store(made)
+    add_json(made)
 
 
 def ls(given: argparse.Namespace) -> int:
-    """`extrags cache ls`; with `--verify`, exit code 1 when an artefact is damaged."""
+    """`extrags cache ls`; with `--verify`, exit code 1 when an artefact is damaged.
+
+    Raises:
+        StoreError: when there is no such store.
+    """
     from rich.table import Table
 
-    from extrags.store import Store
     from flows.terminal import console
 
-    store = Store(store_root(given))
+    store = _existing_store(given)
     manifests = store.ls(given.pattern)
     damaged = [item.key for item in manifests if given.verify and store.examine(item.key)]
     if given.json != "-":
@@ -82,7 +108,10 @@ def ls(given: argparse.Namespace) -> int:
         out.print(table)
         total = size_text(sum(item.bytes for item in manifests))
         out.print(f"{len(manifests)} artefacts, {total}, in {store.root}")
-    rows = [item.model_dump(mode="json") | {"damaged": item.key in damaged} for item in manifests]
+    rows = [
+        item.model_dump(mode="json", exclude={"contents"}) | {"damaged": item.key in damaged}
+        for item in manifests
+    ]
     write_json(rows, given.json)
     return 1 if damaged else 0
 
@@ -96,12 +125,9 @@ def verify(given: argparse.Namespace) -> int:
     from rich.markup import escape
     from rich.table import Table
 
-    from extrags.store import Store
     from flows.terminal import console
 
-    store = Store(store_root(given))
-    if "://" not in store.root and not Path(store.root).is_dir():
-        raise StoreError(f"there is no store {store.root}")
+    store = _existing_store(given)
     checked, damaged = _examined(store)
     aside = [store.set_aside(damage) if given.repair else None for damage in damaged]
     if given.json != "-":
@@ -150,10 +176,12 @@ def _examined(store: Store) -> tuple[int, list[DamagedArtefactError]]:
 
 
 def rm(given: argparse.Namespace) -> int:
-    """`extrags cache rm`."""
-    from extrags.store import Store
+    """`extrags cache rm`.
 
-    store = Store(store_root(given))
+    Raises:
+        StoreError: when there is no such store.
+    """
+    store = _existing_store(given)
     removed = [key for pattern in given.patterns for key in store.rm(pattern)]
     for key in removed:
         print(key)
@@ -161,16 +189,113 @@ def rm(given: argparse.Namespace) -> int:
     return 0
 
 
+def usage(given: argparse.Namespace) -> int:
+    """`extrags cache usage`.
+
+    Raises:
+        StoreError: when there is no such store.
+    """
+    from dataclasses import asdict
+
+    from rich.table import Table
+
+    from extrags.store.retention import usage as usage_of
+    from flows.terminal import console
+
+    store = _existing_store(given)
+    rows = usage_of(store)
+    if given.json != "-":
+        table = Table(box=None, pad_edge=False, header_style="bold")
+        table.add_column("sequence", no_wrap=True)
+        for column in ("artefacts", "files", "size"):
+            table.add_column(column, justify="right", no_wrap=True)
+        for column in ("last made", "last used"):
+            table.add_column(column, no_wrap=True)
+        for row in rows:
+            numbers = (str(row.artefacts), str(row.files), size_text(row.bytes))
+            table.add_row(row.sequence, *numbers, row.made[:16], row.used[:16])
+        out = console()
+        out.print(table)
+        total = f"{sum(row.artefacts for row in rows)} artefacts, {sum(row.files for row in rows)} files"
+        out.print(f"{total}, {size_text(sum(row.bytes for row in rows))}, in {store.root}")
+    write_json([asdict(row) for row in rows], given.json)
+    return 0
+
+
 def gc(given: argparse.Namespace) -> int:
-    """`extrags cache gc`."""
+    """`extrags cache gc`.
+
+    Raises:
+        ConfigError: for an age or a size that is none.
+        StoreError: when there is no such store.
+    """
+    from dataclasses import asdict
+
+    from extrags.store.retention import Policy, apply_policy, planned_removals
+
+    policy = Policy(
+        older_than_s=None if given.older_than is None else age_s(given.older_than),
+        max_bytes=None if given.max_size is None else size_bytes(given.max_size),
+        keep_last=given.keep_last,
+        unreachable=given.unreachable,
+        with_inputs=given.with_inputs,
+    )
+    if policy.keep_last is not None and policy.keep_last < 1:
+        raise ConfigError(f"--keep-last {policy.keep_last}: expected 1 or more")
+    store = _existing_store(given)
     import flows.wiring  # noqa: F401  (registers every stage with its version)
-    from extrags.store import Store
     from tasks.locks import sweep_locks
     from tasks.stage import stage_versions
 
-    store = Store(store_root(given))
-    removed = [*store.gc(stage_versions()), *sweep_locks(store.locks)]
-    for name in removed:
-        print(name)
-    print(f"{len(removed)} leftovers removed from {store.root}")
+    leftovers = store.gc(stage_versions(), dry_run=given.dry_run)
+    if not given.dry_run:
+        leftovers += sweep_locks(store.locks)
+    removed = []
+    if not policy.is_empty:
+        removed = planned_removals(store, policy)[0] if given.dry_run else apply_policy(store, policy)
+    if given.json != "-":
+        for name in leftovers:
+            print(name)
+        for item in removed:
+            print(f"artefacts/{item.key}  {item.sequence}  {size_text(item.bytes)}  {item.reason}")
+        would = "would be " if given.dry_run else ""
+        print(f"{len(leftovers)} leftovers {would}removed from {store.root}")
+        if not policy.is_empty:
+            freed = size_text(sum(item.bytes for item in removed))
+            print(f"{len(removed)} artefacts of {freed} {would}removed")
+    rows = [asdict(item) for item in removed]
+    write_json({"dry_run": given.dry_run, "leftovers": leftovers, "artefacts": rows}, given.json)
     return 0
+
+
+def age_s(text: str) -> float:
+    """`12h`, `30d` or `8w` in seconds.
+
+    Raises:
+        ConfigError: for anything else.
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d+)?)([hdw])", text)
+    if found is None:
+        raise ConfigError(f"{text!r} is no age; expected a number with h, d or w, such as 30d")
+    return float(found[1]) * SECONDS[found[2]]
+
+
+def size_bytes(text: str) -> int:
+    """`500MiB` or `50GiB` in bytes.
+
+    Raises:
+        ConfigError: for anything else.
+    """
+    found = re.fullmatch(r"(\d+(?:\.\d+)?) ?([KMGT]iB|)", text)
+    if found is None:
+        raise ConfigError(f"{text!r} is no size; expected a number with KiB, MiB, GiB or TiB, such as 50GiB")
+    return int(float(found[1]) * BYTES[found[2]])
+
+
+def _existing_store(given: argparse.Namespace) -> Store:
+    from extrags.store import Store
+
+    store = Store(store_root(given))
+    if not store.exists():
+        raise StoreError(f"there is no store {store.root}")
+    return store

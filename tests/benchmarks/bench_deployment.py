@@ -46,7 +46,9 @@ def resident_mib(process: int) -> float:
         status = Path(f"/proc/{process}/status").read_text()
     except FileNotFoundError:
         return 0.0
-    return next((int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS")), 0.0)
+    return next(
+        (int(line.split()[1]) / 1024 for line in status.splitlines() if line.startswith("VmRSS")), 0.0
+    )
 
 
 def descendants(process: int) -> list[int]:
@@ -149,7 +151,9 @@ def run(folder: Path, sequences: Sequence[str], workers: int, cores: Sequence[in
     site = Site(folder, workers, cores)
     with site.stack:
         port = site.address.rpartition(":")[2].partition("/")[0]
-        server = site.start("server", "start", "--host", "127.0.0.1", "--port", port, "--no-ui", log="server.log")
+        server = site.start(
+            "server", "start", "--host", "127.0.0.1", "--port", port, "--no-ui", log="server.log"
+        )
         wait_for(site.ready, "the server to answer")
         site.prefect("work-pool", "create", "local", "--type", "process")
         site.prefect("--no-prompt", "deploy", "--all")
@@ -241,7 +245,9 @@ def run(folder: Path, sequences: Sequence[str], workers: int, cores: Sequence[in
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--sequences", type=int, default=24)

@@ -82,8 +82,8 @@ SHEET_ROWS = 8
 
 
 def loaded(name: str, config: PipelineConfig) -> EndoscopicSequence:
-    """A sequence by name, or from a folder that `EndoscopicSequence.save` wrote."""
-    if (Path(name) / "zarr.json").exists():
+    """A sequence by name, or from what `EndoscopicSequence.save` wrote."""
+    if group_exists(Path(name)):
         return EndoscopicSequence.load(Path(name))
     return read(resolve(name), config.ingest)
 

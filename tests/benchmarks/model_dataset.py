@@ -168,7 +168,10 @@ def model(manifests: Sequence[Manifest], overhead_s: float) -> dict[str, Any]:
         rows.append(
             {
                 "workers": workers,
-                **{way: {"hours": end / 3600, "efficiency": total / (workers * end)} for way, end in ends.items()},
+                **{
+                    way: {"hours": end / 3600, "efficiency": total / (workers * end)}
+                    for way, end in ends.items()
+                },
             }
         )
     last = max(alone, key=lambda name: alone[name])
@@ -214,9 +217,13 @@ def as_text(found: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("store", help="with finished runs, of several numbers of frames")
-    parser.add_argument("--overhead", type=float, default=0.0, metavar="S", help="of each sequence, in seconds")
+    parser.add_argument(
+        "--overhead", type=float, default=0.0, metavar="S", help="of each sequence, in seconds"
+    )
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
     found = model(Store(given.store).ls(), given.overhead)

@@ -10,7 +10,7 @@ from extrags.cameras import Cameras, look_at, pixel_rays
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.surface import Mesh, fuse_depth, fuse_surface, rendered_depth
-from extrags.zarr_io import open_group, read_array, write_array
+from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 from .exploration.tube import centre_line, small_mesh, small_tube
 
@@ -78,9 +78,10 @@ class TestFuseDepth:
 
     def test_arrays_from_zarr_work(self, tmp_path):
         cameras, depth = sphere_views(2, 32)
-        group = open_group(tmp_path, mode="w")
-        for name, array in (("K", cameras.K), ("poses", cameras.world_from_camera), ("depth", depth)):
-            write_array(group, name, array)
+        with new_group(tmp_path / "views") as group:
+            for name, array in (("K", cameras.K), ("poses", cameras.world_from_camera), ("depth", depth)):
+                write_array(group, name, array)
+        group = open_group(tmp_path / "views")
         loaded = Cameras(read_array(group, "K"), read_array(group, "poses"), 32, 32)
         mesh = fuse_depth(loaded, read_array(group, "depth"), SurfaceConfig())
         assert mesh.vertices.tobytes() == fuse_depth(cameras, depth, SurfaceConfig()).vertices.tobytes()

@@ -12,6 +12,7 @@ import random
 import shutil
 import sys
 import tempfile
+import zipfile
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +23,7 @@ import zarr
 from safetensors.numpy import load_file
 
 from extrags.store import MANIFEST, Store
-from extrags.zarr_io import open_group, read_array
+from extrags.zarr_io import PACKED, open_group, read_array
 
 End = Literal["named", "raised", "absent", "other", "harmless"]
 """An error that names artefact and file; any other error; nothing in the store; other data; the same data."""
@@ -50,8 +51,19 @@ def files_of(store: Path) -> list[Path]:
 
 
 def chunks_of(store: Path) -> list[Path]:
-    """All chunks of all arrays, relative to the store."""
-    return [file for file in files_of(store) if "/c/" in file.as_posix() or file.name == "c"]
+    """All files with chunks of arrays, relative to the store."""
+    return [file for file in files_of(store) if file.name.endswith(PACKED)]
+
+
+def lose_a_chunk(file: Path, chance: random.Random) -> None:
+    """One member of packed arrays is gone, and the zip file is whole."""
+    with zipfile.ZipFile(file) as whole:
+        members = [(item, whole.read(item)) for item in whole.infolist()]
+    lost = chance.choice([item.filename for item, _ in members if "/c" in item.filename])
+    with zipfile.ZipFile(file, "w") as less:
+        for item, content in members:
+            if item.filename != lost:
+                less.writestr(item, content)
 
 
 def served(store: Store, key: str) -> Any:
@@ -63,14 +75,10 @@ def served(store: Store, key: str) -> Any:
     found: dict[str, Any] = {MANIFEST: store.manifest(ref).model_dump(exclude={"checksum"})}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()
-        if path.name == "zarr.json":
-            node = json.loads(path.read_bytes())["node_type"]
-            group = open_group(path.parent if node == "group" else path.parent.parent, mode="r")
-            found[name] = dict(group.attrs)
-            if node == "array":
-                array = group[path.parent.name]
-                found[name] = (read_array(group, path.parent.name), array.dtype, dict(array.attrs))
-        elif name in (MANIFEST, "checksums.json") or not path.is_file() or _in_array(path):
+        if path.name.endswith(PACKED):
+            group = open_group(path.with_name(path.name.removesuffix(PACKED)))
+            found[name] = _arrays(group)
+        elif name in (MANIFEST,) or not path.is_file():
             continue
         elif path.suffix == ".json":
             found[name] = json.loads(path.read_bytes())
@@ -81,8 +89,15 @@ def served(store: Store, key: str) -> Any:
     return found
 
 
-def _in_array(path: Path) -> bool:
-    return "c" in path.parts
+def _arrays(group: zarr.Group) -> dict[str, Any]:
+    """Attributes and arrays of a group and of those inside it."""
+    found: dict[str, Any] = {"": dict(group.attrs)}
+    for name, member in group.members():
+        if isinstance(member, zarr.Group):
+            found[name] = _arrays(member)
+        else:
+            found[name] = (read_array(group, name), member.dtype, dict(member.attrs))
+    return found
 
 
 def same(first: Any, second: Any) -> bool:
@@ -127,8 +142,8 @@ def trials(store: Path, count: int, seed: int, **how: Any) -> dict[str, Counter[
     zarr.config.set({"async.concurrency": 1})
     kinds: dict[str, tuple[list[Path], list[Callable[[Path, random.Random], None]]]] = {
         "flipped bit in any file": (files_of(store), [flip_bit]),
-        "flipped bit in a chunk": (chunks_of(store), [flip_bit]),
-        "chunk deleted or truncated": (chunks_of(store), [delete, truncate]),
+        "flipped bit in packed arrays": (chunks_of(store), [flip_bit]),
+        "chunks deleted or truncated": (chunks_of(store), [delete, truncate, lose_a_chunk]),
     }
     return {
         name: Counter(

@@ -139,7 +139,9 @@ class Server:
         """Flow runs that it takes for running."""
         body = json.dumps({"flow_runs": {"state": {"type": {"any_": ["RUNNING", "PENDING", "CANCELLING"]}}}})
         request = urllib.request.Request(
-            f"http://127.0.0.1:{self._port}/api/flow_runs/count", body.encode(), {"Content-Type": "application/json"}
+            f"http://127.0.0.1:{self._port}/api/flow_runs/count",
+            body.encode(),
+            {"Content-Type": "application/json"},
         )
         with urllib.request.urlopen(request, timeout=30) as answer:
             return int(json.load(answer))
@@ -155,7 +157,10 @@ def dask_workers(count: int, log: Path) -> Iterator[str]:
             ["worker", address, "--nworkers", str(count), "--nthreads", "1", "--no-dashboard"],
         ):
             process = subprocess.Popen(
-                [sys.executable, "-m", "dask", *arguments], stdout=stream, stderr=stream, start_new_session=True
+                [sys.executable, "-m", "dask", *arguments],
+                stdout=stream,
+                stderr=stream,
+                start_new_session=True,
             )
             stack.callback(os.killpg, process.pid, signal.SIGKILL)
         yield address
@@ -231,7 +236,9 @@ class Trials:
         root = self.folder / "store"
         left = [
             str(path.relative_to(root))
-            for path in itertools.chain(*(root.glob(f"{name}/*") for name in ("scratch", "damaged", "failed")))
+            for path in itertools.chain(
+                *(root.glob(f"{name}/*") for name in ("scratch", "damaged", "failed"))
+            )
         ]
         for name, wrong in (("other artefacts", other), ("damaged", damaged), ("left behind", left)):
             self.counts[name] += bool(wrong)
@@ -306,7 +313,9 @@ def campaign(kind: str, count: int, seed: int, folder: Path) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("kind", choices=("runs", "workers", "servers"))
     parser.add_argument("count", type=int)
     parser.add_argument("--seed", type=int, default=0)

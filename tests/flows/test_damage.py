@@ -20,7 +20,7 @@ from flows.wiring import run_sequence
 from tests.flows.damaging import chunks_of, delete, files_of, flip_bit, trials, truncate
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config, without_report
 
-RGB = "sequence/rgb/c/2/0/0/0"
+RGB = "sequence.zarr.zip"
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def test_a_run_that_is_not_whole_in_the_store_is_no_finished_run(
     _, whole = finished
     arguments = ([SequenceCase(SEQUENCE, profile="quick", settings=TINY)], store.root, "evaluate")
     assert _from_store(*arguments) is not None
-    (Path(store.root) / "artefacts" / key_of(whole, "renders_final") / "renders/rgb/c/0/0/0/0").unlink()
+    (Path(store.root) / "artefacts" / key_of(whole, "renders_final") / "renders.zarr.zip").unlink()
     assert _from_store(*arguments) is None
 
 

@@ -66,7 +66,11 @@ def test_times_are_read_from_manifests() -> None:
     assert times["ingest"].seconds(20) == pytest.approx(10)
     assert times["coarse"].per_frame == 0
     chain = sequence_tasks(times, 20)
-    assert [(task.name, task.width) for task in chain] == [("ingest", 1), ("explore-branch", 2), ("coarse", 1)]
+    assert [(task.name, task.width) for task in chain] == [
+        ("ingest", 1),
+        ("explore-branch", 2),
+        ("coarse", 1),
+    ]
 
 
 def test_the_published_videos_are_all_there() -> None:

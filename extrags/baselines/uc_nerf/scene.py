@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-import zarr
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
@@ -19,7 +18,7 @@ from extrags.cameras import Cameras, rotation_angle_deg
 from extrags.config import UcNerfConfig
 from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
-from extrags.zarr_io import open_group, read_array, write_array, write_frames
+from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
 
 __all__ = ["UcNerf", "UcNerfNetwork", "nearest_views"]
 
@@ -109,25 +108,25 @@ class UcNerf(Storable):
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group: frames, cameras and the networks' parameters."""
-        group = open_group(path, mode="w")
-        write_frames(group, "rgb", self.rgb)
-        write_array(group, "K", self.cameras.K)
-        write_array(group, "world_from_camera", self.cameras.world_from_camera)
-        write_array(group, "center", self.center)
-        for name, value in self.network.state_dict().items():
-            write_array(group, f"network/{name}", value.numpy())
-        group.attrs.update(
-            {
-                "config": json.loads(self.config.model_dump_json()),
-                "inverse_range": list(self.inverse_range),
-                "scale": self.scale,
-            }
-        )
+        with new_group(path) as group:
+            write_frames(group, "rgb", self.rgb)
+            write_array(group, "K", self.cameras.K)
+            write_array(group, "world_from_camera", self.cameras.world_from_camera)
+            write_array(group, "center", self.center)
+            for name, value in self.network.state_dict().items():
+                write_array(group, f"network/{name}", value.numpy())
+            group.attrs.update(
+                {
+                    "config": json.loads(self.config.model_dump_json()),
+                    "inverse_range": list(self.inverse_range),
+                    "scale": self.scale,
+                }
+            )
 
     @classmethod
     def load(cls, path: Path) -> UcNerf:
         """Read what `save` wrote."""
-        group = zarr.open_group(str(path), mode="r")
+        group = open_group(path)
         attributes: dict[str, Any] = dict(group.attrs)
         config = UcNerfConfig.model_validate(attributes["config"])
         network = UcNerfNetwork(config)

@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from extrags.errors import ShapeError
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.zarr_io import open_group, read_array, write_array, write_frames
+from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
 
 __all__ = ["RealViews"]
 
@@ -63,12 +63,12 @@ class RealViews:
 
     def save(self, path: Path) -> None:
         """Write a zarr v3 group, one frame per chunk."""
-        group = open_group(path, mode="w")
-        write_frames(group, "rgb", self.rgb)
-        write_array(group, "world_from_camera", self.world_from_camera)
+        with new_group(path) as group:
+            write_frames(group, "rgb", self.rgb)
+            write_array(group, "world_from_camera", self.world_from_camera)
 
     @classmethod
     def load(cls, path: Path) -> RealViews:
         """Read what `save` wrote."""
-        group = open_group(path, mode="r")
+        group = open_group(path)
         return cls(read_array(group, "rgb"), read_array(group, "world_from_camera"))

@@ -1,0 +1,267 @@
+"""Which artefacts to keep: by age, size, runs and reachability; and what each sequence uses.
+
+Nothing is removed that a run which is going on has used, that was used a moment ago, or that a kept artefact
+was made from. What is removed all the same while a run looks for it is made anew by that run: artefacts
+disappear atomically.
+"""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import time
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from extrags.store.artefacts import Store
+from extrags.store.manifest import Manifest
+from extrags.store.runs import Run, active_runs, forget, runs_of
+
+__all__ = ["Policy", "Removal", "SequenceUsage", "apply_policy", "planned_removals", "usage"]
+
+log = logging.getLogger(__name__)
+
+MOMENT_S = 600.0
+"""What was made or used within it is kept: a run may have it in hand, and not have recorded it yet."""
+
+FINAL_STAGES = frozenset({"report", "dataset-report", "benchmark-report"})
+"""Where a run has no record, its page stands for it, with what that was made from."""
+
+
+@dataclass(frozen=True)
+class Policy:
+    """What is removed; each rule alone suffices.
+
+    Args:
+        older_than_s: not used for so long.
+        max_bytes: the least recently used, until the store is no larger.
+        keep_last: of each sequence, what only runs before its last so many runs used; a run that found the
+            same artefacts as a former one counts once.
+        unreachable: what none of the runs that are kept used: settings that were tried and left.
+        with_inputs: also what kept artefacts were made from.
+    """
+
+    older_than_s: float | None = None
+    max_bytes: int | None = None
+    keep_last: int | None = None
+    unreachable: bool = False
+    with_inputs: bool = False
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no rule is given."""
+        return (
+            self.older_than_s is None
+            and self.max_bytes is None
+            and self.keep_last is None
+            and not self.unreachable
+        )
+
+
+@dataclass(frozen=True)
+class Removal:
+    """An artefact that goes, and why."""
+
+    key: str
+    sequence: str
+    bytes: int
+    reason: str
+
+
+@dataclass(frozen=True)
+class SequenceUsage:
+    """What the artefacts of a sequence use; those of several sequences count where they were first made.
+
+    Args:
+        sequence: its display name.
+        artefacts: number.
+        files: number, manifests among them.
+        bytes: of all files but manifests.
+        made: the latest, UTC, ISO 8601.
+        used: the latest; on object stores, when it was made.
+    """
+
+    sequence: str
+    artefacts: int
+    files: int
+    bytes: int
+    made: str
+    used: str
+
+
+class _Contents:
+    """The artefacts of a store, what they were made from, and when they were used last."""
+
+    def __init__(self, store: Store) -> None:
+        self.manifests = {manifest.key: manifest for manifest in store.ls()}
+        used = store.backend.last_used(self.manifests)
+        self.used = {key: used.get(key, _made(item)) for key, item in self.manifests.items()}
+
+    def with_inputs(self, keys: Iterable[str]) -> set[str]:
+        """Artefacts, and all those they were made from."""
+        found: set[str] = set()
+        waiting = [key for key in keys if key in self.manifests]
+        while waiting:
+            key = waiting.pop()
+            if key not in found:
+                found.add(key)
+                waiting += [
+                    name for name in self.manifests[key].input_keys.values() if name in self.manifests
+                ]
+        return found
+
+    def in_order_of_use(self) -> list[str]:
+        """Least recently used first; what an artefact was made from counts as used with it, after it."""
+        latest, depth = dict(self.used), {}
+        for key in sorted(self.manifests, key=self.used.__getitem__, reverse=True):
+            for name in self.with_inputs([key]):
+                latest[name] = max(latest[name], self.used[key])
+        for key in self.manifests:
+            depth[key] = len(self.with_inputs([key]))
+        return sorted(self.manifests, key=lambda key: (latest[key], -depth[key], key))
+
+
+def planned_removals(
+    store: Store, policy: Policy, *, now: float | None = None
+) -> tuple[list[Removal], list[Run]]:
+    """What a policy would remove.
+
+    Args:
+        store: to be cleaned.
+        policy: the rules.
+        now: seconds since 1970.
+
+    Returns:
+        The artefacts in the order of their removal, what was made from others before these; and the runs
+        whose records go with them.
+    """
+    return _planned(store, policy, _Contents(store), time.time() if now is None else now)
+
+
+def _planned(
+    store: Store, policy: Policy, contents: _Contents, now: float
+) -> tuple[list[Removal], list[Run]]:
+    runs, going_on = runs_of(store), active_runs(store)
+    runs = [replace(run, ended=max(run.ended, _last_time(run, contents))) for run in runs]
+    kept_runs, former = _last_runs(_with_pages(runs, contents), policy.keep_last)
+    of_kept = {key for run in kept_runs for key in run.keys}
+    reasons: dict[str, str] = {}
+    if policy.older_than_s is not None:
+        limit = now - policy.older_than_s
+        reasons |= {
+            key: f"not used since {_date(used)}" for key, used in contents.used.items() if used < limit
+        }
+    if policy.keep_last is not None:
+        stale = {key for run in former for key in run.keys} - of_kept
+        reasons |= dict.fromkeys(stale, f"of none of the last {policy.keep_last} runs")
+    if policy.unreachable:
+        reached = contents.with_inputs(of_kept)
+        reasons |= {key: "of no run that is kept" for key in contents.manifests if key not in reached}
+    held = {key for run in going_on for key in run.keys}
+    held |= {key for key, used in contents.used.items() if used > now - MOMENT_S}
+    held = contents.with_inputs(held)
+    removed = _removable(reasons, held, contents, policy)
+    if policy.max_bytes is not None:
+        size = sum(item.bytes for key, item in contents.manifests.items() if key not in removed)
+        for key in contents.in_order_of_use():
+            if size <= policy.max_bytes:
+                break
+            if key not in removed and key not in held:
+                removed[key] = f"used least recently, {_date(contents.used[key])}"
+                size -= contents.manifests[key].bytes
+    order = sorted(removed, key=lambda key: (-len(contents.with_inputs([key])), key))
+    found = [
+        Removal(key, contents.manifests[key].label, contents.manifests[key].bytes, removed[key])
+        for key in order
+    ]
+    left = contents.manifests.keys() - removed.keys()
+    gone = [run for run in runs if run in former or not run.keys & left]
+    return found, gone
+
+
+def apply_policy(store: Store, policy: Policy) -> list[Removal]:
+    """Remove what a policy does not keep; returns what was removed."""
+    contents = _Contents(store)
+    plan, gone = _planned(store, policy, contents, time.time())
+    removed = []
+    spared: set[str] = set()
+    for item in plan:
+        # A run may have begun to use it since; then it needs what that was made from.
+        if item.key not in spared:
+            used = store.backend.last_used([item.key]).get(item.key, 0.0)
+            if used > time.time() - MOMENT_S:
+                spared |= contents.with_inputs([item.key])
+            elif store.backend.discard(item.key):
+                removed.append(item)
+    forget(store, gone)
+    return removed
+
+
+def usage(store: Store) -> list[SequenceUsage]:
+    """What each sequence uses, the largest first."""
+    contents = _Contents(store)
+    by_sequence: dict[str, list[Manifest]] = defaultdict(list)
+    for item in contents.manifests.values():
+        by_sequence[item.label].append(item)
+    rows = [
+        SequenceUsage(
+            label,
+            len(items),
+            sum(item.files + 1 for item in items),
+            sum(item.bytes for item in items),
+            max(item.started for item in items),
+            _date(max(contents.used[item.key] for item in items)),
+        )
+        for label, items in by_sequence.items()
+    ]
+    return sorted(rows, key=lambda row: (-row.bytes, row.sequence))
+
+
+def _removable(
+    reasons: Mapping[str, str], held: set[str], contents: _Contents, policy: Policy
+) -> dict[str, str]:
+    """Candidates that nothing holds: no run, nor, unless asked, an artefact that was made from them."""
+    wanted = {key: why for key, why in reasons.items() if key in contents.manifests and key not in held}
+    if policy.with_inputs:
+        return wanted
+    needed = contents.with_inputs(key for key in contents.manifests if key not in wanted)
+    return {key: why for key, why in wanted.items() if key not in needed}
+
+
+def _with_pages(runs: list[Run], contents: _Contents) -> list[Run]:
+    """Runs with records, and, for those from before there were records, their pages."""
+    recorded = {key for run in runs for key in run.keys}
+    pages = [
+        Run("", item.label, _date(contents.used[key]), frozenset(contents.with_inputs([key])))
+        for key, item in contents.manifests.items()
+        if item.stage in FINAL_STAGES and key not in recorded
+    ]
+    return sorted([*runs, *pages], key=lambda run: run.ended)
+
+
+def _last_time(run: Run, contents: _Contents) -> str:
+    """A run that only finds what is there may leave no record: when all that it needs was last used."""
+    return _date(min((contents.used[key] for key in run.keys if key in contents.used), default=0.0))
+
+
+def _last_runs(runs: list[Run], count: int | None) -> tuple[list[Run], list[Run]]:
+    """The last runs of each sequence, and the former ones."""
+    if count is None:
+        return runs, []
+    by_sequence: dict[str, list[Run]] = defaultdict(list)
+    for run in runs:
+        by_sequence[run.sequence].append(run)
+    kept = [run for each in by_sequence.values() for run in each[len(each) - min(count, len(each)) :]]
+    return kept, [run for run in runs if run not in kept]
+
+
+def _made(manifest: Manifest) -> float:
+    try:
+        return datetime.datetime.fromisoformat(manifest.started).timestamp() + manifest.seconds
+    except ValueError:
+        return 0.0  # The first manifests had no date.
+
+
+def _date(moment: float) -> str:
+    return datetime.datetime.fromtimestamp(moment, datetime.UTC).isoformat(timespec="seconds")

@@ -1,0 +1,167 @@
+"""Records of runs: which artefacts a run used, and whether it is still going on.
+
+Retention needs to know both (`extrags.store.retention`); nothing else reads them, and a store without any is
+whole. While a run goes on, its record lies in `runs/active/` of the store's state directory, and its process
+holds a `flock` on it, which the kernel releases however the process ends.
+"""
+
+from __future__ import annotations
+
+import datetime
+import fcntl
+import json
+import logging
+import os
+import secrets
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from extrags.store.artefacts import Store
+from extrags.store.canonical import digest_of
+from extrags.store.records import read_records, remove_record, write_record
+
+__all__ = ["Run", "RunRecord", "active_runs", "recorded_run", "runs_of"]
+
+log = logging.getLogger(__name__)
+
+_PREFIX = "run-"
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of one sequence.
+
+    Args:
+        name: of its record; empty where there is none.
+        sequence: its display name.
+        ended: UTC, ISO 8601; of runs that were killed, when they last recorded something.
+        keys: artefacts it made or found.
+    """
+
+    name: str
+    sequence: str
+    ended: str
+    keys: frozenset[str]
+
+
+class RunRecord:
+    """The record of a run that is going on; see `recorded_run`."""
+
+    def __init__(self, store: Store, sequence: str) -> None:
+        self._store, self._sequence = store, sequence
+        self._keys: set[str] = set()
+        self._guard = threading.Lock()
+        folder = store.state / "runs" / "active"
+        folder.mkdir(parents=True, exist_ok=True)
+        self._path = folder / f"{secrets.token_hex(8)}.json"
+        self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
+        fcntl.flock(self._file, fcntl.LOCK_EX)
+        self._write()
+
+    def add(self, keys: Iterable[str]) -> None:
+        """Artefacts that the run uses."""
+        with self._guard:
+            more = set(keys) - self._keys
+            if more:
+                self._keys |= more
+                self._write()
+
+    def close(self) -> None:
+        """The run has ended, well or not. The same artefacts again replace the record of the former run."""
+        if self._keys:
+            name = _PREFIX + digest_of([self._sequence, sorted(self._keys)])
+            write_record(self._store, name, self._content())
+        self._path.unlink(missing_ok=True)
+        os.close(self._file)
+
+    def _write(self) -> None:
+        text = json.dumps(self._content()).encode()
+        os.pwrite(self._file, text, 0)
+        os.ftruncate(self._file, len(text))
+
+    def _content(self) -> dict[str, Any]:
+        return {"sequence": self._sequence, "ended": _now(), "keys": sorted(self._keys)}
+
+
+@contextmanager
+def recorded_run(store: Store, sequence: str) -> Iterator[RunRecord | None]:
+    """Record the run inside the block; None where the store cannot be written, as for who only looks."""
+    try:
+        record = RunRecord(store, sequence)
+    except OSError as error:
+        log.debug("no record of this run: %s", error)
+        yield None
+        return
+    try:
+        yield record
+    finally:
+        try:
+            record.close()
+        except Exception as error:
+            # Retention alone misses it; each fsspec backend raises its own kinds.
+            log.warning("the record of this run could not be written: %s", error)
+
+
+def active_runs(store: Store) -> list[Run]:
+    """Runs that are going on on this machine, or where the store's directory is shared with locks."""
+    return [run for run, going_on in _unfinished(store) if going_on]
+
+
+def runs_of(store: Store) -> list[Run]:
+    """Runs that ended or were killed, by end; damaged records are left out."""
+    found = [_run(name, record) for name, record in read_records(store, _PREFIX).items()]
+    found += [run for run, going_on in _unfinished(store) if not going_on]
+    return sorted((run for run in found if run is not None), key=lambda run: (run.ended, run.name))
+
+
+def forget(store: Store, runs: Iterable[Run]) -> None:
+    """Remove the records of runs that ended."""
+    for run in runs:
+        if run.name.startswith("active/"):
+            (store.state / "runs" / run.name).unlink(missing_ok=True)
+        else:
+            remove_record(store, run.name)
+
+
+def _unfinished(store: Store) -> Iterator[tuple[Run, bool]]:
+    folder = store.state / "runs" / "active"
+    for path in sorted(folder.glob("*.json")) if folder.is_dir() else []:
+        try:
+            file = os.open(path, os.O_RDONLY)
+        except FileNotFoundError:
+            continue
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            going_on = False
+        except BlockingIOError:
+            going_on = True
+        finally:
+            os.close(file)
+        try:
+            run = _parsed(f"active/{path.name}", path.read_bytes())
+        except FileNotFoundError:
+            continue  # It ended meanwhile; its record is among the others.
+        if run is not None:
+            yield run, going_on
+
+
+def _parsed(name: str, text: bytes) -> Run | None:
+    try:
+        return _run(name, json.loads(text))
+    except ValueError:
+        return None
+
+
+def _run(name: str, record: dict[str, Any]) -> Run | None:
+    try:
+        keys = frozenset(map(str, record["keys"]))
+        return Run(name, str(record["sequence"]), str(record["ended"]), keys)
+    except (KeyError, TypeError):
+        return None
+
+
+def _now() -> str:
+    return datetime.datetime.now(datetime.UTC).isoformat(timespec="microseconds")

@@ -1,0 +1,228 @@
+"""Retention: what goes, what stays, and why."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from extrags.store import Ref, Store
+from extrags.store.retention import Policy, Removal, apply_policy, planned_removals, usage
+from extrags.store.records import remove_record
+from extrags.store.runs import active_runs, recorded_run, runs_of
+
+DAY_S = 86400.0
+
+
+def put(store: Store, name: str, *, days: float = 0.0, label: str = "phantom/0", **inputs: Ref) -> Ref:
+    """An artefact that was used so many days ago."""
+    key = f"{name}-v1-00"
+    with store.slot(stage=name, version=1, key=key, label=label, inputs=inputs) as slot:
+        (slot.path / "file").write_text("x" * 1000)
+    if days:
+        age(store, name, days)
+    return slot.ref
+
+
+def age(store: Store, name: str, days: float) -> None:
+    moment = time.time() - days * DAY_S
+    os.utime(Path(store.root) / "artefacts" / f"{name}-v1-00", (moment, moment))
+
+
+def names(removals: list[Removal]) -> list[str]:
+    return [item.key.removesuffix("-v1-00") for item in removals]
+
+
+def planned(store: Store, **policy: object) -> list[str]:
+    return names(planned_removals(store, Policy(**policy))[0])  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return Store(tmp_path / "store")
+
+
+@pytest.fixture
+def chain(store: Store) -> Store:
+    """ingest -> coarse -> report, and other settings of coarse, 40 to 10 days ago."""
+    ingest = put(store, "ingest", days=40)
+    coarse = put(store, "coarse", days=30, sequence=ingest)
+    put(store, "other", days=20, sequence=ingest)
+    put(store, "report", days=10, scene=coarse)
+    return store
+
+
+class TestAge:
+    def test_what_kept_artefacts_were_made_from_stays(self, chain: Store) -> None:
+        assert planned(chain, older_than_s=15 * DAY_S) == ["other"]
+        assert planned(chain, older_than_s=15 * DAY_S, with_inputs=True) == ["coarse", "other", "ingest"]
+        assert planned(chain, older_than_s=5 * DAY_S) == ["report", "coarse", "other", "ingest"]
+        assert planned(chain, older_than_s=50 * DAY_S) == []
+
+    def test_looking_up_and_opening_are_use(self, chain: Store) -> None:
+        assert chain.find("other-v1-00") is not None
+        assert planned(chain, older_than_s=5 * DAY_S) == ["report", "coarse"]
+
+    def test_nothing_of_now_is_removed(self, store: Store) -> None:
+        put(store, "ingest")
+        assert planned(store, older_than_s=0.0, max_bytes=0, unreachable=True) == []
+        assert names(planned_removals(store, Policy(max_bytes=0), now=time.time() + DAY_S)[0]) == ["ingest"]
+
+
+class TestSize:
+    @pytest.mark.parametrize(
+        ("most", "gone"),
+        [
+            (4000, []),
+            (3999, ["other"]),
+            (2000, ["report", "other"]),
+            (1000, ["report", "coarse", "other"]),
+            (0, ["report", "coarse", "other", "ingest"]),
+        ],
+    )
+    def test_least_recently_used_first_and_never_from_below(
+        self, chain: Store, most: int, gone: list[str]
+    ) -> None:
+        assert planned(chain, max_bytes=most) == gone
+
+
+class TestRuns:
+    @pytest.fixture
+    def three(self, store: Store) -> Store:
+        """Three runs of a sequence with other settings each, and one of another sequence."""
+        ingest = put(store, "ingest", days=40)
+        for index in range(3):
+            final = put(store, f"final{index}", days=30 - index, sequence=ingest)
+            judged = put(store, f"judged{index}", days=30 - index, scene=final)
+            with recorded_run(store, "phantom/0") as record:
+                assert record is not None
+                record.add(Path(ref.uri).name for ref in (ingest, final))
+                record.add([Path(judged.uri).name])
+        elsewhere = put(store, "elsewhere", days=40, label="phantom/1")
+        with recorded_run(store, "phantom/1") as record:
+            assert record is not None
+            record.add([Path(elsewhere.uri).name])
+        return store
+
+    def test_the_last_are_kept(self, three: Store) -> None:
+        assert planned(three, keep_last=3) == []
+        assert planned(three, keep_last=2) == ["judged0", "final0"]
+        assert planned(three, keep_last=1) == ["judged0", "judged1", "final0", "final1"]
+
+    def test_the_same_run_again_counts_once_and_is_the_last(self, three: Store) -> None:
+        assert len(runs_of(three)) == 4
+        with recorded_run(three, "phantom/0") as record:
+            assert record is not None
+            record.add(["judged0-v1-00", "final0-v1-00", "ingest-v1-00"])
+        assert len(runs_of(three)) == 4
+        assert planned(three, keep_last=1) == ["judged1", "judged2", "final1", "final2"]
+
+    def test_a_run_that_only_found_everything_is_the_last(self, three: Store) -> None:
+        for name in ("ingest", "final0", "judged0"):
+            age(three, name, -0.001)
+        assert planned(three, keep_last=1) == ["judged1", "judged2", "final1", "final2"]
+
+    def test_what_no_run_used_is_unreachable(self, three: Store) -> None:
+        put(three, "tried", days=1)
+        assert planned(three, unreachable=True) == ["tried"]
+        gone = apply_policy(three, Policy(unreachable=True, keep_last=1))
+        assert sorted(names(gone)) == ["final0", "final1", "judged0", "judged1", "tried"]
+        assert len(runs_of(three)) == 2
+
+    def test_without_records_pages_stand_for_runs(self, chain: Store) -> None:
+        assert planned(chain, unreachable=True) == ["other"]
+
+    def test_what_a_run_in_progress_used_stays_however_old(self, chain: Store) -> None:
+        with recorded_run(chain, "phantom/0") as record:
+            assert record is not None
+            record.add(["other-v1-00"])
+            (run,) = active_runs(chain)
+            assert run.keys == {"other-v1-00"}
+            assert planned(chain, older_than_s=DAY_S, max_bytes=0) == ["report", "coarse"]
+        assert active_runs(chain) == []
+        assert planned(chain, max_bytes=0) == ["report", "coarse", "other", "ingest"]
+
+    def test_a_killed_run_holds_nothing(self, chain: Store) -> None:
+        code = (
+            "import os, sys\nfrom extrags.store import Store\nfrom extrags.store.records import remove_record
+from extrags.store.runs import RunRecord\n"
+            "RunRecord(Store(sys.argv[1]), 'phantom/0').add(['other-v1-00'])\nos.kill(os.getpid(), 9)"
+        )
+        assert subprocess.run([sys.executable, "-c", code, chain.root]).returncode == -9
+        assert active_runs(chain) == []
+        (run,) = runs_of(chain)
+        assert run.keys == {"other-v1-00"}
+        assert len(apply_policy(chain, Policy(older_than_s=DAY_S))) == 4
+        assert runs_of(chain) == []
+
+    def test_damaged_records_are_left_out(self, three: Store) -> None:
+        for path in (Path(three.root) / "records").glob("run-*.json"):
+            path.write_text("[1")
+        assert runs_of(three) == []
+
+    def test_on_an_object_store(self, tmp_path: Path) -> None:
+        store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)
+        final = put(store, "report", sequence=put(store, "ingest"))
+        put(store, "other")
+        with recorded_run(store, "phantom/0") as record:
+            assert record is not None
+            record.add(["ingest-v1-00", Path(final.uri).name])
+        assert store.keys() == ["ingest-v1-00", "other-v1-00", "report-v1-00"]
+        later = time.time() + DAY_S
+        assert names(planned_removals(store, Policy(unreachable=True), now=later)[0]) == ["other"]
+        assert len(planned_removals(store, Policy(older_than_s=3600.0), now=later)[0]) == 3
+        remove_record(store, runs_of(store)[0].name)
+        assert runs_of(store) == []
+
+
+def test_nothing_is_removed_that_a_run_has_begun_to_use_since(
+    chain: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from extrags.store import retention
+
+    whole = retention._planned
+
+    def and_then_it_is_found(*given: object) -> object:
+        plan = whole(*given)  # type: ignore[arg-type]
+        chain.find("coarse-v1-00")
+        return plan
+
+    monkeypatch.setattr(retention, "_planned", and_then_it_is_found)
+    assert names(apply_policy(chain, Policy(older_than_s=DAY_S))) == ["report", "other"]
+    assert chain.keys() == ["coarse-v1-00", "ingest-v1-00"]
+
+
+def test_usage(chain: Store) -> None:
+    put(chain, "coarse1", label="phantom/1")
+    first, second = usage(chain)
+    assert (first.sequence, first.artefacts, first.files, first.bytes) == ("phantom/0", 4, 8, 4000)
+    assert (second.sequence, second.artefacts) == ("phantom/1", 1)
+    assert first.used < second.used
+    assert first.made
+
+
+@pytest.mark.parametrize("unwritable", [lambda path: path.write_text("")])
+def test_a_store_that_cannot_be_written_is_only_read(
+    store: Store, unwritable: Callable[[Path], None]
+) -> None:
+    put(store, "ingest")
+    unwritable(Path(store.root) / "runs")
+    with recorded_run(store, "phantom/0") as record:
+        assert record is None
+
+
+def test_a_record_is_plain_json(store: Store) -> None:
+    with recorded_run(store, "phantom/0") as record:
+        assert record is not None
+        record.add(["ingest-v1-00"])
+    (path,) = (Path(store.root) / "runs").glob("*.json")
+    read = json.loads(path.read_text())
+    assert read["keys"] == ["ingest-v1-00"]
+    assert read["sequence"] == "phantom/0"

@@ -1,0 +1,37 @@
+"""A run whose store is on an object store."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from extrags.store import Store
+from flows.outcome import SequenceOutcome
+from flows.runners import DirectRunner
+from flows.wiring import run_sequence
+from tests.flows.tiny import SEQUENCE, tiny_config, without_report
+from tests.s3 import BUCKET, SECRET, s3_server
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_whole_run_and_the_same_from_another_machine(
+    finished: tuple[str, SequenceOutcome], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, whole = finished
+    root = f"s3://{BUCKET}/tiny"
+    with s3_server():
+        for machine, state in (("first", "ran"), ("second", "cached")):
+            # Nothing is shared but the URL.
+            monkeypatch.setenv("EXTRAGS_CACHE", str(tmp_path / machine))
+            outcome = run_sequence(SEQUENCE, tiny_config(), root, DirectRunner(root), profile="quick")
+            assert outcome.status == "ok", outcome.error
+            assert {row.state for row in outcome.stages} == {state, "skipped"}
+            assert without_report(outcome.digests) == without_report(whole.digests)
+        store = Store(root)
+        assert not any(map(store.examine, store.keys()))
+        backend = store.backend
+        objects = backend.fs.find(backend.prefix)  # type: ignore[union-attr]
+        assert len(objects) < 60
+        assert not any(SECRET.encode() in backend.fs.cat_file(name) for name in objects)  # type: ignore[union-attr]
