@@ -1,4 +1,4 @@
-"""Many sequences through a real deployment: `python -m tests.benchmarks.bench_deployment FOLDER [--workers 1 2]`.
+"""Many sequences through a real deployment: `python -m tests.benchmarks.bench_deployment FOLDER`.
 
 A Prefect server, a process work pool and its workers are started as docs/running_at_scale.md says; small
 phantoms go through the deployment `reconstruct-dataset/nightly`, shared out evenly where there are two

@@ -151,8 +151,7 @@ class TestRuns:
 
     def test_a_killed_run_holds_nothing(self, chain: Store) -> None:
         code = (
-            "import os, sys\nfrom extrags.store import Store\nfrom extrags.store.records import remove_record
-from extrags.store.runs import RunRecord\n"
+            "import os, sys\nfrom extrags.store import Store\nfrom extrags.store.runs import RunRecord\n"
             "RunRecord(Store(sys.argv[1]), 'phantom/0').add(['other-v1-00'])\nos.kill(os.getpid(), 9)"
         )
         assert subprocess.run([sys.executable, "-c", code, chain.root]).returncode == -9

@@ -1,7 +1,7 @@
 """Kill runs, Dask workers and servers, and see what is left, and what is made in the end.
 
-`python -m tests.flows.killing runs|workers|servers COUNT [--seed N] [--keep FOLDER]` does to the tiny sequence,
-through `extrags run` and a Prefect server that lasts, what power cuts and operators do to larger ones:
+`python -m tests.flows.killing runs|workers|servers COUNT [--seed N] [--keep FOLDER]` does to the tiny
+sequence, through `extrags run` and a Prefect server that lasts, what power cuts and operators do to larger ones:
 
 * runs: the artefacts of one stage are removed, a command is started, killed with its whole process group at a
   random moment of that stage, and started again. Every stage has its turn.
@@ -43,7 +43,7 @@ SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}=
 class Command:
     """`extrags run` of the tiny sequence, as a process group of its own.
 
-    It is forked from this process, which has loaded everything: otherwise loading would take most of the time.
+    It is forked from this process, which has loaded everything: loading would take most of the time.
 
     Args:
         store: its store.
@@ -252,7 +252,8 @@ class Trials:
         self.command.kill()
         self.hits[stage] += inside
         self.counts["killed before the stage's artefact was there"] += inside
-        half = [key for key in self.store.keys() if self.store.examine(key) is not None]
+        every = self.store.keys()
+        half = [key for key in every if self.store.examine(key) is not None]
         self.counts["half-written artefacts"] += len(half)
         self.judge(stage, self.command.start().wait())
 
