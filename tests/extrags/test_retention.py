@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 from extrags.store import Ref, Store
-from extrags.store.retention import Policy, Removal, apply_policy, planned_removals, usage
 from extrags.store.records import remove_record
+from extrags.store.retention import Policy, Removal, apply_policy, planned_removals, usage
 from extrags.store.runs import active_runs, recorded_run, runs_of
 
 DAY_S = 86400.0

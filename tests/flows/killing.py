@@ -1,7 +1,8 @@
 """Kill runs, Dask workers and servers, and see what is left, and what is made in the end.
 
 `python -m tests.flows.killing runs|workers|servers COUNT [--seed N] [--keep FOLDER]` does to the tiny
-sequence, through `extrags run` and a Prefect server that lasts, what power cuts and operators do to larger ones:
+sequence, through `extrags run` and a Prefect server that lasts, what power cuts and operators do to larger
+ones:
 
 * runs: the artefacts of one stage are removed, a command is started, killed with its whole process group at a
   random moment of that stage, and started again. Every stage has its turn.
@@ -210,7 +211,7 @@ class Trials:
         }
 
     def begin(self, stage: str) -> Path | None:
-        """Start a command and wait for a random moment of a stage; its scratch directory, None if it ended."""
+        """Start a command and wait for a random moment of a stage; its scratch directory, if it has one."""
         self.store.rm(stage)
         self.command.start()
 
