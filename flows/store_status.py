@@ -155,7 +155,8 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
     for item in in_work(store):
         running.setdefault(item["label"], set()).add(_stage_of(item["stage"]))
     names = _names(patterns, records, running)
-    rows, bytes_of = [], {}
+    rows: list[StatusRow] = []
+    bytes_of: dict[str, int] = {}
     recorded: set[str] = set()
     for record in records:
         made = {key: size for row in record["stages"] for key, size in row["artefacts"].items()}
@@ -233,7 +234,9 @@ def _stage(row: Mapping[str, Any], there: set[str], running: set[str]) -> StageS
 
 def _unrecorded(name: str, running: set[str]) -> StatusRow:
     """A sequence of which no run has come to an end."""
-    stages = {stage: StageStatus("running" if stage in running else "missing") for stage in STAGES}
+    stages: dict[str, StageStatus] = {
+        stage: StageStatus("running" if stage in running else "missing") for stage in STAGES
+    }
     return StatusRow(name, "", "running" if running else "missing", "", "", None, stages)
 
 

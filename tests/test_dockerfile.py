@@ -177,6 +177,8 @@ def test_the_steps_of_the_build(tmp_path: Path) -> None:
         (tools / name).write_text(f"#!{shell}\n{line}\n")
         (tools / name).chmod(0o755)
     variables = {**os.environ, "PATH": f"{tools}:{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
+    # Nothing is fetched: what pip does not find here fails.
+    variables["PIP_NO_INDEX"] = "1"
     variables.pop("PYTHONPATH", None)
 
     def here(text: str) -> str:
@@ -233,6 +235,10 @@ def _lend_packages(prefix: Path, lent: Path) -> None:
         if not own.match(entry.name) and entry.suffix != ".pth":
             (lent / entry.name).symlink_to(entry)
     (packages,) = (prefix / "lib").glob("python3*/site-packages")
+    # A new environment brings an old one, which would hide what torch asks for.
+    hiding = ("setuptools*", "pkg_resources", "_distutils_hack", "distutils-precedence.pth")
+    for entry in [entry for pattern in hiding for entry in packages.glob(pattern)]:
+        shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
     (packages / "lent.pth").write_text(f"{lent}\n")
 
 

@@ -50,9 +50,9 @@ def trend_chart(entries: Sequence[Mapping[str, Any]], colors: Mapping[str, str])
                         label=method,
                     )
             panel.set_title(title)
-            locator = AutoDateLocator()
+            locator = AutoDateLocator()  # type: ignore[no-untyped-call]
             panel.xaxis.set_major_locator(locator)
-            panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+            panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
         axes[1].set_ylim(bottom=0)
         axes[0].legend(loc="best")
         return svg_image(figure)

@@ -12,6 +12,7 @@ import pytest
 from prefect.artifacts import Artifact
 
 from extrags.errors import ConfigError
+from extrags.store import Store
 from flows.benchmark import benchmark, check_methods, summary_of
 from flows.outcome import SequenceOutcome
 from flows.tables import difference_text, spread_text
@@ -53,7 +54,6 @@ class TestRuns:
         self, found: dict[str, Any], finished: tuple[str, SequenceOutcome]
     ) -> None:
         from extrags.scene import Scene
-        from extrags.store import Store
 
         scenes = {}
         for manifest in Store(finished[0]).ls("coarse"):
