@@ -38,12 +38,15 @@ class Slot:
     Args:
         path: where the stage writes.
         counts: numbers for the manifest, filled by the stage.
+        records: names of files that tell of this run, such as its times, filled by the stage. They are kept
+            and compared as all others, but the artefact's digest does not cover them.
     """
 
     def __init__(self, path: Path, store: Store) -> None:
         self.path = path
         self.store = store
         self.counts: dict[str, float | int | str | None] = {}
+        self.records: set[str] = set()
         self._debug = path.with_name("debug")
         self._manifest: Manifest | None = None
         self._inputs: dict[str, Ref] = {}
@@ -380,14 +383,14 @@ class Store:
             try:
                 with self._blaming(slot._inputs.values()):
                     yield slot
-                digest, files, size = write_checksums(slot.path)
+                contents = write_checksums(slot.path, slot.records)
                 slot._manifest = self.backend.commit(
                     slot.path,
                     Manifest(
                         stage=stage,
                         version=version,
                         key=key,
-                        digest=digest,
+                        digest=contents.digest,
                         label=label,
                         config=dict(config or {}),
                         inputs={name: ref.digest for name, ref in (inputs or {}).items()},
@@ -396,8 +399,9 @@ class Store:
                         started=started.isoformat(timespec="seconds"),
                         seconds=round(time.monotonic() - clock, 3),
                         counts=slot.counts,
-                        files=files,
-                        bytes=size,
+                        files=contents.files,
+                        bytes=contents.bytes,
+                        records=contents.records,
                     ),
                 )
             except Exception as error:

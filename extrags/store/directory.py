@@ -15,7 +15,7 @@ from typing import Any
 from extrags.errors import DamagedArtefactError, StoreError
 from extrags.store.canonical import Ref
 from extrags.store.integrity import Damage, Depth, find_damage, intact_manifest
-from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
+from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, same_content, stage_of
 
 __all__ = ["DAMAGED", "RECORD", "DirectoryBackend", "private_directory", "sweep_directories"]
 
@@ -147,7 +147,7 @@ class DirectoryBackend:
                 return manifest
             except OSError:
                 present = intact_manifest(self, manifest.key)
-                if present is not None and present.digest == manifest.digest:
+                if present is not None and same_content(present, manifest):
                     return present
                 if not target.exists():
                     raise

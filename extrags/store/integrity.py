@@ -1,8 +1,8 @@
 """Whether the files of an artefact are still those that were stored.
 
 `checksums.json`, beside the manifest, holds size and digest of every file. It needs no checksum of its own:
-the artefact's digest is computed from it. Number and size of files are compared on every access, contents
-once per process and artefact (`Depth`).
+the artefact's digest is computed from it, and the manifest has the digests of files that it leaves out.
+Number and size of files are compared on every access, contents once per process and artefact (`Depth`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import errno
 import hashlib
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
@@ -23,6 +23,7 @@ from extrags.store.manifest import MANIFEST, Manifest
 __all__ = [
     "CHECKSUMS",
     "VERIFY_VARIABLE",
+    "Contents",
     "Damage",
     "Depth",
     "content_digest",
@@ -56,6 +57,16 @@ class Damage:
     """Relative name; empty where the artefact has no list of files."""
 
 
+class Contents(NamedTuple):
+    """What the files of an artefact amount to."""
+
+    digest: str
+    files: int
+    bytes: int
+    records: dict[str, str]
+    """Digests of the files that tell of the run, which `digest` leaves out."""
+
+
 class _File(NamedTuple):
     size: int
     digest: str
@@ -83,11 +94,18 @@ def content_digest(directory: Path) -> tuple[str, int, int]:
     return _summary({name: _read(directory / name) for name in _sizes(directory)})
 
 
-def write_checksums(directory: Path) -> tuple[str, int, int]:
-    """Write `checksums.json`; returns what `content_digest` does."""
+def write_checksums(directory: Path, records: Collection[str] = ()) -> Contents:
+    """Write `checksums.json`.
+
+    Args:
+        directory: the files.
+        records: names of those that tell of the run; the digest does not cover them.
+    """
     files = {name: _read(directory / name) for name in sorted(_sizes(directory))}
     (directory / CHECKSUMS).write_text(json.dumps(files), encoding="utf-8")
-    return _summary(files)
+    own = {name: files[name].digest for name in sorted(records)}
+    digest, _, _ = _summary({name: file for name, file in files.items() if name not in own})
+    return Contents(digest, len(files), sum(file.size for file in files.values()), own)
 
 
 def find_damage(directory: Path, manifest: Manifest, depth: Depth) -> Damage | None:
@@ -112,7 +130,7 @@ def find_damage(directory: Path, manifest: Manifest, depth: Depth) -> Damage | N
         counts = find_damaged_sizes(sizes, manifest)
         if counts is not None or depth == "sizes":
             return counts
-        found = _summary({name: _read(directory / name) for name in sizes})[0]
+        found, _, _ = _summary({name: _read(directory / name) for name in sizes})
         return None if found == manifest.digest else _other_digest(found, manifest)
     for name in sorted({*listed, *sizes}):
         if name not in listed:
@@ -187,7 +205,10 @@ def _checksums(directory: Path, manifest: Manifest) -> dict[str, _File] | Damage
         return None
     except (ValueError, TypeError, AttributeError):
         return Damage("is not a list of files", CHECKSUMS)
-    if _summary(files) != (manifest.digest, manifest.files, manifest.bytes):
+    records = {name: file.digest for name, file in files.items() if name in manifest.records}
+    digest, _, _ = _summary({name: file for name, file in files.items() if name not in records})
+    counted = len(files), sum(file.size for file in files.values())
+    if (digest, *counted, records) != (manifest.digest, manifest.files, manifest.bytes, manifest.records):
         return Damage("is not the list of this artefact's files", CHECKSUMS)
     return files
 

@@ -14,7 +14,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from extrags.store.canonical import DIGEST_BYTES
 
-__all__ = ["MANIFEST", "Manifest", "manifest_text", "parsed_manifest", "software_versions", "stage_of"]
+__all__ = [
+    "MANIFEST",
+    "Manifest",
+    "manifest_text",
+    "parsed_manifest",
+    "same_content",
+    "software_versions",
+    "stage_of",
+]
 
 MANIFEST = "manifest.json"
 _CLOSE = b"\n}"
@@ -48,6 +56,9 @@ class Manifest(BaseModel):
     """Summary of the content: numbers of frames, Gaussians, ..."""
     files: int = 0
     bytes: int = 0
+    records: dict[str, str] = Field(default_factory=dict)
+    """Files that tell of the run that made the artefact, such as a page with its times, with their digests.
+    `digest` leaves them out: equal inputs give equal digests."""
     data: str = ""
     """On object stores: the prefix, below the artefact's own, that holds the files of this attempt."""
     checksum: str = ""
@@ -82,6 +93,11 @@ def parsed_manifest(text: bytes) -> Manifest:
     if manifest.checksum and not seal:
         raise ValueError("its checksum is not where it was written")
     return manifest
+
+
+def same_content(one: Manifest, other: Manifest) -> bool:
+    """Whether two manifests are of the same files with the same bytes."""
+    return (one.digest, one.records) == (other.digest, other.records)
 
 
 def stage_of(key: str) -> str:

@@ -22,7 +22,7 @@ from extrags.errors import DamagedArtefactError, MissingDependencyError, StoreEr
 from extrags.store.canonical import Ref, digest_of
 from extrags.store.directory import DAMAGED, RECORD, private_directory, sweep_directories
 from extrags.store.integrity import Damage, find_damage, find_damaged_sizes, intact_manifest
-from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
+from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, same_content, stage_of
 
 __all__ = ["UrlBackend", "default_cache_directory"]
 
@@ -206,7 +206,7 @@ class UrlBackend:
     def commit(self, scratch: Path, manifest: Manifest) -> Manifest:
         """Upload the files, then the manifest."""
         present = intact_manifest(self, manifest.key)
-        if present is not None and present.digest == manifest.digest:
+        if present is not None and same_content(present, manifest):
             return present
         attempt = secrets.token_hex(8)
         manifest = manifest.model_copy(update={"data": attempt})

@@ -76,11 +76,6 @@ def tiny_config(**overrides: Any) -> PipelineConfig:
     return profile_config("quick").with_overrides({**TINY, **more})
 
 
-def without_report(digests: dict[str, str]) -> dict[str, str]:
-    """Digests that must agree between runs; the page holds the times of the run it was built in."""
-    return {name: digest for name, digest in digests.items() if name != "report"}
-
-
 @contextmanager
 def spared() -> Iterator[None]:
     """Most of what a tiny run would cost, and what other packages prove, is not paid for by every run.
