@@ -6,13 +6,16 @@ or changed is damage, never other data.
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import zarr
+import zarr.core.sync as zarr_sync
 from zarr.codecs import BloscCodec, Crc32cCodec
 from zarr.core.array import CompressorsLike
 from zarr.core.array_spec import ArrayConfigParams
@@ -25,6 +28,9 @@ __all__ = ["open_group", "read_array", "write_array", "write_frames"]
 SHARD_ABOVE_CHUNKS = 1000
 """Stacks of more frames than this are sharded, to keep the number of files low."""
 FRAMES_PER_SHARD = 64
+
+SETTLE_SECONDS = 10.0
+"""How long to wait for the other chunks when one could not be written."""
 
 # zarr reads a chunk that is not there as fill values, so that a lost file would be black frames.
 EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
@@ -47,7 +53,7 @@ def write_array(group: zarr.Group, name: str, array: np.ndarray) -> None:
         config=EVERY_CHUNK,
     )
     if array.size:
-        target[...] = array
+        _fill(target, array)
 
 
 def write_frames(group: zarr.Group, name: str, stack: np.ndarray) -> None:
@@ -67,7 +73,7 @@ def write_frames(group: zarr.Group, name: str, stack: np.ndarray) -> None:
         config=EVERY_CHUNK,
     )
     if stack.size:
-        target[...] = stack
+        _fill(target, stack)
 
 
 def read_array(group: zarr.Group, name: str) -> Any:
@@ -96,6 +102,25 @@ def read_array(group: zarr.Group, name: str) -> Any:
         file = _first_unreadable(array)
         raise DamagedArtefactError(str(error), file=file) from error
     return stored.astype(stored.dtype.newbyteorder("="), copy=False)
+
+
+def _fill(target: Any, values: np.ndarray) -> None:
+    try:
+        target[...] = values
+    except Exception:
+        # zarr raises at the first chunk that cannot be written, while others are still being written: into
+        # a directory that is about to be removed, which they would make again.
+        loop = zarr_sync.loop[0]
+        if loop is not None:
+            with suppress(TimeoutError):
+                asyncio.run_coroutine_threadsafe(_all_written(), loop).result(SETTLE_SECONDS)
+        raise
+
+
+async def _all_written() -> None:
+    others = asyncio.all_tasks() - {asyncio.current_task()}
+    if others:
+        await asyncio.wait(others)
 
 
 def _chunks(array: zarr.Array[Any]) -> Iterator[tuple[Path, tuple[slice, ...]]]:

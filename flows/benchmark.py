@@ -16,6 +16,7 @@ from extrags.errors import ConfigError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.store import Store
 from flows.damage import again_after_damage
+from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
@@ -112,7 +113,7 @@ def benchmark(
         return cases, benchmark_page([case.outcome for case in found], cases, words, baseline, name, runner)
 
     runs = len(sequences) * len(profiles) * len(seeds) * len(wanted)
-    with run_page(name, config, "evaluate", sequences=runs) as page:
+    with run_lease(store), run_page(name, config, "evaluate", sequences=runs) as page:
         cases, report = again_after_damage(Store(store), run_all)
         page.link(report, artifact_key("report", name), f"Report of {name}")
     attempt(

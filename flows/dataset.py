@@ -16,6 +16,7 @@ from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
 from flows.damage import again_after_damage
+from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
@@ -104,7 +105,7 @@ def reconstruct_dataset(
             report = dataset_page(outcomes, name, label, PrefectRunner(store, refresh, limits))
         return DatasetOutcome(outcomes, report)
 
-    with run_page(name, config, until, sequences=len(sequences), bars=False) as page:
+    with run_lease(store), run_page(name, config, until, sequences=len(sequences), bars=False) as page:
         found = again_after_damage(Store(store), run_all)
         if found.report is not None:
             page.link(found.report, artifact_key("report", name), f"Report of {name}")

@@ -12,6 +12,7 @@ from pydantic import Field
 from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
+from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, check_not_pinned, method_config, profile_label
 from flows.outcome import SequenceFailedError, SequenceOutcome
@@ -55,7 +56,7 @@ def reconstruct_sequence(
     """
     check_not_pinned(method, settings or {})
     config = method_config(method, profile, settings, seed)
-    with run_page(sequence, config, until) as page:
+    with run_lease(store), run_page(sequence, config, until) as page:
         open_store(store)
         preflight(config, until, METHODS[method].leave_out)
         outcome = run_sequence(

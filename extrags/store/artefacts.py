@@ -18,6 +18,7 @@ from extrags.store.canonical import Ref
 from extrags.store.directory import DirectoryBackend, private_directory
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, write_checksums
 from extrags.store.manifest import Manifest, software_versions, stage_of
+from extrags.store.refusal import refused_write
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
 
@@ -377,10 +378,10 @@ class Store:
         """
         started = datetime.datetime.now(datetime.UTC)
         clock = time.monotonic()
-        with private_directory(self.backend.scratch, key) as scratch:
+        with private_directory(self.backend.scratch, key, stage) as scratch:
             slot = Slot(scratch / "files", self)
-            slot.path.mkdir()
             try:
+                slot.path.mkdir()
                 with self._blaming(slot._inputs.values()):
                     yield slot
                 contents = write_checksums(slot.path, slot.records)
@@ -406,18 +407,23 @@ class Store:
                 )
             except Exception as error:
                 self._keep_failure(slot, key, label, error)
-                raise
+                refused = refused_write(error, stage, self.root, slot.path)
+                if refused is None:
+                    raise
+                # Here, while the file that could not be written is still there to be named.
+                raise refused from error
 
     def _keep_failure(self, slot: Slot, key: str, label: str, error: Exception) -> None:
         if not slot._debug.is_dir():
             return
         kept = self.state / "failed" / key
-        (slot._debug / "error.json").write_text(
-            json.dumps(
-                {"key": key, "label": label, "kind": type(error).__name__, "message": str(error)}, indent=1
-            )
-        )
         try:
+            (slot._debug / "error.json").write_text(
+                json.dumps(
+                    {"key": key, "label": label, "kind": type(error).__name__, "message": str(error)},
+                    indent=1,
+                )
+            )
             kept.parent.mkdir(parents=True, exist_ok=True)
             shutil.rmtree(kept, ignore_errors=True)
             slot._debug.rename(kept)

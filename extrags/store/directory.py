@@ -177,8 +177,13 @@ class DirectoryBackend:
 
 
 @contextmanager
-def private_directory(parent: Path, name: str) -> Iterator[Path]:
+def private_directory(parent: Path, name: str, stage: str = "") -> Iterator[Path]:
     """Create a directory locked by this process; it is removed at the end of the block.
+
+    Args:
+        parent: where.
+        name: what it is for; its own begins so.
+        stage: who needs it, for the message.
 
     Raises:
         StoreError: when it cannot be created.
@@ -186,7 +191,12 @@ def private_directory(parent: Path, name: str) -> Iterator[Path]:
     try:
         path, lock = _claim(parent, name)
     except OSError as error:
-        raise StoreError(f"the store {parent.parent} cannot be written: {error.strerror or error}") from error
+        reason = error.strerror or error
+        if not stage:
+            raise StoreError(f"the store {parent.parent} cannot be written: {reason}") from error
+        raise StoreError(
+            f"stage {stage}: {parent / name} cannot be written: {reason} (store {parent.parent})"
+        ) from error
     try:
         yield path
     finally:

@@ -17,6 +17,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import shutil
 import socket
 import statistics
@@ -39,19 +40,24 @@ WAYS = ("direct", "running", "temporary", "again")
 START_SECONDS = 120.0
 
 
-def run_once(way: str, store: Path, runner: str, environment: dict[str, str]) -> tuple[float, float]:
-    """Wall time of one process, and the seconds its stages took."""
+def run_once(way: str, store: Path, runner: str, environment: dict[str, str]) -> tuple[float, float, float]:
+    """Wall time of one process, the seconds its stages took, and its processor time, its server included."""
     if way == "direct":
         command = ["-m", "tests.flows.tiny", str(store)]
     else:
         command = ["-m", "flows.cli", "run", SEQUENCE, "--profile", "quick", *SETTINGS]
         command += ["--store", str(store), "--runner", runner]
-    clock = time.monotonic()
+    clock, processor = time.monotonic(), _children_seconds()
     ended = subprocess.run([sys.executable, *command], env=environment, capture_output=True, check=False)
     seconds = time.monotonic() - clock
     if ended.returncode:
         raise SystemExit(ended.stderr.decode())
-    return seconds, _at_work(store)
+    return seconds, _at_work(store), _children_seconds() - processor
+
+
+def _children_seconds() -> float:
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
 
 
 def _at_work(store: Path) -> float:
@@ -102,7 +108,7 @@ def main() -> None:
     ways = given.ways.split(",")
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PREFECT_")}
     environment |= {"PREFECT_SERVER_ANALYTICS_ENABLED": "false", "DO_NOT_TRACK": "1"}
-    found: dict[str, list[tuple[float, float]]] = {way: [] for way in ways}
+    found: dict[str, list[tuple[float, float, float]]] = {way: [] for way in ways}
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         with running_server(place, environment) as address:
@@ -116,17 +122,18 @@ def main() -> None:
                     store = place / f"{way}{index}"
                     if way == "again":
                         shutil.copytree(place / f"temporary{index}" / "prefect", store / "prefect")
-                    seconds, stages = run_once(
-                        way, store, given.runner, lasting if way == "running" else environment
-                    )
-                    found[way].append((seconds, stages))
-                    print(f"{way:10} wall {seconds:6.2f} s  stages {stages:6.2f} s", file=sys.stderr)
+                    took = run_once(way, store, given.runner, lasting if way == "running" else environment)
+                    found[way].append(took)
+                    print(_line(way, *took), file=sys.stderr)
                 for left in place.glob("*[0-9]"):
                     shutil.rmtree(left)
-    for way, pairs in found.items():
-        overhead = statistics.median(seconds - stages for seconds, stages in pairs)
-        wall = statistics.median(seconds for seconds, _ in pairs)
-        print(f"{way:10} wall {wall:6.2f} s  overhead {overhead:6.2f} s  (medians of {len(pairs)})")
+    for way, rounds in found.items():
+        overhead = statistics.median(seconds - stages for seconds, stages, _ in rounds)
+        print(f"{_line(way, *map(statistics.median, zip(*rounds, strict=True)))}  overhead {overhead:6.2f} s")
+
+
+def _line(way: str, seconds: float, stages: float, processor: float) -> str:
+    return f"{way:10} wall {seconds:6.2f} s  stages {stages:6.2f} s  processor {processor:6.2f} s"
 
 
 if __name__ == "__main__":
