@@ -71,7 +71,7 @@ def reconstruct_dataset(
     config = method_config(method, profile, settings, seed)
     open_store(store)
     preflight(config, until, METHODS[method].leave_out)
-    one = reconstruct_sequence.with_options(task_runner=task_runner(runner))
+    one = reconstruct_sequence.with_options(task_runner=task_runner(runner, at_once))
 
     def reconstruct(sequence: str) -> SequenceOutcome:
         state: State[Any] = one(
