@@ -69,6 +69,7 @@ class ClusterTaskRunner(DaskTaskRunner):
         self._workers = workers
         self._at_once = at_once
         self._run = f"extrags-{uuid4()}"
+        self._adopted = False
 
     def duplicate(self) -> ClusterTaskRunner:
         """As Prefect does for each flow run."""
@@ -85,11 +86,12 @@ class ClusterTaskRunner(DaskTaskRunner):
             if self._given is None:
                 self.address = _local_cluster(self._workers).scheduler_address
             _adopt(DaskTaskRunner.client.fget(self), self._run)
+            self._adopted = True
         return self._client
 
     def __exit__(self, *args: Any) -> None:
         """Let the workers send what they hold while the server is there."""
-        if self._client is not None:
+        if self._adopted:
             try:
                 self._client.unregister_worker_plugin(self._run)
             except Exception as error:
