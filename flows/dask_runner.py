@@ -54,7 +54,7 @@ _servers: dict[str, str] = {}
 """On a worker: address of the server of each run it works for."""
 
 
-class ClusterTaskRunner(DaskTaskRunner):
+class ClusterTaskRunner(DaskTaskRunner):  # type: ignore[misc]
     """Prefect's task runner for Dask, with workers that use the server of the run.
 
     Args:
@@ -142,7 +142,7 @@ def _adopt(client: distributed.Client, run: str) -> None:
             raise ConfigError(f"the Dask worker {worker} {problem}")
 
 
-class RunOnWorker(WorkerPlugin):
+class RunOnWorker(WorkerPlugin):  # type: ignore[misc]
     """Gives a worker the settings of a run, for as long as it goes on.
 
     Args:

@@ -39,7 +39,7 @@ def flip(store: Store, key: str, file: str) -> None:
 
 
 def run(store: Store) -> SequenceOutcome:
-    return run_sequence(SEQUENCE, tiny_config(), store.root, DirectRunner(store.root), until="evaluate")
+    return run_sequence(SEQUENCE, tiny_config(), store.root, DirectRunner(store.root), profile="quick")
 
 
 def records(store: Store) -> Iterator[tuple[str, str]]:

@@ -254,7 +254,7 @@ def test_killed_in_three_stages_it_ends_bit_identical(
     assert last.returncode == 0, complaints
     assert "ingest=cached" in said
     assert "explore=" in said
-    resumed = run_sequence(SEQUENCE, tiny_config(), str(store), StoreRunner(str(store)), until="evaluate")
+    resumed = run_sequence(SEQUENCE, tiny_config(), str(store), StoreRunner(str(store)), profile="quick")
     assert resumed.digests == undisturbed.digests
     Store(store).sweep()
     assert list((store / "scratch").iterdir()) == []

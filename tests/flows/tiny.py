@@ -97,7 +97,5 @@ def spared() -> Iterator[None]:
 
 if __name__ == "__main__":
     with spared():
-        ended = run_sequence(
-            SEQUENCE, tiny_config(), sys.argv[1], DirectRunner(sys.argv[1]), until="evaluate"
-        )
+        ended = run_sequence(SEQUENCE, tiny_config(), sys.argv[1], DirectRunner(sys.argv[1]), profile="quick")
     print(*[f"{row.stage}={row.state}" for row in ended.stages])
