@@ -21,7 +21,7 @@ import torch
 
 from extrags.raster import native
 
-__all__ = ["in_threads", "one_torch_thread", "torch_threads"]
+__all__ = ["in_threads", "kernel_threads", "one_torch_thread", "torch_threads"]
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -66,6 +66,23 @@ def torch_threads(count: int) -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def kernel_threads(count: int | None) -> Iterator[None]:
+    """The kernels, and `in_threads`, have so many threads in this process; None leaves their number alone.
+
+    For processes that do one thing at a time and share the cores with others, as Dask workers do.
+    """
+    if count is None or not native.native_isa():
+        yield
+        return
+    before = native.num_threads()
+    native.set_num_threads(count)
+    try:
+        yield
+    finally:
+        native.set_num_threads(before)
 
 
 @contextmanager

@@ -38,6 +38,9 @@ METADATA = "zarr.json"
 HELD_BYTES = 64 << 20
 """Of a stack, so much is encoded at once, by several threads, before it is written in order."""
 
+SETTLE_SECONDS = 10.0
+"""How long to wait for the other chunks when one could not be written."""
+
 # zarr reads a chunk that is not there as fill values, so that a lost file would be black frames.
 EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
 

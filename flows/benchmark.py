@@ -25,6 +25,7 @@ from flows.history import (
     regressions,
     trend,
 )
+from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, method_config
 from flows.outcome import SequenceOutcome
@@ -157,7 +158,7 @@ def benchmark(
         return cases, entry, worse, report
 
     runs = len(chosen) * len(profiles) * len(seeds) * len(wanted)
-    with run_page(name, config, "evaluate", sequences=runs) as page:
+    with run_lease(store), run_page(name, config, "evaluate", sequences=runs) as page:
         cases, entry, worse, report = again_after_damage(Store(store), run_all)
         page.link(report, artifact_key("report", name), f"Report of {name}")
     if refresh:

@@ -28,6 +28,7 @@ VERBS = {
     "export": "write a reconstructed scene as PLY, or a sequence as COLMAP model or transforms.json",
     "data": "what sequences there are, and whether a source is right",
     "cache": "what is in the store",
+    "reconcile": "set runs that a power loss left Running to Crashed",
     "weights": "which weights of networks are on this machine, and their download",
     "evaluate": "measure renders made elsewhere, or show the figures of a finished run",
     "benchmark": "compare methods over sequences and seeds",

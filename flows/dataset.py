@@ -18,6 +18,7 @@ from extrags.store import Store
 from flows.cases import Only, SequenceCase, cases_of, record_outcome_quietly, selected
 from flows.damage import again_after_damage
 from flows.expectation import expectations, expected_words, longest_first
+from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, profile_label
 from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceFailedError, SequenceOutcome, StageRow
@@ -112,7 +113,7 @@ def reconstruct_dataset(
     else:
         log.info("%s: none of %d runs is %s; nothing to do", name, len(every), only)
         return DatasetOutcome([])
-    one = reconstruct_sequence.with_options(task_runner=task_runner(runner))
+    one = reconstruct_sequence.with_options(task_runner=task_runner(runner, at_once))
 
     def reconstruct(case: SequenceCase) -> SequenceOutcome:
         state: State[Any] = one(
@@ -154,7 +155,7 @@ def reconstruct_dataset(
         return DatasetOutcome(outcomes, report)
 
     config = cases[0].config()
-    with run_page(name, config, until, sequences=len(cases), bars=False) as page:
+    with run_lease(store), run_page(name, config, until, sequences=len(cases), bars=False) as page:
         found = again_after_damage(Store(store), run_all)
         if found.report is not None:
             page.link(found.report, artifact_key("report", name), f"Report of {name}")

@@ -9,7 +9,12 @@ from pathlib import Path
 
 from extrags.errors import StoreError
 
-__all__ = ["prepare", "without_heartbeat"]
+__all__ = ["has_own_home", "prepare", "without_heartbeat"]
+
+
+def has_own_home() -> bool:
+    """Whether `prepare` keeps Prefect's database in the store, because the user has named no other place."""
+    return not os.environ.get("PREFECT_API_URL") and not os.environ.get("PREFECT_HOME")
 
 
 def prepare(state: Path, *, debug: bool = False) -> None:
@@ -39,7 +44,7 @@ def prepare(state: Path, *, debug: bool = False) -> None:
         "PREFECT_LOGGING_LEVEL": "INFO" if debug else "CRITICAL",
         "PREFECT_SERVER_LOGGING_LEVEL": "WARNING" if debug else "CRITICAL",
     }
-    if not os.environ.get("PREFECT_API_URL") and not os.environ.get("PREFECT_HOME"):
+    if has_own_home():
         home = state / "prefect"
         try:
             home.mkdir(parents=True, exist_ok=True)

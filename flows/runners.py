@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
 from prefect import Task
+from prefect.context import FlowRunContext
 from prefect.futures import PrefectFuture
 
 from extrags.errors import ExtragsError
@@ -94,7 +95,8 @@ class PrefectRunner:
 
     def run(self, calls: Sequence[Call], label: str) -> list[Result]:
         """Submit all, wait for all; a task whose worker was lost is submitted again."""
-        futures = [self._submit(call, label) for call in calls]
+        threads = _threads_for(len(calls))
+        futures = [self._submit(call, label, threads) for call in calls]
         for future in futures:
             future.wait()
         results = []
@@ -105,7 +107,7 @@ class PrefectRunner:
                     break
                 log.warning("%s %s: submitted again, since its worker was lost", call.task.name, label)
                 time.sleep(delay_s)
-                future = self._submit(call, label)
+                future = self._submit(call, label, threads)
                 future.wait()
             state = future.state
             if not state.is_final():
@@ -119,13 +121,24 @@ class PrefectRunner:
             results.append(Result(ref, "cached" if state.name == "Cached" else "ran"))
         return results
 
-    def _submit(self, call: Call, label: str) -> PrefectFuture[Ref]:
+    def _submit(self, call: Call, label: str, threads: int | None) -> PrefectFuture[Ref]:
         refresh = self.refresh and stage_key(call.task, call.inputs) not in self._refreshed
         task = at(self.limits.applied_to(call.task), self.store, refresh=refresh)
         future: PrefectFuture[Ref] = task.submit(
-            store=self.store, label=label, time_limit_s=self.limits.time_limit_s, **call.inputs
+            store=self.store,
+            label=label,
+            time_limit_s=self.limits.time_limit_s,
+            threads=threads,
+            **call.inputs,
         )
         return future
+
+
+def _threads_for(tasks: int) -> int | None:
+    """Threads for each task, where tasks run in processes that share the cores; None in this process."""
+    context = FlowRunContext.get()
+    share = getattr(context.task_runner, "threads_for", None) if context is not None else None
+    return share(tasks) if share is not None else None
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
 from flows.cases import SequenceCase, record_outcome_quietly
+from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, profile_label
 from flows.outcome import SequenceFailedError, SequenceOutcome
@@ -65,7 +66,7 @@ def reconstruct_sequence(
     case = SequenceCase(sequence, method, profile, seed, settings or {}, variant or {})
     config = case.config()
     store = run_store(store)
-    with run_page(sequence, config, until) as page:
+    with run_lease(store), run_page(sequence, config, until) as page:
         open_store(store)
         preflight(config, until, METHODS[method].leave_out)
         outcome = run_sequence(

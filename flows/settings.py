@@ -83,12 +83,13 @@ def pipeline_config(
     return config.with_overrides(settings or {})
 
 
-def task_runner(name: str) -> Any:
+def task_runner(name: str, at_once: int = 1) -> Any:
     """A Prefect task runner by name.
 
     Args:
-        name: `threads`; `dask` for a cluster of this machine's cores that lives as long as the run;
+        name: `threads`; `dask` for a cluster of this machine's cores that lives as long as the process;
             `dask:ADDRESS` for one that is already there, e.g. `dask:tcp://127.0.0.1:8786`.
+        at_once: how many runs use such a runner at the same time.
 
     Raises:
         ConfigError: for any other name.
@@ -100,17 +101,9 @@ def task_runner(name: str) -> Any:
         # One worker per core: the branches of a wave share the machine instead of fighting for it.
         return ThreadPoolTaskRunner(max_workers=usable_cores())
     if kind == "dask":
-        from prefect_dask import DaskTaskRunner
+        from flows.dask_runner import ClusterTaskRunner
 
-        if address:
-            return DaskTaskRunner(address=address)
-        return DaskTaskRunner(
-            cluster_kwargs={
-                "n_workers": usable_cores(),
-                "threads_per_worker": 1,
-                "dashboard_address": None,
-            }
-        )
+        return ClusterTaskRunner(address or None, usable_cores(), at_once)
     raise ConfigError(f"no task runner {name!r}; expected threads, dask or dask:ADDRESS")
 
 

@@ -5,37 +5,73 @@ command has told it how the runs ended, and it outlives a command that is killed
 its own, and its standard input is a pipe whose other end only the command holds. The kernel closes that end
 however the command ends, SIGKILL included; the server reads the end of file and goes.
 
+It starts while its command still imports and looks (`start_early`), and does not make its database anew for
+every store: the first one on a machine is kept as a template, since Prefect's migrations take longer than all
+else.
+
 `python -m flows.temporary_server DESCRIPTOR` is the server; `temporary_server` starts it.
 """
 
 from __future__ import annotations
 
+import asyncio
 import atexit
 import os
 import socket
+import sqlite3
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from importlib import metadata
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 from unittest.mock import patch
+from urllib.parse import quote
 
+from extrags.data_directories import cache_directory
 from extrags.errors import ExtragsError
 
-__all__ = ["ServerError", "temporary_server"]
+if TYPE_CHECKING:
+    import uvicorn
+
+__all__ = ["ServerError", "start_early", "stop_early", "temporary_server"]
 
 POLL_SECONDS = 0.1
 END_SECONDS = 2.0
 """How long the server may take to end by itself."""
 
+DATABASE = "prefect.db"
+"""In Prefect's home."""
+
+_starting: dict[str, subprocess.Popen[bytes]] = {}
+"""The server that was started early, by its address; at most one."""
 _started: dict[str, subprocess.Popen[bytes]] = {}
 """The server of this process by its address; at most one."""
 
 
 class ServerError(ExtragsError, RuntimeError):
     """The temporary server did not start."""
+
+
+def start_early() -> None:
+    """Start the server and do not wait for it: before Prefect is imported, which takes as long.
+
+    For who knows that it will be needed, and that Prefect's home is one of this project
+    (`flows.environment.prepare`); where Prefect then knows another server, this one ends.
+    """
+    if not _starting and not _started and not os.environ.get("PREFECT_API_URL"):
+        address, process = _launch({})
+        _starting[address] = process
+
+
+def stop_early() -> None:
+    """End the server that was started early, where nobody has come to need it."""
+    while _starting:
+        _stop(_starting.popitem()[1])
 
 
 @contextmanager
@@ -50,6 +86,7 @@ def temporary_server() -> Iterator[None]:
     from prefect.settings import PREFECT_API_URL, PREFECT_SERVER_EPHEMERAL_ENABLED, temporary_settings
 
     if PREFECT_API_URL.value() or not PREFECT_SERVER_EPHEMERAL_ENABLED.value():
+        stop_early()
         yield
         return
     address = next((address for address, server in _started.items() if server.poll() is None), None)
@@ -63,14 +100,33 @@ def temporary_server() -> Iterator[None]:
 def _start() -> str:
     from prefect.settings import PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS, get_current_settings
 
+    limit_s = PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS.value()
+    if _starting:
+        address, process = _starting.popitem()
+    else:
+        address, process = _launch(get_current_settings().to_environment_variables(exclude_unset=True))
+    _wait(process, address, limit_s)
+    _started.clear()
+    _started[address] = process
+    return address
+
+
+def _launch(settings: dict[str, str]) -> tuple[str, subprocess.Popen[bytes]]:
+    """Start the server: its address, at which nobody answers yet, and its process."""
     root = str(Path(__file__).resolve().parents[1])
     environment = {
         **os.environ,
-        **get_current_settings().to_environment_variables(exclude_unset=True),
+        **settings,
         # As Prefect starts its own temporary server.
         "PREFECT_UI_ENABLED": "0",
         "PREFECT__SERVER_EPHEMERAL": "1",
         "PREFECT__SERVER_FINAL": "1",
+        # Nobody asks this server for events, automations or blocks.
+        "PREFECT_SERVER_SERVICES_EVENT_PERSISTER_ENABLED": "false",
+        "PREFECT_SERVER_SERVICES_TRIGGERS_ENABLED": "false",
+        "PREFECT_API_BLOCKS_REGISTER_ON_START": "false",
+        # It would be noted as done for the servers to come.
+        "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
         "PYTHONPATH": os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])]),
     }
     # The port is taken here and handed over, so that nobody else can take it meanwhile.
@@ -86,10 +142,7 @@ def _start() -> str:
         )
     # Registered before Prefect's own, hence run after them: they send the last events.
     atexit.register(_stop, process)
-    _wait(process, address, PREFECT_SERVER_EPHEMERAL_STARTUP_TIMEOUT_SECONDS.value())
-    _started.clear()
-    _started[address] = process
-    return address
+    return address, process
 
 
 def _wait(process: subprocess.Popen[bytes], address: str, limit_s: float) -> None:
@@ -114,6 +167,35 @@ def _wait(process: subprocess.Popen[bytes], address: str, limit_s: float) -> Non
     )
 
 
+def copy_database(source: Path, target: Path) -> bool:
+    """Copy an SQLite database that others may be using; whether `target` is now a sound copy.
+
+    A target that is there stays as it is, and so does everything when something fails: then there is merely
+    nothing to be copied the next time.
+    """
+    if not source.is_file():
+        return False
+    part = target.with_name(f"{target.name}.{os.getpid()}.part")
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        address = f"file:{quote(str(source))}?mode=ro"
+        with (
+            closing(sqlite3.connect(address, uri=True)) as one,
+            closing(sqlite3.connect(part)) as other,
+        ):
+            one.backup(other)
+            # No files of a log beside it.
+            other.execute("PRAGMA journal_mode=DELETE")
+            sound = bool(other.execute("PRAGMA quick_check").fetchall() == [("ok",)])
+        if sound:
+            os.link(part, target)
+        return sound
+    except (OSError, sqlite3.Error):
+        return False
+    finally:
+        part.unlink(missing_ok=True)
+
+
 def _stop(process: subprocess.Popen[bytes]) -> None:
     if process.stdin is not None:
         process.stdin.close()
@@ -126,30 +208,60 @@ def _stop(process: subprocess.Popen[bytes]) -> None:
 
 def _serve(descriptor: int) -> None:
     """Serve on a bound socket until standard input ends."""
-    ended = threading.Event()
+    serving: list[uvicorn.Server] = []
 
     def watch() -> None:
         while os.read(0, 1):
             pass
-        ended.set()
-        # Nobody is left to talk to: whatever still hinders the server is not waited for.
-        time.sleep(END_SECONDS)
+        # Nobody is left to talk to: whatever still hinders the server is not waited for, and one that has
+        # not started has nothing to end.
+        for server in serving:
+            server.should_exit = True
+            time.sleep(END_SECONDS if server.started else 0)
         os._exit(0)
 
     threading.Thread(target=watch, daemon=True, name="end-with-the-command").start()
     # After the thread has started: this takes seconds.
     import uvicorn
 
-    server = uvicorn.Server(
-        uvicorn.Config("prefect.server.api.server:create_app", factory=True, log_level="error", lifespan="on")
+    _provide_database()
+    config = uvicorn.Config(
+        "prefect.server.api.server:create_app", factory=True, log_level="error", lifespan="on"
     )
+    serving.append(uvicorn.Server(config))
+    serving[0].run(sockets=[socket.socket(fileno=descriptor)])
 
-    def leave() -> None:
-        ended.wait()
-        server.should_exit = True
 
-    threading.Thread(target=leave, daemon=True, name="leave").start()
-    server.run(sockets=[socket.socket(fileno=descriptor)])
+def _provide_database() -> None:
+    """See to it that Prefect's home has a database: a copy of the template, which is made if need be."""
+    from prefect.settings import PREFECT_API_DATABASE_CONNECTION_URL, PREFECT_HOME, temporary_settings
+
+    database = PREFECT_HOME.value() / DATABASE
+    address = str(PREFECT_API_DATABASE_CONNECTION_URL.value())
+    # Another database, such as Postgres, is whose it is.
+    if database.exists() or not address.endswith(f"/{database}"):
+        return
+    template = cache_directory() / f"prefect-{metadata.version('prefect')}.db"
+    if copy_database(template, database):
+        return
+    from prefect.server.database.alembic_commands import alembic_upgrade
+    from prefect.server.database.dependencies import temporary_database_config
+    from prefect.utilities.asyncutils import run_sync_in_worker_thread
+
+    # Elsewhere first: a command that is killed meanwhile leaves no half of a database.
+    database.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(dir=database.parent) as folder:
+        made = Path(folder) / DATABASE
+        with (
+            temporary_settings(
+                {PREFECT_API_DATABASE_CONNECTION_URL: f"{address.removesuffix(str(database))}{made}"}
+            ),
+            # Else the server would go on with this one.
+            temporary_database_config(None),
+        ):
+            asyncio.run(run_sync_in_worker_thread(alembic_upgrade))
+        copy_database(made, template)
+        copy_database(made, database)
 
 
 if __name__ == "__main__":

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import platform
+from dataclasses import replace
 from typing import Any, Literal, TypeVar, get_args
 
 from extrags.config import PipelineConfig
-from extrags.store import Ref, Slot, Storable, Store
+from extrags.store import Ref, Slot, Storable, Store, digest_of
 from tasks.coarse import HISTORY
 from tasks.evaluate import METRICS_FILE
 from tasks.stage import stage
@@ -14,6 +15,8 @@ from tasks.stage import stage
 __all__ = ["PAGE", "REPORT_PARTS", "dataset_report", "report"]
 
 PAGE = "report.html"
+CONTENT = "content.json"
+"""Beside a page: the digest of what it shows, apart from times and machine of the run."""
 
 S = TypeVar("S", bound=Storable)
 
@@ -39,7 +42,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=5, ignore=("rows",))
+@stage("report", version=6, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
@@ -48,7 +51,7 @@ def report(
     profile: str,
     rows: list[dict[str, Any]],
 ) -> None:
-    """Build the page; writes `report.html`.
+    """Build the page; writes `report.html` and `content.json`.
 
     Args:
         slot: the artefact to write.
@@ -64,7 +67,7 @@ def report(
     from extrags.freespace import FreeSpace
     from extrags.metrics.protocol import RenderedViews
     from extrags.pseudo_views import PseudoViews
-    from extrags.report.build import build_report
+    from extrags.report.build import build_pages
     from extrags.report.inputs import ReportInputs
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
@@ -100,9 +103,19 @@ def report(
         profile=profile,
         absent=_absent(skipped),
     )
-    page = build_report(inputs, config.report)
-    (slot.path / PAGE).write_text(page, encoding="utf-8")
+    page, content = build_pages(inputs, config.report)
+    _save_page(slot, page, content)
     slot.counts["kib"] = round(len(page.encode()) / 1024)
+
+
+def _save_page(slot: Slot, page: str, content: str) -> None:
+    """Write a page, and the digest of what does not depend on the run it shows.
+
+    The artefact's digest covers the latter alone: equal inputs give equal digests.
+    """
+    (slot.path / PAGE).write_text(page, encoding="utf-8")
+    slot.run_files.add(PAGE)
+    slot.save_json(CONTENT, {"digest": digest_of(content)})
 
 
 def _environment(store: Store, parts: dict[str, Ref]) -> dict[str, str]:
@@ -125,7 +138,7 @@ def _absent(skipped: dict[str, str]) -> dict[str, str]:
     }
 
 
-@stage("dataset-report", version=1, ignore=("rows",))
+@stage("dataset-report", version=2, ignore=("rows",))
 def dataset_report(
     slot: Slot,
     name: str,
@@ -135,7 +148,7 @@ def dataset_report(
     failures: dict[str, str],
     rows: list[dict[str, Any]],
 ) -> None:
-    """Build the page that compares sequences; writes `report.html`.
+    """Build the page that compares sequences; writes `report.html` and `content.json`.
 
     Args:
         slot: the artefact to write.
@@ -152,24 +165,24 @@ def dataset_report(
         ref = metrics.get(f"{sequence} {which}")
         return None if ref is None else slot.load_json(METRICS_FILE, ref)["metrics"]
 
-    page = build_dataset_report(
-        [
-            DatasetRow(
-                name=sequence,
-                status="failed" if sequence in failures else "completed",
-                seconds=sum(stage["made_seconds"] for stage in row["stages"]),
-                coarse=figures(sequence, "coarse"),
-                final=figures(sequence, "final"),
-                stages=row["stages"],
-                error=failures.get(sequence, ""),
-                link=_neighbour(row["report"]),
-            )
-            for sequence, row in zip(sequences, rows, strict=True)
-        ],
-        name=name,
-        profile=profile,
+    shown = [
+        DatasetRow(
+            name=sequence,
+            status="failed" if sequence in failures else "completed",
+            seconds=sum(stage["made_seconds"] for stage in row["stages"]),
+            coarse=figures(sequence, "coarse"),
+            final=figures(sequence, "final"),
+            stages=row["stages"],
+            error=failures.get(sequence, ""),
+            link=_neighbour(row["report"]),
+        )
+        for sequence, row in zip(sequences, rows, strict=True)
+    ]
+    page, content = (
+        build_dataset_report(every, name=name, profile=profile)
+        for every in (shown, [replace(row, seconds=0, stages=()) for row in shown])
     )
-    (slot.path / PAGE).write_text(page, encoding="utf-8")
+    _save_page(slot, page, content)
 
 
 def _neighbour(page: str | None) -> str:

@@ -31,7 +31,7 @@ from pydantic import BaseModel
 
 from extrags.errors import ConfigError
 from extrags.store import Ref, Slot, Store, canonical, digest_of
-from extrags.threads import one_torch_thread
+from extrags.threads import kernel_threads, one_torch_thread
 from tasks.locks import FlockManager
 from tasks.memory import peak_memory
 from tasks.progress import reporting
@@ -42,8 +42,9 @@ __all__ = ["ArtefactRecords", "StageKey", "at", "stage", "stage_key", "stage_ver
 
 P = ParamSpec("P")
 
-NOT_IN_KEY = frozenset({"store", "label", "time_limit_s"})
-"""Parameters of every stage that do not affect the content of its artefact: store, display name, limit."""
+NOT_IN_KEY = frozenset({"store", "label", "time_limit_s", "threads"})
+"""Parameters of every stage that do not affect the content of its artefact: store, display name, limit,
+threads."""
 
 _versions: dict[str, int] = {}
 
@@ -125,7 +126,8 @@ def stage(
 
     Returns:
         A decorator. Its task takes the function's arguments by name, and in addition `store` (root of the
-        store), `label` (display name of the sequence) and `time_limit_s` (see `tasks.progress.reporting`);
+        store), `label` (display name of the sequence), `time_limit_s` (see `tasks.progress.reporting`) and
+        `threads` (of the kernels, where other processes share the cores; all by default);
         it returns a `Ref`. Arguments must be refs, settings or plain values, since their canonical form is
         the key.
 
@@ -139,7 +141,14 @@ def stage(
         key_of = StageKey(name=name, version=version, ignore=ignore)
 
         @functools.wraps(body)
-        def run(*, store: str, label: str = "", time_limit_s: float | None = None, **inputs: Any) -> Ref:
+        def run(
+            *,
+            store: str,
+            label: str = "",
+            time_limit_s: float | None = None,
+            threads: int | None = None,
+            **inputs: Any,
+        ) -> Ref:
             where = Store(store)
             bound = signature.bind(**inputs)
             bound.apply_defaults()
@@ -164,7 +173,7 @@ def stage(
                 ) as slot,
             ):
                 # Workers with other numbers of threads share the store.
-                with peak_memory() as peak, one_torch_thread():
+                with peak_memory() as peak, kernel_threads(threads), one_torch_thread():
                     body(slot, **inputs)  # type: ignore[call-arg]
                 slot.counts["peak_mib"] = peak.mib
             return slot.ref
@@ -178,6 +187,7 @@ def stage(
             inspect.Parameter(
                 "time_limit_s", inspect.Parameter.KEYWORD_ONLY, annotation=float | None, default=None
             ),
+            inspect.Parameter("threads", inspect.Parameter.KEYWORD_ONLY, annotation=int | None, default=None),
         ]
         run.__signature__ = inspect.Signature([*own, *given], return_annotation=Ref)  # type: ignore[attr-defined]
         return Task(

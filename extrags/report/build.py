@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from extrags.report.wording import (
     shown_metrics,
 )
 
-__all__ = ["build_report"]
+__all__ = ["build_pages", "build_report"]
 
 IMAGE_BYTES = 4_200_000
 """For all images of views together; charts and figures of the scene need about one million more."""
@@ -56,12 +57,25 @@ def build_report(inputs: ReportInputs, config: ReportConfig) -> str:
         NonFiniteError: when an image to be shown holds NaN or infinity.
         ConfigError: when so many views are asked for that not even thumbnails fit.
     """
-    return rendered_page(
-        "sequence.html.j2",
+    return build_pages(inputs, config)[0]
+
+
+def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
+    """The page of `build_report`, and the same page without what two runs with equal results differ in.
+
+    These are times, whether stages ran or came from the cache, and the machine.
+
+    Args:
+        inputs: what the stages made.
+        config: how many views to show.
+
+    Raises:
+        NonFiniteError: when an image to be shown holds NaN or infinity.
+        ConfigError: when so many views are asked for that not even thumbnails fit.
+    """
+    shared: dict[str, Any] = dict(
         name=inputs.name,
-        made=inputs.made,
         profile=inputs.profile,
-        facts=_facts(inputs),
         summary=_summary(inputs),
         tiles=_tiles(inputs),
         regions=_regions(inputs),
@@ -72,13 +86,23 @@ def build_report(inputs: ReportInputs, config: ReportConfig) -> str:
         **_space(inputs),
         plan=_plan(inputs),
         plan_absent=inputs.why_absent("plan", "assess"),
-        stages=_stages(inputs),
         stages_absent="No stage times were handed to this report.",
-        stage_summary=_stage_summary(inputs),
         protocol=_protocol(inputs),
         settings=_settings(inputs.config),
-        environment=dict(inputs.environment),
     )
+    pages = [
+        rendered_page(
+            "sequence.html.j2",
+            **shared,
+            made=shown.made,
+            facts=_facts(shown),
+            stages=_stages(shown),
+            stage_summary=_stage_summary(shown),
+            environment=dict(shown.environment),
+        )
+        for shown in (inputs, replace(inputs, made="", stages=[], environment={}))
+    ]
+    return pages[0], pages[1]
 
 
 def _facts(inputs: ReportInputs) -> list[tuple[str, str]]:

@@ -18,6 +18,7 @@ from extrags.store.canonical import Ref
 from extrags.store.directory import ABOUT, DirectoryBackend, private_directory
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
 from extrags.store.manifest import Manifest, software_versions, stage_of
+from extrags.store.refusal import refused_write
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
 
@@ -38,12 +39,15 @@ class Slot:
     Args:
         path: where the stage writes.
         counts: numbers for the manifest, filled by the stage.
+        run_files: names of files that tell of this run, such as its times, filled by the stage. They are kept
+            and compared as all others, but the artefact's digest does not cover them.
     """
 
     def __init__(self, path: Path, store: Store) -> None:
         self.path = path
         self.store = store
         self.counts: dict[str, float | int | str | None] = {}
+        self.run_files: set[str] = set()
         self._debug = path.with_name("debug")
         self._manifest: Manifest | None = None
         self._inputs: dict[str, Ref] = {}
@@ -387,27 +391,27 @@ class Store:
         """
         started = datetime.datetime.now(datetime.UTC)
         clock = time.monotonic()
-        with private_directory(self.backend.scratch, key) as scratch:
+        with private_directory(self.backend.scratch, key, stage) as scratch:
             slot = Slot(scratch / "files", self)
-            slot.path.mkdir()
             about = {
                 "key": key,
                 "stage": stage,
                 "label": label,
                 "started": started.isoformat(timespec="seconds"),
             }
-            (scratch / ABOUT).write_text(json.dumps(about), encoding="utf-8")
             try:
+                (scratch / ABOUT).write_text(json.dumps(about), encoding="utf-8")
+                slot.path.mkdir()
                 with self._blaming(slot._inputs.values()):
                     yield slot
-                contents, digest, files, size = list_contents(slot.path)
+                listing = list_contents(slot.path, slot.run_files)
                 slot._manifest = self.backend.commit(
                     slot.path,
                     Manifest(
                         stage=stage,
                         version=version,
                         key=key,
-                        digest=digest,
+                        digest=listing.digest,
                         label=label,
                         config=dict(config or {}),
                         inputs={name: ref.digest for name, ref in (inputs or {}).items()},
@@ -416,26 +420,32 @@ class Store:
                         started=started.isoformat(timespec="seconds"),
                         seconds=round(time.monotonic() - clock, 3),
                         counts=slot.counts,
-                        files=files,
-                        bytes=size,
-                        contents=contents,
+                        files=listing.files,
+                        bytes=listing.bytes,
+                        contents=listing.contents,
+                        run_files=sorted(slot.run_files),
                     ),
                     renew=renew,
                 )
             except Exception as error:
                 self._keep_failure(slot, key, label, error)
-                raise
+                refused = refused_write(error, stage, self.root, slot.path)
+                if refused is None:
+                    raise
+                # Here, while the file that could not be written is still there to be named.
+                raise refused from error
 
     def _keep_failure(self, slot: Slot, key: str, label: str, error: Exception) -> None:
         if not slot._debug.is_dir():
             return
         kept = self.state / "failed" / key
-        (slot._debug / "error.json").write_text(
-            json.dumps(
-                {"key": key, "label": label, "kind": type(error).__name__, "message": str(error)}, indent=1
-            )
-        )
         try:
+            (slot._debug / "error.json").write_text(
+                json.dumps(
+                    {"key": key, "label": label, "kind": type(error).__name__, "message": str(error)},
+                    indent=1,
+                )
+            )
             kept.parent.mkdir(parents=True, exist_ok=True)
             shutil.rmtree(kept, ignore_errors=True)
             slot._debug.rename(kept)

@@ -15,7 +15,7 @@ from typing import Any
 from extrags.errors import DamagedArtefactError, StoreError
 from extrags.store.canonical import Ref
 from extrags.store.integrity import Damage, Depth, find_damage, intact_manifest
-from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
+from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, same_content, stage_of
 
 __all__ = [
     "ABOUT",
@@ -208,7 +208,7 @@ class DirectoryBackend:
                 return manifest
             except OSError:
                 present = intact_manifest(self, manifest.key)
-                if present is not None and present.digest == manifest.digest:
+                if present is not None and same_content(present, manifest):
                     if not renew:
                         return present
                     self._put(target / MANIFEST, manifest_text(manifest))
@@ -241,8 +241,13 @@ class DirectoryBackend:
 
 
 @contextmanager
-def private_directory(parent: Path, name: str) -> Iterator[Path]:
+def private_directory(parent: Path, name: str, stage: str = "") -> Iterator[Path]:
     """Create a directory locked by this process; it is removed at the end of the block.
+
+    Args:
+        parent: where.
+        name: what it is for; its own begins so.
+        stage: who needs it, for the message.
 
     Raises:
         StoreError: when it cannot be created.
@@ -250,7 +255,12 @@ def private_directory(parent: Path, name: str) -> Iterator[Path]:
     try:
         path, lock = _claim(parent, name)
     except OSError as error:
-        raise StoreError(f"the store {parent.parent} cannot be written: {error.strerror or error}") from error
+        reason = error.strerror or error
+        if not stage:
+            raise StoreError(f"the store {parent.parent} cannot be written: {reason}") from error
+        raise StoreError(
+            f"stage {stage}: {parent / name} cannot be written: {reason} (store {parent.parent})"
+        ) from error
     try:
         yield path
     finally:

@@ -1,7 +1,7 @@
 """Whether the files of an artefact are still those that were stored.
 
 The manifest holds size and digest of every file, in earlier artefacts `checksums.json` beside it. Neither
-list needs a checksum of its own: the artefact's digest is computed from it. Number and size of files are
+list needs a checksum of its own: the artefact's digest is computed from it, and the manifest has a checksum. Number and size of files are
 compared on every access, contents once per process and artefact (`Depth`).
 """
 
@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol, runtime_checkable
@@ -24,8 +24,10 @@ from extrags.store.manifest import MANIFEST, Manifest
 __all__ = [
     "CHECKSUMS",
     "VERIFY_VARIABLE",
+    "Contents",
     "Damage",
     "Depth",
+    "Listing",
     "content_digest",
     "default_depth",
     "find_damage",
@@ -62,6 +64,15 @@ class Damage:
     """Relative name; empty where the artefact has no list of files."""
 
 
+class Listing(NamedTuple):
+    """What the files of an artefact amount to."""
+
+    digest: str
+    files: int
+    bytes: int
+    contents: Contents
+
+
 class _File(NamedTuple):
     size: int
     digest: str
@@ -93,8 +104,13 @@ def content_digest(directory: Path) -> tuple[str, int, int]:
     return _summary({name: _read(directory / name) for name in _sizes(directory)})
 
 
-def list_contents(directory: Path) -> tuple[Contents, str, int, int]:
-    """The files of an artefact for its manifest, and what `content_digest` returns."""
+def list_contents(directory: Path, run_files: Collection[str] = ()) -> Listing:
+    """The files of an artefact, for its manifest.
+
+    Args:
+        directory: the files.
+        run_files: names of those that tell of the run; the digest does not cover them.
+    """
     files = {name: _read(directory / name) for name in sorted(_sizes(directory))}
     contents: Contents = {}
     for name, file in files.items():
@@ -103,7 +119,7 @@ def list_contents(directory: Path) -> tuple[Contents, str, int, int]:
             contents[name] = (file.size, file.digest, begin, _read(directory / name, begin).digest)
         else:
             contents[name] = (file.size, file.digest)
-    return contents, *_summary(files)
+    return Listing(*_summary(files, run_files), contents)
 
 
 def find_damage(directory: Path, manifest: Manifest, depth: Depth) -> Damage | None:
@@ -128,7 +144,7 @@ def find_damage(directory: Path, manifest: Manifest, depth: Depth) -> Damage | N
         counts = find_damaged_sizes(sizes, manifest)
         if counts is not None or depth == "sizes":
             return counts
-        found = _summary({name: _read(directory / name) for name in sizes})[0]
+        found, _, _ = _summary({name: _read(directory / name) for name in sizes})
         return None if found == manifest.digest else _other_digest(found, manifest)
     for name in sorted({*listed, *sizes}):
         if name not in listed:
@@ -201,7 +217,7 @@ def _checksums(directory: Path, manifest: Manifest) -> dict[str, _File] | Damage
     """The files of an artefact; None where they were not listed, damage where the list is not its own."""
     if manifest.contents:
         files = {name: _File(*entry) for name, entry in manifest.contents.items()}
-        if _summary(files) != (manifest.digest, manifest.files, manifest.bytes):
+        if _summary(files, manifest.run_files) != (manifest.digest, manifest.files, manifest.bytes):
             return Damage("its list of files is not this artefact's", MANIFEST)
         return files
     try:
@@ -225,9 +241,10 @@ def _is_chunk(name: str) -> bool:
     return "/c/" in name or name.endswith("/c")
 
 
-def _summary(files: Mapping[str, _File]) -> tuple[str, int, int]:
+def _summary(files: Mapping[str, _File], run_files: Collection[str] = ()) -> tuple[str, int, int]:
+    """Digest of the files without those that tell of the run; number and bytes of all."""
     total = hashlib.blake2b(digest_size=DIGEST_BYTES)
-    for name in sorted(files):
+    for name in sorted(set(files).difference(run_files)):
         total.update(f"{name}\0{files[name].digest}\n".encode())
     return total.hexdigest(), len(files), sum(file.size for file in files.values())
 

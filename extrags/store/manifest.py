@@ -14,7 +14,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from extrags.store.canonical import DIGEST_BYTES
 
-__all__ = ["MANIFEST", "Manifest", "manifest_text", "parsed_manifest", "software_versions", "stage_of"]
+__all__ = [
+    "MANIFEST",
+    "Manifest",
+    "manifest_text",
+    "parsed_manifest",
+    "same_content",
+    "software_versions",
+    "stage_of",
+]
 
 MANIFEST = "manifest.json"
 _CLOSE = b"\n}"
@@ -51,6 +59,9 @@ class Manifest(BaseModel):
     contents: dict[str, tuple[int, str] | tuple[int, str, int, str]] = Field(default_factory=dict)
     """Size and digest of each file by relative name; of packed arrays also where their metadata begins, and
     its digest. Earlier artefacts have a file `checksums.json` instead, the first ones nothing."""
+    run_files: list[str] = Field(default_factory=list)
+    """Names of the files that tell of the run that made the artefact, such as a page with its times. `digest`
+    leaves them out: equal inputs give equal digests."""
     data: str = ""
     """On object stores: the prefix, below the artefact's own, that holds the files of this attempt."""
     checksum: str = ""
@@ -85,6 +96,12 @@ def parsed_manifest(text: bytes) -> Manifest:
     if manifest.checksum and not seal:
         raise ValueError("its checksum is not where it was written")
     return manifest
+
+
+def same_content(one: Manifest, other: Manifest) -> bool:
+    """Whether two manifests are of the same files with the same bytes."""
+    told = [{name: item.contents.get(name) for name in item.run_files} for item in (one, other)]
+    return one.digest == other.digest and told[0] == told[1]
 
 
 def stage_of(key: str) -> str:

@@ -23,7 +23,7 @@ from extrags.errors import DamagedArtefactError, MissingDependencyError, StoreEr
 from extrags.store.canonical import Ref, digest_of
 from extrags.store.directory import DAMAGED, RECORD, RECORDS, private_directory, sweep_directories
 from extrags.store.integrity import Damage, find_damage, find_damaged_sizes, intact_manifest
-from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, stage_of
+from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, same_content, stage_of
 
 __all__ = ["UrlBackend", "default_cache_directory"]
 
@@ -272,7 +272,7 @@ class UrlBackend:
         and how fast it was made this time.
         """
         present = intact_manifest(self, manifest.key)
-        if present is not None and present.digest == manifest.digest:
+        if present is not None and same_content(present, manifest):
             if renew:
                 present = manifest.model_copy(update={"data": present.data})
                 self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest_text(present))

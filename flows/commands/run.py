@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 import sys
 import time
@@ -198,8 +199,8 @@ def execute(
         MissingDependencyError: when a package that the settings need is not there.
     """
     from extrags.store import Store
-    from flows.environment import prepare, without_heartbeat
-    from flows.temporary_server import temporary_server
+    from flows.environment import has_own_home, prepare, without_heartbeat
+    from flows.temporary_server import start_early, stop_early, temporary_server
 
     terminal = sys.stderr.isatty()
     set_up_logging(debug=given.debug, terminal=terminal)
@@ -208,7 +209,11 @@ def execute(
     if several.methods == (given.method,):
         # Wrong usage is said before anything is made or loaded.
         run_config(given)
+    own_home = has_own_home()
     prepare(Store(root).state, debug=given.debug)
+    always = refresh or always_flow
+    if own_home and (always or not all(_may_be_finished(root, name, until) for name in sequences)):
+        start_early()
     from flows.cases import cases_of, selected
     from flows.expectation import expectations, expected_words
     from flows.methods import METHODS
@@ -226,12 +231,16 @@ def execute(
     )
     cases = selected(every, several.only, root, until)
     if not cases:
+        stop_early()
         return DatasetOutcome([])
-    if not refresh and not always_flow:
+    if not always:
         # Nothing to make: no need to wait for a server.
         found = _from_store(cases, root, until)
         if found is not None:
+            stop_early()
             return found
+        if own_home:
+            start_early()
     # The flow looks as well; here it is said without waiting for a server.
     from flows.preflight import preflight
 
@@ -274,6 +283,22 @@ def execute(
             if sequence.error is not None:
                 raise sequence.error
     return outcome
+
+
+def _may_be_finished(root: str, sequence: str, until: StageName) -> bool:
+    """False where a sequence was hardly ever taken to its last stage; answers before torch is imported.
+
+    A guess: it decides when the server starts, not whether anything is made.
+    """
+    if until != "report" or "://" in root:
+        return True
+    for manifest in Path(root).glob("artefacts/report-v*/manifest.json"):
+        try:
+            if json.loads(manifest.read_bytes())["label"] == sequence:
+                return True
+        except (OSError, ValueError, KeyError):
+            continue
+    return False
 
 
 def _from_store(cases: Sequence[SequenceCase], root: str, until: StageName) -> DatasetOutcome | None:
