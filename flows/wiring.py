@@ -13,6 +13,7 @@ from extrags.config import PipelineConfig
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
 from extrags.metrics.registry import added_metrics
 from extrags.pipeline import HELD_OUT_TRAINED_ON, STAGES, Pipeline, StageName
+from extrags.redaction import without_credentials
 from extrags.store import Manifest, Ref, Store
 from flows.damage import again_after_damage
 from flows.outcome import Part, SequenceOutcome, StageRow
@@ -452,7 +453,8 @@ class SequenceRun(Pipeline):
             raise
         except Exception as error:
             row.state = "failed"
-            row.reason = str(error) if isinstance(error, ExtragsError) else f"{type(error).__name__}: {error}"
+            told = str(error) if isinstance(error, ExtragsError) else f"{type(error).__name__}: {error}"
+            row.reason = without_credentials(told)
             self.outcome.error = error
             raise _StoppedError from error
         except BaseException:

@@ -6,6 +6,7 @@ import platform
 from typing import Any, Literal, TypeVar, get_args
 
 from extrags.config import PipelineConfig
+from extrags.redaction import without_credentials
 from extrags.store import Ref, Slot, Storable, Store
 from tasks.coarse import HISTORY
 from tasks.evaluate import METRICS_FILE
@@ -100,7 +101,7 @@ def report(
         profile=profile,
         absent=_absent(skipped),
     )
-    page = build_report(inputs, config.report)
+    page = without_credentials(build_report(inputs, config.report))
     (slot.path / PAGE).write_text(page, encoding="utf-8")
     slot.counts["kib"] = round(len(page.encode()) / 1024)
 
@@ -169,7 +170,7 @@ def dataset_report(
         name=name,
         profile=profile,
     )
-    (slot.path / PAGE).write_text(page, encoding="utf-8")
+    (slot.path / PAGE).write_text(without_credentials(page), encoding="utf-8")
 
 
 def _neighbour(page: str | None) -> str:

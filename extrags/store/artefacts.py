@@ -13,7 +13,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from extrags.errors import ArtefactGoneError, DamagedArtefactError, StoreError
+from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError, StoreError
+from extrags.redaction import has_credentials, without_credentials, without_credentials_in
 from extrags.store.canonical import Ref
 from extrags.store.directory import DirectoryBackend, private_directory
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, write_checksums
@@ -112,7 +113,7 @@ class Store:
 
     Raises:
         StoreError: for a URL that fsspec does not know.
-        ConfigError: for another value of `EXTRAGS_VERIFY`.
+        ConfigError: for another value of `EXTRAGS_VERIFY`, or a URL with credentials in it.
     """
 
     def __init__(
@@ -123,6 +124,12 @@ class Store:
         verify: Literal["metadata", "all"] | None = None,
     ) -> None:
         text = str(root)
+        if "://" in text and has_credentials(text):
+            raise ConfigError(
+                f"the URL of the store {text} holds credentials, and URLs of stores are written to "
+                "manifests, logs and Prefect's database; give them in the environment, such as "
+                "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY for s3, or FSSPEC_<PROTOCOL>_PASSWORD"
+            )
         self._depth: Depth = verify or default_depth()
         self.backend: DirectoryBackend | UrlBackend
         if "://" in text and not text.startswith("file://"):
@@ -388,8 +395,8 @@ class Store:
                         version=version,
                         key=key,
                         digest=digest,
-                        label=label,
-                        config=dict(config or {}),
+                        label=without_credentials(label),
+                        config=without_credentials_in(dict(config or {})),
                         inputs={name: ref.digest for name, ref in (inputs or {}).items()},
                         input_keys={name: _key_of(ref) for name, ref in (inputs or {}).items()},
                         software=software_versions(),
