@@ -28,6 +28,7 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
+from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
 from data_catalog.readers.frame_list import present_frames, split_by_name
@@ -113,9 +114,14 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     model = read_model(place)
     pose_file = next(file for file in (place / "images.bin", place / "images.txt") if file.is_file())
     listed = sorted(model.images, key=lambda image: natural_key(image.name))
+    for image in listed:
+        inside(folder, image.name, file=pose_file, frame=image.name, field="name")
     root = _image_root(folder, [image.name for image in listed])
     _tell_about_unposed(root, {image.name for image in listed})
-    files = {image.name: root / image.name for image in listed}
+    files = {
+        image.name: inside(root, image.name, file=pose_file, frame=image.name, field="name")
+        for image in listed
+    }
     present = present_frames(files, config.max_absent_share, listing=pose_file)
     images = [image for image in listed if image.name in present]
     recordings = sorted({str(Path(image.name).parent) for image in images}, key=natural_key)

@@ -18,7 +18,7 @@ from extrags.redaction import has_credentials, without_credentials, without_cred
 from extrags.store.canonical import Ref
 from extrags.store.directory import DirectoryBackend, private_directory
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, write_checksums
-from extrags.store.manifest import Manifest, software_versions, stage_of
+from extrags.store.manifest import Manifest, is_name, software_versions, stage_of
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
 
@@ -164,7 +164,7 @@ class Store:
         Raises:
             DamagedArtefactError: when its manifest is damaged, or files are missing, truncated or too many.
         """
-        manifest = self.backend.read_manifest(key)
+        manifest = self.backend.read_manifest(_checked(key))
         if manifest is None:
             return None
         damage = self.backend.damaged_sizes(manifest)
@@ -293,7 +293,7 @@ class Store:
             StoreError: when the store cannot be read.
         """
         try:
-            manifest = self.backend.read_manifest(key)
+            manifest = self.backend.read_manifest(_checked(key))
         except DamagedArtefactError as error:
             return error
         damage = None if manifest is None else self.backend.examine(manifest)
@@ -381,7 +381,7 @@ class Store:
         """
         started = datetime.datetime.now(datetime.UTC)
         clock = time.monotonic()
-        with private_directory(self.backend.scratch, key) as scratch:
+        with private_directory(self.backend.scratch, _checked(key)) as scratch:
             slot = Slot(scratch / "files", self)
             slot.path.mkdir()
             try:
@@ -488,4 +488,15 @@ def _matches(manifest: Manifest, pattern: str) -> bool:
 
 
 def _key_of(ref: Ref) -> str:
-    return ref.uri.rstrip("/").rsplit("/", 1)[-1]
+    return _checked(ref.uri.rstrip("/").rsplit("/", 1)[-1])
+
+
+def _checked(key: str) -> str:
+    """A key names a folder of the store, and no other place.
+
+    Raises:
+        StoreError: otherwise.
+    """
+    if not is_name(key):
+        raise StoreError(f"{key[:200]!r} is no key of an artefact: keys are names, not paths")
+    return key

@@ -217,9 +217,9 @@ def _sizes(directory: Path) -> dict[str, int]:
         with os.scandir(place) as entries:
             for entry in entries:
                 name = prefix + entry.name
-                if entry.is_dir():
+                if entry.is_dir(follow_symlinks=False):
                     waiting.append((entry.path, f"{name}/"))
-                elif name not in NOT_CONTENT and entry.is_file():
+                elif name not in NOT_CONTENT and entry.is_file(follow_symlinks=False):
                     found[name] = entry.stat().st_size
     return found
 

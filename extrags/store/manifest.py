@@ -14,7 +14,15 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from extrags.store.canonical import DIGEST_BYTES
 
-__all__ = ["MANIFEST", "Manifest", "manifest_text", "parsed_manifest", "software_versions", "stage_of"]
+__all__ = [
+    "MANIFEST",
+    "Manifest",
+    "is_name",
+    "manifest_text",
+    "parsed_manifest",
+    "software_versions",
+    "stage_of",
+]
 
 MANIFEST = "manifest.json"
 _CLOSE = b"\n}"
@@ -60,8 +68,12 @@ def manifest_text(manifest: Manifest) -> bytes:
     return head + _SEAL + _checksum(head) + _SEALED
 
 
-def parsed_manifest(text: bytes) -> Manifest:
+def parsed_manifest(text: bytes, key: str | None = None) -> Manifest:
     """A manifest from its JSON; those written before there were checksums have none.
+
+    Args:
+        text: the file.
+        key: of the artefact that it should be of; None for any.
 
     Raises:
         ValueError: when it is no manifest, or differs from its checksum.
@@ -79,9 +91,18 @@ def parsed_manifest(text: bytes) -> Manifest:
     except ValidationError as error:
         fault = error.errors()[0]
         raise ValueError(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}") from error
+    if not is_name(manifest.key) or (manifest.data and not is_name(manifest.data)):
+        raise ValueError("its key or data is no name, but a path")
+    if key is not None and manifest.key != key:
+        raise ValueError(f"it is the manifest of {manifest.key}")
     if manifest.checksum and not seal:
         raise ValueError("its checksum is not where it was written")
     return manifest
+
+
+def is_name(text: str) -> bool:
+    """Whether a text can name one file or folder: nothing that would lead elsewhere."""
+    return bool(re.fullmatch(r"[^/\\\0]{1,250}", text)) and text not in (".", "..")
 
 
 def stage_of(key: str) -> str:
