@@ -41,7 +41,13 @@ _FOLD_STEP = 0.05
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that reads runs of digits as numbers: `9_color.png` comes before `10_color.png`."""
     parts = re.split(r"(\d+)", name)
-    return tuple((1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts if part)
+    # Digits are compared as text of their length: numbers of any length, and of any script, have a place.
+    digits = [part.lstrip("0") if part.isdecimal() else None for part in parts]
+    return tuple(
+        (0, 0, part) if number is None else (1, len(number), number)
+        for part, number in zip(parts, digits, strict=True)
+        if part
+    )
 
 
 def colour_files(folder: Path) -> list[Path]:

@@ -28,7 +28,7 @@ def inside(
     Raises:
         SourceError: it leads out of the folder, or is no file name.
     """
-    if not name or "\0" in name or len(os.fsencode(name)) > _LONGEST:
+    if not _is_text(name) or len(os.fsencode(name)) > _LONGEST:
         raise SourceError(f"{name[:80]!r} is no file name", file=file, frame=_shown(frame), field=field)
     root = os.path.abspath(folder)
     path = os.path.normpath(os.path.join(root, name))
@@ -44,6 +44,11 @@ def inside(
     if any(len(os.fsencode(part)) > _LONGEST_PART for part in relative.split(os.sep)):
         raise SourceError(f"{name[:80]!r} is no file name", file=file, frame=_shown(frame), field=field)
     return folder / relative
+
+
+def _is_text(name: str) -> bool:
+    # What JSON may hold and no file system: lone halves of characters.
+    return bool(name) and "\0" not in name and not any("\ud800" <= letter <= "\udfff" for letter in name)
 
 
 _LONGEST = 4000

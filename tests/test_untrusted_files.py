@@ -54,7 +54,7 @@ NEVER = {
 }
 """Calls that run what a file says, or unpack it: none is needed here."""
 
-SAFE_YAML = ("yaml.SafeLoader", "yaml.CSafeLoader", "getattr(yaml, 'CSafeLoader', yaml.SafeLoader)")
+SAFE_YAML = ("Loader", "yaml.SafeLoader", "yaml.CSafeLoader", "getattr(yaml, 'CSafeLoader', yaml.SafeLoader)")
 
 OPTED_IN = {("extrags/restoration/pretrained/checkpoint_driver.py", "_content")}
 """`enhance.checkpoint.trust_pickle=true` alone comes here; docs/algorithms/restoration.md says so."""

@@ -297,7 +297,7 @@ def _is_metric(folder: Path) -> bool:
     file = folder / LENGTH_UNIT_FILE
     if not file.is_file():
         return False
-    unit = file.read_text(encoding="utf-8").strip()
+    unit = file.read_text(encoding="utf-8", errors="replace").strip()
     if unit not in ("mm", "arbitrary"):
         raise SourceError(
             f"{unit!r} is no length unit known here; expected mm or arbitrary", file=file, field="length_unit"
@@ -310,7 +310,7 @@ def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train
     file = folder / "test_list.txt"
     if not file.is_file():
         return {}
-    held_out = set(file.read_text(encoding="utf-8").split("\n")) - {""}
+    held_out = _listed(file) - {""}
     unknown = sorted(held_out - known, key=natural_key)
     if unknown:
         raise SourceError(
@@ -321,9 +321,16 @@ def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train
             field="split",
         )
     listed = folder / "train_list.txt"
-    training = set(listed.read_text(encoding="utf-8").split("\n")) if listed.is_file() else known - held_out
+    training = _listed(listed) if listed.is_file() else known - held_out
     # The list may name more than the model holds.
     return split_by_name(known - held_out | (training & held_out), held_out, file=file)
+
+
+def _listed(file: Path) -> set[str]:
+    try:
+        return set(file.read_text(encoding="utf-8").split("\n"))
+    except UnicodeDecodeError as error:
+        raise SourceError(f"not a text file: {error}", file=file, field="split") from error
 
 
 def _tell_about_unposed(root: Path, posed: set[str]) -> None:

@@ -68,7 +68,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / TRANSFORMS_FILE
     content = load_frame_list(file, "file_path")
     unit = content.get("length_unit", "arbitrary")
-    if unit not in _MM_PER_UNIT:
+    if not isinstance(unit, str) or unit not in _MM_PER_UNIT:
         raise SourceError(
             f"{unit!r} is no length unit known here; expected one of {', '.join(_MM_PER_UNIT)}",
             file=file,
@@ -219,12 +219,14 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
             return otherwise
         try:
             return float(values[key])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, OverflowError, TypeError, ValueError) as error:
             raise SourceError(
                 f"{key} = {values.get(key)!r}; expected a number", file=file, frame=frame, field=key
             ) from error
 
     if "w" in values and "h" in values:
+        if not (np.isfinite(number("w")) and np.isfinite(number("h"))):
+            raise SourceError("no image size; expected w and h in pixels", file=file, frame=frame, field="w")
         width, height = int(number("w")), int(number("h"))
     else:
         width, height = image_size(image, frame=frame)
@@ -278,7 +280,10 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
             frame=frame,
             field="camera_model",
         )
-    return Lens(model, tuple(float(named[key]) for key in names), width, height)
+    try:
+        return Lens(model, tuple(float(named[key]) for key in names), width, height)
+    except SourceError as error:
+        raise SourceError(error.problem, file=file, frame=frame, field=error.field) from error
 
 
 def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> float:
@@ -290,7 +295,7 @@ def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> floa
         return _NERFSTUDIO_DEPTH_SCALE
     try:
         factor = float(content[key])
-    except (TypeError, ValueError) as error:
+    except (OverflowError, TypeError, ValueError) as error:
         raise SourceError(f"{content[key]!r}; expected a number", file=file, field=key) from error
     if not np.isfinite(factor) or factor <= 0:
         raise SourceError(f"{factor:g}; expected a positive number", file=file, field=key)
@@ -299,6 +304,10 @@ def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> floa
 
 def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "test"]] | None:
     """Splits by `file_path`; None where the file names none. Validation frames are held out too."""
+    for key in ("train_filenames", "test_filenames", "val_filenames"):
+        named = content.get(key) or []
+        if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
+            raise SourceError("expected a list of file names", file=file, field=key)
     held_out = [
         name for key in ("test_filenames", "val_filenames") for name in content.get(key) or [] if name
     ]

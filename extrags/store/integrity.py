@@ -183,11 +183,12 @@ def _checksums(directory: Path, manifest: Manifest) -> dict[str, _File] | Damage
     try:
         read = json.loads((directory / CHECKSUMS).read_bytes())
         files = {name: _File(int(size), str(digest)) for name, (size, digest) in read.items()}
+        summary = _summary(files)
     except FileNotFoundError:
         return None
-    except (ValueError, TypeError, AttributeError):
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         return Damage("is not a list of files", CHECKSUMS)
-    if _summary(files) != (manifest.digest, manifest.files, manifest.bytes):
+    if summary != (manifest.digest, manifest.files, manifest.bytes):
         return Damage("is not the list of this artefact's files", CHECKSUMS)
     return files
 

@@ -82,7 +82,10 @@ def parsed_manifest(text: bytes, key: str | None = None) -> Manifest:
     head, seal, tail = text.rpartition(_SEAL)
     if seal and tail != _checksum(head) + _SEALED:
         raise ValueError("its content has changed since it was written")
-    fields = json.loads(text)
+    try:
+        fields = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
     if seal:
         # With a valid checksum, an unknown field is no damage but that of a later version.
         fields = {name: value for name, value in fields.items() if name in Manifest.model_fields}
