@@ -74,7 +74,8 @@ class PoseJob:
     @classmethod
     def load(cls, folder: Path) -> PoseJob:
         """Read the job."""
-        return cls(**load_npz(folder / "job.npz"), **json.loads((folder / "job.json").read_text()))
+        fields: dict[str, Any] = {**load_npz(folder / "job.npz")}
+        return cls(**fields, **json.loads((folder / "job.json").read_text()))
 
 
 @dataclass(frozen=True)
