@@ -23,6 +23,7 @@ import numpy as np
 
 from data_catalog.c3vd.pinhole import PinholeResampling
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera, camera_from_json
+from data_catalog.file_storage import read_file_storage
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.sampling import LensSampling, Sampling
 from extrags.config import IngestConfig
@@ -150,23 +151,10 @@ def _scaled(found: _Described, width: int, height: int, file: Path) -> Lens:
 
 
 def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
-    import cv2
-
-    try:
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-        K, D = (_matrix(storage, name) for name in ("K", "D"))
-        width, height = (
-            _whole(storage, name) or size for name, size in (("width", width), ("height", height))
-        )
-        fisheye = bool(_whole(storage, "fisheye"))
-        storage.release()
-    except (cv2.error, SystemError) as error:
-        # Where a constructor fails, the binding reports a SystemError.
-        raise SourceError(
-            f"OpenCV cannot read it; expected what cv::FileStorage writes: {error}",
-            file=file,
-            field="calibration",
-        ) from error
+    storage = read_file_storage(text, file)
+    K, D = (_matrix(storage, name) for name in ("K", "D"))
+    width, height = (_whole(storage, name) or size for name, size in (("width", width), ("height", height)))
+    fisheye = bool(_whole(storage, "fisheye"))
     if K is None or K.shape != (3, 3):
         raise SourceError("expected a matrix of 3 x 3 numbers", file=file, field="camera_matrix")
     terms = () if D is None else tuple(float(value) for value in D.reshape(-1))
@@ -195,20 +183,22 @@ def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
     return _Described(model, K, terms, width, height)
 
 
-def _node(storage: Any, key: str) -> Any:
-    found = (storage.getNode(name) for name in _OPENCV_NAMES[key])
-    return next((item for item in found if not item.empty()), None)
+def _node(storage: Mapping[str, Any], key: str) -> Any:
+    return next((storage[name] for name in _OPENCV_NAMES[key] if name in storage), None)
 
 
-def _matrix(storage: Any, key: str) -> np.ndarray | None:
-    item = _node(storage, key)
-    return None if item is None or not item.isMap() else np.asarray(item.mat(), dtype=np.float64)
+def _matrix(storage: Mapping[str, Any], key: str) -> np.ndarray | None:
+    found = _node(storage, key)
+    return found if isinstance(found, np.ndarray) else None
 
 
-def _whole(storage: Any, key: str) -> int:
+def _whole(storage: Mapping[str, Any], key: str) -> int:
     """A whole number; 0 where it is not there."""
-    item = _node(storage, key)
-    return 0 if item is None else int(item.real())
+    found = _node(storage, key)
+    try:
+        return 0 if found is None else int(float(found))
+    except (OverflowError, TypeError, ValueError):
+        return 0
 
 
 def _kalibr(text: str, file: Path) -> _Described:

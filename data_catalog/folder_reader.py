@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import struct
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,9 +12,35 @@ from typing import Any
 from data_catalog.dataset import Descriptor, file_digests
 from data_catalog.posed_frames import SourceFrames, assembled
 from extrags.config import IngestConfig
+from extrags.errors import ExtragsError, SourceError
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FolderReader"]
+__all__ = ["FolderReader", "understood"]
+
+
+@contextmanager
+def understood(place: Path) -> Iterator[None]:
+    """Readers name what they find wrong; what nobody thought of is a `SourceError`, too, with its cause.
+
+    Faults of disks and networks stay what they are: they may pass.
+    """
+    try:
+        yield
+    except ExtragsError:
+        raise
+    except (
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        LookupError,
+        MemoryError,
+        RecursionError,
+        TypeError,
+        ValueError,
+        struct.error,
+    ) as error:
+        problem = f"its content is not understood ({type(error).__name__}: {error})"
+        raise SourceError(problem, file=place) from error
 
 
 @dataclass(frozen=True)
@@ -53,7 +81,8 @@ class FolderReader:
             SourceError: a file is wrong; names file, frame and field.
             ConfigError: a size that the source cannot give.
         """
-        return assembled(self.frames(place, config), config, name)
+        with understood(place):
+            return assembled(self.frames(place, config), config, name)
 
     def fingerprint(self, place: Path) -> dict[str, Any]:
         """What a folder or file contributes to a cache key: reader, and content of each file it looks at.
@@ -61,6 +90,10 @@ class FolderReader:
         Raises:
             SourceError: not readable as a sequence.
         """
+        with understood(place):
+            return self._fingerprint(place)
+
+    def _fingerprint(self, place: Path) -> dict[str, Any]:
         root = place if place.is_dir() else place.parent
         # Of a single file the content counts, not what it is called.
         listed = [

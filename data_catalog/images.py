@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -11,6 +12,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from data_catalog.inside import inside
+from extrags.array_files import load_npy
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.events import Progress, emit
@@ -38,7 +41,13 @@ _FOLD_STEP = 0.05
 def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that reads runs of digits as numbers: `9_color.png` comes before `10_color.png`."""
     parts = re.split(r"(\d+)", name)
-    return tuple((1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts if part)
+    # Digits are compared as text of their length: numbers of any length, and of any script, have a place.
+    digits = [part.lstrip("0") if part.isdecimal() else None for part in parts]
+    return tuple(
+        (0, 0, part) if number is None else (1, len(number), number)
+        for part, number in zip(parts, digits, strict=True)
+        if part
+    )
 
 
 def colour_files(folder: Path) -> list[Path]:
@@ -91,8 +100,8 @@ def read_depth(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:
         if not file.is_file():
             raise SourceNotFoundError("no such file", file=file, frame=frame, field="depth")
         try:
-            values = np.load(file, allow_pickle=False)
-        except (ValueError, EOFError, OSError) as error:
+            values = load_npy(file)
+        except (ValueError, OSError) as error:
             raise SourceError(f"cannot be read: {error}", file=file, frame=frame, field="depth") from error
     else:
         values = np.array(_opened(file, frame, "depth", mode=None))
@@ -116,6 +125,9 @@ def save_images(sequence: EndoscopicSequence, folder: Path) -> list[str]:
 
     Returns:
         The names of the images below `images/`, one per frame.
+
+    Raises:
+        SourceError: a frame's name that leads out of the folder.
     """
     from PIL import Image
 
@@ -125,6 +137,8 @@ def save_images(sequence: EndoscopicSequence, folder: Path) -> list[str]:
         name = sequence.frame_name(index)
         if several and sequence.recording is not None and "/" not in name:
             name = f"recording_{int(sequence.recording[index])}/{name}"
+        # Names come from sources; nothing is written beside the folder.
+        inside(folder / "images", f"{name}.png", file=folder, frame=index, field="name")
         names.append(f"{name}.png")
     masked = not sequence.mask.all()
     for index, name in enumerate(names):
@@ -304,7 +318,7 @@ def _opened(file: Path, frame: object, field: str, *, mode: str | None) -> np.nd
 @contextmanager
 def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
     """What Pillow raises for a file, as the errors of a source."""
-    from PIL import UnidentifiedImageError
+    from PIL import Image, UnidentifiedImageError
 
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file, frame=frame, field=field)
@@ -317,7 +331,22 @@ def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
             frame=frame,
             field=field,
         ) from error
-    except (OSError, SyntaxError, ValueError, EOFError) as error:
+    except (
+        OSError,
+        SyntaxError,
+        ValueError,
+        EOFError,
+        IndexError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        OverflowError,
+        MemoryError,
+        NotImplementedError,
+        ZeroDivisionError,
+        struct.error,
+        Image.DecompressionBombError,
+    ) as error:
         # Pillow reports damage inside an image as any of these.
         raise SourceError(
             f"damaged or truncated image ({file.stat().st_size} bytes): {error}",

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from extrags.redaction import without_credentials
+
 __all__ = [
     "ArtefactGoneError",
     "CaptureError",
@@ -46,7 +48,10 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 class ExtragsError(Exception):
-    """Root of all errors raised by extrags."""
+    """Root of all errors raised by extrags; messages never hold credentials (`extrags.redaction`)."""
+
+    def __init__(self, *args: object) -> None:
+        super().__init__(*(without_credentials(item) if isinstance(item, str) else item for item in args))
 
 
 class ShapeError(ExtragsError, ValueError):
@@ -79,8 +84,8 @@ class SourceError(ExtragsError, ValueError):
         frame: object | None = None,
         field: str | None = None,
     ) -> None:
-        self.problem = problem
-        self.file = None if file is None else str(file)
+        self.problem = problem = without_credentials(problem)
+        self.file = None if file is None else without_credentials(str(file))
         self.frame = None if frame is None else str(frame)
         self.field = field
         where = [

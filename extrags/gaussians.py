@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from extrags.array_files import load_ply_vertices
 from extrags.errors import ShapeError, SourceError, SourceNotFoundError
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
@@ -182,13 +183,14 @@ class Gaussians:
 
         Raises:
             SourceNotFoundError: when there is no such file.
-            SourceError: when a field is missing.
+            SourceError: when it is damaged, or a field is missing.
         """
-        from plyfile import PlyData
-
         if not Path(path).exists():
             raise SourceNotFoundError("no such file", file=path)
-        vertex = PlyData.read(str(path))["vertex"].data
+        try:
+            vertex = load_ply_vertices(Path(path))
+        except (OSError, ValueError) as error:
+            raise SourceError(f"not a 3DGS PLY: {error}", file=path) from error
         names = set(vertex.dtype.names or ())
         required = [
             "x",
@@ -204,11 +206,20 @@ class Gaussians:
                 raise SourceError("not a 3DGS PLY: the property is missing", file=path, field=name)
 
         def stacked(*columns: str) -> Tensor:
-            return torch.from_numpy(
-                np.stack([np.asarray(vertex[c], dtype=np.float32) for c in columns], axis=1)
-            )
+            try:
+                table = np.stack([np.asarray(vertex[c], dtype=np.float32) for c in columns], axis=1)
+            except (TypeError, ValueError) as error:
+                raise SourceError(f"not numbers: {error}", file=path, field=columns[0]) from error
+            return torch.from_numpy(table)
 
         n_rest = sum(name.startswith("f_rest_") for name in names)
+        missing = [k for k in range(n_rest) if f"f_rest_{k}" not in names]
+        if missing or n_rest not in (0, 9, 24, 45):
+            raise SourceError(
+                f"{n_rest} properties f_rest_*; expected 0, 9, 24 or 45, counted from 0",
+                file=path,
+                field=f"f_rest_{missing[0]}" if missing else "f_rest_0",
+            )
         rest = (
             stacked(*(f"f_rest_{k}" for k in range(n_rest))).reshape(len(vertex), 3, -1)
             if n_rest

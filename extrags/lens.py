@@ -44,6 +44,10 @@ _FOLD_STEPS = 2000
 _FOLD_STEP = 0.05
 
 
+LARGEST_PX = 65_535
+"""Longest side of an image; what announces more is damaged."""
+
+
 @dataclass(frozen=True)
 class Lens:
     """How one camera maps rays to pixels.
@@ -75,6 +79,11 @@ class Lens:
                 f"{len(self.parameters)} parameters for the model {self.model}; expected {len(names)}: "
                 f"{', '.join(names)}",
                 field="camera parameters",
+            )
+        if not (1 <= self.width <= LARGEST_PX and 1 <= self.height <= LARGEST_PX):
+            raise SourceError(
+                f"an image of {self.width} x {self.height} pixels; expected 1 to {LARGEST_PX} each",
+                field="image size",
             )
         for name, value in zip(names, self.parameters, strict=True):
             if not np.isfinite(value):

@@ -97,10 +97,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if "--debug" in arguments:
             raise
         from extrags.errors import ConfigError, UnknownSequenceError
+        from extrags.redaction import without_credentials
         from flows.failures import describe_error
 
         for line in describe_error(error):
-            print(f"extrags: {line}", file=sys.stderr)
+            print(f"extrags: {without_credentials(line)}", file=sys.stderr)
         return USAGE if isinstance(error, ConfigError | UnknownSequenceError) else FAILED
 
 

@@ -13,23 +13,24 @@ from extrags.config import PipelineConfig
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
 from extrags.metrics.registry import added_metrics
 from extrags.pipeline import HELD_OUT_TRAINED_ON, STAGES, Pipeline, StageName
+from extrags.redaction import without_credentials
 from extrags.store import Manifest, Ref, Store
 from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
 from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner, StoreRunner
-from tasks.assess import assess, plan
+from tasks.assess import assess, measuring_settings, plan, planning_settings
 from tasks.coarse import coarse, refined_frames
 from tasks.depth import depth, depth_frames, triangulation_settings
 from tasks.depth import keyed_settings as keyed_depth_settings
-from tasks.enhance import assemble, restore, train
+from tasks.enhance import assemble, judging_settings, restore, restoring_settings, train
 from tasks.enhance import keyed_settings as keyed_enhance_settings
 from tasks.evaluate import METRICS_FILE, measure, render
 from tasks.explore import NEXT, branch, explore, merge, start
-from tasks.finetune import finetune, judge
+from tasks.finetune import finetune, finetuning_settings, judge
 from tasks.freespace import freespace
 from tasks.ingest import ingest, training_frames
-from tasks.poses import poses
+from tasks.poses import estimating_settings, poses
 from tasks.progress import StageProgress, notify
 from tasks.report import PAGE, REPORT_PARTS, report
 from tasks.surface import surface
@@ -199,7 +200,7 @@ class SequenceRun(Pipeline):
     def poses(self) -> None:
         """The artefact `sequence` again, with poses."""
         with self._stage("poses") as row:
-            inputs = {"sequence": self.refs["sequence"], "config": self.config.poses}
+            inputs = {"sequence": self.refs["sequence"], "config": estimating_settings(self.config.poses)}
             self.refs["poses"] = self.refs["sequence"] = self._run_task(row, Call(poses, inputs))
             row.reason = str(self._manifest("poses").counts["summary"])
 
@@ -215,6 +216,7 @@ class SequenceRun(Pipeline):
                 # The network counts by its content; where it lies is not part of the key.
                 "monocular_digest": depth_monocular_digest(settings.monocular),
                 "monocular": settings.monocular,
+                "completion": settings.completion,
             }
             self.refs["depth"] = self._run_task(row, Call(depth, inputs))
             row.reason = str(self._manifest("depth").counts["summary"])
@@ -253,11 +255,12 @@ class SequenceRun(Pipeline):
 
         with self._stage("assess") as row:
             coverage = self.config.explore.coverage
-            inputs = {**self._scene_inputs(), "config": self.config.assess, "coverage": coverage}
+            settings = measuring_settings(self.config.assess)
+            inputs = {**self._scene_inputs(), "config": settings, "coverage": coverage}
             self.refs["assess"] = self._run_task(row, Call(assess, inputs))
             # The decisions depend on the measurements and all budgets. They take no time, and do not affect
             # whether the stage counts as cached.
-            inputs = {"measured": self.refs["assess"], "config": self.config}
+            inputs = {"measured": self.refs["assess"], "config": planning_settings(self.config)}
             self.refs["plan"] = self._run_uncounted(Call(plan, inputs))
             self.plan = self.store.load(ScenePlan, self.refs["plan"])
             self.outcome.plan = self.plan.model_dump(mode="json")
@@ -293,15 +296,17 @@ class SequenceRun(Pipeline):
     def enhance(self) -> None:
         """The restorer, and the virtual views it restores in batches."""
         with self._stage("enhance") as row:
-            settings = keyed_enhance_settings(self.config.enhance)
+            given = self.config.enhance
             inputs = {
                 **self._scene_inputs(),
-                "config": settings,
+                "config": keyed_enhance_settings(given),
                 "coarse": self.config.coarse,
-                "model_digest": restorer_digest(settings),
+                "model_digest": restorer_digest(given),
+                "given": given,
             }
             self.refs["restorer"] = self._run_task(row, Call(train, inputs))
             weights, *_ = self._weights()
+            settings = restoring_settings(given)
             shared = {
                 **self._scene_inputs(),
                 "explore": self.refs["explore"],
@@ -327,10 +332,11 @@ class SequenceRun(Pipeline):
                 "explore": self.refs.get("explore"),
                 "restorer": self.refs.get("restorer"),
                 "config": settings,
-                "enhance": keyed_enhance_settings(self.config.enhance),
+                "enhance": judging_settings(self.config.enhance),
                 "coarse": coarse,
                 "weights_digest": weights.digest,
                 "weights": weights,
+                "clips_per_batch": self.config.enhance.clips_per_batch,
             }
             self.refs["judgement"] = self._run_task(row, Call(judge, inputs))
             judgement = self.store.load(Judgement, self.refs["judgement"])
@@ -340,7 +346,7 @@ class SequenceRun(Pipeline):
             inputs = {
                 **self._scene_inputs(),
                 "pseudo_views": self.refs.get("enhance") if judgement.amount > 0 else None,
-                "config": judgement.applied_to(settings),
+                "config": finetuning_settings(judgement.applied_to(settings)),
                 "coarse": coarse,
             }
             self.refs["finetune"] = self._run_task(row, Call(finetune, inputs))
@@ -460,7 +466,8 @@ class SequenceRun(Pipeline):
             raise
         except Exception as error:
             row.state = "failed"
-            row.reason = str(error) if isinstance(error, ExtragsError) else f"{type(error).__name__}: {error}"
+            told = str(error) if isinstance(error, ExtragsError) else f"{type(error).__name__}: {error}"
+            row.reason = without_credentials(told)
             self.outcome.error = error
             raise _StoppedError from error
         except BaseException:

@@ -6,9 +6,29 @@ from extrags.config import AssessConfig, CoverageConfig, PipelineConfig
 from extrags.store import Ref, Slot
 from tasks.stage import stage
 
-__all__ = ["assess", "plan"]
+__all__ = ["assess", "measuring_settings", "plan", "planning_settings"]
 
 MEASUREMENTS = "measurements.json"
+
+_OF_PLAN = ("force", "full_budget_share", "min_hole_share")
+"""Settings of the assessment that only the plan reads."""
+
+
+def measuring_settings(config: AssessConfig) -> AssessConfig:
+    """The settings that `assess` reads, all others at their defaults: these are not part of the key."""
+    return config.model_copy(update={name: AssessConfig.model_fields[name].default for name in _OF_PLAN})
+
+
+def planning_settings(config: PipelineConfig) -> PipelineConfig:
+    """The settings that `plan` reads, all others at their defaults: these are not part of the key."""
+    read = {
+        **{f"assess.{name}": getattr(config.assess, name) for name in _OF_PLAN},
+        "explore.trajectories": config.explore.trajectories,
+        "explore.length": config.explore.length,
+        "enhance.max_views": config.enhance.max_views,
+        "finetune.iterations": config.finetune.iterations,
+    }
+    return PipelineConfig().with_overrides(read)
 
 
 @stage("assess", version=2)

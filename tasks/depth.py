@@ -6,9 +6,11 @@ from extrags.config import DepthConfig, PosesConfig
 from extrags.errors import WeightsError
 from extrags.store import Ref, Slot
 from tasks.stage import stage
-from tasks.weights import depth_monocular_digest
+from tasks.weights import depth_completion_digest, depth_monocular_digest
 
 __all__ = ["depth", "depth_frames", "keyed_settings", "triangulation_settings"]
+
+BUNDLED = "bundled"
 
 TRIANGULATION = frozenset(
     {
@@ -29,7 +31,7 @@ def triangulation_settings(config: PosesConfig) -> PosesConfig:
 
 
 def keyed_settings(config: DepthConfig) -> DepthConfig:
-    """The settings as they are part of the key: with a device, and without the folder of a model.
+    """The settings as they are part of the key: with a device, and without the places of weights and models.
 
     A device and a processor give depths that differ by rounding: under `auto` the key would hold for either,
     so that it is settled where the key is made. cuda stays what it is where there is none: what was made on
@@ -38,11 +40,11 @@ def keyed_settings(config: DepthConfig) -> DepthConfig:
     from extrags.devices import chosen_device
 
     device = chosen_device("auto", "depth.device").type if config.device == "auto" else config.device
-    return config.model_copy(update={"device": device, "monocular": None})
+    return config.model_copy(update={"device": device, "monocular": None, "completion": BUNDLED})
 
 
 # The digests stand for the content of weights; the task finds them by the settings again.
-@stage("depth", version=3, ignore=("monocular",))
+@stage("depth", version=3, ignore=("monocular", "completion"))
 def depth(
     slot: Slot,
     sequence: Ref,
@@ -51,6 +53,7 @@ def depth(
     weights_digest: str | None,
     monocular_digest: str | None,
     monocular: str | None = None,
+    completion: str = BUNDLED,
 ) -> None:
     """Estimate the depth of the training frames; writes `depth/`.
 
@@ -59,9 +62,10 @@ def depth(
         sequence: the training frames alone, with poses.
         config: what to use, from `keyed_settings`.
         features: settings of features and matching, from `triangulation_settings`.
-        weights_digest: content of the network's weights, for the key alone.
+        weights_digest: content of the completion network's weights; None without them.
         monocular_digest: content of the monocular network's folder.
         monocular: that folder; None without.
+        completion: weights of the completion network, as in the settings.
     """
     from extrags.depth.estimate import estimate_depth
     from extrags.sequence import EndoscopicSequence
@@ -71,8 +75,14 @@ def depth(
             f"the model of depth.monocular={monocular} is not the one this run began with: it changed "
             "meanwhile, or this worker sees other files; run again"
         )
+    config = config.model_copy(update={"monocular": monocular, "completion": completion})
+    if depth_completion_digest(config) != weights_digest:
+        raise WeightsError(
+            f"the weights of depth.completion={completion} are not those this run began with: they changed "
+            "meanwhile, or this worker sees other files; run again"
+        )
     frames = slot.load(EndoscopicSequence, sequence)
-    estimate = estimate_depth(frames, config.model_copy(update={"monocular": monocular}), features)
+    estimate = estimate_depth(frames, config, features)
     slot.save(estimate)
     slot.counts.update(
         frames=len(frames),

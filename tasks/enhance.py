@@ -2,41 +2,99 @@
 
 from __future__ import annotations
 
-from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.config import CaptionConfig, CoarseConfig, EnhanceConfig
 from extrags.errors import WeightsError
 from extrags.store import Ref, Slot
 from tasks.stage import stage
 from tasks.weights import Weights, restorer_digest
 
-__all__ = ["assemble", "keyed_settings", "restore", "train"]
+__all__ = ["assemble", "judging_settings", "keyed_settings", "restore", "restoring_settings", "train"]
 
 RESTORER = "restorer"
 
 
-def keyed_settings(config: EnhanceConfig) -> EnhanceConfig:
-    """The settings as they are part of the key: what `auto` leaves to the machine is settled.
+_OF_RESTORATION = frozenset(
+    {"clips_per_batch", "iou", "max_views", "pixel_confidence", "reference", "references"}
+)
+"""Settings that the stage `enhance-restore` reads itself; all others work through the restorer."""
 
-    bfloat16 and float32, a device and a processor give different views: under `auto` one key would hold for
-    all of them. Settings that the backend does not read stay as they are, so that machines share its views.
+_OF_EMBEDDED = frozenset(
+    {
+        "backend",
+        "batch",
+        "channels",
+        "crop",
+        "fold_iterations",
+        "folds",
+        "judge",
+        "learning_rate",
+        "precision",
+        "reference",
+        "references",
+        "samples",
+        "scene_learning_rate",
+        "seed",
+        "steps",
+        "synthetic_views",
+        "train_iterations",
+    }
+)
+
+_OF_TRAINING: dict[str, frozenset[str]] = {
+    "embedded": _OF_EMBEDDED,
+    "classical": frozenset({"backend"}),
+    **dict.fromkeys(
+        ("wan-vace", "stable-video", "ltx", "sd-img2img", "sd-inpaint"),
+        frozenset({"backend", "seed", "caption", "pretrained"}),
+    ),
+    "dynamicrafter": frozenset({"backend", "seed", "caption", "checkpoint"}),
+}
+"""Settings that the stage `enhance-train` reads, by backend; of another program's backend, all."""
+
+_OF_ASKING = ("file", "retries", "retry_wait_s", "timeout_s")
+"""Settings of captions that decide how they are got, not what they are; the file counts by its content."""
+
+
+def keyed_settings(config: EnhanceConfig) -> EnhanceConfig:
+    """The settings as they are part of the key of `train`: those its backend reads, others at their defaults.
+
+    What `auto` leaves to the machine is settled: bfloat16 and float32, a device and a processor give
+    different views, and under `auto` one key would hold for all of them. Weights and captions count by their
+    content; where a pretrained model or a clone lies is counted, since the restorer refers to it.
     """
     from extrags.devices import chosen_device
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, chosen_precision
 
+    counted = _OF_TRAINING.get(config.backend, frozenset(EnhanceConfig.model_fields) - {"pretrained_weights"})
+    config = _only(config, counted)
+    caption = {name: CaptionConfig.model_fields[name].default for name in _OF_ASKING}
+    settled: dict[str, object] = {"caption": config.caption.model_copy(update=caption)}
     if config.backend == EmbeddedEnhancer.name:
-        return config.model_copy(update={"precision": chosen_precision(config)})
-    if config.backend == "classical":
-        return config
+        settled["precision"] = chosen_precision(config)
     # Of a backend of another program nobody knows which of these it reads.
-    settled = {}
     for name, part in (("pretrained", config.pretrained), ("checkpoint", config.checkpoint)):
-        if part.device == "auto":
+        if name in counted and part.device == "auto":
             device = chosen_device("auto", f"enhance.{name}.device").type
             settled[name] = part.model_copy(update={"device": device})
     return config.model_copy(update=settled)
 
 
+def restoring_settings(config: EnhanceConfig) -> EnhanceConfig:
+    """The settings that `restore` reads, all others at their defaults: the restorer stands for these."""
+    return _only(config, _OF_RESTORATION)
+
+
+def judging_settings(config: EnhanceConfig) -> EnhanceConfig:
+    """The settings that the judge of the fine-tuning restores with: it has a number of views of its own."""
+    return _only(config, _OF_RESTORATION - {"clips_per_batch", "max_views"})
+
+
+def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
+    return EnhanceConfig().model_copy(update={name: getattr(config, name) for name in names})
+
+
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=6)
+@stage("enhance-train", version=6, ignore=("given",))
 def train(
     slot: Slot,
     scene: Ref,
@@ -44,12 +102,31 @@ def train(
     config: EnhanceConfig,
     coarse: CoarseConfig,
     model_digest: str | None,
+    given: EnhanceConfig | None = None,
 ) -> None:
-    """Train the scene's restorer on its own pairs, or prepare a pretrained one; writes `restorer/`."""
+    """Train the scene's restorer on its own pairs, or prepare a pretrained one; writes `restorer/`.
+
+    Args:
+        slot: the artefact to write.
+        scene: the coarse scene.
+        sequence: the training frames.
+        config: from `keyed_settings`.
+        coarse: settings of leave-out reconstructions.
+        model_digest: content of weights and captions.
+        given: the settings of the run, which say where these lie and how captions are asked for.
+    """
     from extrags.restoration.backends import train_enhancer
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
+    if given is not None:
+        caption = {name: getattr(given.caption, name) for name in _OF_ASKING}
+        config = config.model_copy(
+            update={
+                "pretrained_weights": given.pretrained_weights,
+                "caption": config.caption.model_copy(update=caption),
+            }
+        )
     if restorer_digest(config) != model_digest:
         raise WeightsError(
             f"the model of enhance.backend={config.backend} is not the one this run began with: it changed "

@@ -10,11 +10,16 @@ from tasks.enhance import RESTORER
 from tasks.stage import stage
 from tasks.weights import Weights
 
-__all__ = ["finetune", "judge"]
+__all__ = ["finetune", "finetuning_settings", "judge"]
 
 
-# The weights' digest is in the key; where their file lies is not.
-@stage("finetune-judge", version=5, ignore=("weights",))
+def finetuning_settings(config: FinetuneConfig) -> FinetuneConfig:
+    """The settings that `finetune` reads: those of the judge, which has judged, are not part of the key."""
+    return config.model_copy(update={"judge": FinetuneConfig.model_fields["judge"].default})
+
+
+# The weights' digest is in the key; where their file lies is not. Batches only bound the memory.
+@stage("finetune-judge", version=5, ignore=("weights", "clips_per_batch"))
 def judge(
     slot: Slot,
     scene: Ref,
@@ -26,6 +31,7 @@ def judge(
     coarse: CoarseConfig,
     weights_digest: str | None,
     weights: Weights,
+    clips_per_batch: int | None = None,
 ) -> None:
     """Decide how much of the fine-tuning to keep; writes `judgement.json`.
 
@@ -37,6 +43,8 @@ def judge(
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
+    if clips_per_batch is not None:
+        enhance = enhance.model_copy(update={"clips_per_batch": clips_per_batch})
     judgement = judge_finetuning(
         slot.load(Scene, scene),
         slot.load(EndoscopicSequence, sequence),

@@ -6,7 +6,12 @@ from extrags.config import PosesConfig
 from extrags.store import Ref, Slot
 from tasks.stage import stage
 
-__all__ = ["poses"]
+__all__ = ["estimating_settings", "poses"]
+
+
+def estimating_settings(config: PosesConfig) -> PosesConfig:
+    """The settings that `poses` reads; whether poses are estimated at all is no part of the key."""
+    return config.model_copy(update={"replace_given": False})
 
 
 @stage("poses", version=5)

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, Literal, TypeVar, get_args
 
 from extrags.config import PipelineConfig
+from extrags.redaction import without_credentials
 from extrags.store import Ref, Slot, Storable, Store, digest_of
 from tasks.coarse import HISTORY
 from tasks.evaluate import METRICS_FILE
@@ -113,9 +114,9 @@ def _save_page(slot: Slot, page: str, content: str) -> None:
 
     The artefact's digest covers the latter alone: equal inputs give equal digests.
     """
-    (slot.path / PAGE).write_text(page, encoding="utf-8")
+    (slot.path / PAGE).write_text(without_credentials(page), encoding="utf-8")
     slot.run_files.add(PAGE)
-    slot.save_json(CONTENT, {"digest": digest_of(content)})
+    slot.save_json(CONTENT, {"digest": digest_of(without_credentials(content))})
 
 
 def _environment(store: Store, parts: dict[str, Ref]) -> dict[str, str]:

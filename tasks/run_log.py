@@ -12,12 +12,15 @@ from prefect.context import FlowRunContext, TaskRunContext
 from prefect.logging.handlers import APILogHandler
 from prefect.settings import PREFECT_LOGGING_TO_API_ENABLED
 
+from extrags.redaction import CredentialFilter
+
 __all__ = ["LOGGERS", "run_log"]
 
 LOGGERS = ("extrags", "data_catalog", "tasks", "flows")
 """Packages whose log lines belong to the run."""
 
 TASK_RUNS = "prefect.task_runs"
+OF_RUNS = (TASK_RUNS, "prefect.flow_runs")
 
 
 class RunLogHandler(APILogHandler):
@@ -29,6 +32,7 @@ class RunLogHandler(APILogHandler):
 
     def __init__(self, flow_run_id: UUID | None) -> None:
         super().__init__(logging.INFO)
+        self.addFilter(CredentialFilter())
         self.flow_run_id = flow_run_id
 
     def emit(self, record: logging.LogRecord) -> None:
@@ -55,6 +59,7 @@ _guard = threading.Lock()
 _open = 0
 _undo: list[tuple[logging.Logger, int, logging.Handler | None]] = []
 _named = _Named()
+_unsaid = CredentialFilter()
 
 
 @contextmanager
@@ -99,6 +104,8 @@ def _enter(flow_run_id: UUID | None) -> None:
             _undo.append((logger, before, handler))
         # It stays: Prefect says how a task in a worker process ended after the stage has left the log.
         logging.getLogger(TASK_RUNS).addFilter(_named)
+        for name in OF_RUNS:
+            logging.getLogger(name).addFilter(_unsaid)
 
 
 def _leave() -> None:

@@ -29,6 +29,7 @@ _MODEL_NAMES = dict(enumerate(LENS_PARAMETERS))
 """COLMAP numbers its models in this order."""
 _MODEL_IDS = {name: number for number, name in _MODEL_NAMES.items()}
 _NO_POINT = -1
+_LARGEST = 2**63 - 1
 
 
 @dataclass(frozen=True)
@@ -278,6 +279,8 @@ def _binary_points(
     points, colours = np.zeros((count, 3)), np.zeros((count, 3), dtype=np.uint8)
     for index in range(count):
         values = stream.take("Q3d3BdQ", f"point {index + 1}")
+        if values[0] > _LARGEST:
+            raise SourceError(f"point {index + 1}: {values[0]} is no identifier", file=file)
         identifiers[index], points[index], colours[index] = values[0], values[1:4], values[4:7]
         stream.records(np.dtype("<u4"), 2 * int(values[8]), f"the track of point {index + 1}")
     return identifiers, points, colours
@@ -358,6 +361,8 @@ def _text_points(
             points.append([float(word) for word in words[1:4]])
             colours.append([int(word) for word in words[4:7]])
             if len(points[-1]) != 3 or len(colours[-1]) != 3:
+                raise ValueError(line)
+            if not (0 <= identifiers[-1] <= _LARGEST and all(0 <= value <= 255 for value in colours[-1])):
                 raise ValueError(line)
         except ValueError as error:
             raise SourceError(

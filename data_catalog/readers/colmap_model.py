@@ -28,6 +28,7 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
+from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
 from data_catalog.readers.frame_list import present_frames, split_by_name
@@ -113,9 +114,14 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     model = read_model(place)
     pose_file = next(file for file in (place / "images.bin", place / "images.txt") if file.is_file())
     listed = sorted(model.images, key=lambda image: natural_key(image.name))
+    for image in listed:
+        inside(folder, image.name, file=pose_file, frame=image.name, field="name")
     root = _image_root(folder, [image.name for image in listed])
     _tell_about_unposed(root, {image.name for image in listed})
-    files = {image.name: root / image.name for image in listed}
+    files = {
+        image.name: inside(root, image.name, file=pose_file, frame=image.name, field="name")
+        for image in listed
+    }
     present = present_frames(files, config.max_absent_share, listing=pose_file)
     images = [image for image in listed if image.name in present]
     recordings = sorted({str(Path(image.name).parent) for image in images}, key=natural_key)
@@ -291,7 +297,7 @@ def _is_metric(folder: Path) -> bool:
     file = folder / LENGTH_UNIT_FILE
     if not file.is_file():
         return False
-    unit = file.read_text(encoding="utf-8").strip()
+    unit = file.read_text(encoding="utf-8", errors="replace").strip()
     if unit not in ("mm", "arbitrary"):
         raise SourceError(
             f"{unit!r} is no length unit known here; expected mm or arbitrary", file=file, field="length_unit"
@@ -304,7 +310,7 @@ def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train
     file = folder / "test_list.txt"
     if not file.is_file():
         return {}
-    held_out = set(file.read_text(encoding="utf-8").split("\n")) - {""}
+    held_out = _listed(file) - {""}
     unknown = sorted(held_out - known, key=natural_key)
     if unknown:
         raise SourceError(
@@ -315,9 +321,16 @@ def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train
             field="split",
         )
     listed = folder / "train_list.txt"
-    training = set(listed.read_text(encoding="utf-8").split("\n")) if listed.is_file() else known - held_out
+    training = _listed(listed) if listed.is_file() else known - held_out
     # The list may name more than the model holds.
     return split_by_name(known - held_out | (training & held_out), held_out, file=file)
+
+
+def _listed(file: Path) -> set[str]:
+    try:
+        return set(file.read_text(encoding="utf-8").split("\n"))
+    except UnicodeDecodeError as error:
+        raise SourceError(f"not a text file: {error}", file=file, field="split") from error
 
 
 def _tell_about_unposed(root: Path, posed: set[str]) -> None:

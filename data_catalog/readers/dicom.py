@@ -19,6 +19,7 @@ Format: DICOM PS3.3 (C.7.6.3, C.7.6.5) and PS3.5 (annex A).
 from __future__ import annotations
 
 import logging
+import struct
 import tempfile
 import weakref
 from collections.abc import Collection, Iterator, Sequence
@@ -37,7 +38,7 @@ from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames
 from data_catalog.readers.video import VideoFile, only_file, with_files_beside
 from extrags.config import IngestConfig
-from extrags.errors import MissingDependencyError, SourceError, SourceNotFoundError
+from extrags.errors import ExtragsError, MissingDependencyError, SourceError, SourceNotFoundError
 
 __all__ = ["DICOM_SUFFIXES", "READER", "DicomFile", "open_dicom"]
 
@@ -78,6 +79,12 @@ class DicomFile:
     def __init__(self, file: Path, header: Any) -> None:
         self._file = file
         self._announced = int(header.get("NumberOfFrames") or 1)
+        if self._announced > file.stat().st_size:
+            raise SourceError(
+                f"{self._announced} frames announced, in {file.stat().st_size} bytes: the file is damaged",
+                file=file,
+                field="NumberOfFrames",
+            )
         if self._announced < 2:
             raise SourceError(
                 "a single frame; expected a multi-frame file", file=file, field="NumberOfFrames"
@@ -176,8 +183,9 @@ class _DicomVideo(VideoFile):
         with _dicom_errors(file, None):
             _copy_stream(file, stream)
         super().__init__(stream, named=file)
-        if "PixelAspectRatio" in header:
-            self._pixel_aspect = _pixel_aspect(header)
+        with _dicom_errors(file, None):
+            if "PixelAspectRatio" in header:
+                self._pixel_aspect = _pixel_aspect(header)
 
 
 def open_dicom(file: Path) -> Footage:
@@ -201,11 +209,14 @@ def open_dicom(file: Path) -> Footage:
     with _dicom_errors(file, None):
         header = dcmread(file, stop_before_pixels=True, specific_tags=list(_LOOKED_AT))
         syntax = header.file_meta.TransferSyntaxUID
-    if header.get("Rows") is None or header.get("Columns") is None:
+    with _dicom_errors(file, None):
+        pixels = header.get("Rows") is not None and header.get("Columns") is not None
+    if not pixels:
         raise SourceError("the file holds no pixels", file=file, field="Rows")
     if syntax in (*MPEGTransferSyntaxes, HEVCMP51, HEVCM10P51):
         return _DicomVideo(file, header)
-    return DicomFile(file, header)
+    with _dicom_errors(file, None):
+        return DicomFile(file, header)
 
 
 def _dicom_file(place: Path) -> Path | None:
@@ -282,15 +293,30 @@ def _copy_stream(file: Path, place: Path) -> None:
 @contextmanager
 def _dicom_errors(file: Path, frame: int | None) -> Iterator[None]:
     """What pydicom and Pillow raise for a file, as the errors of a source."""
-    from pydicom.errors import InvalidDicomError
+    from pydicom.errors import BytesLengthException, InvalidDicomError
 
     try:
         yield
+    except ExtragsError:
+        raise
     except InvalidDicomError as error:
         raise SourceError("no DICOM file, or damaged from its first bytes", file=file) from error
     except NotImplementedError as error:
         raise SourceError(f"cannot be decoded: {error}", file=file, field="TransferSyntaxUID") from error
-    except (AttributeError, KeyError, RuntimeError, ValueError, OSError, EOFError) as error:
+    except (
+        ArithmeticError,
+        AssertionError,
+        AttributeError,
+        BytesLengthException,
+        EOFError,
+        LookupError,
+        MemoryError,
+        OSError,
+        RuntimeError,
+        TypeError,
+        ValueError,
+        struct.error,
+    ) as error:
         raise SourceError(
             f"damaged, truncated, or of an unknown compression: {error}", file=file, frame=frame
         ) from error

@@ -33,6 +33,7 @@ from jaxtyping import Bool, Float, UInt8
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import colour_files, read_colour, read_mask, spread
 from data_catalog.posed_frames import PosedFrame, SourceFrames
+from extrags.array_files import load_npy
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
@@ -140,7 +141,7 @@ def read_llff(
         PoseError: a row that is not finite.
     """
     try:
-        rows = np.load(file, allow_pickle=False)
+        rows = load_npy(file)
     except (ValueError, EOFError, OSError) as error:
         raise SourceError(f"cannot be read: {error}", file=file, field="poses") from error
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":

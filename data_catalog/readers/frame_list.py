@@ -34,7 +34,7 @@ def load_frame_list(file: Path, key: str) -> dict[str, Any]:
     """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (RecursionError, ValueError) as error:
         raise SourceError(f"not readable as JSON: {error}", file=file) from error
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):
         raise SourceError("expected an object with a list `frames`", file=file, field="frames")
@@ -114,7 +114,7 @@ def matrix_of(
         raise error(f"no {field}; expected {size} x {size} numbers", file=file, frame=frame, field=field)
     try:
         matrix = np.asarray(owner[field], dtype=np.float64)
-    except (TypeError, ValueError) as cause:
+    except (OverflowError, TypeError, ValueError) as cause:
         raise error(f"not a matrix of numbers: {cause}", file=file, frame=frame, field=field) from cause
     if matrix.shape != (size, size):
         raise error(

@@ -148,7 +148,9 @@ def read_intrinsics(
         else:
             fx, fy, cx, cy = (float(content[key]) for key in ("fx", "fy", "cx", "cy"))
             K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-    except (json.JSONDecodeError, KeyError, TypeError) as error:
+    except SourceError:
+        raise
+    except (KeyError, OverflowError, RecursionError, TypeError, ValueError) as error:
         raise SourceError(
             f"expected K, or fx, fy, cx, cy, or field_of_view_deg: {error!r}", file=file, field="K"
         ) from error

@@ -37,6 +37,7 @@ from typing import Any
 from data_catalog.checks import check_intrinsics
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import colour_files, image_size
+from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frame_list import load_frame_list, matrix_of
 from extrags.config import IngestConfig
@@ -55,13 +56,15 @@ def _recognises(folder: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    inside = [
-        file
-        for part in ("rgb", "depth", "mask")
-        if (folder / part).is_dir()
-        for file in (folder / part).iterdir()
-    ]
-    return sorted(file for file in [folder / POSES_FILE, *inside] if file.is_file())
+    file = folder / POSES_FILE
+    found = {file}
+    for part in ("rgb", "depth", "mask"):
+        if (folder / part).is_dir():
+            found |= set((folder / part).iterdir())
+    # Images may lie elsewhere below the folder.
+    for entry in load_frame_list(file, "file")["frames"]:
+        found.add(inside(folder, entry["file"], file=file, frame=entry["file"], field="file"))
+    return sorted(item for item in found if item.is_file())
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
@@ -75,7 +78,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         frames=[
             PosedFrame(
                 name=entry["file"],
-                file=folder / entry["file"],
+                file=inside(folder, entry["file"], file=file, frame=entry["file"], field="file"),
                 lens=_lens(folder, entry, content, file),
                 world_from_camera=matrix_of(
                     entry, "world_from_camera", 4, file=file, frame=entry["file"], error=PoseError
@@ -118,10 +121,11 @@ def _load(file: Path) -> dict[str, Any]:
 def _check_count(folder: Path, frames: list[dict[str, Any]]) -> None:
     listed = [entry["file"] for entry in frames]
     for name in listed:
-        if not (folder / name).is_file():
+        place = inside(folder, name, file=folder / POSES_FILE, frame=name, field="file")
+        if not place.is_file():
             raise SourceNotFoundError(
                 f"{POSES_FILE} lists this frame, but there is no such file",
-                file=folder / name,
+                file=place,
                 frame=name,
                 field="file",
             )

@@ -28,8 +28,10 @@ from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, image_size, natural_key, read_depth, save_images
+from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frame_list import load_frame_list, matrix_of, present_frames, split_by_name
+from extrags.array_files import load_ply_vertices
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.lens import LENS_PARAMETERS, Lens
@@ -49,22 +51,24 @@ def _recognises(folder: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    content = load_frame_list(folder / TRANSFORMS_FILE, "file_path")
-    found = {folder / TRANSFORMS_FILE}
+    file = folder / TRANSFORMS_FILE
+    content = load_frame_list(file, "file_path")
+    found = {file}
     for entry in content["frames"]:
         for key in _FILE_KEYS:
             if isinstance(entry.get(key), str):
-                found.add(_with_suffix(folder / entry[key]))
+                place = inside(folder, entry[key], file=file, frame=entry["file_path"], field=key)
+                found.add(_with_suffix(place))
     if isinstance(content.get("ply_file_path"), str):
-        found.add(folder / content["ply_file_path"])
-    return sorted(file for file in found if file.is_file() and file.is_relative_to(folder))
+        found.add(inside(folder, content["ply_file_path"], file=file, field="ply_file_path"))
+    return sorted(file for file in found if file.is_file())
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / TRANSFORMS_FILE
     content = load_frame_list(file, "file_path")
     unit = content.get("length_unit", "arbitrary")
-    if unit not in _MM_PER_UNIT:
+    if not isinstance(unit, str) or unit not in _MM_PER_UNIT:
         raise SourceError(
             f"{unit!r} is no length unit known here; expected one of {', '.join(_MM_PER_UNIT)}",
             file=file,
@@ -72,7 +76,10 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         )
     scale = _MM_PER_UNIT[unit]
     listed = sorted(content["frames"], key=lambda entry: natural_key(entry["file_path"]))
-    files = {entry["file_path"]: _with_suffix(folder / entry["file_path"]) for entry in listed}
+    files = {}
+    for entry in listed:
+        name = entry["file_path"]
+        files[name] = _with_suffix(inside(folder, name, file=file, frame=name, field="file_path"))
     present = present_frames(files, config.max_absent_share, listing=file)
     entries = [entry for entry in listed if entry["file_path"] in present]
     splits = _splits(content, file)
@@ -190,7 +197,7 @@ def _with_suffix(file: Path) -> Path:
 def _beside(folder: Path, entry: dict[str, Any], key: str, frame: str) -> Path | None:
     if key not in entry:
         return None
-    file = folder / str(entry[key])
+    file = inside(folder, str(entry[key]), file=folder / TRANSFORMS_FILE, frame=frame, field=key)
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file, frame=frame, field=key)
     return file
@@ -212,12 +219,14 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
             return otherwise
         try:
             return float(values[key])
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, OverflowError, TypeError, ValueError) as error:
             raise SourceError(
                 f"{key} = {values.get(key)!r}; expected a number", file=file, frame=frame, field=key
             ) from error
 
     if "w" in values and "h" in values:
+        if not (np.isfinite(number("w")) and np.isfinite(number("h"))):
+            raise SourceError("no image size; expected w and h in pixels", file=file, frame=frame, field="w")
         width, height = int(number("w")), int(number("h"))
     else:
         width, height = image_size(image, frame=frame)
@@ -271,7 +280,10 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
             frame=frame,
             field="camera_model",
         )
-    return Lens(model, tuple(float(named[key]) for key in names), width, height)
+    try:
+        return Lens(model, tuple(float(named[key]) for key in names), width, height)
+    except SourceError as error:
+        raise SourceError(error.problem, file=file, frame=frame, field=error.field) from error
 
 
 def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> float:
@@ -283,7 +295,7 @@ def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> floa
         return _NERFSTUDIO_DEPTH_SCALE
     try:
         factor = float(content[key])
-    except (TypeError, ValueError) as error:
+    except (OverflowError, TypeError, ValueError) as error:
         raise SourceError(f"{content[key]!r}; expected a number", file=file, field=key) from error
     if not np.isfinite(factor) or factor <= 0:
         raise SourceError(f"{factor:g}; expected a positive number", file=file, field=key)
@@ -292,6 +304,10 @@ def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> floa
 
 def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "test"]] | None:
     """Splits by `file_path`; None where the file names none. Validation frames are held out too."""
+    for key in ("train_filenames", "test_filenames", "val_filenames"):
+        named = content.get(key) or []
+        if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
+            raise SourceError("expected a list of file names", file=file, field=key)
     held_out = [
         name for key in ("test_filenames", "val_filenames") for name in content.get(key) or [] if name
     ]
@@ -310,23 +326,23 @@ def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "
 def _points(
     folder: Path, content: dict[str, Any], file: Path
 ) -> tuple[Float[np.ndarray, "p 3"] | None, UInt8[np.ndarray, "p 3"] | None]:
-    from plyfile import PlyData, PlyParseError
-
     if "ply_file_path" not in content:
         return None, None
-    place = folder / str(content["ply_file_path"])
+    place = inside(folder, str(content["ply_file_path"]), file=file, field="ply_file_path")
     if not place.is_file():
         raise SourceNotFoundError("no such file", file=place, field="ply_file_path")
     try:
-        vertices = PlyData.read(str(place))["vertex"]
+        vertices = load_ply_vertices(place)
         located = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
-    except (PlyParseError, KeyError, ValueError) as error:
+    except (OSError, TypeError, ValueError) as error:
         raise SourceError(f"no PLY with vertices: {error}", file=place, field="ply_file_path") from error
-    names = {item.name for item in vertices.properties}
+    names = set(vertices.dtype.names or ())
     if not {"red", "green", "blue"} <= names:
         return located, None
-    coloured = np.stack([np.asarray(vertices[name]) for name in ("red", "green", "blue")], axis=1)
-    return located, coloured.astype(np.uint8)
+    coloured = [vertices[name] for name in ("red", "green", "blue")]
+    if any(values.dtype.kind not in "fiu" for values in coloured):
+        raise SourceError("colours are not numbers", file=place, field="ply_file_path")
+    return located, np.nan_to_num(np.stack(coloured, axis=1)).clip(0, 255).astype(np.uint8)
 
 
 def _write_points(

@@ -194,7 +194,8 @@ def _opened(file: Path, named: Path) -> Iterator[tuple[Any, Any]]:
     problem = f"cannot be opened as a video ({file.stat().st_size} bytes); is it whole?"
     try:
         container = av.open(str(file))
-    except av.error.FFmpegError as error:
+    except (av.error.FFmpegError, UnicodeDecodeError) as error:
+        # Metadata that are no text fail in the binding.
         raise SourceError(problem, file=named) from error
     with container:
         if not container.streams.video:

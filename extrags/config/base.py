@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, field_validator
 from pydantic_core import CoreSchema, core_schema
 
 from extrags.errors import ConfigError, did_you_mean
+from extrags.redaction import has_credentials
 
 __all__ = ["KeyOf", "StageConfig"]
 
@@ -39,6 +40,14 @@ class KeyOf:
 
 
 class StageConfig(BaseModel):
-    """Base class of all settings: immutable; unknown names are errors."""
+    """Base class of all settings: immutable; unknown names are errors, and so are credentials."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True)
+
+    @field_validator("*")
+    @classmethod
+    def _without_credentials(cls, value: Any) -> Any:
+        # Settings are stored: in manifests, on pages, in Prefect's database.
+        if isinstance(value, str) and has_credentials(value):
+            raise ValueError("it holds a password, key or token; credentials belong in the environment")
+        return value

@@ -29,7 +29,7 @@ from extrags.depth.stereo import (
     multi_view_stereo,
     sweep_around,
 )
-from extrags.depth.weights import NONE, load_completion
+from extrags.depth.weights import BUNDLED, NONE, completion_digest, load_completion
 from extrags.devices import chosen_device
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
@@ -212,7 +212,10 @@ def estimate_depth(
             }
             for fit in stereo.monocular
         ],
-        "completion": config.completion,
+        # Never a path: the same weights elsewhere make the same artefact.
+        "completion": config.completion
+        if config.completion in (BUNDLED, NONE)
+        else f"weights {completion_digest(config.completion)}",
         "device": device.type,
         "median_expected_error": float(np.median(expected[sequence.mask])) if sequence.mask.any() else 1.0,
     }

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from jaxtyping import Float
 
+from extrags.array_files import load_npy
 from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
 from extrags.metrics.protocol import RenderedViews
 from extrags.sequence import EndoscopicSequence
@@ -151,7 +152,7 @@ def _depth(file: Path, shape: tuple[int, int], step_mm: float | None) -> Float[n
 
     try:
         if file.suffix.lower() == ".npy":
-            values = np.load(file, allow_pickle=False)
+            values = load_npy(file)
         else:
             with Image.open(file) as image:
                 values = np.asarray(image)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import pickle
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from extrags.array_files import load_npz, load_state_dict
 from extrags.config import LpipsNet
 from extrags.data_directories import weights_roots
 from extrags.errors import ConfigError, WeightsError
@@ -128,9 +128,9 @@ def read_weights(files: tuple[Path, ...], net: LpipsNet) -> dict[str, Tensor]:
     said = " and ".join(str(file) for file in files)
     if len(files) == 1:
         try:
-            with np.load(files[0]) as archive:
-                weights = {name: torch.from_numpy(archive[name].astype(np.float32)) for name in archive.files}
-        except (OSError, ValueError) as error:
+            arrays = load_npz(files[0])
+            weights = {name: torch.from_numpy(value.astype(np.float32)) for name, value in arrays.items()}
+        except (OSError, TypeError, ValueError) as error:
             raise WeightsError(f"{said}: not a readable npz file ({error})") from error
     else:
         heads, backbone = (_state_dict(file) for file in files)
@@ -206,20 +206,16 @@ def _sha256(file: Path, size: int, changed_ns: int) -> str:
 
 def _state_dict(file: Path) -> dict[str, Tensor]:
     try:
-        found = torch.load(file, map_location="cpu", weights_only=True)
-    except (OSError, RuntimeError, EOFError, ValueError, pickle.UnpicklingError) as error:
+        return load_state_dict(file)
+    except (OSError, ValueError) as error:
         raise WeightsError(f"{file}: not a readable file of PyTorch weights ({error})") from error
-    if not isinstance(found, dict) or not all(isinstance(value, Tensor) for value in found.values()):
-        raise WeightsError(f"{file}: holds no state dictionary")
-    return found
 
 
 def _other_network(file: Path, net: LpipsNet) -> LpipsNet | None:
     """The network whose weights an npz file holds, if it is not the one that is looked for."""
     try:
-        with np.load(file) as archive:
-            names = set(archive.files)
-    except (OSError, ValueError, EOFError):
+        names = set(load_npz(file))
+    except (OSError, ValueError):
         return None  # Reading says what is wrong with it.
     held = [known for known in BACKBONES if names >= set(array_names(known))]
     return None if not held or net in held else held[0]

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from extrags.array_files import load_npz
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
 
@@ -73,8 +74,8 @@ class PoseJob:
     @classmethod
     def load(cls, folder: Path) -> PoseJob:
         """Read the job."""
-        with np.load(folder / "job.npz") as arrays:
-            return cls(**dict(arrays.items()), **json.loads((folder / "job.json").read_text()))
+        fields: dict[str, Any] = {**load_npz(folder / "job.npz")}
+        return cls(**fields, **json.loads((folder / "job.json").read_text()))
 
 
 @dataclass(frozen=True)
@@ -116,8 +117,7 @@ class PoseJobResult:
     @classmethod
     def load(cls, folder: Path) -> PoseJobResult:
         """Read the result."""
-        with np.load(folder / "result.npz") as arrays:
-            return cls(**dict(arrays.items()), report=json.loads((folder / "result.json").read_text()))
+        return cls(**load_npz(folder / "result.npz"), report=json.loads((folder / "result.json").read_text()))
 
 
 def reserve_stdout() -> None:

@@ -43,7 +43,7 @@ def read_description(file: Path) -> dict[str, Any]:
         raise WeightsError(f"{file}: no such file; train the restorer first (stage enhance)")
     try:
         return dict(json.loads(file.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
+    except (OSError, RecursionError, TypeError, ValueError) as error:
         raise WeightsError(f"{file}: not readable as a JSON object ({error})") from error
 
 
@@ -82,5 +82,5 @@ def description_fields(file: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise WeightsError(f"{file}: not the description of a restorer ({error!r})") from error

@@ -13,11 +13,12 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from extrags.errors import ArtefactGoneError, DamagedArtefactError, StoreError
+from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError, StoreError
+from extrags.redaction import has_credentials, without_credentials, without_credentials_in
 from extrags.store.canonical import Ref
 from extrags.store.directory import ABOUT, DirectoryBackend, private_directory
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
-from extrags.store.manifest import Manifest, software_versions, stage_of
+from extrags.store.manifest import Manifest, is_name, software_versions, stage_of
 from extrags.store.refusal import refused_write
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
@@ -116,7 +117,7 @@ class Store:
 
     Raises:
         StoreError: for a URL that fsspec does not know.
-        ConfigError: for another value of `EXTRAGS_VERIFY`.
+        ConfigError: for another value of `EXTRAGS_VERIFY`, or a URL with credentials in it.
     """
 
     def __init__(
@@ -127,6 +128,12 @@ class Store:
         verify: Literal["metadata", "all"] | None = None,
     ) -> None:
         text = str(root)
+        if "://" in text and has_credentials(text):
+            raise ConfigError(
+                f"the URL of the store {text} holds credentials, and URLs of stores are written to "
+                "manifests, logs and Prefect's database; give them in the environment, such as "
+                "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY for s3, or FSSPEC_<PROTOCOL>_PASSWORD"
+            )
         self._depth: Depth = verify or default_depth()
         self.backend: DirectoryBackend | UrlBackend
         if "://" in text and not text.startswith("file://"):
@@ -169,7 +176,7 @@ class Store:
         Raises:
             DamagedArtefactError: when its manifest is damaged, or files are missing, truncated or too many.
         """
-        manifest = self.backend.read_manifest(key)
+        manifest = self.backend.read_manifest(_checked(key))
         if manifest is None:
             return None
         damage = self.backend.damaged_sizes(manifest)
@@ -300,7 +307,7 @@ class Store:
             StoreError: when the store cannot be read.
         """
         try:
-            manifest = self.backend.read_manifest(key)
+            manifest = self.backend.read_manifest(_checked(key))
         except DamagedArtefactError as error:
             return error
         damage = None if manifest is None else self.backend.examine(manifest)
@@ -391,7 +398,7 @@ class Store:
         """
         started = datetime.datetime.now(datetime.UTC)
         clock = time.monotonic()
-        with private_directory(self.backend.scratch, key, stage) as scratch:
+        with private_directory(self.backend.scratch, _checked(key), stage) as scratch:
             slot = Slot(scratch / "files", self)
             about = {
                 "key": key,
@@ -412,8 +419,8 @@ class Store:
                         version=version,
                         key=key,
                         digest=listing.digest,
-                        label=label,
-                        config=dict(config or {}),
+                        label=without_credentials(label),
+                        config=without_credentials_in(dict(config or {})),
                         inputs={name: ref.digest for name, ref in (inputs or {}).items()},
                         input_keys={name: _key_of(ref) for name, ref in (inputs or {}).items()},
                         software=software_versions(),
@@ -522,4 +529,15 @@ def _matches(manifest: Manifest, pattern: str) -> bool:
 
 
 def _key_of(ref: Ref) -> str:
-    return ref.uri.rstrip("/").rsplit("/", 1)[-1]
+    return _checked(ref.uri.rstrip("/").rsplit("/", 1)[-1])
+
+
+def _checked(key: str) -> str:
+    """A key names a folder of the store, and no other place.
+
+    Raises:
+        StoreError: otherwise.
+    """
+    if not is_name(key):
+        raise StoreError(f"{key[:200]!r} is no key of an artefact: keys are names, not paths")
+    return key

@@ -81,7 +81,7 @@ class DirectoryBackend:
         """
         path = self.artefacts / key / MANIFEST
         try:
-            return parsed_manifest(path.read_bytes())
+            return parsed_manifest(path.read_bytes(), key)
         except (FileNotFoundError, NotADirectoryError):
             return None
         except ValueError as error:

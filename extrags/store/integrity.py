@@ -1,8 +1,8 @@
 """Whether the files of an artefact are still those that were stored.
 
 The manifest holds size and digest of every file, in earlier artefacts `checksums.json` beside it. Neither
-list needs a checksum of its own: the artefact's digest is computed from it, and the manifest has a checksum. Number and size of files are
-compared on every access, contents once per process and artefact (`Depth`).
+list needs a checksum of its own: the artefact's digest is computed from it, and the manifest has one. Number
+and size of files are compared on every access, contents once per process and artefact (`Depth`).
 """
 
 from __future__ import annotations
@@ -223,11 +223,12 @@ def _checksums(directory: Path, manifest: Manifest) -> dict[str, _File] | Damage
     try:
         read = json.loads((directory / CHECKSUMS).read_bytes())
         files = {name: _File(int(size), str(digest)) for name, (size, digest) in read.items()}
+        summary = _summary(files)
     except FileNotFoundError:
         return None
-    except (ValueError, TypeError, AttributeError):
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         return Damage("is not a list of files", CHECKSUMS)
-    if _summary(files) != (manifest.digest, manifest.files, manifest.bytes):
+    if summary != (manifest.digest, manifest.files, manifest.bytes):
         return Damage("is not the list of this artefact's files", CHECKSUMS)
     return files
 
@@ -258,9 +259,9 @@ def _sizes(directory: Path) -> dict[str, int]:
         with os.scandir(place) as entries:
             for entry in entries:
                 name = prefix + entry.name
-                if entry.is_dir():
+                if entry.is_dir(follow_symlinks=False):
                     waiting.append((entry.path, f"{name}/"))
-                elif name not in NOT_CONTENT and entry.is_file():
+                elif name not in NOT_CONTENT and entry.is_file(follow_symlinks=False):
                     found[name] = entry.stat().st_size
     return found
 

@@ -17,6 +17,7 @@ from extrags.store.canonical import DIGEST_BYTES
 __all__ = [
     "MANIFEST",
     "Manifest",
+    "is_name",
     "manifest_text",
     "parsed_manifest",
     "same_content",
@@ -74,8 +75,12 @@ def manifest_text(manifest: Manifest) -> bytes:
     return head + _SEAL + _checksum(head) + _SEALED
 
 
-def parsed_manifest(text: bytes) -> Manifest:
+def parsed_manifest(text: bytes, key: str | None = None) -> Manifest:
     """A manifest from its JSON; those written before there were checksums have none.
+
+    Args:
+        text: the file.
+        key: of the artefact that it should be of; None for any.
 
     Raises:
         ValueError: when it is no manifest, or differs from its checksum.
@@ -84,7 +89,10 @@ def parsed_manifest(text: bytes) -> Manifest:
     head, seal, tail = text.rpartition(_SEAL)
     if seal and tail != _checksum(head) + _SEALED:
         raise ValueError("its content has changed since it was written")
-    fields = json.loads(text)
+    try:
+        fields = json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
     if seal:
         # With a valid checksum, an unknown field is no damage but that of a later version.
         fields = {name: value for name, value in fields.items() if name in Manifest.model_fields}
@@ -93,6 +101,10 @@ def parsed_manifest(text: bytes) -> Manifest:
     except ValidationError as error:
         fault = error.errors()[0]
         raise ValueError(f"{'.'.join(map(str, fault['loc']))}: {fault['msg']}") from error
+    if not is_name(manifest.key) or (manifest.data and not is_name(manifest.data)):
+        raise ValueError("its key or data is no name, but a path")
+    if key is not None and manifest.key != key:
+        raise ValueError(f"it is the manifest of {manifest.key}")
     if manifest.checksum and not seal:
         raise ValueError("its checksum is not where it was written")
     return manifest
@@ -102,6 +114,11 @@ def same_content(one: Manifest, other: Manifest) -> bool:
     """Whether two manifests are of the same files with the same bytes."""
     told = [{name: item.contents.get(name) for name in item.run_files} for item in (one, other)]
     return one.digest == other.digest and told[0] == told[1]
+
+
+def is_name(text: str) -> bool:
+    """Whether a text can name one file or folder: nothing that would lead elsewhere."""
+    return bool(re.fullmatch(r"[^/\\\0]{1,250}", text)) and text not in (".", "..")
 
 
 def stage_of(key: str) -> str:

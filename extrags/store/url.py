@@ -23,7 +23,15 @@ from extrags.errors import DamagedArtefactError, MissingDependencyError, StoreEr
 from extrags.store.canonical import Ref, digest_of
 from extrags.store.directory import DAMAGED, RECORD, RECORDS, private_directory, sweep_directories
 from extrags.store.integrity import Damage, find_damage, find_damaged_sizes, intact_manifest
-from extrags.store.manifest import MANIFEST, Manifest, manifest_text, parsed_manifest, same_content, stage_of
+from extrags.store.manifest import (
+    MANIFEST,
+    Manifest,
+    is_name,
+    manifest_text,
+    parsed_manifest,
+    same_content,
+    stage_of,
+)
 
 __all__ = ["UrlBackend", "default_cache_directory"]
 
@@ -111,7 +119,7 @@ class UrlBackend:
         """
         name = f"{self.prefix}/{key}/{MANIFEST}"
         try:
-            return parsed_manifest(self.fs.cat_file(name))
+            return parsed_manifest(self.fs.cat_file(name), key)
         except FileNotFoundError:
             return None
         except ValueError as error:
@@ -240,6 +248,8 @@ class UrlBackend:
             self.fs.invalidate_cache(source)
             for name in self.fs.find(source):
                 relative = str(name).removeprefix(source).lstrip("/")
+                if not all(is_name(part) for part in relative.split("/")):
+                    raise StoreError(f"{self.url}: the object {name!r} would be written outside the copy")
                 (scratch / relative).parent.mkdir(parents=True, exist_ok=True)
                 # What goes away meanwhile is missing then, and said to be.
                 with suppress(FileNotFoundError):

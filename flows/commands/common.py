@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
+from extrags.redaction import CredentialFilter
 
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
@@ -167,6 +168,7 @@ def set_up_logging(*, debug: bool, terminal: bool) -> None:
     handler = logging.StreamHandler(sys.stderr)
     # The handler's as well as the loggers': a run on a lasting server sends more to its log than is shown.
     handler.setLevel(level)
+    handler.addFilter(CredentialFilter())
     logging.basicConfig(level=level, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=[handler])
     for noisy in ("httpx", "httpcore", "prefect", "distributed", "distributed.scheduler", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING if debug else logging.CRITICAL)

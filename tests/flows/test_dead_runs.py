@@ -117,7 +117,7 @@ def test_a_killed_run_is_crashed_at_the_next_start_and_the_living_are_left_alone
         assert task_states(dead) == {StateType.CRASHED}
         assert state_of(living) == StateType.RUNNING
         assert state_of(foreign) == StateType.RUNNING
-        left = {path.stem for path in (tmp_path / "runs").iterdir()}
+        left = {path.stem for path in (tmp_path / "leases").iterdir()}
         assert str(dead) not in left
         assert str(living) in left
         assert settle_dead_runs(str(tmp_path)) == ([], set())
@@ -167,7 +167,7 @@ def test_a_lease_that_another_machine_wrote_says_nothing(
     run = FlowRun(id=uuid4(), flow_id=uuid4(), name="elsewhere", state_type=StateType.RUNNING)
     silent(monkeypatch, run, last_beat_s=1.0)
     monkeypatch.setattr(flows.leases, "_host", lambda: "another")
-    descriptor = flows.leases._take(tmp_path / "runs", run)
+    descriptor = flows.leases._take(tmp_path / "leases", run)
     assert descriptor is not None
     os.close(descriptor)
     monkeypatch.undo()
@@ -187,7 +187,7 @@ def test_a_run_that_never_started_is_dead_after_an_hour(
 
 def test_outside_a_run_there_is_no_lease(tmp_path: Path) -> None:
     with run_lease(str(tmp_path)):
-        assert not (Store(tmp_path).state / "runs").exists()
+        assert not (Store(tmp_path).state / "leases").exists()
 
 
 def test_the_automation_is_made_once() -> None:

@@ -11,8 +11,9 @@ from dataclasses import asdict
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
+from extrags.array_files import load_safetensors
 from extrags.depth.completion import CompletionNetwork
 from extrags.depth.pretraining.cavities import KINDS
 from extrags.depth.pretraining.examples import SIZES, Examples, make_examples
@@ -70,7 +71,9 @@ def main() -> None:
         log.info("%d examples read", len(bank))
     network = CompletionNetwork().to(device)
     if options.start is not None:
-        network.load_state_dict({name: value.float() for name, value in load_file(options.start).items()})
+        network.load_state_dict(
+            {name: value.float() for name, value in load_safetensors(options.start).items()}
+        )
     for number in range(options.batches):
         target = held_out if number < options.validation_batches else bank
         kind, size = KINDS[number % len(KINDS)], SIZES[(number // len(KINDS)) % len(SIZES)]
@@ -109,7 +112,7 @@ def main() -> None:
 
     network = train_completion(bank, settings, network, told=told, half=device.type == "cuda")
     if options.start is not None and options.keep > 0:
-        mix_weights(network, load_file(options.start), options.keep)
+        mix_weights(network, load_safetensors(options.start), options.keep)
     scores = _scores(network, held_out)
     log.info("after: %s", scores)
     weights = {name: value.cpu().half().contiguous() for name, value in network.state_dict().items()}

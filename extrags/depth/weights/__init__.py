@@ -9,8 +9,7 @@ import hashlib
 from importlib.resources import files
 from pathlib import Path
 
-from safetensors.torch import load_file
-
+from extrags.array_files import load_safetensors
 from extrags.depth.completion import CompletionNetwork
 from extrags.errors import WeightsError
 
@@ -61,8 +60,8 @@ def load_completion(setting: str) -> CompletionNetwork | None:
         return None
     network = CompletionNetwork()
     try:
-        network.load_state_dict({name: value.float() for name, value in load_file(file).items()})
-    except (RuntimeError, ValueError) as error:
+        network.load_state_dict({name: value.float() for name, value in load_safetensors(file).items()})
+    except (OSError, RuntimeError, ValueError) as error:
         raise WeightsError(
             f"depth.completion={setting}: {file} is not a completion network: {error}"
         ) from error

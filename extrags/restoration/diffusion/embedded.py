@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from extrags.array_files import load_safetensors
 from extrags.config import EnhanceConfig
 from extrags.errors import WeightsError
 from extrags.restoration.description import description_fields, read_description, write_description
@@ -221,9 +222,6 @@ class EmbeddedEnhancer:
         Raises:
             WeightsError: when a file is missing, or does not fit this version.
         """
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-
         weights_file = path / WEIGHTS if path.is_dir() or path.suffix != ".safetensors" else path
         description_file = weights_file.with_suffix(".json")
         if not weights_file.exists():
@@ -253,8 +251,8 @@ class EmbeddedEnhancer:
             )
         try:
             network.load_state_dict(
-                {name: value.float() for name, value in load_file(str(weights_file)).items()}
+                {name: value.float() for name, value in load_safetensors(weights_file).items()}
             )
-        except (OSError, RuntimeError, SafetensorError) as error:
+        except (OSError, RuntimeError, ValueError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return enhancer

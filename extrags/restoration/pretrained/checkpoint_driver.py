@@ -58,7 +58,7 @@ def _here() -> str:
 def _settings(request: str) -> Any:
     import numpy
 
-    with numpy.load(request) as archive:
+    with numpy.load(request, allow_pickle=False) as archive:
         return json.loads(str(archive["settings"]))
 
 
@@ -78,7 +78,7 @@ def _run(settings: Any, request: str, result: str) -> None:
     import numpy
     import torch
 
-    with numpy.load(request) as archive:
+    with numpy.load(request, allow_pickle=False) as archive:
         frames, unknown, poses = (torch.from_numpy(archive[name]) for name in ("frames", "unknown", "poses"))
         seeds = archive["seeds"].tolist()
     torch.set_num_threads(settings["threads"])

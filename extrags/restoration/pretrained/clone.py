@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from extrags.array_files import load_npz
 from extrags.config import CheckpointConfig
 from extrags.errors import ConfigError, ExtragsError, MissingDependencyError, WeightsError
 from extrags.model_files import files_fingerprint
@@ -215,8 +216,10 @@ def run_clone(
             )
         if check:
             return np.zeros(0, np.float32)
-        with np.load(result) as archive:
-            return np.asarray(archive["frames"], dtype=np.float32)
+        try:
+            return np.asarray(load_npz(result)["frames"], dtype=np.float32)
+        except (OSError, KeyError, ValueError) as error:
+            raise ExtragsError(f"the clone {clone.root} wrote no readable result: {error}") from error
 
 
 def _environment(python: str) -> dict[str, str]:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from extrags.array_files import load_safetensors
 from extrags.config import CoarseConfig, EnhanceConfig, PretrainedConfig
 from extrags.errors import ConfigError, WeightsError
 from extrags.model_files import fingerprint
@@ -208,13 +209,10 @@ class DiffusersBackend:
         Raises:
             WeightsError: when a file is missing, damaged, or does not fit this version.
         """
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
-
         description, views = load_prepared(path, format_number=FORMAT, files=(TEXT,))
         try:
-            text = load_file(str(path / TEXT))
-        except (OSError, SafetensorError) as error:
+            text = load_safetensors(path / TEXT)
+        except (OSError, ValueError) as error:
             raise WeightsError(f"{path / TEXT}: not readable as safetensors ({error})") from error
         with description_fields(path / DESCRIPTION):
             return PretrainedEnhancer(

@@ -1,0 +1,131 @@
+"""Arrays from files of others: npy, npz, PLY, safetensors and PyTorch, never with code in them.
+
+Pickles are refused: they can run any code. What is wrong with a file is a ValueError, whatever the library
+below raised; callers add file and remedy.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_PLY_HEADER_BYTES = 1 << 16
+
+__all__ = ["load_npy", "load_npz", "load_ply_vertices", "load_safetensors", "load_state_dict"]
+
+
+def load_npy(file: Path) -> np.ndarray:
+    """One array.
+
+    Raises:
+        OSError: when the file cannot be read.
+        ValueError: when it is damaged, holds Python objects, or announces more than there is.
+    """
+    try:
+        with file.open("rb") as stream:
+            version = np.lib.format.read_magic(stream)
+            read = (
+                np.lib.format.read_array_header_1_0
+                if version == (1, 0)
+                else np.lib.format.read_array_header_2_0
+            )
+            shape, _, kind = read(stream)
+            announced = kind.itemsize
+            for length in shape:
+                announced *= int(length)
+            there = file.stat().st_size - stream.tell()
+        if kind.hasobject:
+            raise ValueError("it holds Python objects (a pickle), which are never loaded")
+        if announced > there:
+            raise ValueError(f"{announced} bytes of values announced, {there} there: it is truncated")
+        return np.asarray(np.load(file, allow_pickle=False))
+    except (ValueError, OSError):
+        raise
+    except Exception as error:
+        # Headers are parsed as Python literals, which fail in many ways.
+        raise ValueError(f"no npy file, or damaged: {type(error).__name__}: {error}") from error
+
+
+def load_npz(file: Path) -> dict[str, np.ndarray]:
+    """All arrays of an archive, by name.
+
+    Raises:
+        OSError: when the file cannot be read.
+        ValueError: when it is damaged or holds Python objects.
+    """
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            found = {name: archive[name] for name in archive.files}
+        # Members that are no npy files come back as bytes.
+        if not all(isinstance(value, np.ndarray) for value in found.values()):
+            raise ValueError("the archive holds other things than arrays")
+        return found
+    except (ValueError, OSError):
+        raise
+    except Exception as error:
+        raise ValueError(f"no npz file, or damaged: {type(error).__name__}: {error}") from error
+
+
+def load_safetensors(file: Path) -> dict[str, Tensor]:
+    """All tensors, by name.
+
+    Raises:
+        OSError: when the file cannot be read.
+        ValueError: when it is damaged.
+    """
+    from safetensors.torch import load_file
+
+    try:
+        return load_file(file)
+    except (ValueError, OSError):
+        raise
+    except Exception as error:
+        raise ValueError(f"no safetensors file, or damaged: {error}") from error
+
+
+def load_state_dict(file: Path) -> dict[str, Tensor]:
+    """Tensors that `torch.save` wrote, by name.
+
+    Raises:
+        OSError: when the file cannot be read.
+        ValueError: when it is damaged, or holds anything but tensors.
+    """
+    import torch
+
+    try:
+        found = torch.load(file, map_location="cpu", weights_only=True)
+    except OSError:
+        raise
+    except Exception as error:
+        # Damaged archives and pickles raise almost anything.
+        raise ValueError(f"no file of PyTorch weights, damaged, or a pickle of more: {error}") from error
+    if not isinstance(found, dict) or not all(isinstance(value, torch.Tensor) for value in found.values()):
+        raise ValueError("it holds no state dictionary")
+    return found
+
+
+def load_ply_vertices(file: Path) -> np.ndarray:
+    """The table of vertices of a PLY file, one column per property.
+
+    Raises:
+        OSError: when the file cannot be read.
+        ValueError: when it is no PLY, damaged, without vertices, or announces more than there is.
+    """
+    from plyfile import PlyData
+
+    try:
+        with file.open("rb") as stream:
+            header = stream.read(_PLY_HEADER_BYTES).partition(b"end_header")[0]
+        counts = [line.split()[-1] for line in header.splitlines() if line.startswith(b"element ")]
+        if sum(int(count) for count in counts) > file.stat().st_size:
+            raise ValueError("more elements announced than the file has bytes: it is truncated")
+        return np.asarray(PlyData.read(str(file), mmap=False)["vertex"].data)
+    except (ValueError, OSError):
+        raise
+    except Exception as error:
+        raise ValueError(f"no PLY with vertices, or damaged: {type(error).__name__}: {error}") from error

@@ -1,0 +1,88 @@
+"""Credentials taken out of text before it is shown, logged or stored.
+
+Recognised are the user and password of a URL (`s3://KEY:SECRET@bucket`), values of query fields whose names
+speak of keys, tokens, signatures or passwords, HTTP authorisation headers, and the values of environment
+variables that hold such things (`EXTRAGS_CAPTION_KEY`, `AWS_SECRET_ACCESS_KEY`, `HF_TOKEN`, ...).
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from typing import Any
+
+__all__ = ["HIDDEN", "CredentialFilter", "has_credentials", "without_credentials", "without_credentials_in"]
+
+HIDDEN = "***"
+"""Stands where a credential was."""
+
+# Secrets may hold slashes; what follows a colon as a number is a port, though.
+_USER = re.compile(
+    r"""(?P<scheme>\b[a-zA-Z][\w+.-]*://)(?:[^\s/@:"'<>]*:(?!\d{1,5}(?:[/?#]|$))[^\s@"'<>]*|[^\s/@"'<>?#]+)@"""
+)
+_QUERY = re.compile(
+    r"""(?P<name>[?&;][^=&;\s"'<>]{0,64}(?:key|token|secret|pass|pwd|sig|auth|credential)"""
+    r"""[^=&;\s"'<>]{0,64}=)[^&;\s"'<>#]+""",
+    re.IGNORECASE,
+)
+_HEADER = re.compile(r"(?P<name>\b(?:bearer|basic)\s+)[A-Za-z0-9+/_.~=-]{12,}", re.IGNORECASE)
+_SECRET_VARIABLE = re.compile(
+    r"(SECRET|TOKEN|PASSWORD|PASSWD|API_?KEY|ACCESS_KEY|CAPTION_KEY|CREDENTIALS?)", re.IGNORECASE
+)
+_SHORTEST = 8
+"""Shorter values of variables are found in harmless text by chance."""
+
+
+def without_credentials(text: str) -> str:
+    """The text with `***` in place of each credential; text without any comes back as it was."""
+    for value in _secret_values():
+        if value in text:
+            text = text.replace(value, HIDDEN)
+    if "://" in text:
+        text = _USER.sub(rf"\g<scheme>{HIDDEN}@", text)
+        text = _QUERY.sub(rf"\g<name>{HIDDEN}", text)
+    return _HEADER.sub(rf"\g<name>{HIDDEN}", text)
+
+
+def has_credentials(text: str) -> bool:
+    """Whether anything would be taken out."""
+    return without_credentials(text) != text
+
+
+def without_credentials_in(value: Any) -> Any:
+    """The same for all text inside JSON-like lists and dicts, keys included."""
+    if isinstance(value, str):
+        return without_credentials(value)
+    if isinstance(value, list | tuple):
+        return [without_credentials_in(item) for item in value]
+    if isinstance(value, dict):
+        return {without_credentials(str(key)): without_credentials_in(item) for key, item in value.items()}
+    return value
+
+
+class CredentialFilter(logging.Filter):
+    """For handlers and loggers: takes credentials out of messages and tracebacks; drops nothing."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Change the record in place."""
+        text = record.getMessage()
+        shown = without_credentials(text)
+        if shown != text:
+            record.msg, record.args = shown, ()
+        if record.exc_info and not record.exc_text:
+            traceback = logging.Formatter().formatException(record.exc_info)
+            # Formatters take this text instead of formatting the exception themselves.
+            if has_credentials(traceback):
+                record.exc_text = without_credentials(traceback)
+        return True
+
+
+def _secret_values() -> list[str]:
+    """The longest first: one may hold another."""
+    found = {
+        value
+        for name, value in os.environ.items()
+        if len(value) >= _SHORTEST and _SECRET_VARIABLE.search(name) and not os.path.exists(value)
+    }
+    return sorted(found, key=len, reverse=True)

@@ -1,0 +1,104 @@
+"""A run of all stages without any of them: a runner that notes keys, and a store of made-up artefacts.
+
+The digest of a made-up artefact comes from its key, so that a key that changes changes the keys of all stages
+that follow. The plan alone is made as it is, since later stages read their budgets from it.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from extrags.assessment import ScenePlan, decide
+from extrags.config import PipelineConfig
+from extrags.finetuning_judge import Judgement
+from extrags.store import Manifest, Ref, digest_of
+from flows.runners import Call, Result
+from flows.wiring import SequenceRun
+from tasks.evaluate import METRICS_FILE
+from tasks.explore import NEXT
+from tasks.stage import stage_key
+
+LACKING = {"lacking_share": 0.1}
+"""What the assessment measured: the plan then takes 8 of 20 trajectories."""
+
+
+class RecordedRun:
+    """Runner and store in one.
+
+    Args:
+        has_poses: whether the source has poses.
+        has_depth: whether the source has depth.
+    """
+
+    def __init__(self, *, has_poses: bool, has_depth: bool) -> None:
+        self.keys: dict[str, list[str]] = defaultdict(list)
+        self.plans: dict[str, ScenePlan] = {}
+        self.counts: dict[str, Any] = {
+            "has_poses": int(has_poses),
+            "has_depth": int(has_depth),
+            "summary": "made up",
+            "train": 20,
+            "test": 4,
+            "trajectories": 8,
+            "virtual_views": 100,
+        }
+
+    def run(self, calls: Sequence[Call], label: str) -> list[Result]:
+        """Note the keys."""
+        return [Result(self._made(call), "ran") for call in calls]
+
+    def _made(self, call: Call) -> Ref:
+        key = stage_key(call.task, call.inputs)
+        self.keys[call.task.name].append(key)
+        ref = Ref(uri=f"made-up/{key}", digest=digest_of(key))
+        if call.task.name == "plan":
+            made = decide(LACKING, call.inputs["config"])
+            ref = Ref(uri=ref.uri, digest=digest_of(made.model_dump(mode="json")))
+            self.plans[ref.uri] = made
+        return ref
+
+    def manifest(self, ref: Ref) -> Manifest:
+        """One for all."""
+        return Manifest(stage="made-up", version=1, key=ref.uri, digest=ref.digest, counts=self.counts)
+
+    def load(self, kind: type, ref: Ref) -> Any:
+        """The plan, or a judgement that keeps everything."""
+        return Judgement(1.0, "made up") if kind is Judgement else self.plans[ref.uri]
+
+    def load_json(self, file: str, ref: Ref) -> Any:
+        """One wave of two branches; no figures."""
+        waits = "explore-start" in ref.uri
+        return {NEXT: {"anchors": [3, 7] if waits else [], "accepted": 0}, METRICS_FILE: {"metrics": {}}}[
+            file
+        ]
+
+
+def recorded_keys(
+    name: str,
+    config: PipelineConfig,
+    *,
+    has_poses: bool = False,
+    has_depth: bool = False,
+    leave_out: Mapping[str, str] | None = None,
+) -> dict[str, list[str]]:
+    """The keys of all stages of a sequence, by the stage's name; nothing is run.
+
+    Args:
+        name: of the sequence; its content is looked at as in any run.
+        config: settings of all stages.
+        has_poses: whether the source shall have poses.
+        has_depth: whether it shall have depth.
+        leave_out: see `extrags.pipeline.Pipeline`.
+
+    Raises:
+        Exception: what a stage failed with.
+    """
+    recorded = RecordedRun(has_poses=has_poses, has_depth=has_depth)
+    run = SequenceRun(name, config, "memory://made-up", recorded, leave_out=leave_out)
+    run.store = recorded  # type: ignore[assignment]
+    outcome = run.run()
+    if outcome.error is not None:
+        raise outcome.error
+    return dict(recorded.keys)
