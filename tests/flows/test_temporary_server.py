@@ -1,0 +1,44 @@
+"""The database of the temporary server, which is copied from a template."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+from flows.temporary_server import copy_database
+
+
+def made(path: Path, word: str = "whole") -> Path:
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("CREATE TABLE words (word TEXT)")
+        database.execute("INSERT INTO words VALUES (?)", (word,))
+    return path
+
+
+def words(path: Path) -> list[tuple[str]]:
+    with closing(sqlite3.connect(path)) as database:
+        return database.execute("SELECT word FROM words").fetchall()
+
+
+def test_a_copy_is_whole_and_nothing_lies_beside_it(tmp_path: Path) -> None:
+    target = tmp_path / "home" / "prefect.db"
+    assert copy_database(made(tmp_path / "template.db"), target)
+    assert [path.name for path in target.parent.iterdir()] == ["prefect.db"]
+    assert words(target) == [("whole",)]
+
+
+def test_a_database_that_is_there_stays(tmp_path: Path) -> None:
+    target = made(tmp_path / "prefect.db", "mine")
+    assert not copy_database(made(tmp_path / "template.db"), target)
+    assert words(target) == [("mine",)]
+
+
+def test_without_a_sound_template_there_is_no_copy(tmp_path: Path) -> None:
+    target = tmp_path / "prefect.db"
+    assert not copy_database(tmp_path / "absent.db", target)
+    broken = tmp_path / "broken.db"
+    broken.write_bytes(b"no database" * 1000)
+    assert not copy_database(broken, target)
+    assert list(tmp_path.iterdir()) == [broken]
