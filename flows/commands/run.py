@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from extrags.errors import ConfigError, DamagedArtefactError, ExtragsError, UnknownSequenceError
@@ -255,26 +256,27 @@ def execute(
     from flows.console import progress_bars
     from flows.dataset import reconstruct_dataset
 
-    limits = stage_limits(given)
+    # Names were checked by the parser; flows have literals for them.
+    arguments: dict[str, Any] = {
+        "sequences": absolute_manifests(sequences),
+        "profile": given.profile,
+        "settings": given.settings,
+        "store": root,
+        "refresh": refresh,
+        "until": until,
+        "runner": given.runner,
+        "at_once": at_once,
+        "method": several.methods[0],
+        "methods": list(several.methods) if len(several.methods) > 1 else None,
+        "seed": several.seeds[0],
+        "seeds": list(several.seeds) if len(several.seeds) > 1 else None,
+        "matrix": dict(several.matrix) or None,
+        "only": several.only,
+        "limits": stage_limits(given),
+    }
     with temporary_server(), without_heartbeat(), progress_bars(terminal=terminal):
         try:
-            outcome: DatasetOutcome = reconstruct_dataset(
-                sequences=absolute_manifests(sequences),
-                profile=given.profile,
-                settings=given.settings,
-                store=root,
-                refresh=refresh,
-                until=until,
-                runner=given.runner,
-                at_once=at_once,
-                method=several.methods[0],  # type: ignore[arg-type]
-                methods=list(several.methods) if len(several.methods) > 1 else None,  # type: ignore[arg-type]
-                seed=several.seeds[0],
-                seeds=list(several.seeds) if len(several.seeds) > 1 else None,  # type: ignore[arg-type]
-                matrix=dict(several.matrix) or None,
-                only=several.only,
-                limits=limits,
-            )
+            outcome: DatasetOutcome = reconstruct_dataset(**arguments)
         except DatasetFailedError as error:
             # Said to Prefect; here each sequence is reported, and the exit code is 1 if any failed.
             outcome = error.outcome
