@@ -22,7 +22,7 @@ MARKS = {
     "missing": "[yellow]·[/]",
     "running": "[cyan]▶[/]",
 }
-SHORT = 5
+SHORT = 3
 """Letters of a stage's name above its column."""
 
 
@@ -72,8 +72,8 @@ def _print(found: StoreStatus) -> None:
     from flows.terminal import console
 
     out = console()
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("sequence", no_wrap=True)
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+    table.add_column("sequence", overflow="fold")
     table.add_column("run")
     for stage in STAGES:
         table.add_column(stage[:SHORT], justify="center", no_wrap=True)

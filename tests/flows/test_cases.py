@@ -88,7 +88,7 @@ class TestMatrix:
 
 class TestOnly:
     def test_failed_missing_and_changed(self, finished: tuple[str, SequenceOutcome], tmp_path: Path) -> None:
-        shutil.copytree(finished[0], tmp_path / "store")
+        shutil.copytree(Path(finished[0]) / "artefacts", tmp_path / "store" / "artefacts")
         store = str(tmp_path / "store")
         done, broken, new = case(), case("phantom/1@sparse"), case("phantom/2@sparse")
         leave(store, done)

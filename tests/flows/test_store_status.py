@@ -23,7 +23,9 @@ CASE = SequenceCase(SEQUENCE, profile="quick", settings=TINY)
 @pytest.fixture
 def store(finished: tuple[str, SequenceOutcome], tmp_path: Path) -> Store:
     root, outcome = finished
-    shutil.copytree(root, tmp_path / "store")
+    # Tests of flows add to that store: other artefacts, and records of their runs.
+    for key in {key for row in outcome.stages for key in row.made}:
+        shutil.copytree(Path(root) / "artefacts" / key, tmp_path / "store" / "artefacts" / key)
     made = Store(tmp_path / "store")
     record_outcome(made, CASE, outcome, "report", tiny_config())
     return made
