@@ -12,6 +12,7 @@ from pydantic import Field
 from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
+from extrags.store.runs import file_killed
 from flows.cases import SequenceCase, record_outcome_quietly
 from flows.leases import run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
@@ -100,6 +101,6 @@ def open_store(root: str) -> Store:
     """
     store = Store(root)
     store.check_writable()
-    for name in [*store.sweep(), *sweep_locks(store.locks)]:
+    for name in [*store.sweep(), *sweep_locks(store.locks), *file_killed(store)]:
         log.info("removed what a killed run left: %s", name)
     return store

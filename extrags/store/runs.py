@@ -23,7 +23,7 @@ from extrags.store.artefacts import Store
 from extrags.store.canonical import digest_of
 from extrags.store.records import read_records, remove_record, write_record
 
-__all__ = ["Run", "RunRecord", "active_runs", "recorded_run", "runs_of"]
+__all__ = ["Run", "RunRecord", "active_runs", "file_killed", "recorded_run", "runs_of"]
 
 log = logging.getLogger(__name__)
 
@@ -115,6 +115,20 @@ def runs_of(store: Store) -> list[Run]:
     found = [_run(name, record) for name, record in read_records(store, _PREFIX).items()]
     found += [run for run, going_on in _unfinished(store) if not going_on]
     return sorted((run for run in found if run is not None), key=lambda run: (run.ended, run.name))
+
+
+def file_killed(store: Store) -> list[str]:
+    """Put what killed runs recorded to the records of runs that ended; names of the files that are gone."""
+    filed = []
+    for run, going_on in list(_unfinished(store)):
+        if going_on:
+            continue
+        if run.keys:
+            content = {"sequence": run.sequence, "ended": run.ended, "keys": sorted(run.keys)}
+            write_record(store, _PREFIX + digest_of([run.sequence, sorted(run.keys)]), content)
+        (store.state / "runs" / run.name).unlink(missing_ok=True)
+        filed.append(f"runs/{run.name}")
+    return filed
 
 
 def forget(store: Store, runs: Iterable[Run]) -> None:

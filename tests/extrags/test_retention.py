@@ -16,7 +16,7 @@ import pytest
 from extrags.store import Ref, Store
 from extrags.store.records import remove_record
 from extrags.store.retention import Policy, Removal, apply_policy, planned_removals, usage
-from extrags.store.runs import active_runs, recorded_run, runs_of
+from extrags.store.runs import active_runs, file_killed, recorded_run, runs_of
 
 DAY_S = 86400.0
 
@@ -158,6 +158,12 @@ class TestRuns:
         assert active_runs(chain) == []
         (run,) = runs_of(chain)
         assert run.keys == {"other-v1-00"}
+        # The next run leaves one record of it, however often the same run was killed.
+        assert len(file_killed(chain)) == 1
+        assert file_killed(chain) == []
+        assert list((chain.state / "runs" / "active").iterdir()) == []
+        (filed,) = runs_of(chain)
+        assert (filed.keys, filed.ended) == (run.keys, run.ended)
         assert len(apply_policy(chain, Policy(older_than_s=DAY_S))) == 4
         assert runs_of(chain) == []
 
