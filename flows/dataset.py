@@ -123,7 +123,7 @@ def reconstruct_dataset(
             store=store,
             refresh=refresh,
             until=until,
-            method=case.method,  # type: ignore[arg-type]
+            method=case.method,
             limits=limits,
             variant=dict(case.changed) or None,
             return_state=True,

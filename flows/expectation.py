@@ -165,7 +165,7 @@ def _scales(sequence: str, config: PipelineConfig) -> Mapping[StageName, float]:
         return {}  # A path: nothing is known of it before it is read.
     ingest: Any = config.ingest
     frames = min(about.frames, ingest.max_frames or about.frames)
-    pixels = about.width * about.height
+    pixels = float(about.width * about.height)
     if ingest.width and ingest.height and about.format == "phantom":
         pixels = ingest.width * ingest.height
     elif about.format != "phantom":

@@ -79,7 +79,7 @@ def _deployment(declared: Declared, *, schedules: bool) -> Any:
     from prefect.client.schemas.actions import DeploymentScheduleCreate
     from prefect.client.schemas.objects import ConcurrencyLimitConfig
     from prefect.client.schemas.schedules import CronSchedule
-    from prefect.flows import EntrypointType
+    from prefect.types.entrypoint import EntrypointType
 
     when = (
         []

@@ -104,8 +104,8 @@ def _print(found: StoreStatus) -> None:
         f"{found.artefacts} artefacts in {found.store}, {found.unrecorded} of them of other runs",
         soft_wrap=True,
     )
-    marks = "   ".join(f"{mark} {state}" for state, mark in MARKS.items())
-    out.print(f"[dim]{marks}[/]")
+    legend = "   ".join(f"{mark} {state}" for state, mark in MARKS.items())
+    out.print(f"[dim]{legend}[/]")
 
 
 def size_text(count: float) -> str:
