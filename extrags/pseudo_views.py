@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.store.storable import Storable
-from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
+from extrags.zarr_io import has_array, new_group, open_group, read_array, write_array, write_frames
 
 __all__ = ["PseudoViews"]
 
@@ -155,7 +155,7 @@ class PseudoViews(Storable):
         group = open_group(path)
         attributes: Any = dict(group.attrs)
         arrays: dict[str, Any] = {name: _from_steps(read_array(group, name)) for name in _STEPPED}
-        if "expected_error" in group:
+        if has_array(group, "expected_error"):
             arrays["expected_error"] = read_array(group, "expected_error").astype(np.float32)
         for name in ("depth_mm", "image_confidence", "reference", "clip"):
             arrays[name] = read_array(group, name)

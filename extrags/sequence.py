@@ -14,7 +14,7 @@ from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.store.storable import Storable
 from extrags.thresholds import RELIABLE_DEPTH_ERROR, SATURATED
-from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
+from extrags.zarr_io import has_array, new_group, open_group, read_array, write_array, write_frames
 
 __all__ = [
     "EndoscopicSequence",
@@ -409,7 +409,7 @@ class EndoscopicSequence(Storable):
         attributes = dict(group.attrs)
         split: Any = attributes["split"]
         optional = {
-            name: read_array(group, name) if name in group else None
+            name: read_array(group, name) if has_array(group, name) else None
             for name in (
                 "depth_mm",
                 "withheld_depth_mm",

@@ -30,16 +30,22 @@ from zarr.storage import LocalStore, MemoryStore, ZipStore
 
 from extrags.errors import DamagedArtefactError, SourceNotFoundError
 
-__all__ = ["PACKED", "group_exists", "new_group", "open_group", "read_array", "write_array", "write_frames"]
+__all__ = [
+    "PACKED",
+    "group_exists",
+    "has_array",
+    "new_group",
+    "open_group",
+    "read_array",
+    "write_array",
+    "write_frames",
+]
 
 PACKED = ".zarr.zip"
 """Ending of a packed group; callers name it without."""
 METADATA = "zarr.json"
 HELD_BYTES = 64 << 20
 """Of a stack, so much is encoded at once, by several threads, before it is written in order."""
-
-SETTLE_SECONDS = 10.0
-"""How long to wait for the other chunks when one could not be written."""
 
 # zarr reads a chunk that is not there as fill values, so that a lost file would be black frames.
 EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
@@ -177,6 +183,18 @@ def write_frames(group: zarr.Group, name: str, stack: np.ndarray) -> None:
 def _flush(group: zarr.Group) -> None:
     if isinstance(group.store, _Pack):
         group.store.flush()
+
+
+def has_array(group: zarr.Group, name: str) -> bool:
+    """Whether a group has an array of this name.
+
+    Raises:
+        DamagedArtefactError: when its metadata cannot be read.
+    """
+    try:
+        return name in group
+    except UNREADABLE as error:
+        raise DamagedArtefactError(f"{name}: {error}", file=_place(group)) from error
 
 
 def read_array(group: zarr.Group, name: str) -> Any:

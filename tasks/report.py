@@ -181,7 +181,7 @@ def dataset_report(
     ]
     page, content = (
         build_dataset_report(every, name=name, profile=profile)
-        for every in (shown, [replace(row, seconds=0, stages=()) for row in shown])
+        for every in (shown, [replace(row, seconds=0.0, stages=()) for row in shown])
     )
     _save_page(slot, page, content)
 

@@ -176,7 +176,7 @@ def read_stored(folder: Path) -> object:
 
 
 def resealed(folder: Path) -> object:
-    """Metadata that a foreign store may hold: its checksums are right."""
+    """Arrays without a manifest that vouches for them."""
     return EndoscopicSequence.load(folder / "artefacts" / "toy-v1-0" / EndoscopicSequence.stored_as)
 
 
@@ -285,7 +285,8 @@ CASES: dict[str, Case] = {
     ),
     "ocamcalib.txt": Case(ocamcalib, "calib_results.txt", calibration),
     "manifest.json": Case(stored, "artefacts/toy-v1-0/manifest.json", read_stored),
-    "checksums.json": Case(stored, "artefacts/toy-v1-0/checksums.json", read_stored),
+    "sequence.zarr.zip": Case(stored, "artefacts/toy-v1-0/sequence.zarr.zip", read_stored),
+    "foreign.zarr.zip": Case(stored, "artefacts/toy-v1-0/sequence.zarr.zip", resealed),
     "lpips.npz": Case(lpips, "w.npz", lambda file: read_weights((file,), "alex")),
     "torch.pth": Case(state, "w.pth", lambda file: read_weights((file, file), "alex")),
     "completion.safetensors": Case(tensors, "w.safetensors", lambda file: load_completion(str(file))),

@@ -10,7 +10,6 @@ from __future__ import annotations
 import datetime
 import json
 import os
-import re
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator
@@ -44,29 +43,12 @@ def default_cache_directory() -> Path:
     return cache_directory()
 
 
-def _refuse_secrets(url: str) -> None:
-    """A URL is in messages, logs, references and Prefect's parameters.
-
-    Raises:
-        StoreError: for one with a password or a key in it, which the message does not repeat.
-    """
-    scheme, _, rest = url.partition("://")
-    before = rest.partition("/")[0]
-    if (":" in before.rpartition("@")[0]) or re.search(r"[?&][^=&/]*(key|secret|token|sig|pass)", rest, re.I):
-        raise StoreError(
-            f"the URL of this store ({scheme}://...) holds credentials, which would be in logs; "
-            "give them by the environment, such as AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or "
-            "FSSPEC_<PROTOCOL>_<NAME>, or by a file in ~/.config/fsspec"
-        )
-
-
 class UrlBackend:
     """A store on an object store, read through a local directory."""
 
     def __init__(self, url: str, cache: Path | None) -> None:
         import fsspec
 
-        _refuse_secrets(url)
         try:
             self.fs, self.prefix = fsspec.core.url_to_fs(url)
         except ImportError as error:
@@ -225,6 +207,7 @@ class UrlBackend:
         for name in self.fs.find(f"{self.prefix}/{key}"):
             relative = str(name).removeprefix(f"{self.prefix}/{key}").lstrip("/")
             self.fs.mv(str(name), f"{place}/artefact/{relative}")
+        self._remove_empty(f"{self.prefix}/{key}")
         return f"{self.url}/{DAMAGED}/{place.rsplit('/', 1)[-1]}"
 
     def remove_damaged(self, *, dry_run: bool = False) -> list[str]:
@@ -320,7 +303,17 @@ class UrlBackend:
         for attempt in attempts:
             with suppress(FileNotFoundError):
                 self.fs.rm(f"{place}/{attempt}", recursive=True)
+        self._remove_empty(place)
         return True
+
+    def _remove_empty(self, place: str) -> None:
+        """Object stores have no directories, but other file systems keep empty ones."""
+        for inner, kind in self._children(place):
+            if kind == "directory":
+                self._remove_empty(f"{place}/{inner}")
+        if not self._children(place):
+            with suppress(OSError):
+                self.fs.rmdir(place)
 
     def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
         """Remove local leftovers, and remote attempts without a manifest older than `older_than_hours`.

@@ -227,7 +227,7 @@ def test_a_record_is_plain_json(store: Store) -> None:
     with recorded_run(store, "phantom/0") as record:
         assert record is not None
         record.add(["ingest-v1-00"])
-    (path,) = (Path(store.root) / "runs").glob("*.json")
+    (path,) = (Path(store.root) / "records").glob("run-*.json")
     read = json.loads(path.read_text())
     assert read["keys"] == ["ingest-v1-00"]
     assert read["sequence"] == "phantom/0"

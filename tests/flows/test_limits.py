@@ -184,7 +184,7 @@ def test_a_task_of_a_lost_worker_is_submitted_again(
         pass
 
     Lost.losses = losses
-    monkeypatch.setattr(PrefectRunner, "_submit", lambda self, call, label: Lost(store))
+    monkeypatch.setattr(PrefectRunner, "_submit", lambda self, call, label, threads: Lost(store))
     runner = PrefectRunner(store, limits=AT_ONCE)
     if losses == 2:
         assert [result.state for result in runner.run([Call(source, {"seed": 1})], "toy")] == ["ran"]

@@ -11,6 +11,7 @@ from extrags.config.base import StageConfig
 from extrags.errors import WeightsError
 from extrags.restoration.description import DESCRIPTION, check_format, read_description, write_description
 from extrags.restoration.pretrained.real_views import RealViews
+from extrags.zarr_io import group_exists
 
 __all__ = ["PreparedEnhancer", "load_prepared"]
 
@@ -71,8 +72,10 @@ def load_prepared(
         WeightsError: when a file is missing or damaged, or the format is another.
     """
     description = read_description(path / DESCRIPTION)
-    for name in (*files, REFERENCES):
-        if not (path / name).exists():
-            raise WeightsError(f"{path / name}: not there; prepare the restorer first (stage enhance)")
+    missing = [name for name in files if not (path / name).exists()]
+    if not group_exists(path / REFERENCES):
+        missing.append(REFERENCES)
+    if missing:
+        raise WeightsError(f"{path / missing[0]}: not there; prepare the restorer first (stage enhance)")
     check_format(path / DESCRIPTION, description, format_number)
     return description, RealViews.load(path / REFERENCES)
