@@ -13,6 +13,7 @@ import atexit
 import logging
 import os
 import threading
+from collections.abc import Callable, Mapping
 from typing import Any
 from urllib.error import URLError
 from urllib.request import urlopen
@@ -22,10 +23,11 @@ import distributed
 from distributed.diagnostics.plugin import WorkerPlugin
 from prefect.settings import PREFECT_API_URL
 from prefect_dask import DaskTaskRunner
+from pydantic import BaseModel
 
 from extrags.errors import ConfigError
 
-__all__ = ["ClusterTaskRunner"]
+__all__ = ["ClusterTaskRunner", "needed_resources"]
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +72,7 @@ class ClusterTaskRunner(DaskTaskRunner):  # type: ignore[misc]
         self._at_once = at_once
         self._run = f"extrags-{uuid4()}"
         self._adopted = False
+        self._resources: dict[str, float] | None = None
 
     def duplicate(self) -> ClusterTaskRunner:
         """As Prefect does for each flow run."""
@@ -104,6 +107,45 @@ class ClusterTaskRunner(DaskTaskRunner):  # type: ignore[misc]
         None on a cluster of somebody else, who has decided that.
         """
         return None if self._given is not None else max(1, self._workers // (tasks * self._at_once))
+
+    @property
+    def resources(self) -> dict[str, float]:
+        """The largest amount of each resource that a worker declares (`dask worker --resources GPU=1`)."""
+        if self._resources is None:
+            self._resources = {}
+            for worker in self.client.scheduler_info(n_workers=-1)["workers"].values():
+                for name, amount in (worker.get("resources") or {}).items():
+                    self._resources[name] = max(amount, self._resources.get(name, 0.0))
+        return self._resources
+
+
+def needed_resources(
+    inputs: Mapping[str, Any], peak_mib: Callable[[], float | None], declared: Mapping[str, float]
+) -> dict[str, float]:
+    """What a task takes of the resources that workers declare; nothing of those that none does.
+
+    `GPU`: 1 for a task whose settings have a device `cuda`. `MEMORY`, in bytes: what such tasks took before,
+    and no more than the largest worker has, since a task that needs more would wait for ever.
+
+    Args:
+        inputs: of the task.
+        peak_mib: looks up the largest memory of such a task before, None where there was none.
+        declared: see `ClusterTaskRunner.resources`.
+    """
+    needed = {}
+    if "GPU" in declared and any(_on_gpu(value) for value in inputs.values()):
+        needed["GPU"] = 1.0
+    before = peak_mib() if "MEMORY" in declared else None
+    if before is not None:
+        needed["MEMORY"] = min(before * 2**20, declared["MEMORY"])
+    return needed
+
+
+def _on_gpu(value: Any) -> bool:
+    if not isinstance(value, BaseModel):
+        return False
+    fields = [getattr(value, name) for name in type(value).model_fields]
+    return getattr(value, "device", None) == "cuda" or any(map(_on_gpu, fields))
 
 
 def _local_cluster(workers: int) -> distributed.LocalCluster:

@@ -10,7 +10,9 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, Literal, Protocol
 
 from prefect import Task
@@ -124,20 +126,44 @@ class PrefectRunner:
     def _submit(self, call: Call, label: str, threads: int | None) -> PrefectFuture[Ref]:
         refresh = self.refresh and stage_key(call.task, call.inputs) not in self._refreshed
         task = at(self.limits.applied_to(call.task), self.store, refresh=refresh)
-        future: PrefectFuture[Ref] = task.submit(
-            store=self.store,
-            label=label,
-            time_limit_s=self.limits.time_limit_s,
-            threads=threads,
-            **call.inputs,
-        )
+        with self._resources(call):
+            future: PrefectFuture[Ref] = task.submit(
+                store=self.store,
+                label=label,
+                time_limit_s=self.limits.time_limit_s,
+                threads=threads,
+                **call.inputs,
+            )
         return future
+
+    def _resources(self, call: Call) -> AbstractContextManager[object]:
+        """Where Dask workers declare a GPU or their memory, tasks are placed by what they need."""
+        declared = getattr(_task_runner(), "resources", None)
+        if not declared:
+            return nullcontext()
+        import dask
+
+        from flows.dask_runner import needed_resources
+
+        needed = needed_resources(call.inputs, lambda: _peak_mib(self.store, call.task.name), declared)
+        return dask.annotate(resources=needed) if needed else nullcontext()
+
+
+@cache
+def _peak_mib(store: str, stage: str) -> float | None:
+    """The largest memory that a stage took before, in any sequence of the store."""
+    peaks = [item.counts.get("peak_mib") for item in Store(store).ls(stage)]
+    return max((float(peak) for peak in peaks if peak is not None), default=None)
+
+
+def _task_runner() -> object:
+    context = FlowRunContext.get()
+    return context.task_runner if context is not None else None
 
 
 def _threads_for(tasks: int) -> int | None:
     """Threads for each task, where tasks run in processes that share the cores; None in this process."""
-    context = FlowRunContext.get()
-    share = getattr(context.task_runner, "threads_for", None) if context is not None else None
+    share = getattr(_task_runner(), "threads_for", None)
     return share(tasks) if share is not None else None
 
 

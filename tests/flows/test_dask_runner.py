@@ -12,10 +12,13 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
 
+import distributed
 import pytest
+from prefect.settings import PREFECT_API_URL, temporary_settings
 
 import flows.dask_runner
-from flows.dask_runner import ClusterTaskRunner
+from extrags.config import DepthConfig, profile_config
+from flows.dask_runner import ClusterTaskRunner, needed_resources
 from flows.settings import task_runner
 from tests.flows.tiny import SEQUENCE, TINY
 
@@ -128,3 +131,38 @@ def test_each_run_on_a_lasting_cluster_reaches_its_own_server(tmp_path: Path) ->
         assert not (tmp_path / "workers" / "prefect.db").exists()
         cluster.communicate()
     assert "failed to process" not in log.read_text()
+
+
+class TestResources:
+    def test_tasks_take_what_workers_declare(self) -> None:
+        on_gpu = {"config": DepthConfig(device="cuda"), "seed": 3}
+        plain = {"config": DepthConfig(device="cpu")}
+        declared = {"GPU": 1.0, "MEMORY": 4e9}
+        assert needed_resources(on_gpu, lambda: None, declared) == {"GPU": 1.0}
+        assert needed_resources(plain, lambda: None, declared) == {}
+        assert needed_resources(plain, lambda: 1000.0, declared) == {"MEMORY": 1000 * 2**20}
+        assert needed_resources(plain, lambda: 9000.0, declared) == {"MEMORY": 4e9}
+
+    def test_what_no_worker_declares_is_not_asked_for(self) -> None:
+        def unasked() -> float:
+            raise AssertionError("the store is not read")
+
+        assert needed_resources({"config": DepthConfig(device="cuda")}, unasked, {}) == {}
+
+    def test_a_device_deep_in_the_settings_counts(self) -> None:
+        enhance = profile_config("quick").with_overrides({"enhance.pretrained.device": "cuda"}).enhance
+        assert needed_resources({"config": enhance}, lambda: None, {"GPU": 1.0}) == {"GPU": 1.0}
+
+    def test_workers_are_asked(self, server: str) -> None:
+        with (
+            distributed.LocalCluster(
+                n_workers=1,
+                threads_per_worker=2,
+                processes=False,
+                dashboard_address=None,
+                resources={"GPU": 1},
+            ) as cluster,
+            temporary_settings({PREFECT_API_URL: server}),
+            ClusterTaskRunner(cluster.scheduler_address) as runner,
+        ):
+            assert runner.resources == {"GPU": 1}
