@@ -90,8 +90,9 @@ class Command:
         return self.code
 
     def kill(self) -> None:
-        os.killpg(self.pid, signal.SIGKILL)
-        self.wait()
+        if not self.ended():
+            os.killpg(self.pid, signal.SIGKILL)
+            self.wait()
 
 
 def wait_for(ready: Callable[[], bool], what: str, seconds: float = PATIENCE_S) -> None:
