@@ -80,6 +80,9 @@ def reconstruct_sequence(
             leave_out=METHODS[method].leave_out,
         )
         record_outcome_quietly(Store(store), case, outcome, until, config)
+        # Of workers that died while others went on.
+        for name in Store(store).sweep_scratch():
+            log.info("removed what a killed worker left: %s", name)
         page.sequence_ended(outcome, store)
     attempt(
         lambda: create_markdown_artifact(

@@ -16,7 +16,7 @@ from typing import Any, Literal, TypeVar
 from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError, StoreError
 from extrags.redaction import has_credentials, without_credentials, without_credentials_in
 from extrags.store.canonical import Ref
-from extrags.store.directory import ABOUT, DirectoryBackend, private_directory
+from extrags.store.directory import ABOUT, DirectoryBackend, private_directory, sweep_directories
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
 from extrags.store.manifest import Manifest, is_name, software_versions, stage_of
 from extrags.store.refusal import refused_write
@@ -480,6 +480,10 @@ class Store:
     def rm(self, pattern: str) -> list[str]:
         """Remove artefacts by a shell pattern over key, stage or label; returns their keys."""
         return [manifest.key for manifest in self.ls(pattern) if self.backend.discard(manifest.key)]
+
+    def sweep_scratch(self) -> list[str]:
+        """Remove scratch directories of killed processes of this machine alone; as `sweep`, but at once."""
+        return sweep_directories(self.backend.scratch)
 
     def sweep(self, *, older_than_hours: float = 24.0) -> list[str]:
         """Remove leftovers of killed processes; scratch directories of running processes are kept.

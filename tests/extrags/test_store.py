@@ -302,7 +302,8 @@ class TestDirectory:
         assert len(list((tmp_path / "scratch").iterdir())) == 1
         with store.slot(stage="toy", version=1, key="toy-v1-bb") as alive:
             (alive.path / "being-written").write_text("x")
-            removed = store.sweep()
+            removed = store.sweep_scratch()
+            assert store.sweep() == []
             assert len(removed) == 1
             assert removed[0].startswith("scratch/toy-v1-aa.")
         assert [manifest.key for manifest in store.ls()] == ["toy-v1-bb"]
