@@ -118,9 +118,15 @@ class Server:
 
     def start(self) -> None:
         arguments = ["-m", "prefect", "server", "start", "--host", "127.0.0.1", "--port", str(self._port)]
+        # Its database lies beside the log, and so with the trials.
+        environment = os.environ | {"PREFECT_HOME": str(self._log.with_name("prefect"))}
         with self._log.open("ab") as stream:
             self._process = subprocess.Popen(
-                [sys.executable, *arguments, "--no-ui"], stdout=stream, stderr=stream, start_new_session=True
+                [sys.executable, *arguments, "--no-ui"],
+                stdout=stream,
+                stderr=stream,
+                env=environment,
+                start_new_session=True,
             )
         wait_for(self._answers, "the server to answer")
 
@@ -258,6 +264,8 @@ class Trials:
         half = [key for key in every if self.store.examine(key) is not None]
         self.counts["half-written artefacts"] += len(half)
         self.judge(stage, self.command.start().wait())
+        where = "inside" if inside else "outside"
+        print(f"{self.counts['trials']} {stage} {where}", file=sys.stderr, flush=True)
 
     def kill_worker(self, stage: str) -> None:
         """Kill the Dask worker that has the stage in work."""
@@ -324,14 +332,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep store and logs here")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = given.keep or Path(scratch)
-        folder.mkdir(parents=True, exist_ok=True)
-        # Before Prefect is loaded.
-        os.environ["PREFECT_HOME"] = str(folder / "prefect")
+    if "PREFECT_API_URL" not in os.environ:
+        # Prefect reads its settings when it is loaded, and what is imported above has loaded it.
         os.environ["PREFECT_API_URL"] = f"http://127.0.0.1:{free_port()}/api"
         os.environ["PREFECT_SERVER_ANALYTICS_ENABLED"] = "false"
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+        os.execv(sys.executable, [sys.executable, "-m", "tests.flows.killing", *sys.argv[1:]])
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = given.keep or Path(scratch)
+        folder.mkdir(parents=True, exist_ok=True)
         begun = time.monotonic()
         found = campaign(given.kind, given.count, given.seed, folder)
         print(json.dumps({**found, "seconds": round(time.monotonic() - begun)}, indent=1))
