@@ -14,11 +14,13 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 from urllib.error import URLError
 from urllib.request import urlopen
 from uuid import uuid4
 
+import dask
 import distributed
 from distributed.diagnostics.plugin import WorkerPlugin
 from prefect.settings import PREFECT_API_URL
@@ -107,6 +109,13 @@ class ClusterTaskRunner(DaskTaskRunner):  # type: ignore[misc]
         None on a cluster of somebody else, who has decided that.
         """
         return None if self._given is not None else max(1, self._workers // (tasks * self._at_once))
+
+    def placed(
+        self, inputs: Mapping[str, Any], peak_mib: Callable[[], float | None]
+    ) -> AbstractContextManager[object]:
+        """What is submitted inside the block goes where there is what it needs (`needed_resources`)."""
+        needed = needed_resources(inputs, peak_mib, self.resources) if self.resources else {}
+        return dask.annotate(resources=needed) if needed else nullcontext()
 
     @property
     def resources(self) -> dict[str, float]:

@@ -138,15 +138,13 @@ class PrefectRunner:
 
     def _resources(self, call: Call) -> AbstractContextManager[object]:
         """Where Dask workers declare a GPU or their memory, tasks are placed by what they need."""
-        declared = getattr(_task_runner(), "resources", None)
-        if not declared:
+        placed = getattr(_task_runner(), "placed", None)
+        if placed is None:
             return nullcontext()
-        import dask
-
-        from flows.dask_runner import needed_resources
-
-        needed = needed_resources(call.inputs, lambda: _peak_mib(self.store, call.task.name), declared)
-        return dask.annotate(resources=needed) if needed else nullcontext()
+        found: AbstractContextManager[object] = placed(
+            call.inputs, lambda: _peak_mib(self.store, call.task.name)
+        )
+        return found
 
 
 @cache

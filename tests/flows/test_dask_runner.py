@@ -12,6 +12,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
 
+import dask
 import distributed
 import pytest
 from prefect.settings import PREFECT_API_URL, temporary_settings
@@ -159,10 +160,14 @@ class TestResources:
                 n_workers=1,
                 threads_per_worker=2,
                 processes=False,
-                dashboard_address=None,
+                dashboard_address=":0",
                 resources={"GPU": 1},
             ) as cluster,
             temporary_settings({PREFECT_API_URL: server}),
             ClusterTaskRunner(cluster.scheduler_address) as runner,
         ):
             assert runner.resources == {"GPU": 1}
+            with runner.placed({"config": DepthConfig(device="cuda")}, lambda: None):
+                assert dask.get_annotations() == {"resources": {"GPU": 1.0}}
+            with runner.placed({"config": DepthConfig(device="cpu")}, lambda: None):
+                assert dask.get_annotations() == {}
