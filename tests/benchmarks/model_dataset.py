@@ -1,4 +1,4 @@
-"""What a data set costs on 1 to 64 workers: `python -m tests.benchmarks.model_dataset STORE [--overhead S]`.
+"""What a data set costs on 1 to 64 workers: `python -m tests.benchmarks.model_dataset STORE ...`.
 
 Simulates C3VDv2's 169 registered videos. How long each task takes is fitted to the manifests of a store of
 finished runs: seconds = a + b * frames, both at least 0, one robust line per task. Workers take one sequence
@@ -220,13 +220,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("store", help="with finished runs, of several numbers of frames")
+    parser.add_argument("stores", nargs="+", help="with runs, of several numbers of frames among them")
     parser.add_argument(
         "--overhead", type=float, default=0.0, metavar="S", help="of each sequence, in seconds"
     )
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
-    found = model(Store(given.store).ls(), given.overhead)
+    manifests = [
+        manifest.model_copy(update={"label": f"{store} {manifest.label}"})
+        for store in given.stores
+        for manifest in Store(store).ls()
+    ]
+    found = model(manifests, given.overhead)
     efficiencies = [row["longest first"]["efficiency"] for row in found["rows"]]
     assert all(later <= earlier + 1e-9 for earlier, later in pairwise(efficiencies)), efficiencies
     print(json.dumps(found, indent=1) if given.json else as_text(found))
