@@ -211,7 +211,9 @@ def record_outcome(
         StoreError: when it cannot be written.
     """
     failed = next((row for row in outcome.stages if row.state == "failed"), None)
-    expected = expected_seconds(config)
+    expected: dict[str, float] = {
+        stage: sum(tasks.values()) for stage, tasks in expected_seconds(config).items()
+    }
     record: OutcomeRecord = {
         "sequence": case.sequence,
         "method": case.method,
@@ -225,7 +227,7 @@ def record_outcome(
         "ended": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "seconds": round(outcome.seconds, 3),
         "config": digest_of(config),
-        "stages": [_stage_record(row, sum(expected.get(row.stage, {}).values())) for row in outcome.stages],  # type: ignore[call-overload]
+        "stages": [_stage_record(row, expected.get(row.stage, 0.0)) for row in outcome.stages],
         "metrics": outcome.metrics,
         "report": outcome.report,
         "extrags": __version__,

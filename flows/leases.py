@@ -54,7 +54,7 @@ __all__ = ["FLOWS", "HEARTBEAT", "run_lease", "second_look_seconds", "settle_dea
 
 log = logging.getLogger(__name__)
 
-FLOWS = ("reconstruct-sequence", "reconstruct-dataset", "benchmark")
+FLOWS = ("reconstruct-sequence", "reconstruct-dataset", "benchmark", "retention")
 """Flows of this project; runs of others are not ours to judge."""
 HEARTBEAT = "prefect.flow-run.heartbeat"
 UNENDED = (StateType.RUNNING, StateType.CANCELLING, StateType.PENDING)

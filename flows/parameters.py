@@ -9,6 +9,7 @@ are better than a schema's.
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from functools import cache
 from typing import Annotated, Any
@@ -96,7 +97,7 @@ def settings_schema(
     }
 
 
-class _Shown:
+class _Shown(ABC):
     """Annotation: the schema that Prefect is shown in place of pydantic's own; validation stays as it is."""
 
     def __get_pydantic_json_schema__(
@@ -104,9 +105,9 @@ class _Shown:
     ) -> JsonSchemaValue:
         return self.schema()
 
+    @abstractmethod
     def schema(self) -> JsonSchemaValue:
         """What it is."""
-        raise NotImplementedError
 
 
 class _SettingsSchema(_Shown):

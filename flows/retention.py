@@ -22,19 +22,20 @@ from prefect.exceptions import ObjectNotFound
 from pydantic import Field
 
 import flows.wiring  # noqa: F401  (registers every stage with its version)
+from extrags.errors import StoreError
 from extrags.store import Store
 from extrags.store.retention import Policy, apply_policy, planned_removals
-from flows.settings import DEFAULT_STORE
+from flows.leases import FLOWS, run_lease
+from flows.parameters import StoreRoot
+from flows.settings import run_store
 from tasks.locks import sweep_locks
 from tasks.run_page import artifact_key, attempt
 from tasks.stage import stage_versions
 
-__all__ = ["FLOWS", "prune_flow_runs", "retention"]
+__all__ = ["prune_flow_runs", "retention"]
 
 log = logging.getLogger(__name__)
 
-FLOWS = ("reconstruct-sequence", "reconstruct-dataset", "benchmark", "retention")
-"""Runs of other flows on the same server are not ours to delete."""
 BATCH = 200
 """The most that a server returns at once."""
 DAY_S = 86400.0
@@ -43,7 +44,9 @@ ENDED = [StateType.COMPLETED, StateType.FAILED, StateType.CANCELLED, StateType.C
 
 @flow(name="retention", log_prints=False, persist_result=False)
 def retention(
-    store: Annotated[str, Field(description="directory or URL of the artefact store")] = DEFAULT_STORE,
+    store: Annotated[
+        StoreRoot, Field(description="directory or URL of the artefact store; EXTRAGS_STORE by default")
+    ] = None,
     older_than_days: Annotated[
         float | None, Field(gt=0, description="remove artefacts not used for so long")
     ] = None,
@@ -63,24 +66,32 @@ def retention(
 
     Returns:
         Numbers of `artefacts`, `bytes`, `leftovers` and `flow_runs` that were removed, or would be.
+
+    Raises:
+        ConfigError: for a store that is relative to where a worker was started.
+        StoreError: when there is no such store, or it cannot be used.
     """
+    store = run_store(store)
     place = Store(store)
-    leftovers = place.gc(stage_versions(), dry_run=dry_run)
-    if not dry_run:
-        leftovers += sweep_locks(place.locks)
-    policy = Policy(
-        older_than_s=None if older_than_days is None else older_than_days * DAY_S,
-        max_bytes=None if max_gib is None else int(max_gib * 2**30),
-        keep_last=keep_last,
-        unreachable=unreachable,
-    )
-    removed = planned_removals(place, policy)[0] if dry_run else apply_policy(place, policy)
-    for item in removed:
-        log.info("%s %s: %s", "would remove" if dry_run else "removed", item.key, item.reason)
-    runs = 0
-    if flow_runs_days is not None:
-        limit = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=flow_runs_days)
-        runs = prune_flow_runs(limit, dry_run=dry_run)
+    if not place.exists():
+        raise StoreError(f"there is no store {store}")
+    with run_lease(store):
+        leftovers = place.gc(stage_versions(), dry_run=dry_run)
+        if not dry_run:
+            leftovers += sweep_locks(place.locks)
+        policy = Policy(
+            older_than_s=None if older_than_days is None else older_than_days * DAY_S,
+            max_bytes=None if max_gib is None else int(max_gib * 2**30),
+            keep_last=keep_last,
+            unreachable=unreachable,
+        )
+        removed = planned_removals(place, policy)[0] if dry_run else apply_policy(place, policy)
+        for item in removed:
+            log.info("%s %s: %s", "would remove" if dry_run else "removed", item.key, item.reason)
+        runs = 0
+        if flow_runs_days is not None:
+            limit = datetime.datetime.now(datetime.UTC) - datetime.timedelta(days=flow_runs_days)
+            runs = prune_flow_runs(limit, dry_run=dry_run)
     found = {
         "artefacts": len(removed),
         "bytes": sum(item.bytes for item in removed),

@@ -33,7 +33,7 @@ DAMAGED = "damaged"
 RECORD = "damage.json"
 """Beside an artefact that was set aside: what is wrong with it."""
 RECORDS = "records"
-"""Where records of runs are, below the root of a store (`Store.write_record`)."""
+"""Where records of runs are, below the root of a store (`extrags.store.records`)."""
 ABOUT = "about.json"
 """In a scratch directory: what is being made there."""
 

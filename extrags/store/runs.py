@@ -23,7 +23,7 @@ from extrags.store.artefacts import Store
 from extrags.store.canonical import digest_of
 from extrags.store.records import read_records, remove_record, write_record
 
-__all__ = ["Run", "RunRecord", "active_runs", "file_killed", "recorded_run", "runs_of"]
+__all__ = ["Run", "RunRecord", "active_runs", "file_killed", "forget", "recorded_run", "runs_of"]
 
 log = logging.getLogger(__name__)
 

@@ -38,6 +38,10 @@ class TestFile:
             assert item.limit == 1
             assert ":" not in item.entrypoint, "a path is found from a checkout alone"
             assert item.flow().name
+            # Its worker knows the store; a default of this side would be a place where it was started.
+            store = item.flow().parameters.properties["store"]
+            assert store["default"] is None
+            assert store["pattern"]
 
     @pytest.mark.parametrize(
         ("text", "message"),

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from extrags.errors import StoreError
 from extrags.store import Store
 from extrags.store.retention import Policy, apply_policy
 from extrags.store.runs import active_runs, runs_of
@@ -94,6 +95,8 @@ def test_the_flow(store: Store) -> None:
         pass
 
     other()
+    with pytest.raises(StoreError, match="there is no store"):
+        retention(store=f"{store.root}-elsewhere")
     before = len(store.keys())
     said = retention(store=store.root, older_than_days=30, dry_run=True)
     assert (said["artefacts"], len(store.keys())) == (before, before)
