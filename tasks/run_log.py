@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from contextvars import copy_context
 from uuid import UUID
 
 from prefect.context import FlowRunContext, TaskRunContext
@@ -26,14 +27,16 @@ OF_RUNS = (TASK_RUNS, "prefect.flow_runs")
 class RunLogHandler(APILogHandler):
     """Sends records to the run of the thread they come from.
 
-    Threads that native code or a library starts know of no run; their records go to the flow run that
-    opened the log.
+    Threads that native code or a library starts know of no run, nor of settings that hold for a block
+    only, such as the address of a temporary server; their records go to the flow run that opened the log,
+    with its settings.
     """
 
     def __init__(self, flow_run_id: UUID | None) -> None:
         super().__init__(logging.INFO)
         self.addFilter(CredentialFilter())
         self.flow_run_id = flow_run_id
+        self.opened_in = copy_context()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Send one record; dropped where no run is known."""
@@ -41,7 +44,10 @@ class RunLogHandler(APILogHandler):
             if self.flow_run_id is None:
                 return
             record.flow_run_id = str(self.flow_run_id)
-        super().emit(record)
+            # A copy: a context can be entered by one thread at a time only.
+            self.opened_in.copy().run(super().emit, record)
+        else:
+            super().emit(record)
 
 
 class _Named(logging.Filter):

@@ -10,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 from prefect import flow, get_client
@@ -21,7 +22,7 @@ from prefect.client.schemas.filters import (
 )
 from prefect.logging.handlers import APILogHandler
 from prefect.runtime import flow_run
-from prefect.settings import PREFECT_LOGGING_TO_API_ENABLED, temporary_settings
+from prefect.settings import PREFECT_API_URL, PREFECT_LOGGING_TO_API_ENABLED, temporary_settings
 
 from extrags.events import Progress, emit
 from extrags.pipeline import STAGES
@@ -32,7 +33,7 @@ from flows.run_page import EXPECTED_SECONDS, SequenceEstimate, run_page
 from flows.sequence import reconstruct_sequence
 from tasks import run_page as senders
 from tasks.progress import StageProgress
-from tasks.run_log import run_log
+from tasks.run_log import RunLogHandler, run_log
 from tasks.run_page import PAGE_VARIABLE, artifact_key
 from tasks.stage import at, stage, stage_versions
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config
@@ -151,6 +152,21 @@ class TestLog:
         assert (logging.INFO, "the library speaks, seed 7") in lines
         assert (logging.INFO, "from a thread without a run") in lines
         assert any(message.startswith("toy-long some/scene: finished in state") for _, message in lines)
+
+    def test_a_thread_without_a_run_sends_to_the_runs_server(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        sent: list[tuple[str, str]] = []
+        monkeypatch.setattr(
+            "prefect.logging.handlers.emit_api_log",
+            lambda log: sent.append((log["message"], PREFECT_API_URL.value())),
+        )
+        address = "http://localhost:1/of-the-block/api"
+        with temporary_settings({PREFECT_LOGGING_TO_API_ENABLED: True, PREFECT_API_URL: address}):
+            handler = RunLogHandler(uuid4())
+        record = logging.LogRecord("extrags.toy", logging.INFO, "toy.py", 1, "words", None, None)
+        thread = threading.Thread(target=handler.emit, args=(record,))
+        thread.start()
+        thread.join()
+        assert sent == [("words", address)]
 
     def test_levels_and_handlers_are_as_before(self, tmp_path: Path) -> None:
         before = [(logging.getLogger(name).level, list(logging.getLogger(name).handlers)) for name in LOGGED]
