@@ -213,6 +213,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "explore.visibility": "blending",
         "explore.rotation_deg": 10.0,
         "explore.orbit_deg": 10.0,
+        "explore.score": "pairs",
         "explore.hole_weight": 0.0,
         "explore.darkness_weight": 0.5,
         "explore.fold_steps": 1,

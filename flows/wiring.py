@@ -282,8 +282,9 @@ class SequenceRun(Pipeline):
         """The virtual trajectories, wave by wave."""
         with self._stage("explore") as row:
             space = self.refs["freespace"]
-            shared = {**self._scene_inputs(), "freespace": space, "config": self.config.explore}
-            self.refs["waves"] = self._run_task(row, Call(start, shared))
+            inputs = {**self._scene_inputs(), "freespace": space, "config": self.config.explore}
+            self.refs["waves"] = search = self._run_task(row, Call(start, inputs))
+            shared = {name: inputs[name] for name in ("scene", "freespace", "config")} | {"search": search}
             while anchors := self.store.load_json(NEXT, self.refs["waves"])["anchors"]:
                 state = self.refs["waves"]
                 calls = [Call(branch, {**shared, "state": state, "anchor": anchor}) for anchor in anchors]
@@ -291,7 +292,8 @@ class SequenceRun(Pipeline):
                 self.refs["waves"] = self._run_task(row, Call(merge, {"state": state, "branches": branches}))
                 accepted = self.store.load_json(NEXT, self.refs["waves"])["accepted"]
                 self._report_progress(row, "running", accepted, self.config.explore.trajectories)
-            self.refs["explore"] = self._run_task(row, Call(explore, {**shared, "state": self.refs["waves"]}))
+            collected = {**inputs, "search": search, "state": self.refs["waves"]}
+            self.refs["explore"] = self._run_task(row, Call(explore, collected))
 
     def enhance(self) -> None:
         """The restorer, and the virtual views it restores in batches."""

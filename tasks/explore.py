@@ -1,6 +1,6 @@
 """explore: virtual trajectories in waves of parallel branches.
 
-`start` chooses the anchors; each `branch` is searched independently from the coverage snapshot of its wave;
+`start` measures the scene and chooses the anchors; each `branch` is searched independently from the coverage snapshot of its wave;
 `merge` accepts branches and writes the state of the next wave; `explore` collects the accepted trajectories.
 `next.json` lists the anchors of the next wave, so that the flow need not read arrays.
 """
@@ -15,36 +15,42 @@ from tasks.stage import stage
 
 if TYPE_CHECKING:
     from extrags.exploration import SearchContext, WaveState
-    from extrags.sequence import EndoscopicSequence
 
 __all__ = ["NEXT", "branch", "explore", "merge", "start"]
 
 NEXT = "next.json"
 
 
-@stage("explore-start", version=3)
+@stage("explore-start", version=4)
 def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig) -> None:
-    """Choose the anchors; writes `state/` and `next.json`."""
-    from extrags.exploration import start_exploration
+    """Measure the scene and choose the anchors; writes `search/`, `state/` and `next.json`."""
+    from extrags.exploration import prepare_search, start_exploration
+    from extrags.freespace import FreeSpace
+    from extrags.scene import Scene
+    from extrags.sequence import EndoscopicSequence
 
-    context, frames = _prepared(slot, scene, sequence, freespace, config)
-    _write_state(slot, start_exploration(context, frames.training_cameras))
+    cameras = slot.load(EndoscopicSequence, sequence).training_cameras
+    space = slot.load(FreeSpace, freespace)
+    context = prepare_search(slot.load(Scene, scene), cameras, space, config)
+    slot.save(context.measured)
+    _write_state(slot, start_exploration(context))
+    slot.counts.update(renders=context.measured.renders)
 
 
-@stage("explore-branch", version=3)
+@stage("explore-branch", version=4)
 def branch(
-    slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, anchor: int, config: ExploreConfig
+    slot: Slot, scene: Ref, freespace: Ref, search: Ref, state: Ref, anchor: int, config: ExploreConfig
 ) -> None:
     """Grow the branch of one anchor; writes `branch/`."""
     from extrags.exploration import WaveState, grow
 
-    context, frames = _prepared(slot, scene, sequence, freespace, config)
-    grown = grow(context, frames.training_cameras, slot.load(WaveState, state).coverage, anchor)
+    context = _prepared(slot, scene, freespace, search, config)
+    grown = grow(context, slot.load(WaveState, state).known, anchor)
     slot.save(grown)
     slot.counts.update(views=len(grown), renders=grown.renders)
 
 
-@stage("explore-merge", version=2)
+@stage("explore-merge", version=3)
 def merge(slot: Slot, state: Ref, branches: list[Ref]) -> None:
     """Accept the branches of a wave; writes the next `state/` and `next.json`."""
     from extrags.exploration import Branch, WaveState
@@ -53,13 +59,23 @@ def merge(slot: Slot, state: Ref, branches: list[Ref]) -> None:
     _write_state(slot, before.merged([slot.load(Branch, ref) for ref in branches]))
 
 
-@stage("explore", version=2)
-def explore(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, config: ExploreConfig) -> None:
+@stage("explore", version=3)
+def explore(
+    slot: Slot,
+    scene: Ref,
+    sequence: Ref,
+    freespace: Ref,
+    search: Ref,
+    state: Ref,
+    config: ExploreConfig,
+) -> None:
     """Collect the accepted trajectories; writes `trajectories/` and `exploration.json`."""
     from extrags.exploration import WaveState, finish
+    from extrags.sequence import EndoscopicSequence
 
-    context, frames = _prepared(slot, scene, sequence, freespace, config)
-    exploration = finish(context, slot.load(WaveState, state), frames.train)
+    context = _prepared(slot, scene, freespace, search, config)
+    train = slot.load(EndoscopicSequence, sequence).train
+    exploration = finish(context, slot.load(WaveState, state), train)
     slot.save(exploration)
     slot.counts.update(
         trajectories=len(exploration),
@@ -69,17 +85,14 @@ def explore(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, state: Ref, c
     )
 
 
-def _prepared(
-    slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig
-) -> tuple[SearchContext, EndoscopicSequence]:
-    from extrags.exploration import prepare_search
+def _prepared(slot: Slot, scene: Ref, freespace: Ref, search: Ref, config: ExploreConfig) -> SearchContext:
+    from extrags.exploration import SceneMeasurements, prepare_search
     from extrags.freespace import FreeSpace
     from extrags.scene import Scene
-    from extrags.sequence import EndoscopicSequence
 
-    frames = slot.load(EndoscopicSequence, sequence)
+    measured = slot.load(SceneMeasurements, search)
     space = slot.load(FreeSpace, freespace)
-    return prepare_search(slot.load(Scene, scene), frames.training_cameras, space, config), frames
+    return prepare_search(slot.load(Scene, scene), measured.training, space, config, measured)
 
 
 def _write_state(slot: Slot, state: WaveState) -> None:

@@ -384,13 +384,52 @@ class ExploreConfig(StageConfig):
         le=1,
         description="a candidate is rejected when the light that rides on the camera overexposes more",
     )
+    score: Literal["error", "pairs"] = Field(
+        "error",
+        description="what a view is worth. error: error it takes from views off the trajectory, by the pixels "
+        "in which they show surface that is missing or was seen with fewer pixels; pairs: newly covered "
+        "(Gaussian, direction) pairs, as in the paper",
+    )
+    probe_views: int = Field(
+        512, ge=1, description="score=error: views off the trajectory by which error is measured"
+    )
+    probe_shift: float = Field(
+        1.5, ge=0, description="score=error: largest shift of a probe, in median rendered depths"
+    )
+    probe_turn_deg: float = Field(180.0, ge=0, le=180, description="score=error: largest turn of a probe")
+    sufficient_resolution: float = Field(
+        0.4,
+        gt=0,
+        description="score=error: surface is seen well enough with this share of the pixels that a view off "
+        "the trajectory has of it",
+    )
+    hole_error: float = Field(
+        0.24, ge=0, description="score=error: error of an empty pixel that restoring takes away, of 1"
+    )
+    unresolved_error: float = Field(
+        0.08, ge=0, description="score=error: the same of a pixel of surface that was not resolved at all"
+    )
+    destinations: bool = Field(
+        True, description="score=error: propose straight ways to probes besides the fourteen moves"
+    )
+    min_view_gain: float = Field(
+        2e-5,
+        ge=0,
+        description="score=error: stop when a trajectory takes less error than this, for each of its views, "
+        "from views off the trajectory",
+    )
+    max_training_views: int = Field(
+        256, ge=1, description="coverage is measured at so many training views, spread evenly"
+    )
     hole_weight: float = Field(
         4.0,
         ge=0,
-        description="worth of a voxel where a view through a hole leaves known space, in voxels of known "
-        "surface: missing surface has no Gaussians that could count as covered; 0 is the paper's rule",
+        description="score=pairs: worth of a voxel where a view through a hole leaves known space, in voxels "
+        "of known surface: missing surface has no Gaussians that could count as covered; 0 is the paper's rule",
     )
-    darkness_weight: float = Field(0.5, ge=0, description="lambda_l of the illumination weight")
+    darkness_weight: float = Field(
+        0.0, ge=0, description="lambda_l of the illumination weight; 0.5 in the paper; 0 switches it off"
+    )
     fold_angle_deg: float = Field(
         25.0,
         gt=0,
@@ -400,7 +439,9 @@ class ExploreConfig(StageConfig):
     fold_steps: int = Field(
         3, ge=1, description="moves the net rotation is taken over; 1 is the paper's inter-step rule"
     )
-    fold_penalty: float = Field(0.6, gt=0, le=1, description="eta; 1 switches the term off")
+    fold_penalty: float = Field(
+        1.0, gt=0, le=1, description="eta; 0.6 in the paper; 1 switches the term off"
+    )
     top_candidates: int = Field(
         14,
         ge=1,
@@ -412,18 +453,26 @@ class ExploreConfig(StageConfig):
         60, ge=1, description="budget of expansions per trajectory; the paper has none: take a large number"
     )
     wave: int = Field(
-        5,
+        3,
         ge=1,
         description="branches that grow from one coverage snapshot; with 1 each trajectory sees the coverage "
         "of all before it, as in the paper",
     )
+    wave_kept_share: float = Field(
+        0.8,
+        ge=0,
+        le=1,
+        description="a branch to which the others of its wave leave a smaller share of its worth is not "
+        "accepted, and grows again",
+    )
     min_gain_share: float = Field(
         0.002,
         ge=0,
-        description="stop when what a trajectory adds is worth less than this share of all pairs; 0: when it "
-        "adds nothing",
+        description="score=pairs: stop when what a trajectory adds is worth less than this share of all "
+        "pairs; 0: when it adds nothing",
     )
     render_width: int = Field(80, ge=16, description="width of the scoring renders in pixels")
+    seed: int = Field(0, ge=0, description="seed of the probes")
 
     @property
     def coverage(self) -> CoverageConfig:

@@ -4,6 +4,7 @@ from extrags.exploration.coverage import coverage_gain as coverage_gain
 from extrags.exploration.coverage import direction_bin as direction_bin
 from extrags.exploration.coverage import direction_counts as direction_counts
 from extrags.exploration.coverage import training_coverage as training_coverage
+from extrags.exploration.measurements import SceneMeasurements as SceneMeasurements
 from extrags.exploration.search import Branch as Branch
 from extrags.exploration.search import SearchContext as SearchContext
 from extrags.exploration.search import grow_branch as grow_branch

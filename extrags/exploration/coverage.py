@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, UInt32
+from jaxtyping import Float, Int, UInt32
 
 from extrags.cameras import Cameras
 from extrags.config import Visibility
@@ -16,7 +15,6 @@ from extrags.raster import Rendering
 from extrags.scene import Scene
 
 __all__ = [
-    "PairValue",
     "count_pairs",
     "coverage_gain",
     "direction_bin",
@@ -76,29 +74,25 @@ def _collars(n: int) -> tuple[Float[np.ndarray, "e"], Int[np.ndarray, "c"], Int[
 
 def view_pairs(
     scene: Scene,
-    cameras: Cameras,
-    seen: Bool[np.ndarray, "c n"],
+    center: Float[np.ndarray, "3"],
+    seen: Int[np.ndarray, "m"],
     n_directions: int,
-) -> UInt32[np.ndarray, "c n"]:
-    """(Gaussian, direction) pairs that each view covers, at most one per Gaussian and view.
+) -> UInt32[np.ndarray, "m"]:
+    """(Gaussian, direction) pairs that a view covers: a word with one bit for each Gaussian it sees.
 
     Args:
         scene: its Gaussians' centres give the directions.
-        cameras: the views.
-        seen: which Gaussians each of them sees.
+        center: of the camera, in world units.
+        seen: indices of the Gaussians the view sees.
         n_directions: D.
 
     Returns:
-        Bit k of word [c, j] is set when view c sees Gaussian j in direction bin k.
+        Bit k of a word is set when the direction from its Gaussian to the camera lies in bin k.
     """
-    means = scene.gaussians.means.detach().numpy().astype(np.float64)
-    pairs = np.zeros(seen.shape, dtype=np.uint32)
-    for index, center in enumerate(cameras.centers):
-        those = np.flatnonzero(seen[index])
-        toward = center - means[those]
-        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-12)
-        pairs[index, those] = np.uint32(1) << direction_bin(toward, n_directions).astype(np.uint32)
-    return pairs
+    means = scene.gaussians.means.detach().numpy()[seen].astype(np.float64)
+    toward = center - means
+    toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-12)
+    return np.asarray(np.uint32(1) << direction_bin(toward, n_directions).astype(np.uint32))
 
 
 def rendered_pairs(
@@ -124,7 +118,11 @@ def rendered_pairs(
     rendering = scene.render(cameras, visibility=visibility == "blending", sh_degree=0)
     weight = rendering.visibility_max
     seen = rendering.visible if weight is None else weight > visible_weight
-    return rendering, view_pairs(scene, cameras, seen.numpy(), n_directions)
+    pairs = np.zeros(tuple(seen.shape), dtype=np.uint32)
+    for index, center in enumerate(cameras.centers):
+        rows = np.flatnonzero(seen[index].numpy())
+        pairs[index, rows] = view_pairs(scene, center, rows, n_directions)
+    return rendering, pairs
 
 
 def training_coverage(
@@ -168,33 +166,6 @@ def coverage_gain(
 ) -> Int[np.ndarray, "*b"]:
     r"""Newly covered pairs, :math:`IG_c = \sum_{j,k} \Delta M[j,k]` [ExtraGS, eq. 11]."""
     return count_pairs(pairs & ~covered)
-
-
-@dataclass(frozen=True)
-class PairValue:
-    """What newly covered pairs are worth, in (Gaussian, direction) pairs.
-
-    The rows of the coverage map are the N Gaussians and then F frontier voxels
-    (`extrags.exploration.frontier`).
-
-    Args:
-        n_gaussians: N.
-        frontier_pair: worth of a pair of a frontier voxel; 0 where there are none.
-    """
-
-    n_gaussians: int
-    frontier_pair: float = 0.0
-
-    def gain(self, covered: UInt32[np.ndarray, "r"], pairs: UInt32[np.ndarray, "r"]) -> float:
-        r"""Worth of the pairs that are not covered yet.
-
-        .. math:: V = \sum_{j \le N, k} \Delta M[j, k] + \lambda_h \rho \sum_{j > N, k} \Delta M[j, k]
-
-        A weighted coverage function: monotone and submodular. Without frontier it is `coverage_gain`.
-        """
-        new = pairs & ~covered
-        gaussians = int(count_pairs(new[: self.n_gaussians]))
-        return gaussians + self.frontier_pair * int(count_pairs(new[self.n_gaussians :]))
 
 
 def direction_counts(covered: UInt32[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:

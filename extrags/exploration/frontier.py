@@ -16,14 +16,10 @@ from extrags.cameras import Cameras, pixel_rays
 from extrags.errors import ShapeError
 from extrags.exploration.coverage import direction_bin
 from extrags.freespace import FREE, FreeSpace
+from extrags.raster.native import compiled_kernels
 from extrags.scene import Scene
 
 __all__ = ["Frontier", "find_frontier"]
-
-HALF_DIAGONAL = 0.87
-"""Half the diagonal of a voxel, rounded up: a point lies within this of its voxel's centre, in voxels."""
-BEYOND_FACE = 1e-6
-"""Rays that leave a voxel go so far into the next one, in voxels."""
 
 
 @dataclass(frozen=True)
@@ -50,12 +46,10 @@ class Frontier:
 
     def pairs(
         self, camera: Cameras, holes: Bool[np.ndarray, "h w"], n_directions: int
-    ) -> UInt32[np.ndarray, "f"]:
-        """(Frontier voxel, direction) pairs that a view covers, packed like those of Gaussians.
+    ) -> tuple[Int[np.ndarray, "m"], UInt32[np.ndarray, "m"]]:
+        """(Frontier voxel, direction) pairs that a view covers: voxels, rising, and a word for each.
 
-        Each ray through a hole is followed to the first voxel that is not free: from face to face, and far
-        from all such voxels in strides that cannot pass one ([Hart1996], with the distances in `reach`). The
-        direction is that from the voxel to the camera.
+        The direction is that from the voxel to the camera.
 
         Args:
             camera: the view, a batch of one.
@@ -65,40 +59,40 @@ class Frontier:
         Raises:
             ShapeError: when the mask does not fit the camera.
         """
+        seen, _ = self.counts(camera, holes)
+        toward = camera.centers[0] - self.centers[seen]
+        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-12)
+        return seen, np.uint32(1) << direction_bin(toward, n_directions).astype(np.uint32)
+
+    def counts(
+        self, camera: Cameras, holes: Bool[np.ndarray, "h w"]
+    ) -> tuple[Int[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+        """Frontier voxels that a view looks into through its holes, rising, and in how many pixels.
+
+        Each ray through a hole is followed to the first voxel that is not free: from face to face, and far
+        from all such voxels in strides that cannot pass one ([Hart1996], with the distances in `reach`).
+
+        Args:
+            camera: the view, a batch of one.
+            holes: its pixels without a surface.
+
+        Raises:
+            ShapeError: when the mask does not fit the camera.
+        """
         if holes.shape != (camera.height, camera.width):
             raise ShapeError(f"holes {holes.shape} for an image of {camera.height} x {camera.width}")
-        words = np.zeros(len(self), dtype=np.uint32)
         rays = pixel_rays(camera)[0][holes]
         if len(rays) == 0 or len(self) == 0:
-            return words
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
         start = self.space.to_grid(camera.centers[0]) + 1
         step = self.space.to_grid(camera.centers[0] + rays) + 1 - start
         step /= np.linalg.norm(step, axis=1, keepdims=True)
-        position = np.broadcast_to(start, step.shape).copy()
-        with np.errstate(divide="ignore"):
-            inverse = 1 / step
-        entered = np.full(len(rays), -1, dtype=np.int64)
-        moving = np.arange(len(rays))
-        while moving.size:
-            voxel = np.floor(position[moving]).astype(np.int64)
-            inside = ((voxel >= 0) & (voxel < self.row.shape[0])).all(axis=1)
-            moving, (i, j, k) = moving[inside], voxel[inside].T
-            reach = self.reach[i, j, k]
-            at_end = reach == 0
-            entered[moving[at_end]] = self.row[i[at_end], j[at_end], k[at_end]]
-            moving, reach = moving[~at_end], reach[~at_end]
-            face = np.floor(position[moving]) + (step[moving] > 0)
-            with np.errstate(invalid="ignore"):
-                to_face = (face - position[moving]) * inverse[moving]
-            leaving = np.where(np.isfinite(to_face), to_face, np.inf).min(axis=1) + BEYOND_FACE
-            # The next voxel that is not free has its centre at `reach`; both points lie off theirs.
-            advance = np.maximum(reach - 2 * HALF_DIAGONAL, leaving)
-            position[moving] += advance[:, None] * step[moving]
-        seen = np.unique(entered[entered >= 0])
-        toward = camera.centers[0] - self.centers[seen]
-        toward /= np.maximum(np.linalg.norm(toward, axis=1, keepdims=True), 1e-12)
-        words[seen] = np.uint32(1) << direction_bin(toward, n_directions).astype(np.uint32)
-        return words
+        entered = np.empty(len(step), dtype=np.int64)
+        compiled_kernels().march(self.reach, np.ascontiguousarray(start), np.ascontiguousarray(step), entered)
+        rows = self.row.reshape(-1)[entered[entered >= 0]]
+        count = np.bincount(rows[rows >= 0], minlength=len(self))
+        seen = np.flatnonzero(count)
+        return seen, count[seen]
 
 
 def find_frontier(scene: Scene, space: FreeSpace, weight: float) -> Frontier:

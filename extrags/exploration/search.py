@@ -8,33 +8,31 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
 import zarr
-from jaxtyping import Bool, Float, Int, UInt32
+from jaxtyping import Bool, Float, UInt32
 
 from extrags.cameras import Cameras, rotation_angle_deg
 from extrags.config import ExploreConfig
-from extrags.errors import CaptureError, ShapeError
+from extrags.errors import ShapeError
 from extrags.events import Progress, emit
-from extrags.exploration.coverage import PairValue, coverage_gain, rendered_pairs
-from extrags.exploration.darkness import dark_direction, luminance
-from extrags.exploration.frontier import Frontier, find_frontier
+from extrags.exploration.approach import Approaches
+from extrags.exploration.frontier import Frontier
+from extrags.exploration.measurements import SceneMeasurements, frontier_of, measure_scene
+from extrags.exploration.observation import Observation, gaussian_words, observe, seen_pairs
 from extrags.exploration.primitives import PRIMITIVES, apply_primitives, primitive_motions
 from extrags.exploration.score import Candidates, net_turn_deg, score
+from extrags.exploration.seen import Seen, Value, union
 from extrags.freespace import FREE, FreeSpace
-from extrags.raster import Rendering
 from extrags.scene import Scene
 from extrags.store.storable import Storable
-from extrags.thresholds import HOLE_ALPHA
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
-__all__ = ["Branch", "SearchContext", "grow_branch", "known_coverage", "prepare_search"]
+__all__ = ["Branch", "SearchContext", "grow_branch", "prepare_search"]
 
-NEAR_SHARE = 0.5
-"""A candidate is too near when more than this share of its surface pixels is inside the safety margin."""
+APPROACH = "approach"
+"""Name of the moves on a straight way to a destination."""
 SAME_POSE_SHARE = 0.25
 """Poses nearer than this share of a step and of a turn are the same pose."""
-VIEWS_PER_BATCH = 16
 
 
 @dataclass(frozen=True)
@@ -44,27 +42,26 @@ class SearchContext:
     Args:
         scene: the reconstructed scene.
         freespace: where cameras may go.
-        K: intrinsics of the virtual cameras at full size, [3, 3].
-        width: full image width in pixels.
-        height: full image height in pixels.
-        depth_unit_mm: median rendered depth of the training views: the unit of step and margin.
+        measured: what was measured of the scene once.
         config: settings of the search.
-        frontier: where missing surface begins; empty with `explore.hole_weight=0`.
+        frontier: where missing surface begins; empty with pairs and `explore.hole_weight=0`.
     """
 
     scene: Scene
     freespace: FreeSpace
-    K: Float[np.ndarray, "3 3"]
-    width: int
-    height: int
-    depth_unit_mm: float
+    measured: SceneMeasurements
     config: ExploreConfig
     frontier: Frontier
 
     @property
-    def value(self) -> PairValue:
-        """What newly covered pairs are worth."""
-        return PairValue(len(self.scene.gaussians), self.frontier.pair_value)
+    def value(self) -> Value:
+        """What a view newly shows is worth."""
+        return self.measured.value
+
+    @property
+    def depth_unit_mm(self) -> float:
+        """Median rendered depth of the training views: the unit of step and margin."""
+        return self.measured.depth_unit_mm
 
     @property
     def step_mm(self) -> float:
@@ -82,8 +79,37 @@ class SearchContext:
 
     def full_cameras(self, poses: Float[np.ndarray, "c 4 4"]) -> Cameras:
         """Cameras at the size the sequence has."""
-        K = np.broadcast_to(self.K, (len(poses), 3, 3)).copy()
-        return Cameras(K, poses, self.width, self.height)
+        return self.measured.cameras(poses)
+
+    def observe(self, poses: Float[np.ndarray, "c 4 4"]) -> list[Observation]:
+        """Render views at the small size and measure each of them."""
+        cameras = self.scoring_cameras(poses)
+        return observe(self.scene, cameras, self.frontier, self.config, depth_unit_mm=self.depth_unit_mm)
+
+    def seen(self, observation: Observation) -> Seen:
+        """What a view shows, in the terms of `value`."""
+        if self.measured.sizes is not None:
+            return self.measured.sizes.seen(observation.sizes)
+        camera = self.scoring_cameras(observation.pose[None])
+        return seen_pairs(self.scene, camera, observation, self.frontier, self.config.directions)
+
+    def is_allowed(
+        self, start: Float[np.ndarray, "3"], ends: Float[np.ndarray, "a 3"], clearance_mm: float
+    ) -> Bool[np.ndarray, "a"]:
+        """Which camera centres may be reached straight from another.
+
+        Args:
+            start: centre to start from.
+            ends: centres to reach.
+            clearance_mm: at the start. A recording may itself go nearer to the wall than the margin; from
+                there every move that does not go nearer still is allowed.
+        """
+        needed = min(self.margin_mm, clearance_mm)
+        return np.asarray(
+            (self.freespace.lookup(ends) == FREE)
+            & (self.freespace.clearance_at(ends) >= needed)
+            & self.freespace.segment_is_free(np.broadcast_to(start, ends.shape), ends)
+        )
 
 
 @dataclass(frozen=True)
@@ -94,9 +120,9 @@ class Branch(Storable):
         anchor: index of the training view it starts from (its position among the training views).
         poses: `world_from_camera` of the views, the start first, [L', 4, 4]; L' <= L.
         moves: name of the move that led to each further view, L' - 1 of them.
-        gains: newly covered (Gaussian, direction) pairs of each further view against the snapshot, [L' - 1].
-        values: worth of all newly covered pairs of each further view, [L' - 1].
-        pairs: all pairs the views add to the snapshot, packed: N Gaussians, then F frontier voxels, [N + F].
+        values: worth of what each further view newly shows, against the snapshot and the views before, [L' - 1].
+        seen: rows that the views show beyond the snapshot: N Gaussians, then F frontier voxels.
+        pairs: all (Gaussian, direction) pairs the views cover, packed, [N].
         expansions: states expanded.
         renders: images rendered.
         reason: why the search ended.
@@ -107,9 +133,9 @@ class Branch(Storable):
     anchor: int
     poses: Float[np.ndarray, "l 4 4"]
     moves: tuple[str, ...]
-    gains: tuple[int, ...]
     values: tuple[float, ...]
-    pairs: UInt32[np.ndarray, "r"]
+    seen: Seen
+    pairs: UInt32[np.ndarray, "n"]
     expansions: int
     renders: int
     reason: str
@@ -125,12 +151,13 @@ class Branch(Storable):
     def write(self, group: zarr.Group) -> None:
         """Write into a group."""
         write_array(group, "poses", self.poses)
+        write_array(group, "seen_rows", self.seen.row)
+        write_array(group, "seen_values", self.seen.value)
         write_array(group, "pairs", self.pairs)
         group.attrs.update(
             {
                 "anchor": self.anchor,
                 "moves": list(self.moves),
-                "gains": list(self.gains),
                 "values": list(self.values),
                 "expansions": self.expansions,
                 "renders": self.renders,
@@ -151,8 +178,8 @@ class Branch(Storable):
             anchor=attributes["anchor"],
             poses=read_array(group, "poses"),
             moves=tuple(attributes["moves"]),
-            gains=tuple(attributes["gains"]),
             values=tuple(attributes["values"]),
+            seen=Seen(read_array(group, "seen_rows"), read_array(group, "seen_values")),
             pairs=read_array(group, "pairs"),
             expansions=attributes["expansions"],
             renders=attributes["renders"],
@@ -164,21 +191,19 @@ class Branch(Storable):
 class _State:
     """A view on a path, with the measurements of its scoring render."""
 
-    pose: Float[np.ndarray, "4 4"]
-    pairs: UInt32[np.ndarray, "m"]
-    """Words of the pairs this view adds to its path, for the rows in `index` alone."""
-    index: Int[np.ndarray, "m"]
-    look_at_mm: float
-    dark: Float[np.ndarray, "3"]
+    observation: Observation
+    seen: Seen
+    """What the view shows beyond what was known when it was reached."""
     clearance_mm: float
-    gain: int = 0
     value: float = 0.0
     move: str = ""
     parent: _State | None = None
     length: int = 1
     path_value: float = 0.0
-    saturated_share: float = 0.0
-    rejected: bool = False
+
+    @property
+    def pose(self) -> Float[np.ndarray, "4 4"]:
+        return self.observation.pose
 
     def path(self) -> list[_State]:
         """The states from the start to this one."""
@@ -210,74 +235,35 @@ class _VisitedPoses:
 
 
 def prepare_search(
-    scene: Scene, cameras: Cameras, freespace: FreeSpace, config: ExploreConfig
+    scene: Scene,
+    cameras: Cameras,
+    freespace: FreeSpace,
+    config: ExploreConfig,
+    measured: SceneMeasurements | None = None,
 ) -> SearchContext:
-    """Measure the scene's depth unit and collect the inputs that all branches share.
+    """Collect the inputs that all branches share.
 
     Args:
         scene: the reconstructed scene.
-        cameras: the training views.
+        cameras: the training views; not looked at where `measured` is given.
         freespace: where cameras may go.
         config: settings.
+        measured: from an earlier call with the same inputs (`SearchContext.measured`); None measures now.
 
     Raises:
         CaptureError: when there is no training view, or none sees a surface.
     """
-    if len(cameras) == 0:
-        raise CaptureError("there is no training view to explore from")
-    small = cameras.at_most_width(config.render_width)
-    depths = []
-    with torch.no_grad():
-        for start in range(0, len(small), VIEWS_PER_BATCH):
-            rendering = scene.render(small[start : start + VIEWS_PER_BATCH], sh_degree=0)
-            depths.append(rendering.depth[rendering.alpha >= HOLE_ALPHA].numpy())
-    depth = np.concatenate(depths)
-    if depth.size == 0:
-        raise CaptureError(f"none of the {len(cameras)} training views sees a surface of the scene")
-    return SearchContext(
-        scene.detached(),
-        freespace,
-        np.median(cameras.K, axis=0),
-        cameras.width,
-        cameras.height,
-        float(np.median(depth)),
-        config,
-        find_frontier(scene, freespace, config.hole_weight),
-    )
-
-
-def known_coverage(context: SearchContext, cameras: Cameras) -> UInt32[np.ndarray, "r"]:
-    """Coverage by the training views: of the Gaussians, then of the frontier voxels, packed, [N + F].
-
-    Args:
-        context: from `prepare_search`.
-        cameras: the training views.
-    """
-    small = cameras.at_most_width(context.config.render_width)
-    covered = np.zeros(len(context.scene.gaussians) + len(context.frontier), dtype=np.uint32)
-    for start in range(0, len(small), VIEWS_PER_BATCH):
-        _, pairs = _rendered_pairs(context, small[start : start + VIEWS_PER_BATCH])
-        covered |= np.bitwise_or.reduce(pairs, axis=0)
-    return covered
-
-
-def _rendered_pairs(context: SearchContext, cameras: Cameras) -> tuple[Rendering, UInt32[np.ndarray, "c r"]]:
-    """Images of views, and the pairs each of them covers: of Gaussians, then of frontier voxels."""
-    config = context.config
-    with torch.no_grad():
-        rendering, pairs = rendered_pairs(context.scene, cameras, **config.coverage.options)
-    holes = rendering.alpha.numpy() < HOLE_ALPHA
-    frontier = [
-        context.frontier.pairs(cameras[index], holes[index], config.directions)
-        for index in range(len(cameras))
-    ]
-    return rendering, np.concatenate([pairs, np.stack(frontier)], axis=1)
+    scene = scene.detached()
+    frontier = frontier_of(scene, freespace, config)
+    if measured is None:
+        measured = measure_scene(scene, cameras, freespace, config, frontier)
+    return SearchContext(scene, freespace, measured, config, frontier)
 
 
 def grow_branch(
     context: SearchContext,
     start: Float[np.ndarray, "4 4"],
-    coverage: UInt32[np.ndarray, "r"],
+    coverage: np.ndarray,
     anchor: int = 0,
 ) -> Branch:
     """Search one trajectory alone from a snapshot of the shared coverage.
@@ -285,194 +271,211 @@ def grow_branch(
     The best candidate of each expansion becomes the next state; the next `top_candidates` - 1 wait in a
     priority queue. Where no candidate is left, the search goes on from the best of the queue. It ends with L
     views, with an empty queue, or when the budget of expansions is spent; in the last two cases the path
-    whose new pairs are worth most is kept. A pure function: same inputs, same branch.
+    that is worth most is kept. A pure function: same inputs, same branch.
 
     Args:
         context: what all branches share.
         start: `world_from_camera` of the training view it starts from.
-        coverage: packed coverage that counts as known (`known_coverage`), [N + F].
+        coverage: what counts as known of each row, like `SceneMeasurements.known`, [R].
         anchor: index of that view, kept in the result.
 
     Raises:
         ShapeError: when the coverage belongs to another scene.
     """
-    config = context.config
     rows = len(context.scene.gaussians) + len(context.frontier)
     if len(coverage) != rows:
         raise ShapeError(
             f"coverage of {len(coverage)} rows, but the scene has {len(context.scene.gaussians)} Gaussians "
             f"and {len(context.frontier)} frontier voxels"
         )
-    root = _observe(context, start[None], coverage, context.freespace.clearance_at(start[None, :3, 3]))[0]
-    visited = _VisitedPoses(context.step_mm, min(config.rotation_deg, config.orbit_deg), [start])
-    queue: list[tuple[float, int, _State]] = []
-    order, expansions, renders = 0, 0, 1
-    best = current = root
-    reason = ""
-    while not reason:
-        scored, rendered = _expand(context, current, coverage, visited)
-        expansions += 1
-        renders += rendered
-        if scored:
-            # The best of this expansion is appended even when an older entry scores higher: the queue
-            # is for the case that the path ends.
-            following, *others = (state for _, state in scored)
-            for (score, _), state in zip(scored[1:], others, strict=True):
-                order += 1
-                # Ties go to the older entry, so that the order never depends on anything else.
-                heapq.heappush(queue, (-score, order, state))
-        elif queue:
-            following = heapq.heappop(queue)[2]
-        else:
-            reason = f"no further move is possible after {best.length} views"
-            break
-        current = following
-        emit(Progress("explore-branch", current.length, config.length, {"value": current.path_value}))
-        if (current.path_value, current.length) > (best.path_value, best.length):
-            best = current
-        if current.length >= config.length:
-            best = current
-            reason = f"reached {config.length} views"
-        elif expansions >= config.max_expansions:
-            reason = f"budget of {config.max_expansions} expansions spent, {best.length} views"
-    return _branch_of(best, anchor, np.zeros_like(coverage), expansions, renders, reason)
+    return _Search(context, coverage).branch(start, anchor)
 
 
-def _branch_of(
-    last: _State, anchor: int, pairs: UInt32[np.ndarray, "r"], expansions: int, renders: int, reason: str
-) -> Branch:
-    """The path to a state; `pairs` comes empty and is filled with what the path adds."""
-    path = last.path()
-    for state in path:
-        pairs[state.index] |= state.pairs
-    return Branch(
-        anchor=anchor,
-        poses=np.stack([state.pose for state in path]),
-        moves=tuple(state.move for state in path[1:]),
-        gains=tuple(state.gain for state in path[1:]),
-        values=tuple(state.value for state in path[1:]),
-        pairs=pairs,
-        expansions=expansions,
-        renders=renders,
-        reason=reason,
-    )
+class _Search:
+    """State of the search for one branch."""
 
-
-def _expand(
-    context: SearchContext, state: _State, coverage: UInt32[np.ndarray, "r"], visited: _VisitedPoses
-) -> tuple[list[tuple[float, _State]], int]:
-    """The best valid candidates of a state, best score first, and how many images that took."""
-    config = context.config
-    motions = primitive_motions(context.step_mm, config.rotation_deg, config.orbit_deg, state.look_at_mm)
-    poses = apply_primitives(state.pose, motions)
-    centers = poses[:, :3, 3]
-    clearance = context.freespace.clearance_at(centers)
-    # A recording may itself go nearer to the wall than the margin; from there every move that does
-    # not go nearer still is allowed.
-    needed = min(context.margin_mm, state.clearance_mm)
-    feasible = (
-        ~visited.contains(poses)
-        & (context.freespace.lookup(centers) == FREE)
-        & (clearance >= needed)
-        & context.freespace.segment_is_free(np.broadcast_to(state.pose[:3, 3], centers.shape), centers)
-    )
-    kept = np.flatnonzero(feasible)
-    if len(kept) == 0:
-        return [], 0
-    known = coverage.copy()
-    path = state.path()
-    for earlier in path:
-        known[earlier.index] |= earlier.pairs
-    candidates = _observe(context, poses[kept], known, clearance[kept], state, [PRIMITIVES[i] for i in kept])
-    scores = score(
-        Candidates(
-            value=np.array([candidate.value for candidate in candidates]),
-            poses=poses[kept],
-            start=state.pose,
-            dark=state.dark,
-            turned_deg=net_turn_deg(
-                np.stack([earlier.pose for earlier in path]), poses[kept], config.fold_steps
-            ),
-        ),
-        config,
-    )
-    scored = [
-        (value, candidate)
-        for value, candidate in zip(scores.tolist(), candidates, strict=True)
-        if not candidate.rejected
-    ]
-    # Stable: equal scores keep the order of the primitives.
-    scored = sorted(scored, key=lambda item: -item[0])[: config.top_candidates]
-    visited.poses += [candidate.pose for _, candidate in scored]
-    return scored, len(kept)
-
-
-def _observe(
-    context: SearchContext,
-    poses: Float[np.ndarray, "a 4 4"],
-    known: UInt32[np.ndarray, "r"],
-    clearance_mm: Float[np.ndarray, "a"],
-    parent: _State | None = None,
-    moves: list[str] | None = None,
-) -> list[_State]:
-    """Render poses in one batch; reject those with too many holes, overexposure or too little clearance."""
-    config = context.config
-    cameras = context.scoring_cameras(poses)
-    rendering, pairs = _rendered_pairs(context, cameras)
-    n = context.value.n_gaussians
-    gains = coverage_gain(known[:n], pairs[:, :n])
-    alpha, depth, rgb = rendering.alpha.numpy(), rendering.depth.numpy(), rendering.rgb.numpy()
-    states = []
-    for index in range(len(poses)):
-        surface = (alpha[index] >= HOLE_ALPHA) & (depth[index] > 0)
-        near = depth[index][surface] < context.margin_mm
-        # Near to the wall the camera's own light whites the image out: nothing could be learned from
-        # it. A recording may itself be overexposed; from there the share must not grow.
-        saturated = float((luminance(rgb[index]) >= 1.0).mean())
-        glare = saturated > max(config.max_saturated_share, 0.0 if parent is None else parent.saturated_share)
-        # A view of no surface at all shows nothing that a restorer could continue.
-        rejected = bool(
-            glare
-            or not surface.any()
-            or 1 - surface.mean() > config.max_hole_share
-            or near.mean() > NEAR_SHARE
+    def __init__(self, context: SearchContext, coverage: np.ndarray) -> None:
+        self.context = context
+        self.coverage = coverage
+        self.visited = _VisitedPoses(
+            context.step_mm, min(context.config.rotation_deg, context.config.orbit_deg)
         )
-        new = pairs[index] & ~known
-        touched = np.flatnonzero(new).astype(np.int32)
-        value = context.value.gain(known, pairs[index])
-        states.append(
-            _State(
-                pose=poses[index],
-                pairs=new[touched],
-                index=touched,
-                look_at_mm=_look_at_distance(depth[index], surface, context),
-                dark=dark_direction(
-                    cameras[index], rgb[index], alpha[index], depth[index], context.scene.light
-                ),
-                clearance_mm=float(clearance_mm[index]),
-                gain=int(gains[index]),
-                value=value,
-                move="" if moves is None else moves[index],
-                parent=parent,
-                length=1 if parent is None else parent.length + 1,
-                path_value=value + (0.0 if parent is None else parent.path_value),
-                saturated_share=saturated,
-                rejected=rejected,
+        self.approaches = Approaches(
+            context.measured.destinations,
+            context.value,
+            coverage,
+            step_mm=context.step_mm,
+            turn_deg=context.config.rotation_deg,
+        )
+        self.renders = 0
+
+    def branch(self, start: Float[np.ndarray, "4 4"], anchor: int) -> Branch:
+        """Search from a training view."""
+        config = self.context.config
+        clearance_mm = float(self.context.freespace.clearance_at(start[None, :3, 3])[0])
+        (observation,) = self._observe(start[None])
+        current = best = self._state(observation, self.coverage, clearance_mm)
+        self.visited.poses.append(start)
+        queue: list[tuple[float, int, _State]] = []
+        order, expansions = 0, 0
+        reason = ""
+        while not reason:
+            scored = self._expand(current)
+            expansions += 1
+            if scored:
+                # The best of this expansion is appended even when an older entry scores higher: the queue
+                # is for the case that the path ends.
+                following, *others = (state for _, state in scored)
+                for (worth, _), state in zip(scored[1:], others, strict=True):
+                    order += 1
+                    # Ties go to the older entry, so that the order never depends on anything else.
+                    heapq.heappush(queue, (-worth, order, state))
+            elif queue:
+                following = heapq.heappop(queue)[2]
+            else:
+                reason = f"no further move is possible after {best.length} views"
+                break
+            current = following
+            emit(Progress("explore-branch", current.length, config.length, {"value": current.path_value}))
+            if (current.path_value, current.length) > (best.path_value, best.length):
+                best = current
+            if current.length >= config.length:
+                best = current
+                reason = f"reached {config.length} views"
+            elif expansions >= config.max_expansions:
+                reason = f"budget of {config.max_expansions} expansions spent, {best.length} views"
+        return self._branch_of(best, anchor, expansions, reason)
+
+    def _branch_of(self, last: _State, anchor: int, expansions: int, reason: str) -> Branch:
+        context = self.context
+        path = last.path()
+        pairs = np.zeros(len(context.scene.gaussians), dtype=np.uint32)
+        for state in path:
+            observation = state.observation
+            pairs[observation.visible] |= gaussian_words(
+                context.scene, observation, context.config.directions
             )
+        return Branch(
+            anchor=anchor,
+            poses=np.stack([state.pose for state in path]),
+            moves=tuple(state.move for state in path[1:]),
+            values=tuple(state.value for state in path[1:]),
+            seen=union(context.value, [state.seen for state in path], self.coverage),
+            pairs=pairs,
+            expansions=expansions,
+            renders=self.renders,
+            reason=reason,
         )
-    return states
 
+    def _expand(self, state: _State) -> list[tuple[float, _State]]:
+        """The best valid candidates of a state, best score first."""
+        context, config = self.context, self.context.config
+        known = self.coverage.copy()
+        path = state.path()
+        for earlier in path:
+            context.value.add(known, earlier.seen)
+        scored = self._moves(state, path, known)
+        if config.score == "error":
+            scored = self._with_approach(state, known, scored)
+        # Stable: equal scores keep the order of the primitives.
+        scored = sorted(scored, key=lambda item: -item[0])[: config.top_candidates]
+        self.visited.poses += [candidate.pose for _, candidate in scored]
+        return scored
 
-def _look_at_distance(
-    depth_mm: Float[np.ndarray, "h w"], surface: Bool[np.ndarray, "h w"], context: SearchContext
-) -> float:
-    """Median depth of the surface in the central half of the view, held near the scene's own unit.
+    def _moves(self, state: _State, path: list[_State], known: np.ndarray) -> list[tuple[float, _State]]:
+        """The moves of `PRIMITIVES` that are possible, with their scores."""
+        context, config = self.context, self.context.config
+        motions = primitive_motions(
+            context.step_mm, config.rotation_deg, config.orbit_deg, state.observation.look_at_mm
+        )
+        poses = apply_primitives(state.pose, motions)
+        allowed = context.is_allowed(state.pose[:3, 3], poses[:, :3, 3], state.clearance_mm)
+        kept = np.flatnonzero(allowed & ~self.visited.contains(poses))
+        if len(kept) == 0:
+            return []
+        clearance_mm = context.freespace.clearance_at(poses[kept, :3, 3])
+        candidates = [
+            self._state(observation, known, float(clearance), state, PRIMITIVES[move])
+            for move, observation, clearance in zip(
+                kept, self._observe(poses[kept]), clearance_mm, strict=True
+            )
+        ]
+        scores = score(
+            Candidates(
+                value=np.array([candidate.value for candidate in candidates]),
+                poses=poses[kept],
+                start=state.pose,
+                dark=state.observation.dark,
+                turned_deg=net_turn_deg(
+                    np.stack([earlier.pose for earlier in path]), poses[kept], config.fold_steps
+                ),
+            ),
+            config,
+        )
+        return [
+            (worth, candidate)
+            for worth, candidate in zip(scores.tolist(), candidates, strict=True)
+            if not self._is_rejected(candidate)
+        ]
 
-    Looking down the lumen the centre may be far away or empty; an orbit about so
-    distant a point would be a large jump.
-    """
-    height, width = depth_mm.shape
-    centre = (slice(height // 4, height - height // 4), slice(width // 4, width - width // 4))
-    seen = depth_mm[centre][surface[centre]]
-    unit = context.depth_unit_mm
-    return float(np.clip(np.median(seen), 0.25 * unit, 2.0 * unit)) if seen.size else unit
+    def _with_approach(
+        self, state: _State, known: np.ndarray, scored: list[tuple[float, _State]]
+    ) -> list[tuple[float, _State]]:
+        """Add the way to a destination that is worth more for each view than the best move."""
+        context = self.context
+        best = max((worth for worth, _ in scored), default=0.0)
+        left = context.config.length - state.length
+        for rate, poses in self.approaches.better(state.pose, known, left, best):
+            starts = np.concatenate([state.pose[None], poses[:-1]])[:, :3, 3]
+            centers = poses[:, :3, 3]
+            if not all(
+                context.is_allowed(start, center[None], state.clearance_mm)[0]
+                for start, center in zip(starts, centers, strict=True)
+            ):
+                continue
+            last, along = state, known.copy()
+            clearance_mm = context.freespace.clearance_at(centers)
+            for observation, clearance in zip(self._observe(poses), clearance_mm, strict=True):
+                last = self._state(observation, along, float(clearance), last, APPROACH)
+                context.value.add(along, last.seen)
+                if self._is_rejected(last):
+                    break
+            else:
+                return [(rate, last), *scored]
+        return scored
+
+    def _observe(self, poses: Float[np.ndarray, "a 4 4"]) -> list[Observation]:
+        self.renders += len(poses)
+        return self.context.observe(poses)
+
+    def _state(
+        self,
+        observation: Observation,
+        known: np.ndarray,
+        clearance_mm: float,
+        parent: _State | None = None,
+        move: str = "",
+    ) -> _State:
+        value = self.context.value
+        seen = self.context.seen(observation)
+        worth = value.gain(known, seen)
+        return _State(
+            observation=observation,
+            seen=value.beyond(known, seen),
+            clearance_mm=clearance_mm,
+            value=worth,
+            move=move,
+            parent=parent,
+            length=1 if parent is None else parent.length + 1,
+            path_value=worth + (0.0 if parent is None else parent.path_value),
+        )
+
+    def _is_rejected(self, state: _State) -> bool:
+        """Too many holes, too near, or more overexposed than allowed.
+
+        Near to the wall the camera's own light whites the image out: nothing could be learned from it. A
+        recording may itself be overexposed; from there the share must not grow.
+        """
+        before = 0.0 if state.parent is None else state.parent.observation.saturated_share
+        limit = max(self.context.config.max_saturated_share, before)
+        return state.observation.rejected or state.observation.saturated_share > limit

@@ -18,8 +18,8 @@ from extrags.config import ExploreConfig
 from extrags.errors import ShapeError
 from extrags.events import MetricRecorded, Progress, emit
 from extrags.exploration.coverage import count_pairs
-from extrags.exploration.search import Branch, SearchContext, grow_branch, known_coverage, prepare_search
-from extrags.exploration.waves import WaveState, start_views
+from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
+from extrags.exploration.waves import Least, WaveState, start_views
 from extrags.freespace import FreeSpace, carve
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -44,15 +44,18 @@ class Exploration(Storable):
         trajectory: index of each view's trajectory, rising, [V].
         anchors: frame of the sequence each trajectory starts from, [T].
         gains: newly covered (Gaussian, direction) pairs of each trajectory, in order of acceptance, [T].
-        values: worth of what each trajectory adds, holes included, in the same unit, [T].
+        values: worth of what each trajectory adds: error of views off the trajectory that it takes away, as
+            a share of full error in all pixels; with `score=pairs` the pairs, holes included, [T].
         moves: names of the moves of each trajectory.
         reasons: why each search ended.
         rejected: why other branches were not accepted.
         coverage_before: packed coverage by the training views, [N].
         coverage_after: packed coverage with all trajectories, [N].
         directions: D.
-        renders: images the search rendered.
+        renders: images rendered to measure the scene and by the search.
         waves: waves it took.
+        score: what `values` are, `explore.score`.
+        removable_error: error that views could take away before the first trajectory; 0 with `score=pairs`.
 
     Raises:
         ShapeError: when the arrays do not fit each other.
@@ -73,6 +76,8 @@ class Exploration(Storable):
     directions: int
     renders: int
     waves: int
+    score: str = "pairs"
+    removable_error: float = 0.0
 
     def __post_init__(self) -> None:
         count = len(self.anchors)
@@ -124,7 +129,7 @@ class Exploration(Storable):
                     "anchor_frame": int(self.anchors[index]),
                     "views": int((self.trajectory == index).sum()),
                     "gain": int(self.gains[index]),
-                    "value": round(float(self.values[index])),
+                    "value": float(self.values[index]),
                     "moves": list(self.moves[index]),
                     "reason": self.reasons[index],
                 }
@@ -135,6 +140,9 @@ class Exploration(Storable):
             "gain_share": self.gain_share,
             "coverage_share": {"before": self.coverage_share_before, "after": self.coverage_share_after},
             "pairs": self.n_pairs,
+            "score": self.score,
+            "removable_error": self.removable_error,
+            "removed_error": float(self.values.sum()) if self.score == "error" else 0.0,
             "renders": self.renders,
             "waves": self.waves,
             "rejected": list(self.rejected),
@@ -158,6 +166,8 @@ class Exploration(Storable):
                     "directions": self.directions,
                     "renders": self.renders,
                     "waves": self.waves,
+                    "score": self.score,
+                    "removable_error": self.removable_error,
                 }
             )
         text = json.dumps(self.summary(), indent=2)
@@ -181,35 +191,42 @@ class Exploration(Storable):
             directions=attributes["directions"],
             renders=attributes["renders"],
             waves=attributes["waves"],
+            score=attributes.get("score", "pairs"),
+            removable_error=attributes.get("removable_error", 0.0),
             **arrays,
         )
 
 
-def start_exploration(context: SearchContext, cameras: Cameras) -> WaveState:
+def start_exploration(context: SearchContext) -> WaveState:
     """The state before the first wave: coverage by the training views, and the queue of anchors.
 
     Args:
         context: from `prepare_search`.
-        cameras: the training views.
     """
-    config = context.config
-    anchors = start_views(cameras, config.trajectories, context.depth_unit_mm)
-    covered = known_coverage(context, cameras)
-    pairs = len(context.scene.gaussians) * config.directions
+    config, measured = context.config, context.measured
+    anchors = start_views(measured.training, config.trajectories, measured.depth_unit_mm)
+    if config.score == "pairs":
+        pairs = len(context.scene.gaussians) * config.directions
+        total = max(1.0, float(np.ceil(config.min_gain_share * pairs)))
+        least = Least(total=total, kept_share=config.wave_kept_share)
+    else:
+        least = Least(per_view=config.min_view_gain, kept_share=config.wave_kept_share)
     return WaveState(
-        coverage_before=covered,
-        coverage=covered,
-        value=context.value,
+        pairs_before=measured.pairs,
+        pairs=measured.pairs,
+        known=measured.known,
+        value=measured.value,
         waiting=tuple(int(anchor) for anchor in anchors),
         room=config.trajectories,
-        min_gain=max(1, int(np.ceil(config.min_gain_share * pairs))),
+        least=least,
         wave=config.wave,
+        renders=measured.renders,
     )
 
 
-def grow(context: SearchContext, cameras: Cameras, coverage: UInt32[np.ndarray, "r"], anchor: int) -> Branch:
+def grow(context: SearchContext, known: np.ndarray, anchor: int) -> Branch:
     """Grow the branch of one anchor: the unit of parallel work."""
-    return grow_branch(context, cameras.world_from_camera[anchor], coverage, anchor)
+    return grow_branch(context, context.measured.training.world_from_camera[anchor], known, anchor)
 
 
 def finish(context: SearchContext, state: WaveState, train_frames: Int[np.ndarray, "c"]) -> Exploration:
@@ -231,11 +248,13 @@ def finish(context: SearchContext, state: WaveState, train_frames: Int[np.ndarra
         moves=tuple(branch.moves for branch in state.branches),
         reasons=tuple(branch.reason for branch in state.branches),
         rejected=state.rejected,
-        coverage_before=state.coverage_before[: len(context.scene.gaussians)],
-        coverage_after=state.coverage[: len(context.scene.gaussians)],
+        coverage_before=state.pairs_before,
+        coverage_after=state.pairs,
         directions=context.config.directions,
         renders=state.renders,
         waves=state.waves,
+        score=context.config.score,
+        removable_error=context.measured.removable_error,
     )
 
 
@@ -270,20 +289,22 @@ def explore(
     if freespace is None:
         freespace = carve(scene, fuse_surface(scene, cameras), cameras)
     context = prepare_search(scene, cameras, freespace, config)
-    state = start_exploration(context, cameras)
+    state = start_exploration(context)
     while anchors := state.next_wave():
-        branches = list(map(partial(grow, context, cameras, state.coverage), anchors))
+        branches = list(map(partial(grow, context, state.known), anchors))
         state = state.merged(branches)
         emit(
             Progress(
                 "explore",
                 len(state.branches),
                 config.trajectories,
-                {"gain": float(sum(state.gains)), "renders": float(state.renders)},
+                {"value": float(sum(state.values)), "renders": float(state.renders)},
             )
         )
     exploration = finish(context, state, sequence.train)
     emit(MetricRecorded("explore", "gain_share", exploration.gain_share))
+    if exploration.score == "error":
+        emit(MetricRecorded("explore", "removed_error", float(exploration.values.sum())))
     _log.info(
         "explore: %d trajectories, %d virtual views, %.2f %% of all pairs added in %d renders",
         len(exploration),

@@ -16,12 +16,13 @@ from jaxtyping import Float, Int, UInt32
 
 from extrags.cameras import Cameras, pose_distances
 from extrags.errors import ConfigError
-from extrags.exploration.coverage import PairValue, coverage_gain
+from extrags.exploration.coverage import coverage_gain
 from extrags.exploration.search import Branch
+from extrags.exploration.seen import PairValue, Value, restored
 from extrags.store.storable import Storable
-from extrags.zarr_io import new_group, open_group, read_array, write_array
+from extrags.zarr_io import has_array, new_group, open_group, read_array, write_array
 
-__all__ = ["Merge", "WaveState", "merge_wave", "start_views"]
+__all__ = ["Least", "Merge", "WaveState", "merge_wave", "start_views"]
 
 
 def start_views(cameras: Cameras, count: int, depth_unit_mm: float) -> Int[np.ndarray, "t"]:
@@ -61,60 +62,93 @@ def start_views(cameras: Cameras, count: int, depth_unit_mm: float) -> Int[np.nd
 
 
 @dataclass(frozen=True)
+class Least:
+    """What a trajectory must be worth to be accepted.
+
+    Args:
+        total: at least.
+        per_view: for each of its virtual views.
+        kept_share: of its worth alone, that the other branches of its wave have to leave; one that lost more
+            grows again from what is known then.
+    """
+
+    total: float = 0.0
+    per_view: float = 0.0
+    kept_share: float = 0.0
+
+    def of(self, branch: Branch) -> float:
+        """What a branch must be worth."""
+        return max(self.total, self.per_view * (len(branch) - 1))
+
+    def accepts(self, branch: Branch, worth: float) -> bool:
+        """Whether a worth is enough; a trajectory that adds nothing, or has no virtual view, never is."""
+        return len(branch) >= 2 and worth > 0 and worth >= self.of(branch)
+
+
+@dataclass(frozen=True)
 class Merge:
     """Result of a merge.
 
     Args:
-        coverage: the shared coverage with the accepted branches added, packed, [N + F].
+        known: the shared coverage with the accepted branches added, [R].
+        pairs: (Gaussian, direction) pairs with theirs, packed, [N].
         accepted: positions of the accepted branches in the wave, in the order of acceptance.
         gains: newly covered (Gaussian, direction) pairs each of them added when it was accepted.
-        values: worth of all pairs it added then.
+        values: worth of what it added then.
     """
 
-    coverage: UInt32[np.ndarray, "r"]
+    known: np.ndarray
+    pairs: UInt32[np.ndarray, "n"]
     accepted: tuple[int, ...]
     gains: tuple[int, ...]
     values: tuple[float, ...]
 
 
 def merge_wave(
-    coverage: UInt32[np.ndarray, "r"],
+    known: np.ndarray,
+    pairs: UInt32[np.ndarray, "n"],
     branches: Sequence[Branch],
-    value: PairValue,
+    value: Value,
     *,
-    min_gain: int,
+    least: Least,
     room: int,
 ) -> Merge:
     """Accept branches greedily by the worth of what each still adds to the shared coverage.
 
-    Weighted coverage is submodular, so greedy acceptance is within 1 - 1/e of the best choice (Nemhauser,
-    Wolsey and Fisher 1978), and once the largest marginal gain is below the threshold all others are, too.
+    The worth is submodular, so greedy acceptance is within 1 - 1/e of the best choice (Nemhauser, Wolsey and
+    Fisher 1978), and a branch that is not worth enough now never is again.
 
     Args:
-        coverage: the snapshot the branches grew from, packed, [N + F].
+        known: the snapshot the branches grew from, [R].
+        pairs: (Gaussian, direction) pairs that are covered, packed, [N].
         branches: the wave.
-        value: what pairs are worth; the same as in the search.
-        min_gain: a branch must add pairs of at least this worth.
+        value: what rows are worth; the same as in the search.
+        least: what a branch must be worth.
         room: accept at most so many.
     """
-    coverage = coverage.copy()
-    left = [index for index, branch in enumerate(branches) if len(branch) >= 2]
+    known, pairs = known.copy(), pairs.copy()
+    left = list(range(len(branches)))
     accepted: list[int] = []
     gains: list[int] = []
     values: list[float] = []
-    while left and len(accepted) < room:
-        marginal = [value.gain(coverage, branches[index].pairs) for index in left]
-        # The first of equals, so that the order of the wave decides and nothing else.
-        top = int(np.argmax(marginal))
-        if marginal[top] < max(1, min_gain):
+    alone = [value.gain(known, branch.seen) for branch in branches]
+    while len(accepted) < room:
+        worths = [value.gain(known, branches[index].seen) for index in left]
+        enough = [
+            least.accepts(branches[index], worth) and worth >= least.kept_share * alone[index]
+            for index, worth in zip(left, worths, strict=True)
+        ]
+        if not any(enough):
             break
+        # The first of equals, so that the order of the wave decides and nothing else.
+        top = int(np.argmax(np.where(enough, worths, -np.inf)))
         chosen = left.pop(top)
-        n = value.n_gaussians
-        gains.append(int(coverage_gain(coverage[:n], branches[chosen].pairs[:n])))
-        values.append(marginal[top])
-        coverage |= branches[chosen].pairs
+        gains.append(int(coverage_gain(pairs, branches[chosen].pairs)))
+        values.append(worths[top])
+        value.add(known, branches[chosen].seen)
+        pairs |= branches[chosen].pairs
         accepted.append(chosen)
-    return Merge(coverage, tuple(accepted), tuple(gains), tuple(values))
+    return Merge(known, pairs, tuple(accepted), tuple(gains), tuple(values))
 
 
 @dataclass(frozen=True)
@@ -122,29 +156,31 @@ class WaveState(Storable):
     """State of the exploration between two waves.
 
     Args:
-        coverage_before: coverage by the training views, packed: N Gaussians, F frontier voxels, [N + F].
-        coverage: coverage with all accepted trajectories, packed, [N + F].
-        value: what newly covered pairs are worth.
+        pairs_before: (Gaussian, direction) pairs that the training views cover, packed, [N].
+        pairs: the same with all accepted trajectories.
+        known: what is known of each row, in the terms of `value`, [R].
+        value: what newly shown rows are worth.
         waiting: queue of anchors, the next one first.
         room: trajectories that may still be accepted.
-        min_gain: worth of the pairs a trajectory must add.
+        least: what a trajectory must be worth.
         wave: branches per wave.
         branches: accepted so far.
         gains: (Gaussian, direction) pairs each of them added.
-        values: worth of all pairs each of them added.
+        values: worth of what each of them added.
         rejected: why branches were not accepted, one sentence each.
         waves: waves finished.
-        renders: images rendered by all branches, rejected ones included.
+        renders: images rendered: to measure the scene, and by all branches, rejected ones included.
     """
 
     stored_as: ClassVar[str] = "state"
 
-    coverage_before: UInt32[np.ndarray, "r"]
-    coverage: UInt32[np.ndarray, "r"]
-    value: PairValue
+    pairs_before: UInt32[np.ndarray, "n"]
+    pairs: UInt32[np.ndarray, "n"]
+    known: np.ndarray
+    value: Value
     waiting: tuple[int, ...]
     room: int
-    min_gain: int
+    least: Least
     wave: int
     branches: tuple[Branch, ...] = ()
     gains: tuple[int, ...] = ()
@@ -182,22 +218,30 @@ class WaveState(Storable):
                 f"the wave has the anchors {anchors}, but the branches start from "
                 f"{tuple(branch.anchor for branch in branches)}"
             )
-        merge = merge_wave(self.coverage, branches, self.value, min_gain=self.min_gain, room=self.room)
+        merge = merge_wave(
+            self.known, self.pairs, branches, self.value, least=self.least, room=self.room
+        )
         again, rejected = [], []
         for index, branch in enumerate(branches):
-            alone = self.value.gain(self.coverage, branch.pairs)
+            alone = self.value.gain(self.known, branch.seen)
             if index not in merge.accepted:
-                left = self.value.gain(merge.coverage, branch.pairs)
-                why = f"needs {self.min_gain}" if left < self.min_gain else "there was no room left"
+                left = self.value.gain(merge.known, branch.seen)
+                if not self.least.accepts(branch, left):
+                    why = f"needs {self._said(self.least.of(branch))}"
+                elif self.room == len(merge.accepted):
+                    why = "there was no room left"
+                else:
+                    why = "grows again after the others of its wave"
                 rejected.append(
-                    f"from view {branch.anchor}: adds {left:.0f} pairs ({alone:.0f} alone), {why}; "
+                    f"from view {branch.anchor}: adds {self._said(left)} ({self._said(alone)} alone), {why}; "
                     f"{branch.reason}"
                 )
-            if len(branch) >= 2 and alone >= max(1, self.min_gain):
+            if self.least.accepts(branch, alone):
                 again.append(branch.anchor)
         return replace(
             self,
-            coverage=merge.coverage,
+            known=merge.known,
+            pairs=merge.pairs,
             waiting=(*self.waiting[len(anchors) :], *again),
             room=self.room - len(merge.accepted),
             branches=(*self.branches, *(branches[index] for index in merge.accepted)),
@@ -208,25 +252,34 @@ class WaveState(Storable):
             renders=self.renders + sum(branch.renders for branch in branches),
         )
 
+    def _said(self, worth: float) -> str:
+        if isinstance(self.value, PairValue):
+            return f"{worth:.0f} pairs"
+        return f"{100 * worth:.3f} % of error"
+
     def save(self, path: Path) -> None:
         """Write a zarr v3 group, accepted branches inside."""
         with new_group(path) as group:
-            write_array(group, "coverage_before", self.coverage_before)
-            write_array(group, "coverage", self.coverage)
+            for name in ("pairs_before", "pairs", "known"):
+                write_array(group, name, getattr(self, name))
+            attributes, arrays = self.value.saved()
+            for name, array in arrays.items():
+                write_array(group, name, array)
             group.attrs.update(
                 {
                     "waiting": list(self.waiting),
                     "room": self.room,
-                    "min_gain": self.min_gain,
+                    "least_total": self.least.total,
+                    "least_per_view": self.least.per_view,
+                    "least_kept_share": self.least.kept_share,
                     "wave": self.wave,
                     "gains": list(self.gains),
                     "values": list(self.values),
-                    "n_gaussians": self.value.n_gaussians,
-                    "frontier_pair": self.value.frontier_pair,
                     "rejected": list(self.rejected),
                     "waves": self.waves,
                     "renders": self.renders,
                     "n_branches": len(self.branches),
+                    **attributes,
                 }
             )
             for index, branch in enumerate(self.branches):
@@ -238,12 +291,13 @@ class WaveState(Storable):
         group = open_group(path)
         attributes: dict[str, Any] = dict(group.attrs)
         return cls(
-            coverage_before=read_array(group, "coverage_before"),
-            coverage=read_array(group, "coverage"),
-            value=PairValue(attributes["n_gaussians"], attributes["frontier_pair"]),
+            pairs_before=read_array(group, "pairs_before"),
+            pairs=read_array(group, "pairs"),
+            known=read_array(group, "known"),
+            value=restored(attributes, read_array(group, "error") if has_array(group, "error") else None),
             waiting=tuple(attributes["waiting"]),
             room=attributes["room"],
-            min_gain=attributes["min_gain"],
+            least=Least(*(attributes[f"least_{name}"] for name in ("total", "per_view", "kept_share"))),
             wave=attributes["wave"],
             branches=tuple(
                 Branch.read(group.require_group(f"branch_{index:04d}"))

@@ -22,6 +22,7 @@
 #include <vector>
 
 #include "kernels.h"
+#include "march.h"
 
 namespace nb = nanobind;
 using namespace extrags;
@@ -31,6 +32,8 @@ namespace {
 using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using Counts = nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+using Indices = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Flags = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // The tables this processor can run, the fastest first.
@@ -378,6 +381,12 @@ StereoMemory& stereo_memory() {
 // Brightness, mask, 3 x 3 matrix from pixels of the reference, offset
 using SourceTuple = std::tuple<In, In, In, In>;
 
+void march_rays(const In& reach, const Doubles& start, const Doubles& directions, Indices entered) {
+  nb::gil_scoped_release release_gil;
+  march(reach.data(), static_cast<int64_t>(reach.shape(0)), start.data(), directions.data(),
+        static_cast<int64_t>(directions.shape(0)), entered.data());
+}
+
 void sweep(const In& reference, const In& mask, const In& base, const In& ratios,
            const std::vector<SourceTuple>& sources, int kept, int radius, Out cost) {
   expect(reference.ndim() == 2, "a reference");
@@ -527,6 +536,9 @@ NB_MODULE(_native, m) {
   m.def("inverse_depth", &inverse_depth, nb::arg("depth"), nb::arg("alpha"), nb::arg("target"),
         nb::arg("gradient").noconvert(), nb::arg("scale"), nb::arg("weight"),
         nb::arg("confidence").none() = nb::none());
+  m.def("march", &march_rays, nb::arg("reach").noconvert(), nb::arg("start").noconvert(),
+        nb::arg("directions").noconvert(), nb::arg("entered").noconvert(),
+        "Flat index of the first voxel without reach on each ray, -1 where a ray leaves the grid.");
   m.def("sweep", &sweep, nb::arg("reference"), nb::arg("mask"), nb::arg("base"), nb::arg("ratios"),
         nb::arg("sources"), nb::arg("kept"), nb::arg("radius"), nb::arg("cost").noconvert());
   m.def("semi_global", &semi_global, nb::arg("cost"), nb::arg("grey"), nb::arg("small_step"), nb::arg("jump"),

@@ -31,6 +31,13 @@ def frontier_of(space: FreeSpace, weight: float = 1.0) -> Frontier:
     return find_frontier(scene_of_points(points), space, weight)
 
 
+def words_of(found: Frontier, camera: Cameras, holes: np.ndarray) -> np.ndarray:
+    words = np.zeros(len(found), np.uint32)
+    seen, value = found.pairs(camera, holes, 32)
+    words[seen] = value
+    return words
+
+
 def everywhere(camera: Cameras) -> np.ndarray:
     return np.ones((camera.height, camera.width), bool)
 
@@ -57,14 +64,14 @@ class TestFindFrontier:
         found = frontier_of(room(), weight=0.0)
         assert len(found) == 0
         assert found.pair_value == 0
-        assert found.pairs(square_camera(), everywhere(square_camera()), 32).shape == (0,)
+        assert words_of(found, square_camera(), everywhere(square_camera())).shape == (0,)
 
 
 class TestPairs:
     def test_each_ray_covers_the_voxel_it_enters(self):
         camera = square_camera()
         found = frontier_of(room())
-        words = found.pairs(camera, everywhere(camera), 32)
+        words = words_of(found, camera, everywhere(camera))
         # 90 degrees wide in a cube: the face ahead, 8 x 8 voxels whose centres are at z = 4.5, and its rim.
         seen = found.centers[words > 0]
         ahead = (seen[:, 2] == 4.5) & (np.abs(seen[:, :2]) < 4).all(axis=1)
@@ -73,14 +80,26 @@ class TestPairs:
         bins = np.uint32(1) << direction_bin(toward, 32).astype(np.uint32)
         np.testing.assert_array_equal(words[words > 0], bins[words > 0])
 
+    def test_counts_the_rays_into_each_voxel(self):
+        camera = square_camera()
+        found = frontier_of(room())
+        seen, pixels = found.counts(camera, everywhere(camera))
+        words = words_of(found, camera, everywhere(camera))
+        np.testing.assert_array_equal(seen, np.flatnonzero(words))
+        # Every ray leaves free space through a voxel of the shell.
+        assert pixels.sum() == 32 * 32
+        ahead = (found.centers[seen] == [0.5, 0.5, 4.5]).all(axis=1)
+        # A voxel of edge 1 on the face at depth 4, with 16 px of focal length: 4 x 4 pixels.
+        assert pixels[ahead].tolist() == [16]
+
     def test_only_holes_count(self):
         camera = square_camera()
         found = frontier_of(room())
         nothing = np.zeros((32, 32), bool)
-        assert not found.pairs(camera, nothing, 32).any()
+        assert not words_of(found, camera, nothing).any()
         left = nothing.copy()
         left[:, :8] = True
-        seen = found.centers[found.pairs(camera, left, 32) > 0]
+        seen = found.centers[words_of(found, camera, left) > 0]
         assert len(seen) > 0
         assert (seen[:, 0] < 0).all()
 
@@ -99,7 +118,7 @@ class TestPairs:
             first = points[np.argmax(space.lookup(points) != FREE)]
             expected.add(tuple(np.floor(space.to_grid(first)).astype(int) + 1))
         entered = set(
-            map(tuple, np.argwhere(found.row >= 0)[found.pairs(camera, everywhere(camera), 32) > 0])
+            map(tuple, np.argwhere(found.row >= 0)[words_of(found, camera, everywhere(camera)) > 0])
         )
         # The small steps may pass a corner of a voxel.
         assert len(entered) > 100

@@ -9,12 +9,13 @@ import pytest
 
 from extrags.cameras import rotation_angle_deg
 from extrags.errors import CaptureError, ShapeError
-from extrags.exploration.coverage import PairValue, coverage_gain, rendered_pairs, training_coverage
+from extrags.exploration.coverage import coverage_gain, rendered_pairs, training_coverage
 from extrags.exploration.darkness import luminance
 from extrags.exploration.primitives import PRIMITIVES, apply_primitives, primitive_motions
 from extrags.exploration.score import fold_weight, net_turn_deg
-from extrags.exploration.search import Branch, SearchContext, grow_branch, known_coverage, prepare_search
-from extrags.exploration.waves import WaveState
+from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
+from extrags.exploration.seen import PairValue
+from extrags.exploration.waves import Least, WaveState
 from extrags.freespace import FREE, OCCUPIED, FreeSpace
 from extrags.scene import Scene
 
@@ -34,12 +35,11 @@ def context(**changes: object) -> SearchContext:
 
 @cache
 def known() -> np.ndarray:
-    return known_coverage(context(), small_tube().cameras)
+    return context().measured.known
 
 
 def branch_of(ready: SearchContext) -> Branch:
-    coverage = known_coverage(ready, small_tube().cameras)
-    return grow_branch(ready, small_tube().cameras.world_from_camera[START], coverage, START)
+    return grow_branch(ready, small_tube().cameras.world_from_camera[START], ready.measured.known, START)
 
 
 @cache
@@ -87,36 +87,36 @@ class TestGrowBranch:
         assert len(found) == 5
         assert found.reason == "reached 5 views"
         assert found.anchor == START
-        assert len(found.moves) == len(found.gains) == 4
+        assert len(found.moves) == len(found.values) == 4
         np.testing.assert_array_equal(found.poses[0], small_tube().cameras.world_from_camera[START])
 
-    def test_its_gains_are_what_its_views_add(self):
-        found, ready = branch(), context()
-        n = len(ready.scene.gaussians)
-        covered = known()[:n].copy()
-        for pose, gain in zip(found.poses[1:], found.gains, strict=True):
-            _, pairs = rendered_pairs(ready.scene, ready.scoring_cameras(pose[None]), **SEEN)
-            assert coverage_gain(covered, pairs[0]) == gain
-            covered |= pairs[0]
-        assert coverage_gain(known()[:n], found.pairs[:n]) == sum(found.gains) > 0
-        assert ready.value.gain(known(), found.pairs) == pytest.approx(sum(found.values))
-
-    def test_without_holes_the_value_is_the_gain(self):
-        ready = context(hole_weight=0.0)
+    def test_its_values_are_what_its_views_add(self):
+        found, ready = branch(hole_weight=0.0), context(hole_weight=0.0)
         assert ready.value == PairValue(len(ready.scene.gaussians), 0.0)
-        found = branch(hole_weight=0.0)
-        assert found.values == found.gains
+        covered = ready.measured.known.copy()
         np.testing.assert_array_equal(
-            known_coverage(ready, small_tube().cameras),
-            training_coverage(ready.scene, small_tube().cameras.resized(32, 24), **SEEN),
+            covered, training_coverage(ready.scene, small_tube().cameras.resized(32, 24), **SEEN)
         )
+        for pose, value in zip(found.poses[1:], found.values, strict=True):
+            _, pairs = rendered_pairs(ready.scene, ready.scoring_cameras(pose[None]), **SEEN)
+            assert coverage_gain(covered, pairs[0]) == value
+            covered |= pairs[0]
+        assert coverage_gain(ready.measured.known, found.pairs) == sum(found.values) > 0
+
+    def test_holes_count_besides(self):
+        found, ready = branch(), context()
+        gaussians = coverage_gain(ready.measured.pairs, found.pairs)
+        assert ready.value.gain(known(), found.seen) == pytest.approx(sum(found.values))
+        assert sum(found.values) >= gaussians > 0
 
     def test_the_first_move_is_the_best_of_all(self):
         # With neither light nor folds the score is the value alone.
         plain = branch(darkness_weight=0.0, fold_penalty=1.0)
         assert plain.values[0] >= branch().values[0]
         paper = branch(darkness_weight=0.0, fold_penalty=1.0, hole_weight=0.0)
-        assert paper.gains[0] >= plain.gains[0]
+        gained = coverage_gain(context().measured.pairs, plain.pairs)
+        assert 0 < gained <= sum(plain.values)
+        assert sum(paper.values) > 0
 
     def test_stays_in_free_space_with_its_margin(self):
         space, ready = small_freespace(), context()
@@ -159,7 +159,7 @@ class TestGrowBranch:
         first, second = branch(), branch_of(context())
         np.testing.assert_array_equal(first.poses, second.poses)
         np.testing.assert_array_equal(first.pairs, second.pairs)
-        assert (first.moves, first.gains, first.renders) == (second.moves, second.gains, second.renders)
+        assert (first.moves, first.values, first.renders) == (second.moves, second.values, second.renders)
 
     def test_survives_pickling_of_its_inputs(self):
         found = branch_of(pickle.loads(pickle.dumps(context())))
@@ -176,7 +176,7 @@ class TestGrowBranch:
         alone = [rendered_pairs(ready.scene, ready.scoring_cameras(pose[None]), **SEEN)[1] for pose in turns]
         start = found.pairs & 0
         start |= rendered_pairs(ready.scene, ready.scoring_cameras(np.eye(4)[None]), **SEEN)[1][0]
-        assert found.gains[0] == max(int(coverage_gain(start, pairs[0])) for pairs in alone)
+        assert found.values[0] == max(int(coverage_gain(start, pairs[0])) for pairs in alone)
 
     def test_a_spent_budget_keeps_the_best_path(self):
         found = branch(length=16, max_expansions=3)
@@ -197,7 +197,9 @@ class TestGrowBranch:
         loaded = Branch.load(tmp_path / "branch")
         np.testing.assert_array_equal(loaded.poses, found.poses)
         np.testing.assert_array_equal(loaded.pairs, found.pairs)
-        for name in ("anchor", "moves", "gains", "values", "expansions", "renders", "reason"):
+        np.testing.assert_array_equal(loaded.seen.row, found.seen.row)
+        np.testing.assert_array_equal(loaded.seen.value, found.seen.value)
+        for name in ("anchor", "moves", "values", "expansions", "renders", "reason"):
             assert getattr(loaded, name) == getattr(found, name)
 
     def test_coverage_of_another_scene_is_refused(self):
@@ -215,17 +217,18 @@ class TestHoles:
     def test_draw_the_search_where_no_gaussian_is_left_to_cover(self):
         ready, start, coverage = self.hole_alone()
         found = grow_branch(ready, start, coverage, START)
-        assert sum(found.gains) == 0
+        pairs = coverage[: len(ready.scene.gaussians)]
         assert sum(found.values) > 0
         state = WaveState(
-            coverage, coverage, ready.value, waiting=(START,), room=1, min_gain=1, wave=1
+            pairs, pairs, coverage, ready.value, waiting=(START,), room=1, least=Least(1.0), wave=1
         ).merged([found])
         assert len(state.branches) == 1
+        assert state.gains == (0,)
         # No training view has looked there: what the start itself sees counts as well.
-        assert state.values == (ready.value.gain(coverage, found.pairs),)
+        assert state.values == (ready.value.gain(coverage, found.seen),)
         assert state.values[0] >= sum(found.values)
         # Seen into once, a hole is worth nothing more from there.
-        assert ready.value.gain(state.coverage, found.pairs) == 0
+        assert ready.value.gain(state.known, found.seen) == 0
 
     def test_a_spent_budget_keeps_the_path_of_the_largest_value(self):
         ready, start, coverage = self.hole_alone()
@@ -241,7 +244,7 @@ class TestHoles:
         ready = prepare_search(
             scene, square_camera(), small_room(), small_config(max_hole_share=1.0, rotation_deg=90.0)
         )
-        found = grow_branch(ready, np.eye(4), known_coverage(ready, square_camera()))
+        found = grow_branch(ready, np.eye(4), ready.measured.known)
         images = scene.render(ready.scoring_cameras(found.poses)).alpha.numpy()
         assert (images >= 0.5).any(axis=(1, 2)).all()
 

@@ -15,25 +15,27 @@ from extrags.cameras import Cameras
 from extrags.errors import ConfigError
 from extrags.exploration import Exploration, WaveState, explore, merge_wave, start_views
 from extrags.exploration.coverage import (
-    PairValue,
     count_pairs,
     coverage_gain,
     rendered_pairs,
     training_coverage,
 )
 from extrags.exploration.search import Branch, grow_branch, prepare_search
+from extrags.exploration.seen import PairValue, Seen
+from extrags.exploration.waves import Least
 
 from .tube import SEEN, make_tube, small_config, small_freespace, small_tube
 
 
-def made_branch(anchor: int, pairs: np.ndarray, length: int = 3) -> Branch:
+def made_branch(anchor: int, words: np.ndarray, length: int = 3, gaussians: int = 4) -> Branch:
+    row = np.flatnonzero(words).astype(np.int32)
     return Branch(
         anchor,
         np.stack([np.eye(4)] * length),
         ("move_right",) * (length - 1),
-        (1,) * (length - 1),
         (1.0,) * (length - 1),
-        pairs,
+        Seen(row, words[row]),
+        words[:gaussians],
         1,
         1,
         "made",
@@ -42,7 +44,16 @@ def made_branch(anchor: int, pairs: np.ndarray, length: int = 3) -> Branch:
 
 def made_state(**changes: object) -> WaveState:
     nothing = np.zeros(6, np.uint32)
-    state = WaveState(nothing, nothing, PairValue(4, 2.5), waiting=(0, 1, 2, 3), room=4, min_gain=2, wave=2)
+    state = WaveState(
+        nothing[:4],
+        nothing[:4],
+        nothing,
+        PairValue(4, 2.5),
+        waiting=(0, 1, 2, 3),
+        room=4,
+        least=Least(2.0),
+        wave=2,
+    )
     return replace(state, **changes)
 
 
@@ -99,9 +110,10 @@ class TestMergeWave:
         covered = words[0] & words[1]
         merge = merge_wave(
             covered,
-            [made_branch(i, w) for i, w in enumerate(words)],
+            covered[:5],
+            [made_branch(i, w, gaussians=5) for i, w in enumerate(words)],
             PairValue(5, frontier_pair),
-            min_gain=min_gain,
+            least=Least(float(min_gain)),
             room=room,
         )
         assert len(merge.accepted) <= room
@@ -112,7 +124,8 @@ class TestMergeWave:
             assert value(check, words[index]) == worth == max(left) >= min_gain
             assert coverage_gain(check[:5], words[index][:5]) == gain
             check |= words[index]
-        np.testing.assert_array_equal(check, merge.coverage)
+        np.testing.assert_array_equal(check, merge.known)
+        np.testing.assert_array_equal(check[:5], merge.pairs)
         if len(merge.accepted) < room:
             rest = [i for i in range(6) if i not in merge.accepted]
             assert all(value(check, words[i]) < min_gain for i in rest)
@@ -124,23 +137,45 @@ class TestMergeWave:
         )
         nothing = np.zeros(4, np.uint32)
         merge = merge_wave(
-            nothing, [made_branch(i, w) for i, w in enumerate(words)], PairValue(4), min_gain=1, room=3
+            nothing,
+            nothing,
+            [made_branch(i, w) for i, w in enumerate(words)],
+            PairValue(4),
+            least=Least(1.0),
+            room=3,
         )
         best = max(
             int(count_pairs(words[a] | words[b] | words[c]))
             for a, b, c in itertools.combinations(range(7), 3)
         )
-        assert count_pairs(merge.coverage) >= (1 - 1 / np.e) * best
+        assert count_pairs(merge.known) >= (1 - 1 / np.e) * best
 
     def test_a_branch_that_never_left_its_start_is_not_accepted(self):
         merge = merge_wave(
             np.zeros(2, np.uint32),
+            np.zeros(2, np.uint32),
             [made_branch(0, np.full(2, 255, np.uint32), length=1)],
             PairValue(2),
-            min_gain=1,
+            least=Least(1.0),
             room=3,
         )
         assert merge.accepted == ()
+
+
+    def test_a_branch_that_the_others_left_too_little_waits_for_another_turn(self):
+        first, second = np.array([15, 0, 0, 0], np.uint32), np.array([12, 1, 0, 0], np.uint32)
+        nothing = np.zeros(4, np.uint32)
+        branches = [made_branch(0, first), made_branch(1, second)]
+
+        def accepted(kept_share: float) -> tuple[int, ...]:
+            least = Least(1.0, kept_share=kept_share)
+            return merge_wave(nothing, nothing, branches, PairValue(4), least=least, room=3).accepted
+
+        assert accepted(0.3) == (0, 1)
+        assert accepted(0.5) == (0,)
+        state = made_state(least=Least(1.0, kept_share=0.5)).merged(branches)
+        assert state.waiting == (2, 3, 0, 1)
+        assert "grows again" in state.rejected[0]
 
 
 class TestWaveState:
@@ -154,13 +189,13 @@ class TestWaveState:
         assert state.waiting == (2, 3, 0)
         assert state.gains == (3,)
         assert state.room == 3
-        assert "from view 1: adds 0 pairs (0 alone), needs 2" in state.rejected[0]
+        assert "from view 1: adds 0 pairs (0 pairs alone), needs 2 pairs" in state.rejected[0]
 
     def test_an_anchor_that_lost_to_its_neighbour_may_try_again(self):
         full = np.array([7, 0, 0, 0, 0, 0], np.uint32)
         state = made_state().merged([made_branch(0, full), made_branch(1, full)])
         assert state.waiting == (2, 3, 0, 1)
-        assert "adds 0 pairs (3 alone)" in state.rejected[0]
+        assert "adds 0 pairs (3 pairs alone)" in state.rejected[0]
 
     def test_a_trajectory_into_a_hole_is_accepted(self):
         # Rows 4 and 5 are frontier voxels: this branch covers no Gaussian anew.
@@ -168,7 +203,7 @@ class TestWaveState:
         state = made_state().merged([made_branch(0, into), made_branch(1, into)])
         assert state.gains == (0,)
         assert state.values == (7.5,)
-        assert "from view 1: adds 0 pairs (8 alone)" in state.rejected[0]
+        assert "from view 1: adds 0 pairs (8 pairs alone)" in state.rejected[0]
 
     def test_ends_when_there_is_no_room(self):
         full = np.array([7, 0, 0, 0, 0, 0], np.uint32)
@@ -185,9 +220,10 @@ class TestWaveState:
         state = made_state().merged([made_branch(0, full), made_branch(1, full)])
         state.save(tmp_path / "state")
         loaded = WaveState.load(tmp_path / "state")
-        np.testing.assert_array_equal(loaded.coverage, state.coverage)
+        np.testing.assert_array_equal(loaded.known, state.known)
+        np.testing.assert_array_equal(loaded.pairs, state.pairs)
         np.testing.assert_array_equal(loaded.branches[0].pairs, state.branches[0].pairs)
-        for name in ("value", "waiting", "room", "min_gain", "wave", "gains", "values", "rejected", "waves"):
+        for name in ("value", "waiting", "room", "least", "wave", "gains", "values", "rejected", "waves"):
             assert getattr(loaded, name) == getattr(state, name)
 
 

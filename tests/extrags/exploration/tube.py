@@ -159,5 +159,17 @@ def small_freespace() -> FreeSpace:
 
 
 def small_config(**changes: object) -> ExploreConfig:
-    settings = {"trajectories": 4, "length": 5, "render_width": 32, "max_expansions": 12, "wave": 3}
+    """Small budgets, and the score by pairs with the paper's two weights unless told otherwise."""
+    settings = {
+        "score": "pairs",
+        "trajectories": 4,
+        "length": 5,
+        "render_width": 32,
+        "max_expansions": 12,
+        "wave": 3,
+        "wave_kept_share": 0.0,
+        "probe_views": 64,
+        "darkness_weight": 0.5,
+        "fold_penalty": 0.6,
+    }
     return ExploreConfig.model_validate(settings | changes)
