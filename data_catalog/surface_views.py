@@ -1,0 +1,381 @@
+"""What views show of the true surface: of what training never saw, and of what it saw badly.
+
+The measure of a search for virtual views. It knows the true surface and is for evaluation alone: no stage of
+the pipeline may look at it.
+
+**Denominator.** Samples spread evenly by area over the true surface (`extrags.metrics.surface`), as far as a
+camera near the recording could see them: a sample counts when at least one *viewpoint* has it in free sight,
+at less than `MAX_INCIDENCE_DEG` from its normal and no farther away than the `FAR_QUANTILE` of all true
+distances in the sequence. Viewpoints are the camera centres of all frames, held-out ones included, and points of the lumen
+within one median depth of them, which a camera reaches on a straight way and with the clearance
+`VIEWPOINT_CLEARANCE_SHARE`. They look in all directions.
+
+**Never seen.** No training camera has the sample in its image, inside the frame's mask, in free sight and at
+less than `MAX_INCIDENCE_DEG`.
+
+**Badly seen.** Seen, but not well (`WellSeen`).
+
+Free sight is a ray against the true surface. Nothing depends on a reconstruction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt32
+
+from data_catalog.ray_casting import RayCaster
+from data_catalog.true_surface import true_surface
+from extrags.cameras import Cameras, pixel_rays
+from extrags.errors import CaptureError
+from extrags.exploration.coverage import direction_bin
+from extrags.metrics.surface import TrueSurface, sample_triangles
+from extrags.sequence import EndoscopicSequence
+from extrags.surface import Mesh
+
+__all__ = ["SurfaceCoverage", "SurfaceTruth", "Visible", "WellSeen"]
+
+MAX_INCIDENCE_DEG = 85.0
+"""Surface seen under a larger angle from its normal counts as not seen."""
+FAR_QUANTILE = 0.98
+"""Quantile of the true distance of pixels beyond which surface is out of reach; that of the surface metrics."""
+VIEWPOINT_CLEARANCE_SHARE = 0.15
+"""Smallest clearance of a viewpoint, in median true depths: that of virtual cameras by default."""
+VIEWPOINTS_PER_FRAME = 6
+MAX_VIEWPOINT_FRAMES = 60
+N_SAMPLES = 40_000
+MAX_HELD_OUT_PIXELS = 20_000
+DIRECTIONS = 32
+_SAME_SURFACE_SHARE = 0.05
+"""A pixel's ray hits the true surface where the true depth says, up to this share of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class WellSeen:
+    """When surface counts as well seen: from several directions, each of them near and steep enough.
+
+    Args:
+        min_directions: views from so many different cells of the sphere (`direction_bin`, 32 cells).
+        max_distance_share: only views from at most so far count, in median true depths of training frames.
+        max_incidence_deg: only views under at most this angle from the normal count.
+    """
+
+    min_directions: int = 2
+    max_distance_share: float = 1.5
+    max_incidence_deg: float = 75.0
+
+
+@dataclass(frozen=True, slots=True)
+class Visible:
+    """What one camera sees of a set of surface points.
+
+    Args:
+        index: of the points it sees, rising, [M].
+        distance_mm: of each from the camera, [M].
+        incidence_cos: cosine of the angle between the normal and the way to the camera, [M].
+        toward: unit vectors from the points to the camera, [M, 3].
+    """
+
+    index: Int[np.ndarray, "m"]
+    distance_mm: Float[np.ndarray, "m"]
+    incidence_cos: Float[np.ndarray, "m"]
+    toward: Float[np.ndarray, "m 3"]
+
+
+@dataclass(frozen=True)
+class SurfaceCoverage:
+    """What a list of views adds, cumulative: entry v is after the first v views, entry 0 without any.
+
+    All are shares of 0 to 1; NaN where there is nothing that could be seen.
+
+    Args:
+        never_seen: share of the never-seen area that the views see, [V + 1].
+        badly_seen: share of the badly-seen area that is well seen from training and virtual views together,
+            [V + 1].
+        held_out: share of the never-observed pixels of held-out frames whose surface the views see, [V + 1].
+    """
+
+    never_seen: Float[np.ndarray, "v"]
+    badly_seen: Float[np.ndarray, "v"]
+    held_out: Float[np.ndarray, "v"]
+
+    def __len__(self) -> int:
+        """V, the number of views."""
+        return len(self.never_seen) - 1
+
+    def after(self, n_views: int) -> dict[str, float]:
+        """The three shares after so many views; after all where there are fewer."""
+        row = min(n_views, len(self))
+        return {name: float(getattr(self, name)[row]) for name in ("never_seen", "badly_seen", "held_out")}
+
+
+@dataclass(frozen=True)
+class SurfaceTruth:
+    """The true surface of a sequence, in samples of equal area, and what training saw of it.
+
+    Args:
+        points: the samples that a camera near the recording could see, [P, 3].
+        normals: unit normals into the lumen, [P, 3].
+        area_mm2: area that one sample stands for.
+        reachable_share: share of all of the true surface that the samples stand for.
+        seen: by a training camera, [P].
+        well_from: cells of the sphere from which training sees the sample well, one bit each, [P].
+        held_out_points: surface at never-observed pixels of held-out frames, [Q, 3].
+        held_out_normals: its unit normals, [Q, 3].
+        unit_mm: median true depth of the training frames.
+        rule: when surface counts as well seen.
+        kind: `mesh` for the source's own geometry, `depth` for the fusion of its true depth.
+        rays: rays against the surface.
+        mesh: the surface.
+    """
+
+    points: Float[np.ndarray, "p 3"]
+    normals: Float[np.ndarray, "p 3"]
+    area_mm2: float
+    reachable_share: float
+    seen: Bool[np.ndarray, "p"]
+    well_from: UInt32[np.ndarray, "p"]
+    held_out_points: Float[np.ndarray, "q 3"]
+    held_out_normals: Float[np.ndarray, "q 3"]
+    unit_mm: float
+    rule: WellSeen
+    kind: Literal["mesh", "depth"]
+    rays: RayCaster
+    mesh: Mesh
+
+    @property
+    def never_seen(self) -> Bool[np.ndarray, "p"]:
+        """Samples that no training camera sees."""
+        return ~self.seen
+
+    @property
+    def badly_seen(self) -> Bool[np.ndarray, "p"]:
+        """Samples that training cameras see, but not well."""
+        return self.seen & ~self.is_well(self.well_from)
+
+    @classmethod
+    def of(
+        cls,
+        sequence: EndoscopicSequence,
+        seed: int = 0,
+        *,
+        rule: WellSeen | None = None,
+        n_samples: int = N_SAMPLES,
+        surface: TrueSurface | None = None,
+    ) -> SurfaceTruth:
+        """Sample the true surface of a sequence and look at it through the training cameras.
+
+        Args:
+            sequence: all frames, held-out ones included, as the source has them.
+            seed: of the samples and the viewpoints.
+            rule: when surface counts as well seen; None takes the defaults.
+            n_samples: samples of all of the surface, out of reach or not.
+            surface: the true surface; None takes `true_surface`.
+
+        Raises:
+            CaptureError: where the sequence has no true surface or no true depth, or none of it can be seen.
+            ShapeError: while the poses are unknown.
+        """
+        rule = WellSeen() if rule is None else rule
+        truth = true_surface(sequence) if surface is None else surface
+        depth = sequence.true_depth_mm
+        if truth is None or depth is None:
+            raise CaptureError(
+                f"{sequence.name} has no true surface: neither geometry nor true depth of its frames"
+            )
+        rng = np.random.default_rng([seed, 0x5EE])
+        rays = RayCaster(truth.mesh.vertices, truth.mesh.triangles)
+        unit_mm = float(np.median(_known(depth, sequence.mask, sequence.train)))
+        frames = np.concatenate([sequence.train, sequence.test])
+        # Along the rays, as what is compared with it: towards the corners of an image z-depth is shorter.
+        distance = np.zeros_like(depth)
+        for frame in frames:
+            distance[frame] = depth[frame] * np.linalg.norm(
+                pixel_rays(sequence.cameras[int(frame)])[0], axis=-1
+            )
+        far_mm = float(np.quantile(_known(distance, sequence.mask, frames), FAR_QUANTILE))
+        normals = _triangle_normals(truth.mesh)
+
+        points, triangle = sample_triangles(truth.mesh, n_samples, seed=seed)
+        eyes = _viewpoints(rays, sequence.cameras[frames].centers, unit_mm, rng)
+        reachable = _in_sight_of(rays, points, normals[triangle], eyes, far_mm)
+        if not reachable.any():
+            raise CaptureError(f"{sequence.name}: no camera near the recording sees any true surface")
+        held_out_points, held_out_triangle = _unobserved_surface(rays, sequence, depth, rng)
+        self = cls(
+            points=points[reachable],
+            normals=normals[triangle[reachable]],
+            area_mm2=_area_mm2(truth.mesh) / n_samples,
+            reachable_share=float(reachable.mean()),
+            seen=np.zeros(np.count_nonzero(reachable), dtype=bool),
+            well_from=np.zeros(np.count_nonzero(reachable), dtype=np.uint32),
+            held_out_points=held_out_points,
+            held_out_normals=normals[held_out_triangle],
+            unit_mm=unit_mm,
+            rule=rule,
+            kind=truth.kind,
+            rays=rays,
+            mesh=truth.mesh,
+        )
+        for frame in sequence.train:
+            visible = self.visible(sequence.cameras[int(frame)], sequence.mask[frame])
+            self.seen[visible.index] = True
+            self.well_from[visible.index] |= self.well_words(visible)
+        return self
+
+    def visible(self, camera: Cameras, mask: Bool[np.ndarray, "h w"] | None = None) -> Visible:
+        """What a camera sees of the samples.
+
+        Args:
+            camera: the view, a batch of one.
+            mask: its valid pixels; None is all of the image.
+        """
+        return _visible(self.rays, self.points, self.normals, camera, mask)
+
+    def well_words(self, visible: Visible) -> UInt32[np.ndarray, "m"]:
+        """For each visible sample the bit of the direction it is seen from, 0 where not near and steep."""
+        near = visible.distance_mm <= self.rule.max_distance_share * self.unit_mm
+        steep = visible.incidence_cos >= np.cos(np.radians(self.rule.max_incidence_deg))
+        word = np.uint32(1) << direction_bin(visible.toward, DIRECTIONS).astype(np.uint32)
+        return np.where(near & steep, word, np.uint32(0)).astype(np.uint32)
+
+    def is_well(self, well_from: UInt32[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+        """Whether samples seen well from these directions, one bit each, are well seen."""
+        return np.asarray(np.bitwise_count(well_from) >= self.rule.min_directions)
+
+    def measure(self, cameras: Cameras | Sequence[Cameras]) -> SurfaceCoverage:
+        """What virtual views add to the training views, view by view.
+
+        Args:
+            cameras: the views in order, or batches of them (e.g. one per trajectory), without real ones.
+        """
+        batches = [cameras] if isinstance(cameras, Cameras) else list(cameras)
+        never, badly = self.never_seen, self.badly_seen
+        seen, well = np.zeros(len(self.points), dtype=bool), self.well_from.copy()
+        served = np.zeros(len(self.held_out_points), dtype=bool)
+        rows = [(0.0, 0.0, 0.0)]
+        for camera in (batch[index] for batch in batches for index in range(len(batch))):
+            visible = self.visible(camera)
+            seen[visible.index] = True
+            well[visible.index] |= self.well_words(visible)
+            left = np.flatnonzero(~served)
+            points, normals = self.held_out_points[left], self.held_out_normals[left]
+            served[left[_visible(self.rays, points, normals, camera).index]] = True
+            rows.append((float(seen[never].sum()), float(self.is_well(well[badly]).sum()), served.sum()))
+        total = np.array([never.sum(), badly.sum(), len(served)], dtype=np.float64)
+        shares = np.array(rows) / np.where(total > 0, total, np.nan)
+        return SurfaceCoverage(*np.ascontiguousarray(shares.T))
+
+
+def _visible(
+    rays: RayCaster,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    camera: Cameras,
+    mask: Bool[np.ndarray, "h w"] | None = None,
+) -> Visible:
+    center = camera.centers[0]
+    toward = center - points
+    distance = np.sqrt(np.einsum("nk,nk->n", toward, toward))
+    cosine = np.einsum("nk,nk->n", toward, normals) / np.maximum(distance, 1e-12)
+    facing = np.flatnonzero(cosine > np.cos(np.radians(MAX_INCIDENCE_DEG)))
+    (pixels,), _ = camera.project(points[facing])
+    inside = camera.contains(pixels)
+    if mask is not None:
+        column, row = pixels[inside].astype(np.int64).T
+        inside[inside] = mask[row, column]
+    index = facing[inside]
+    index = index[rays.reaches(center, -toward[index])] if len(index) else index
+    return Visible(index, distance[index], cosine[index], toward[index] / distance[index][:, None])
+
+
+def _in_sight_of(
+    rays: RayCaster,
+    points: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    eyes: Float[np.ndarray, "e 3"],
+    far_mm: float,
+) -> Bool[np.ndarray, "n"]:
+    """Which points any of the eyes, looking everywhere, has in free sight."""
+    found = np.zeros(len(points), dtype=bool)
+    for eye in eyes:
+        left = np.flatnonzero(~found)
+        toward = eye - points[left]
+        distance = np.linalg.norm(toward, axis=1)
+        cosine = np.einsum("nk,nk->n", toward, normals[left]) / np.maximum(distance, 1e-12)
+        near = (cosine > np.cos(np.radians(MAX_INCIDENCE_DEG))) & (distance <= far_mm)
+        if near.any():
+            found[left[near]] = rays.reaches(eye, -toward[near])
+    return found
+
+
+def _viewpoints(
+    rays: RayCaster, centers: Float[np.ndarray, "f 3"], unit_mm: float, rng: np.random.Generator
+) -> Float[np.ndarray, "e 3"]:
+    """Camera centres, evenly thinned, and points of the lumen within `unit_mm` of them, [E, 3]."""
+    kept = np.linspace(0, len(centers) - 1, min(len(centers), MAX_VIEWPOINT_FRAMES)).round().astype(int)
+    offset = rng.normal(size=(len(kept), VIEWPOINTS_PER_FRAME, 3))
+    # The cube root spreads the points evenly over the ball.
+    radius = unit_mm * np.cbrt(rng.random((len(kept), VIEWPOINTS_PER_FRAME, 1)))
+    offset *= radius / np.linalg.norm(offset, axis=-1, keepdims=True)
+    found = [centers[kept]]
+    for center, around in zip(centers[kept], offset, strict=True):
+        # `reaches` stops short of its aim: what is cast is a little longer than the way.
+        clear = rays.clearance_mm(center + around) >= VIEWPOINT_CLEARANCE_SHARE * unit_mm
+        found.append((center + around)[clear & rays.reaches(center, 1.01 * around)])
+    return np.concatenate(found)
+
+
+def _unobserved_surface(
+    rays: RayCaster,
+    sequence: EndoscopicSequence,
+    depth_mm: Float[np.ndarray, "f h w"],
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, "q 3"], Int[np.ndarray, "q"]]:
+    """Points and triangles of the surface at never-observed pixels of held-out frames.
+
+    Pixels whose ray misses the true surface, or hits it elsewhere than the true depth says, are left out.
+    At most `MAX_HELD_OUT_PIXELS`, drawn evenly from all.
+    """
+    points, triangles = [np.zeros((0, 3))], [np.zeros(0, dtype=np.int64)]
+    if sequence.observed is not None:
+        for frame in sequence.test:
+            known = (depth_mm[frame] > 0) & np.isfinite(depth_mm[frame])
+            chosen = known & sequence.mask[frame] & ~sequence.observed[frame]
+            camera = sequence.cameras[int(frame)]
+            along = pixel_rays(camera)[0][chosen]
+            hits = rays.cast(camera.centers[0], along)
+            true = depth_mm[frame][chosen]
+            same = np.abs(hits.distance - true) <= _SAME_SURFACE_SHARE * true
+            points.append(camera.centers[0] + along[same] * hits.distance[same][:, None].astype(np.float64))
+            triangles.append(hits.triangle[same])
+    point, triangle = np.concatenate(points), np.concatenate(triangles)
+    if len(point) > MAX_HELD_OUT_PIXELS:
+        kept = np.sort(rng.choice(len(point), MAX_HELD_OUT_PIXELS, replace=False))
+        point, triangle = point[kept], triangle[kept]
+    return point, triangle
+
+
+def _known(
+    depth_mm: Float[np.ndarray, "f h w"], mask: Bool[np.ndarray, "f h w"], frames: Int[np.ndarray, "n"]
+) -> Float[np.ndarray, "k"]:
+    depth = depth_mm[frames]
+    found = depth[(depth > 0) & np.isfinite(depth) & mask[frames]]
+    if found.size == 0:
+        raise CaptureError("none of the training frames has true depth; there is no scale to measure by")
+    return np.asarray(found)
+
+
+def _triangle_normals(mesh: Mesh) -> Float[np.ndarray, "t 3"]:
+    """Unit normals on the side of free space; zero where a triangle has no area."""
+    a, b, c = mesh.vertices.astype(np.float64)[mesh.triangles].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12))
+
+
+def _area_mm2(mesh: Mesh) -> float:
+    a, b, c = mesh.vertices.astype(np.float64)[mesh.triangles].transpose(1, 0, 2)
+    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
