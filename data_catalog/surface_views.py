@@ -21,7 +21,7 @@ Free sight is a ray against the true surface. Nothing depends on a reconstructio
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal
 
 import numpy as np
@@ -35,7 +35,7 @@ from extrags.metrics.surface import TrueSurface, sample_triangles
 from extrags.sequence import EndoscopicSequence
 from extrags.surface import Mesh
 
-__all__ = ["Seen", "SurfaceCoverage", "SurfaceTruth", "Visible", "WellSeen"]
+__all__ = ["Seen", "SurfaceCoverage", "SurfaceTruth", "Visible", "WellSeen", "sight_of"]
 
 MAX_INCIDENCE_DEG = 85.0
 """Surface seen under a larger angle from its normal counts as not seen."""
@@ -131,18 +131,23 @@ class Seen:
             & (visible.incidence_cos >= np.cos(np.radians(self.rule.max_incidence_deg)))
         )
 
-    def add(self, visible: Visible) -> None:
-        """Count one more view."""
-        self.seen[visible.index] = True
-        good = self.good(visible)
-        index, toward = visible.index[good], visible.toward[good]
-        before = self.good_from[index]
-        first = ~before.any(axis=1)
+    def news(self, visible: Visible) -> tuple[Bool[np.ndarray, "m"], Bool[np.ndarray, "m"]]:
+        """Which samples a further view would be the first good one of, and which it would make well seen."""
+        before = self.good_from[visible.index]
+        good, first = self.good(visible), ~before.any(axis=1)
         # Against the first good view alone, not all pairs: of three views the angle may be missed by a factor
         # of two, which is nothing beside the arbitrariness of the threshold.
-        apart = np.einsum("mk,mk->m", before, toward) <= np.cos(np.radians(self.rule.min_separation_deg))
-        self.well[index[~first & apart]] = True
-        self.good_from[index[first]] = toward[first]
+        apart = np.einsum("mk,mk->m", before, visible.toward) <= np.cos(
+            np.radians(self.rule.min_separation_deg)
+        )
+        return good & first, good & ~first & apart & ~self.well[visible.index]
+
+    def add(self, visible: Visible) -> None:
+        """Count one more view."""
+        first, second = self.news(visible)
+        self.seen[visible.index] = True
+        self.well[visible.index[second]] = True
+        self.good_from[visible.index[first]] = visible.toward[first]
 
 
 @dataclass(frozen=True)
@@ -153,12 +158,14 @@ class SurfaceCoverage:
 
     Args:
         never_seen: share of the never-seen area that the views see, [V + 1].
+        never_seen_well: share of it that they see well, [V + 1].
         badly_seen: share of the badly-seen area that is well seen from training and virtual views together,
             [V + 1].
         held_out: share of the never-observed pixels of held-out frames whose surface the views see, [V + 1].
     """
 
     never_seen: Float[np.ndarray, "v"]
+    never_seen_well: Float[np.ndarray, "v"]
     badly_seen: Float[np.ndarray, "v"]
     held_out: Float[np.ndarray, "v"]
 
@@ -167,9 +174,9 @@ class SurfaceCoverage:
         return len(self.never_seen) - 1
 
     def after(self, n_views: int) -> dict[str, float]:
-        """The three shares after so many views; after all where there are fewer."""
+        """The shares after so many views, by name; after all where there are fewer."""
         row = min(n_views, len(self))
-        return {name: float(getattr(self, name)[row]) for name in ("never_seen", "badly_seen", "held_out")}
+        return {item.name: float(getattr(self, item.name)[row]) for item in fields(self)}
 
 
 @dataclass(frozen=True)
@@ -285,7 +292,7 @@ class SurfaceTruth:
             camera: the view, a batch of one.
             mask: its valid pixels; None is all of the image.
         """
-        return _visible(self.rays, self.points, self.normals, camera, mask)
+        return sight_of(self.rays, self.points, self.normals, camera, mask)
 
     def measure(self, cameras: Cameras | Sequence[Cameras]) -> SurfaceCoverage:
         """What virtual views add to the training views, view by view.
@@ -297,25 +304,35 @@ class SurfaceTruth:
         never, badly = self.never_seen, self.badly_seen
         seen = self.training.copy()
         served = np.zeros(len(self.held_out_points), dtype=bool)
-        rows = [(0.0, 0.0, 0.0)]
+        rows = [(0.0, 0.0, 0.0, 0.0)]
         for camera in (batch[index] for batch in batches for index in range(len(batch))):
             seen.add(self.visible(camera))
             left = np.flatnonzero(~served)
             points, normals = self.held_out_points[left], self.held_out_normals[left]
-            served[left[_visible(self.rays, points, normals, camera).index]] = True
-            rows.append((float(seen.seen[never].sum()), float(seen.well[badly].sum()), float(served.sum())))
-        total = np.array([never.sum(), badly.sum(), len(served)], dtype=np.float64)
+            served[left[sight_of(self.rays, points, normals, camera).index]] = True
+            found = (seen.seen[never], seen.well[never], seen.well[badly], served)
+            rows.append(tuple(float(np.count_nonzero(part)) for part in found))
+        total = np.array([never.sum(), never.sum(), badly.sum(), len(served)], dtype=np.float64)
         shares = np.array(rows) / np.where(total > 0, total, np.nan)
         return SurfaceCoverage(*np.ascontiguousarray(shares.T))
 
 
-def _visible(
+def sight_of(
     rays: RayCaster,
     points: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     camera: Cameras,
     mask: Bool[np.ndarray, "h w"] | None = None,
 ) -> Visible:
+    """What a camera sees of points on a surface: in its image, in free sight and not grazing.
+
+    Args:
+        rays: against the surface.
+        points: on the surface, [N, 3].
+        normals: unit normals on the side of free space, [N, 3].
+        camera: the view, a batch of one.
+        mask: its valid pixels; None is all of the image.
+    """
     center = camera.centers[0]
     toward = center - points
     distance = np.sqrt(np.einsum("nk,nk->n", toward, toward))
