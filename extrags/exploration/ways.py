@@ -280,7 +280,7 @@ def greedy_clips(
         beam: paths kept.
         min_gain: ends with the first clip that adds no more.
 
-    Source: Minoux 1978, "Accelerated greedy algorithms for maximizing submodular set functions".
+    Source: [Minoux1978], see docs/references.md.
     """
     grower = _Grower(moves, worth, beam)
     clips: list[Clip] = []
