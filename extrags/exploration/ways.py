@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import heapq
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -46,22 +46,20 @@ MAX_FRONTIER_VOXELS = 1500
 FRONTIER_REACH_UNITS = 3.0
 """A frontier voxel farther from the camera than so many depth units does not count as seen."""
 
-S = TypeVar("S")
-"""What one view sees."""
 
-
-class Worth(Protocol[S]):
+@runtime_checkable
+class Worth(Protocol):
     """What views are worth, given those that were chosen already; a value, not changed by its methods."""
 
-    def look(self, pose: Float[np.ndarray, "4 4"]) -> S:
+    def look(self, pose: Float[np.ndarray, "4 4"]) -> Any:
         """What a view at this `world_from_camera` sees; independent of other views."""
         ...
 
-    def gain(self, sight: S) -> float:
+    def gain(self, sight: Any) -> float:
         """What a view that sees this adds."""
         ...
 
-    def after(self, sight: S) -> Worth[S]:
+    def after(self, sight: Any) -> Worth:
         """What views are worth once this one is chosen."""
         ...
 
@@ -263,7 +261,7 @@ class _FrontierWorth:
 
 
 def greedy_clips(
-    moves: Moves, cameras: Cameras, n_views: int, worth: Worth[Any], *, beam: int, min_gain: float = 0.0
+    moves: Moves, cameras: Cameras, n_views: int, worth: Worth, *, beam: int, min_gain: float = 0.0
 ) -> list[Clip]:
     """Clips chosen one after the other by what they add to those before.
 
@@ -311,7 +309,7 @@ def greedy_clips(
 @dataclass
 class _Path:
     poses: list[Float[np.ndarray, "4 4"]]
-    worth: Worth[Any]
+    worth: Worth
     gain: float = 0.0
 
 
@@ -320,7 +318,7 @@ class _Grower:
     """Beam search for the clip that adds most; remembers what each pose sees and where it leads."""
 
     moves: Moves
-    sights: Worth[Any]
+    sights: Worth
     beam: int
     _seen: dict[bytes, Any] = field(default_factory=dict)
     _next: dict[bytes, Float[np.ndarray, "a 4 4"]] = field(default_factory=dict)
@@ -339,7 +337,7 @@ class _Grower:
             self._next[key] = self.moves.possible(pose, self.sights.look_at_mm(pose))
         return self._next[key]
 
-    def best(self, start: Float[np.ndarray, "4 4"], worth: Worth[Any], length: int) -> _Path:
+    def best(self, start: Float[np.ndarray, "4 4"], worth: Worth, length: int) -> _Path:
         """The best clip of at most so many views, the start included."""
         paths = [_Path([start], worth)]
         best = paths[0]

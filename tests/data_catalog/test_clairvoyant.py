@@ -1,4 +1,4 @@
-"""Views chosen with the true surface: what they show is what the truth measures, and no other way shows more."""
+"""Views chosen with the true surface: what they are worth is what the truth measures."""
 
 from __future__ import annotations
 
@@ -78,4 +78,3 @@ def test_free_poses_need_about_as_many_views_as_there_are_faces(truth: SurfaceTr
     again = oracle_poses(truth, moves, AHEAD, 3, seed=0, pool=200)
     assert all(np.array_equal(a.poses, b.poses) for a, b in zip(again, clips[:3], strict=True))
     assert found.never_seen[3] >= truth.measure(SIDES[:3]).never_seen[-1] - 0.1
-
