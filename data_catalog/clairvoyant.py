@@ -78,7 +78,8 @@ class LackingSurface:
     def gain(self, sight: Visible) -> float:
         """How many samples a view serves that were not served before."""
         first, second = self.seen.news(sight)
-        return float(np.count_nonzero(~self.seen.seen[sight.index])) + 0.5 * (first.sum() + second.sum())
+        unseen = np.count_nonzero(~self.seen.seen[sight.index])
+        return float(unseen + 0.5 * (np.count_nonzero(first) + np.count_nonzero(second)))
 
     def after(self, sight: Visible) -> LackingSurface:
         """With one more view."""

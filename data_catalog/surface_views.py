@@ -212,12 +212,12 @@ class SurfaceTruth:
     @property
     def never_seen(self) -> Bool[np.ndarray, "p"]:
         """Samples that no training camera sees."""
-        return ~self.training.seen
+        return np.asarray(~self.training.seen)
 
     @property
     def badly_seen(self) -> Bool[np.ndarray, "p"]:
         """Samples that training cameras see, but not well."""
-        return self.training.seen & ~self.training.well
+        return np.asarray(self.training.seen & ~self.training.well)
 
     @classmethod
     def of(
@@ -304,14 +304,14 @@ class SurfaceTruth:
         never, badly = self.never_seen, self.badly_seen
         seen = self.training.copy()
         served = np.zeros(len(self.held_out_points), dtype=bool)
-        rows = [(0.0, 0.0, 0.0, 0.0)]
+        rows = [[0.0, 0.0, 0.0, 0.0]]
         for camera in (batch[index] for batch in batches for index in range(len(batch))):
             seen.add(self.visible(camera))
             left = np.flatnonzero(~served)
             points, normals = self.held_out_points[left], self.held_out_normals[left]
             served[left[sight_of(self.rays, points, normals, camera).index]] = True
             found = (seen.seen[never], seen.well[never], seen.well[badly], served)
-            rows.append(tuple(float(np.count_nonzero(part)) for part in found))
+            rows.append([float(np.count_nonzero(part)) for part in found])
         total = np.array([never.sum(), never.sum(), badly.sum(), len(served)], dtype=np.float64)
         shares = np.array(rows) / np.where(total > 0, total, np.nan)
         return SurfaceCoverage(*np.ascontiguousarray(shares.T))

@@ -209,7 +209,7 @@ def bench_explore(
     ways = check_ways(ways)
     if not views or min([*views, *end_use]) < 1:
         raise ConfigError(f"numbers of views {[*views, *end_use]}; expected 1 or more")
-    cases = []
+    cases: list[dict[str, Any]] = []
     for name in sequences:
         _check_truth(name, profile, settings, store, seeds[0])
     for name in sequences:
@@ -257,7 +257,7 @@ def _cases(
         seconds = time.perf_counter() - begun
         poses = [clip.views for clip in chosen.clips]
         coverage = truth.measure(given.cameras(np.concatenate(poses) if poses else np.zeros((0, 4, 4))))
-        case = {
+        case: dict[str, Any] = {
             **shared,
             "way": way,
             "seconds": seconds,
@@ -270,11 +270,10 @@ def _cases(
             "after_each": _by_view(coverage),
         }
         if tuning is not None:
-            case["end_use"] = {}
+            case["end_use"] = {"0": tuning.before}
             for count in end_use:
                 report(f"{name}, seed {given.seed}: {way}, fine-tuned with {count} views")
                 case["end_use"][str(count)] = tuning.measured(_first_views(chosen.clips, count))
-            case["end_use"]["0"] = tuning.before
         yield case
 
 

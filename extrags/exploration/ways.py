@@ -140,7 +140,7 @@ class Moves:
         look_at = self.unit_mm if look_at_mm is None else look_at_mm
         motions = primitive_motions(self.step_mm, config.rotation_deg, config.orbit_deg, look_at)
         poses = apply_primitives(pose, motions)
-        return poses[self.allowed(pose, poses)]
+        return np.asarray(poses[self.allowed(pose, poses)])
 
 
 def random_walk(moves: Moves, cameras: Cameras, n_views: int, seed: int) -> list[Clip]:
@@ -246,7 +246,7 @@ class _FrontierWorth:
         (pixels,), _ = camera.project(self.points[index])
         index = index[camera.contains(pixels)]
         eye = np.broadcast_to(pose[:3, 3], (len(index), 3))
-        return index[self.moves.space.segment_is_free(eye, self.points[index])]
+        return np.asarray(index[self.moves.space.segment_is_free(eye, self.points[index])])
 
     def gain(self, sight: Int[np.ndarray, "m"]) -> float:
         return float(np.count_nonzero(self.left[sight]))
