@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
@@ -37,6 +37,7 @@ __all__ = [
     "distance_to_surface",
     "evaluate_surface",
     "sample_surface",
+    "sample_triangles",
     "scene_surface",
     "seen_by",
     "surface_errors",
@@ -241,6 +242,17 @@ def sample_surface(mesh: Mesh, n_samples: int, *, seed: int) -> Float[np.ndarray
     Raises:
         ConfigError: for a mesh without area, or no samples.
     """
+    return sample_triangles(mesh, n_samples, seed=seed)[0]
+
+
+def sample_triangles(
+    mesh: Mesh, n_samples: int, *, seed: int
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    """As `sample_surface`; also the triangle that each point lies in.
+
+    Raises:
+        ConfigError: as `sample_surface`.
+    """
     if n_samples < 1:
         raise ConfigError(f"{n_samples} samples of a surface; expected 1 or more")
     corners = mesh.vertices[mesh.triangles].astype(np.float64)
@@ -255,7 +267,7 @@ def sample_surface(mesh: Mesh, n_samples: int, *, seed: int) -> Float[np.ndarray
     # Square root: uniform in the triangle, not in the parallelogram's skew (Osada et al. 2002).
     root, along = np.sqrt(rng.random(n_samples)), rng.random(n_samples)
     weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
-    return np.asarray(np.einsum("nk,nkx->nx", weights, corners[triangle]))
+    return np.asarray(np.einsum("nk,nkx->nx", weights, corners[triangle])), triangle
 
 
 def distance_to_surface(
