@@ -413,7 +413,7 @@ class ExploreConfig(StageConfig):
         True, description="score=error: propose straight ways to probes besides the fourteen moves"
     )
     min_view_gain: float = Field(
-        2e-5,
+        4e-5,
         ge=0,
         description="score=error: stop when a trajectory takes less error than this, for each of its views, "
         "from views off the trajectory",

@@ -31,6 +31,8 @@ __all__ = ["Sizes", "SizeModel", "measure_sizes", "probe_cameras", "sizes_in"]
 SMALLEST_SIZE_PX = 0.05
 """A Gaussian with fewer pixels in a view does not count as shown by it."""
 VIEWS_PER_BATCH = 16
+ROUNDING = 1e-5
+"""Clearances are of single precision, and interpolated."""
 SHORTEST_SHIFT = 0.02
 """Probes are shifted by at least this share of the depth unit, or turned in place."""
 
@@ -90,11 +92,13 @@ def probe_cameras(
     count = config.probe_views
     which = np.arange(count) * len(cameras) // count
     poses = cameras.world_from_camera[which].copy()
-    needed = np.minimum(margin_mm, freespace.clearance_at(poses[:, :3, 3]))
+    needed = np.minimum(margin_mm, freespace.clearance_at(poses[:, :3, 3])) * (1 - ROUNDING)
     for index in range(count):
         axis, side = _directions(generator)
         turn, shift = np.radians(config.probe_turn_deg) * generator.uniform(), generator.uniform()
         poses[index, :3, :3] = poses[index, :3, :3] @ rotation_about(axis, turn)
+        # In the camera's own frame, so that nothing depends on how the world is turned.
+        side = cameras.world_from_camera[which[index], :3, :3] @ side
         start, length = poses[index, :3, 3].copy(), shift * config.probe_shift * depth_unit_mm
         while length > SHORTEST_SHIFT * depth_unit_mm:
             center = start + length * side

@@ -31,6 +31,8 @@ __all__ = ["Branch", "SearchContext", "grow_branch", "prepare_search"]
 
 APPROACH = "approach"
 """Name of the moves on a straight way to a destination."""
+ROUNDING = 1e-5
+"""Clearances are of single precision, and interpolated."""
 SAME_POSE_SHARE = 0.25
 """Poses nearer than this share of a step and of a turn are the same pose."""
 
@@ -104,7 +106,8 @@ class SearchContext:
             clearance_mm: at the start. A recording may itself go nearer to the wall than the margin; from
                 there every move that does not go nearer still is allowed.
         """
-        needed = min(self.margin_mm, clearance_mm)
+        # A hair less: a camera that keeps its distance does so in any unit and any frame of the world.
+        needed = min(self.margin_mm, clearance_mm) * (1 - ROUNDING)
         return np.asarray(
             (self.freespace.lookup(ends) == FREE)
             & (self.freespace.clearance_at(ends) >= needed)

@@ -1,0 +1,340 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from extrags.cameras import Cameras, rotation_about, rotation_angle_deg
+from extrags.exploration import Exploration, explore
+from extrags.exploration.approach import Approaches, straight_way
+from extrags.exploration.expected_error import Sizes, measure_sizes, probe_cameras
+from extrags.exploration.measurements import Destinations, SceneMeasurements, frontier_of, measure_scene
+from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
+from extrags.exploration.seen import ErrorValue, PairValue, Seen, Value, union
+from extrags.freespace import FREE, FreeSpace, carve
+from extrags.scene import Scene
+from extrags.surface import fuse_surface
+
+from .tube import Tube, make_ball, make_tube, small_config, small_freespace, small_tube
+
+ROWS = 12
+START = 5
+
+
+def error_config(**changes: object):
+    settings = {"score": "error", "darkness_weight": 0.0, "fold_penalty": 1.0, "rotation_deg": 20.0}
+    return small_config(**settings | {"orbit_deg": 20.0, "max_hole_share": 0.7} | changes)
+
+
+@cache
+def context(**changes: object) -> SearchContext:
+    tube = small_tube()
+    return prepare_search(tube.scene, tube.cameras, small_freespace(), error_config(**changes))
+
+
+@cache
+def explored(**changes: object) -> Exploration:
+    tube = small_tube()
+    return explore(tube.scene, tube.sequence, error_config(**changes), freespace=small_freespace())
+
+
+def random_seen(rng: np.random.Generator, pairs: bool) -> Seen:
+    row = np.flatnonzero(rng.random(ROWS) < 0.5).astype(np.int32)
+    if pairs:
+        return Seen(row, rng.integers(1, 2**32, len(row), dtype=np.uint32))
+    return Seen(row, rng.uniform(0.05, 1, len(row)).astype(np.float32))
+
+
+def random_value(rng: np.random.Generator, pairs: bool) -> tuple[Value, np.ndarray]:
+    if pairs:
+        return PairValue(8, 2.5), np.zeros(ROWS, np.uint32)
+    return ErrorValue(rng.random(ROWS).astype(np.float32)), np.zeros(ROWS, np.float32)
+
+
+class TestValue:
+    @settings(max_examples=60, deadline=None)
+    @given(seed=st.integers(0, 10_000), pairs=st.booleans())
+    def test_is_monotone_and_has_diminishing_returns(self, seed, pairs):
+        rng = np.random.default_rng(seed)
+        value, known = random_value(rng, pairs)
+        few, view = random_seen(rng, pairs), random_seen(rng, pairs)
+        value.add(known, few)
+        more = known.copy()
+        value.add(more, random_seen(rng, pairs))
+        gain, later = value.gain(known, view), value.gain(more, view)
+        assert gain >= later >= 0
+        value.add(known, view)
+        assert value.gain(known, view) == 0
+
+    @settings(max_examples=30, deadline=None)
+    @given(seed=st.integers(0, 10_000), pairs=st.booleans())
+    def test_what_is_beyond_the_known_is_all_that_counts(self, seed, pairs):
+        rng = np.random.default_rng(seed)
+        value, known = random_value(rng, pairs)
+        value.add(known, random_seen(rng, pairs))
+        view = random_seen(rng, pairs)
+        beyond = value.beyond(known, view)
+        assert value.gain(known, beyond) == pytest.approx(value.gain(known, view), rel=1e-6)
+        one, other = known.copy(), known.copy()
+        value.add(one, view)
+        value.add(other, beyond)
+        np.testing.assert_array_equal(one, other)
+        assert len(beyond.row) == np.count_nonzero(one != known)
+
+    def test_a_union_is_worth_what_its_parts_add_one_after_the_other(self):
+        rng = np.random.default_rng(3)
+        for pairs in (True, False):
+            value, known = random_value(rng, pairs)
+            parts = [random_seen(rng, pairs) for _ in range(4)]
+            together = union(value, parts, known)
+            total = 0.0
+            along = known.copy()
+            for part in parts:
+                total += value.gain(along, part)
+                value.add(along, part)
+            assert value.gain(known, together) == pytest.approx(total, rel=1e-6)
+
+
+class TestMeasureSizes:
+    def test_follows_its_formula(self):
+        config = error_config(hole_error=0.3, unresolved_error=0.1, sufficient_resolution=0.5)
+        probes = [
+            Sizes(np.array([0, 2], np.int32), np.array([4.0, 10.0], np.float32)),
+            Sizes(np.array([0], np.int32), np.array([8.0], np.float32)),
+        ]
+        model = measure_sizes(probes, 2, 1, 100, config)
+        np.testing.assert_allclose(model.value.error, [0.1 * 6 / 100, 0, 0.3 * 5 / 100], rtol=1e-6)
+        np.testing.assert_allclose(model.size_px, [(16 + 64) / 12, 0, 10], rtol=1e-6)
+        seen = model.seen(Sizes(np.array([0, 1, 2], np.int32), np.array([2.0, 5.0, 9.0], np.float32)))
+        # Row 1 is in no probe: nothing is known of its worth.
+        assert seen.row.tolist() == [0, 2]
+        np.testing.assert_allclose(seen.value, [2 / (0.5 * 80 / 12), 1.0], rtol=1e-6)
+
+
+class TestProbes:
+    def test_stay_inside_and_differ_from_the_recording(self):
+        tube, space, ready = small_tube(), small_freespace(), context()
+        cameras = tube.cameras.at_most_width(32)
+        probes = probe_cameras(cameras, space, ready.depth_unit_mm, ready.margin_mm, ready.config)
+        assert len(probes) == 64
+        centers = probes.centers
+        assert (space.lookup(centers) == FREE).all()
+        which = np.arange(64) * len(cameras) // 64
+        needed = np.minimum(ready.margin_mm, space.clearance_at(cameras.centers[which]))
+        assert (space.clearance_at(centers) >= needed - 1e-9).all()
+        turned = rotation_angle_deg(
+            probes.world_from_camera[:, :3, :3], cameras.world_from_camera[which, :3, :3]
+        )
+        assert turned.max() > 120
+        assert np.linalg.norm(centers - cameras.centers[which], axis=1).max() > 0.5 * ready.depth_unit_mm
+
+    def test_another_seed_gives_others(self):
+        first, second = context().measured, context(seed=1).measured
+        assert not np.array_equal(first.destinations.poses, second.destinations.poses)
+
+
+class TestMeasureScene:
+    def test_what_was_resolved_is_known_and_holes_are_not(self):
+        ready = context()
+        n = len(ready.scene.gaussians)
+        assert ready.measured.known[:n].max() == 1.0
+        assert (ready.measured.known[n:] == 0).all()
+        assert ready.measured.removable_error > 0
+
+    def test_round_trip_on_disk(self, tmp_path):
+        for ready in (context(), context(score="pairs")):
+            ready.measured.save(tmp_path / ready.config.score)
+            loaded = SceneMeasurements.load(tmp_path / ready.config.score)
+            again = prepare_search(
+                ready.scene, ready.measured.training, ready.freespace, ready.config, loaded
+            )
+            start = loaded.training.world_from_camera[START]
+            one, other = (
+                grow_branch(c, start, c.measured.known, START) for c in (ready, again)
+            )
+            np.testing.assert_array_equal(one.poses, other.poses)
+            assert one.values == other.values
+
+    def test_many_training_views_are_measured_in_part(self):
+        tube = small_tube()
+        poses = np.repeat(tube.cameras.world_from_camera, 5, axis=0)
+        cameras = Cameras(np.repeat(tube.cameras.K, 5, axis=0), poses, tube.cameras.width, tube.cameras.height)
+        config = error_config(max_training_views=10)
+        frontier = frontier_of(tube.scene, small_freespace(), config)
+        measured = measure_scene(tube.scene, cameras, small_freespace(), config, frontier)
+        assert measured.renders == 10 + 64
+        assert len(measured.training) == 40
+
+
+class TestGrowBranch:
+    def test_its_values_are_the_error_its_views_take_away(self):
+        ready = context()
+        found = grow_branch(ready, small_tube().cameras.world_from_camera[START], ready.measured.known, START)
+        known = ready.measured.known.copy()
+        start, *views = ready.observe(found.poses)
+        ready.value.add(known, ready.seen(start))
+        for observation, value in zip(views, found.values, strict=True):
+            assert ready.value.gain(known, ready.seen(observation)) == pytest.approx(value, rel=1e-6)
+            ready.value.add(known, ready.seen(observation))
+        assert 0 < sum(found.values) <= ready.measured.removable_error
+
+    def test_trajectories_are_continuous_and_stay_inside(self):
+        space, ready = small_freespace(), context()
+        for start in (0, 3, 5, 7):
+            pose = small_tube().cameras.world_from_camera[start]
+            found = grow_branch(ready, pose, ready.measured.known, start)
+            rotation, centers = found.poses[:, :3, :3], found.poses[:, :3, 3]
+            identity = np.broadcast_to(np.eye(3), rotation.shape)
+            np.testing.assert_allclose(rotation @ rotation.transpose(0, 2, 1), identity, atol=1e-6)
+            np.testing.assert_allclose(np.linalg.det(rotation), 1, atol=1e-6)
+            assert (space.lookup(centers[1:]) == FREE).all()
+            assert space.segment_is_free(centers[:-1], centers[1:]).all()
+            needed = min(ready.margin_mm, float(space.clearance_at(centers[0])))
+            assert (space.clearance_at(centers[1:]) >= needed - 1e-9).all()
+            assert (rotation_angle_deg(rotation[1:], rotation[:-1]) <= 20 + 1e-4).all()
+            steps = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+            orbit = 2 * np.sin(np.radians(20) / 2) * 2.0 * ready.depth_unit_mm
+            assert (steps <= max(ready.step_mm, orbit) + 1e-9).all()
+
+    def test_straight_ways_are_taken_where_they_pay(self):
+        names = [move for moves in explored(trajectories=8).moves for move in moves]
+        assert "approach" in names
+        without = explored(trajectories=8, destinations=False)
+        assert "approach" not in [move for moves in without.moves for move in moves]
+
+
+class TestApproaches:
+    def made(self, rng: np.random.Generator) -> tuple[Approaches, ErrorValue]:
+        value = ErrorValue(rng.random(ROWS).astype(np.float32))
+        poses = np.broadcast_to(np.eye(4), (30, 4, 4)).copy()
+        poses[:, :3, 3] = rng.uniform(-4, 4, (30, 3))
+        seen = [random_seen(rng, pairs=False) for _ in range(30)]
+        nothing = np.zeros(ROWS, np.float32)
+        return (
+            Approaches(Destinations.of(poses, seen), value, nothing, step_mm=1.0, turn_deg=20.0),
+            value,
+        )
+
+    @settings(max_examples=30, deadline=None)
+    @given(seed=st.integers(0, 10_000))
+    def test_lazily_finds_what_a_full_search_finds(self, seed):
+        rng = np.random.default_rng(seed)
+        approaches, value = self.made(rng)
+        known = np.zeros(ROWS, np.float32)
+        value.add(known, random_seen(rng, pairs=False))
+        distance = np.linalg.norm(approaches.destinations.poses[:, :3, 3], axis=1)
+        views = np.maximum(1, np.ceil(distance - 1e-6))
+        rates = np.array([value.gain(known, approaches.destinations.seen(i)) for i in range(30)]) / views
+        allowed = np.sort(rates[(views <= 4) & (rates > 0.2)])[::-1]
+        found = [rate for rate, _ in approaches.better(np.eye(4), known, 4, 0.2)]
+        np.testing.assert_allclose(found, allowed[: len(found)], rtol=1e-12)
+        assert len(found) == min(12, len(allowed))
+
+    def test_a_straight_way_arrives_in_equal_steps(self):
+        start, end = np.eye(4), np.eye(4)
+        end[:3, :3] = rotation_about(np.array([0.0, 1.0, 0.0]), 1.2)
+        end[:3, 3] = [3.0, 0.0, 4.0]
+        poses = straight_way(start, end, 4)
+        np.testing.assert_allclose(poses[-1], end, atol=1e-12)
+        turned = rotation_angle_deg(poses[:, :3, :3], np.concatenate([start[None], poses[:-1]])[:, :3, :3])
+        np.testing.assert_allclose(turned, np.degrees(1.2) / 4, atol=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1), 1.25)
+
+
+def moved_tube(tube: Tube, space: FreeSpace, scale: float, turn: np.ndarray) -> tuple[Tube, FreeSpace]:
+    """The same world, scaled, turned and shifted."""
+    import torch
+    from scipy.spatial.transform import Rotation
+
+    shift = np.array([30.0, -7.0, 12.0])
+    g = tube.scene.gaussians
+    means = scale * (g.means.numpy() @ turn.T) + shift
+    spins = Rotation.from_matrix(turn) * Rotation.from_quat(g.quats.numpy()[:, [1, 2, 3, 0]])
+    quats = spins.as_quat()[:, [3, 0, 1, 2]]
+    gaussians = replace(
+        g,
+        means=torch.from_numpy(means.astype(np.float32)),
+        quats=torch.from_numpy(quats.astype(np.float32)),
+        scales=g.scales + float(np.log(scale)),
+    )
+    poses = tube.cameras.world_from_camera.copy()
+    poses[:, :3, 3] = scale * (poses[:, :3, 3] @ turn.T) + shift
+    poses[:, :3, :3] = turn @ poses[:, :3, :3]
+    moved = replace(
+        space,
+        origin_mm=scale * (turn @ space.origin_mm) + shift,
+        axes=space.axes @ turn.T,
+        voxel_mm=scale * space.voxel_mm,
+        clearance=space.clearance * np.float32(scale),
+    )
+    return Tube(Scene(gaussians, None), replace(tube.sequence, world_from_camera=poses)), moved
+
+
+class TestExplore:
+    def test_takes_error_away(self):
+        found = explored()
+        assert 1 <= len(found) <= 4
+        assert found.score == "error"
+        assert 0 < found.values.sum() <= found.removable_error
+        summary = found.summary()
+        assert summary["removed_error"] == pytest.approx(found.values.sum())
+
+    @pytest.mark.parametrize("workers", [2, 4])
+    def test_is_the_same_for_any_number_of_workers(self, workers, tmp_path):
+        from concurrent.futures import ThreadPoolExecutor
+
+        tube = small_tube()
+        with ThreadPoolExecutor(workers) as pool:
+            found = explore(
+                tube.scene, tube.sequence, error_config(), freespace=small_freespace(), map=pool.map
+            )
+        np.testing.assert_array_equal(
+            found.cameras.world_from_camera, explored().cameras.world_from_camera
+        )
+        np.testing.assert_array_equal(found.values, explored().values)
+
+    def test_waves_lose_little_against_one_at_a_time(self):
+        wide = explored(trajectories=6, wave=3, wave_kept_share=0.8)
+        alone = explored(trajectories=6, wave=1)
+        assert wide.values.sum() >= 0.95 * alone.values.sum()
+
+    def test_moves_with_the_world(self):
+        # Lights whose fall-off is in millimetres do not scale: without light.
+        tube = make_tube(n_gaussians=1500, n_views=7, width=48, height=36, light=False)
+        config = error_config(trajectories=2, length=4)
+        turn = rotation_about(np.array([1.0, 2.0, 3.0]), 0.8)
+        moved, space = moved_tube(tube, small_freespace(), 2.5, turn)
+        still = explore(tube.scene, tube.sequence, config, freespace=small_freespace())
+        found = explore(moved.scene, moved.sequence, config, freespace=space)
+        assert found.moves == still.moves
+        assert found.removable_error == pytest.approx(still.removable_error, rel=1e-3)
+        expected = 2.5 * still.cameras.centers @ turn.T + np.array([30.0, -7.0, 12.0])
+        np.testing.assert_allclose(found.cameras.centers, expected, atol=2e-3)
+
+    def test_nothing_is_proposed_where_nothing_is_missing(self):
+        ball = make_ball()
+        mesh = fuse_surface(ball.scene, ball.cameras)
+        space = carve(ball.scene, mesh, ball.cameras)
+        found = explore(ball.scene, ball.sequence, error_config(render_width=48), freespace=space)
+        tube = explored()
+        assert found.removable_error < 0.05 * tube.removable_error
+        assert found.n_virtual <= 0.25 * tube.n_virtual
+
+    def test_more_is_planned_where_more_is_missing(self):
+        few = explored(trajectories=8, min_view_gain=1e-3)
+        many = explored(trajectories=8, min_view_gain=0.0)
+        assert few.n_virtual < many.n_virtual
+        assert any("% of error" in line for line in few.rejected)
+
+
+def test_a_branch_survives_its_file(tmp_path):
+    ready = context()
+    found = grow_branch(ready, small_tube().cameras.world_from_camera[START], ready.measured.known, START)
+    found.save(tmp_path / "branch")
+    loaded = Branch.load(tmp_path / "branch")
+    np.testing.assert_array_equal(loaded.seen.value, found.seen.value)
+    assert loaded.seen.value.dtype == np.float32
