@@ -18,7 +18,7 @@ class AdamW:
         parameters: leaves, stepped in place; those without a gradient stay as they are.
         weight_decay: per step, as a share of the learning rate.
 
-    Source: Loshchilov & Hutter, Decoupled weight decay regularization, ICLR 2019.
+    Source: [LoshchilovHutter2019].
     """
 
     BETAS = (0.9, 0.999)

@@ -74,8 +74,7 @@ def non_decreasing(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
     For the few knots of a curve; `scipy.optimize` has the same, and takes half a second to load.
 
-    Source: Busing, Monotone regression: a simple and fast O(n) PAVA implementation, Journal of Statistical
-    Software 102, 2022.
+    Source: [Busing2022].
     """
     pools: list[tuple[float, int]] = []
     """Mean and number of values that are pooled so far."""
