@@ -14,6 +14,7 @@ from importlib import import_module
 
 from flows.commands.options import Parser
 from flows.interruption import interruptible
+from flows.process_end import ProcessEnd
 
 __all__ = ["main", "parser"]
 
@@ -84,9 +85,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             (`flows.interruption`).
     """
     if arguments is None:
-        # Signals belong to the process: they are handled where the command is the whole process.
+        # Signals and the end belong to the process: they are handled where the command is all of it.
+        end = ProcessEnd()
         with interruptible():
-            return main(sys.argv[1:])
+            end.code = code = main(sys.argv[1:])
+        return code
     try:
         return _run(arguments)
     except BrokenPipeError:

@@ -230,6 +230,8 @@ def _serve(descriptor: int) -> None:
     )
     serving.append(uvicorn.Server(config))
     serving[0].run(sockets=[socket.socket(fileno=descriptor)])
+    # All is written. What Python would clear up takes seconds, for which the command would wait.
+    os._exit(0)
 
 
 def _provide_database() -> None:

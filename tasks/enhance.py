@@ -63,13 +63,14 @@ def keyed_settings(config: EnhanceConfig) -> EnhanceConfig:
     content; where a pretrained model or a clone lies is counted, since the restorer refers to it.
     """
     from extrags.devices import chosen_device
-    from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, chosen_precision
+    from extrags.restoration.diffusion.backend import EMBEDDED
+    from extrags.restoration.diffusion.precision import chosen_precision
 
     counted = _OF_TRAINING.get(config.backend, frozenset(EnhanceConfig.model_fields) - {"pretrained_weights"})
     config = _only(config, counted)
     caption = {name: CaptionConfig.model_fields[name].default for name in _OF_ASKING}
     settled: dict[str, object] = {"caption": config.caption.model_copy(update=caption)}
-    if config.backend == EmbeddedEnhancer.name:
+    if config.backend == EMBEDDED.name:
         settled["precision"] = chosen_precision(config)
     # Of a backend of another program nobody knows which of these it reads.
     for name, part in (("pretrained", config.pretrained), ("checkpoint", config.checkpoint)):

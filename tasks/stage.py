@@ -31,7 +31,6 @@ from pydantic import BaseModel
 
 from extrags.errors import ConfigError
 from extrags.store import Ref, Slot, Store, canonical, digest_of
-from extrags.threads import kernel_threads, one_torch_thread
 from tasks.locks import FlockManager
 from tasks.memory import peak_memory
 from tasks.progress import reporting
@@ -157,6 +156,9 @@ def stage(
             found = where.find_or_set_aside(key)
             if found is not None and not _refreshing():
                 return found
+            # Here, because it loads torch, which looking up an artefact must not.
+            from extrags.threads import kernel_threads, one_torch_thread
+
             refs, settings = _split({name: value for name, value in inputs.items() if name not in ignore})
             with (
                 run_log(),

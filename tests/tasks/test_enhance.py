@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from extrags.config import CoarseConfig, EnhanceConfig
-from extrags.restoration.diffusion import embedded
+from extrags.restoration.diffusion import precision
 from extrags.store import Ref
 from tasks.enhance import keyed_settings, train
 from tasks.stage import stage_key
@@ -28,7 +28,7 @@ def key(**settings: Any) -> str:
 
 @pytest.mark.parametrize("fast", [True, False])
 def test_the_precision_is_settled_before_the_key(fast: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(embedded, "has_fast_half_precision", lambda: fast)
+    monkeypatch.setattr(precision, "has_fast_half_precision", lambda: fast)
     assert key(precision="bfloat16") != key(precision="float32")
     assert key(precision="auto") == key(precision="bfloat16" if fast else "float32")
 
@@ -59,6 +59,6 @@ def test_a_device_that_is_not_used_is_not_in_it(backend: str, monkeypatch: pytes
 def test_blending_and_filling_has_no_precision(monkeypatch: pytest.MonkeyPatch) -> None:
     keys = set()
     for fast in (True, False):
-        monkeypatch.setattr(embedded, "has_fast_half_precision", lambda fast=fast: fast)
+        monkeypatch.setattr(precision, "has_fast_half_precision", lambda fast=fast: fast)
         keys.add(key(backend="classical"))
     assert len(keys) == 1

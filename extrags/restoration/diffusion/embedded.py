@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,11 +13,12 @@ from torch import Tensor
 
 from extrags.array_files import load_safetensors
 from extrags.config import EnhanceConfig
-from extrags.errors import WeightsError
+from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.description import description_fields, read_description, write_description
 from extrags.restoration.diffusion.network import RestorationNetwork, build_network
+from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.diffusion.rectified_flow import Sampled, sample
-from extrags.restoration.diffusion.weights import WEIGHTS
+from extrags.restoration.diffusion.weights import WEIGHTS, find_weights
 from extrags.restoration.protocol import Clip, Restoration
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
@@ -26,25 +27,13 @@ from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, cond
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["EmbeddedEnhancer", "chosen_precision", "has_fast_half_precision"]
+__all__ = ["EmbeddedEnhancer", "pretrained"]
 
 FORMAT = 2
 """Raised when a saved restorer cannot be read by newer code."""
 CANDIDATE_STEPS = (1, 4)
 """More steps never gained on held-out pairs; which of these does differs from scene to scene."""
 VIEWS_AT_ONCE = 4
-
-
-def has_fast_half_precision() -> bool:
-    """Whether this processor computes bfloat16 convolutions faster than float32 ones."""
-    return bool(torch.cpu._is_avx512_bf16_supported())
-
-
-def chosen_precision(config: EnhanceConfig) -> Literal["float32", "bfloat16"]:
-    """The precision that the settings mean on this processor."""
-    if config.precision != "auto":
-        return config.precision
-    return "bfloat16" if has_fast_half_precision() else "float32"
 
 
 @dataclass(frozen=True)
@@ -256,3 +245,18 @@ class EmbeddedEnhancer:
         except (OSError, RuntimeError, ValueError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return enhancer
+
+
+def pretrained(config: EnhanceConfig) -> EmbeddedEnhancer | None:
+    """The restorer with pretrained weights; None where training starts from random ones.
+
+    Raises:
+        WeightsError: when the weights are missing or do not fit.
+        ConfigError: when there would be neither weights nor training.
+    """
+    weights = find_weights(config.pretrained_weights)
+    if weights is None and config.train_iterations == 0:
+        raise ConfigError(
+            "enhance.train_iterations is 0 and enhance.pretrained_weights is none: nothing would restore"
+        )
+    return None if weights is None else EmbeddedEnhancer.load(weights)

@@ -154,7 +154,9 @@ def build_network(
     """A network whose weights come from `generator` alone (no global random state is touched)."""
     with torch.device("meta"):
         network = RestorationNetwork(condition_channels, widths)
-    network = network.to_empty(device="cpu")
+    # Not `to_empty`, which loads torch's symbolic shapes, and with them sympy.
+    empty = {name: torch.empty(value.shape) for name, value in network.state_dict().items()}
+    network.load_state_dict(empty, assign=True)
     network.initialise(generator)
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 

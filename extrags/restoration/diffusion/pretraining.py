@@ -15,9 +15,10 @@ from pydantic import Field
 from extrags.config.base import StageConfig
 from extrags.errors import ConfigError
 from extrags.metrics.lpips import Lpips
-from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, has_fast_half_precision
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import with_error_model
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetwork, build_network
+from extrags.restoration.diffusion.precision import has_fast_half_precision
 from extrags.restoration.diffusion.rectified_flow import TrainingSettings, train_network
 from extrags.restoration.diffusion.validation import validation_scores
 from extrags.restoration.training_data.augmentation import CropSampler, MixedSampler

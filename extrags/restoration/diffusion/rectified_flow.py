@@ -22,6 +22,7 @@ from extrags.errors import DivergedError
 from extrags.events import Progress, emit
 from extrags.metrics.image import ssim_map
 from extrags.metrics.lpips import Lpips
+from extrags.restoration.diffusion.adamw import AdamW
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetwork
 from extrags.restoration.training_data.augmentation import Batch
 from extrags.view_synthesis.conditioning import COLOR_CENTER, COLOR_SCALE, Conditioning
@@ -134,12 +135,10 @@ def train_network(
         DivergedError: when the loss stops being finite.
     """
     network.train()
-    optimiser = torch.optim.AdamW(network.parameters(), lr=settings.learning_rate, weight_decay=1e-4)
+    optimiser = AdamW(network.parameters(), weight_decay=1e-4)
     mean = {name: value.detach().clone() for name, value in network.state_dict().items()}
     history: list[dict[str, float]] = []
     for iteration in range(settings.iterations):
-        for group in optimiser.param_groups:
-            group["lr"] = settings.learning_rate * _rate(iteration, settings.iterations)
         batch = draw()
         loss = _diffusion_loss(network, batch, generator, settings)
         value = float(loss.detach())
@@ -147,10 +146,9 @@ def train_network(
             raise DivergedError(
                 f"{stage}: the restorer's loss is {value} at iteration {iteration} (parameter group: network)"
             )
-        optimiser.zero_grad(set_to_none=True)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), GRADIENT_LIMIT)
-        optimiser.step()
+        optimiser.step(settings.learning_rate * _rate(iteration, settings.iterations))
         decay = min(settings.ema_decay, (1 + iteration) / (10 + iteration))
         with torch.no_grad():
             for name, current in network.state_dict().items():

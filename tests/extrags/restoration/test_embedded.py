@@ -12,7 +12,6 @@ from extrags.errors import ConfigError, DivergedError, WeightsError
 from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import render_clips
-from extrags.restoration.diffusion.backend import better_of_both
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
 from extrags.restoration.diffusion.rectified_flow import (
@@ -22,6 +21,7 @@ from extrags.restoration.diffusion.rectified_flow import (
     sample,
     train_network,
 )
+from extrags.restoration.diffusion.scene_restorer import better_of_both
 from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.protocol import Clip, Enhancer
 from extrags.restoration.training_data.augmentation import Batch

@@ -3,8 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from scipy.optimize import isotonic_regression
 
-from extrags.restoration.uncertainty.calibration import Calibration, cell_means
+from extrags.restoration.uncertainty.calibration import Calibration, cell_means, non_decreasing
 from extrags.restoration.uncertainty.error_model import MIN_CONTRAST, MIN_ERROR, ErrorModel, error_features
 from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
 
@@ -29,6 +30,14 @@ def test_too_few_cells_give_no_curve() -> None:
     calibration = Calibration.fitted(np.linspace(0.1, 0.2, 20), np.zeros(20))
     values = np.array([0.1, 0.4])
     assert calibration.applied(values) is values
+
+
+def test_the_fit_is_the_isotonic_regression_bit_by_bit() -> None:
+    generator = np.random.default_rng(0)
+    for _ in range(500):
+        values = np.sort(generator.random(17)) + generator.normal(scale=generator.random(), size=17)
+        assert np.array_equal(non_decreasing(values), isotonic_regression(values).x)
+    assert np.array_equal(non_decreasing(np.array([3.0, 2.0, 1.0])), [2.0, 2.0, 2.0])
 
 
 def test_cell_means_leave_out_what_has_no_weight() -> None:

@@ -1,0 +1,89 @@
+"""The embedded restorer made ready for a scene: trained on it, and compared with the classical fill."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.events import MetricRecorded, emit
+from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
+from extrags.restoration.diffusion.scene_training import train_on_scene
+from extrags.restoration.diffusion.validation import validation_scores
+from extrags.restoration.protocol import Enhancer
+from extrags.restoration.training_data.pairs import Pairs, make_pairs
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
+from extrags.training.leave_out import MIN_FRAMES
+from extrags.view_synthesis.gamut import Gamut
+from extrags.view_synthesis.gather import gather_references
+from extrags.view_synthesis.references import LightTransfer
+
+__all__ = ["better_of_both", "scene_restorer"]
+
+MAX_LOSS_DB = 0.5
+"""A PSNR lower by up to so much is accepted: leave-out views are near the path, with little to restore."""
+
+logger = logging.getLogger(__name__)
+
+
+def scene_restorer(
+    scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
+) -> Enhancer:
+    """The restorer of a scene; see `extrags.restoration.diffusion.backend.EmbeddedBackend.prepare`.
+
+    Raises:
+        CaptureError: with too few training frames to train on.
+        DivergedError: when a reconstruction or the training does not stay finite.
+        WeightsError: when the weights are missing or do not fit.
+        ConfigError: when there would be neither weights nor training.
+    """
+    start = pretrained(config)
+    transfer = gather_references(scene, sequence, sequence.train).transfer
+    if start is not None and config.train_iterations == 0:
+        untouched = start.with_settings(config, _scene_gamut(sequence))
+        if not config.judge or len(sequence.train) < MIN_FRAMES:
+            return untouched
+        # Nothing is trained, so all leave-out pairs validate; synthetic ones would favour filling holes.
+        fresh = make_pairs(scene, sequence, config.model_copy(update={"synthetic_views": 0}), coarse)
+        pairs = replace(fresh, validation=np.ones(len(fresh), dtype=bool))
+        return better_of_both(untouched, pairs, transfer)
+    pairs = make_pairs(scene, sequence, config, coarse)
+    trained = train_on_scene(pairs, transfer, config, start)
+    return better_of_both(trained, pairs, transfer) if config.judge else trained
+
+
+def better_of_both(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> Enhancer:
+    """The restorer, or the classical one where that is clearly better on the scene's validation pairs.
+
+    On scenes unlike its training data a network can do harm; the classical restorer then replaces it, and
+    carries the reason.
+
+    Args:
+        enhancer: ready for the scene.
+        pairs: those for validation were not trained on.
+        transfer: how brightness changes with distance.
+    """
+    scores = validation_scores(enhancer, pairs, transfer, (enhancer.steps,))
+    restored, filled = scores[f"embedded_{enhancer.steps}"]["psnr"], scores["classical"]["psnr"]
+    emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
+    if restored < filled - MAX_LOSS_DB:
+        reason = (
+            f"on leave-out pairs of this scene the embedded restorer reaches {restored:.2f} dB, blending and "
+            f"filling {filled:.2f} dB"
+        )
+        logger.warning("%s; the scene is restored by blending and filling", reason)
+        return ClassicalEnhancer(reason)
+    validation = {**enhancer.record.get("validation", {}), **scores}
+    return replace(enhancer, record={**enhancer.record, "validation": validation})
+
+
+def _scene_gamut(sequence: EndoscopicSequence) -> Gamut:
+    """Hues of the training frames' valid tissue."""
+    images = torch.from_numpy(sequence.rgb[sequence.train].astype(np.float32) / 255).permute(0, 3, 1, 2)
+    weight = torch.from_numpy(sequence.mask[sequence.train].astype(np.float32))[:, None]
+    return Gamut.of_images(images, weight)
