@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from extrags.cameras import Cameras, pose_distances
 from extrags.config import FreespaceConfig
 from extrags.errors import CaptureError
-from extrags.freespace.distances import distance_to_cubes, signed_distance
+from extrags.freespace.distances import box_around, distance_to_cubes, signed_distance
 from extrags.freespace.grid import FREE, OCCUPIED, UNKNOWN, FreeSpace, rotated, to_grid
 from extrags.freespace.passages import ball_mask, mark, reachable
 from extrags.freespace.visibility import ViewDepths, seen_through
@@ -151,17 +151,14 @@ def _clearance(
     size = len(free)
     if not blocked.any() or not free.any():
         return np.full(free.shape, np.float32(size))
-    # All that matters to a free voxel lies in the box of what is free and blocked beside it.
-    used = free | (blocked if blocked.mean() < 0.5 else free)
-    box = tuple(
-        slice(max(0, int(np.flatnonzero(line)[0]) - 1), int(np.flatnonzero(line)[-1]) + 2)
-        for line in (used.any(axis=(1, 2)), used.any(axis=(0, 2)), used.any(axis=(0, 1)))
-    )
-    # Between centres the distance is never less than from a centre to the nearest cube.
-    limit = float(np.asarray(distance_transform_edt(~blocked[box]))[free[box]].max())
+    # From a free voxel the nearest blocked one is no farther by cubes than by centres.
+    near = box_around(free, 1)
+    held = box_around(free | blocked, 0) if blocked.mean() < 0.5 else near
+    limit = float(np.asarray(distance_transform_edt(~blocked[held]))[free[held]].max())
+    box = box_around(free, np.ceil(limit) + 1)
     distance = np.where(blocked, np.float32(-WALL_DEPTH), np.float32(limit))
     distance[box] = signed_distance(blocked[box], limit, WALL_DEPTH)
-    return np.asarray(distance)
+    return distance
 
 
 def _bounding_volume(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = ["distance_to_cubes", "signed_distance"]
+__all__ = ["box_around", "distance_to_cubes", "signed_distance"]
 
 
 def distance_to_cubes(
@@ -23,10 +23,26 @@ def distance_to_cubes(
     Returns:
         Zero inside marked voxels; `limit` where none is nearer.
     """
-    squared = np.where(marked, np.float32(0), np.float32(np.inf))
+    distance = np.full(marked.shape, np.float32(limit))
+    box = box_around(marked, limit)
+    squared = np.where(marked[box], np.float32(0), np.float32(np.inf))
     for axis in (2, 1, 0):
         squared = _along(squared, axis, limit)
-    return np.minimum(np.sqrt(squared), np.float32(limit))
+    distance[box] = np.minimum(np.sqrt(squared), np.float32(limit))
+    return distance
+
+
+def box_around(marked: Bool[np.ndarray, "x y z"], margin: float) -> tuple[slice, slice, slice]:
+    """The smallest box that holds all marked voxels and those `margin` voxels beside them."""
+    slices = []
+    for axes in ((1, 2), (0, 2), (0, 1)):
+        line = marked.any(axis=axes)
+        held = np.flatnonzero(line)
+        if not len(held):
+            return slice(0), slice(0), slice(0)
+        wide = len(line) if np.isinf(margin) else int(np.ceil(margin))
+        slices.append(slice(max(0, int(held[0]) - wide), int(held[-1]) + 1 + wide))
+    return slices[0], slices[1], slices[2]
 
 
 def signed_distance(
@@ -39,7 +55,10 @@ def signed_distance(
         limit: the largest distance told apart outside.
         depth_limit: the same inside.
     """
-    return distance_to_cubes(marked, limit) - distance_to_cubes(~marked, depth_limit)
+    distance = distance_to_cubes(marked, limit)
+    box = box_around(marked, depth_limit)
+    distance[box] -= np.where(marked[box], distance_to_cubes(~marked[box], depth_limit), 0)
+    return distance
 
 
 def _along(squared: Float[np.ndarray, "x y z"], axis: int, limit: float) -> Float[np.ndarray, "x y z"]:

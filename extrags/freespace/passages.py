@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from extrags.freespace.distances import distance_to_cubes
+from extrags.freespace.distances import box_around, distance_to_cubes
 
 __all__ = ["ball_mask", "mark", "reachable"]
 
@@ -34,8 +34,16 @@ def reachable(
 
     at = tuple(cameras.T)
     radius = min(radius, float(np.quantile(clearance[at], NARROW_SHARE)))
-    wide, _ = label(free & (clearance >= radius))
-    passed = np.isin(wide, np.setdiff1d(wide[at], [0]))
+    wide = free & (clearance >= radius)
+    starts = wide[at]
+    box = box_around(wide, 0)
+    parts, n = label(wide[box])
+    low = [edge.start for edge in box]
+    joined = np.zeros(n + 1, dtype=bool)
+    joined[parts[tuple((cameras[starts] - low).T)]] = True
+    joined[0] = False
+    passed = np.zeros_like(free)
+    passed[box] = joined[parts]
     return free & (distance_to_cubes(passed, radius + 1.0) <= radius)
 
 
