@@ -335,7 +335,7 @@ class FreespaceConfig(StageConfig):
         0.15,
         ge=0,
         description="free space that a ball of this radius, in median rendered depths, cannot reach from the "
-        "training cameras is unknown: it lies behind a hole in the wall; 0 keeps it",
+        "training cameras is unknown: it lies behind a hole in the wall; 0 asks for a connection alone",
     )
 
 

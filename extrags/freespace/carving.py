@@ -87,10 +87,11 @@ def carve(
         raise CaptureError("no voxel of the scene is free; the views see no surface at a distance")
     occupancy = np.select([free, occupied], [np.uint8(FREE), np.uint8(OCCUPIED)], np.uint8(UNKNOWN))
 
-    import os
-    distance = _clearance(free, ~free if os.environ.get("VARIANT") == "B" else occupied) * voxel_mm
+    # Unknown space may hold the wall: only what is known to be free gives room.
+    distance = _clearance(free, ~free) * voxel_mm
     if surface_error_mm is not None and len(surface_error_mm):
-        distance = distance - _nearest_error(corners, surface_error_mm, size)
+        less = distance - _nearest_error(corners, surface_error_mm, size)
+        distance = np.where(distance > 0, np.maximum(less, 0.0), distance)
     space = FreeSpace(occupancy, origin_mm, axes, voxel_mm, distance.astype(np.float32))
     _log.info("freespace: %.1f %% of %d^3 voxels of %.3g are free", 100 * space.free_share, size, voxel_mm)
     return space
@@ -152,10 +153,10 @@ def _clearance(
     if not blocked.any() or not free.any():
         return np.full(free.shape, np.float32(size))
     # From a free voxel the nearest blocked one is no farther by cubes than by centres.
-    near = box_around(free, 1)
-    held = box_around(free | blocked, 0) if blocked.mean() < 0.5 else near
+    near = box_around(free, 1.0)
+    held = near if blocked[near].mean() > 0.5 else box_around(free | blocked, 0.0)
     limit = float(np.asarray(distance_transform_edt(~blocked[held]))[free[held]].max())
-    box = box_around(free, np.ceil(limit) + 1)
+    box = box_around(free, limit + 2.0)
     distance = np.where(blocked, np.float32(-WALL_DEPTH), np.float32(limit))
     distance[box] = signed_distance(blocked[box], limit, WALL_DEPTH)
     return distance

@@ -25,7 +25,7 @@ UNKNOWN = 2
 
 @dataclass(frozen=True)
 class FreeSpace(Storable):
-    """Occupancy grid of S x S x S cubic voxels, and the distance to the nearest occupied voxel.
+    """Occupancy grid of S x S x S cubic voxels, and the signed distance to the boundary of free space.
 
     Voxel (i, j, k) has its centre at `origin_mm + ((i, j, k) + 0.5) * voxel_mm @ axes`.
 
@@ -34,8 +34,9 @@ class FreeSpace(Storable):
         origin_mm: corner of voxel (0, 0, 0) in world units.
         axes: rows are the grid's unit axes in world coordinates, det +1.
         voxel_mm: edge of a voxel in world units.
-        clearance: distance of the voxel's centre from the nearest occupied voxel in world units, less what
-            the surface there may be off; zero inside those, float32, [S, S, S].
+        clearance: distance of the voxel's centre from the nearest cube that is not free, occupied or unknown,
+            in world units, less what the surface there may be off. In voxels that are not free it is minus
+            the distance to the nearest free one, up to some voxels. float32, [S, S, S].
 
     Raises:
         ShapeError: when the arrays do not fit each other.
@@ -91,7 +92,7 @@ class FreeSpace(Storable):
         return self._lookup_grid(self.to_grid(points))
 
     def clearance_at(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
-        """Distance to the nearest occupied voxel, interpolated between voxel centres; 0 outside."""
+        """Distance to the nearest voxel that is not free, interpolated between centres; 0 outside free space."""
         from scipy.ndimage import map_coordinates
 
         grid = self.to_grid(points)
@@ -99,7 +100,7 @@ class FreeSpace(Storable):
         between = map_coordinates(
             self.clearance, np.moveaxis(grid - 0.5, -1, 0).reshape(3, -1), order=1, mode="nearest"
         ).reshape(inside.shape)
-        return np.where(inside, between, 0.0)
+        return np.where(inside, np.maximum(between, 0.0), 0.0)
 
     def segment_is_free(
         self, a: Float[np.ndarray, "*b 3"], b: Float[np.ndarray, "*b 3"]

@@ -33,10 +33,11 @@ def reachable(
     from scipy.ndimage import label
 
     at = tuple(cameras.T)
-    radius = min(radius, float(np.quantile(clearance[at], NARROW_SHARE)))
-    wide = free & (clearance >= radius)
+    radius = max(0.0, min(radius, float(np.quantile(clearance[at], NARROW_SHARE))))
+    # The wall lies somewhere in its cubes: on average half a voxel behind the face that clearance ends at.
+    wide = free & (clearance >= max(radius - 0.5, min(radius, 0.5)))
     starts = wide[at]
-    box = box_around(wide, 0)
+    box = box_around(wide, 0.0)
     parts, n = label(wide[box])
     low = [edge.start for edge in box]
     joined = np.zeros(n + 1, dtype=bool)
