@@ -216,7 +216,7 @@ class TestCarve:
             np.concatenate([screen.vertices, wall.vertices]),
             np.concatenate([screen.triangles, wall.triangles + 4]),
         )
-        config = FreespaceConfig(grid_size=32, wall_voxels=1.5, passage_share=0.1)
+        config = FreespaceConfig(grid_size=32, wall_voxels=1.5, passage_share=0.0)
         space = carve(scene, both, square_camera(), config)
         assert space.lookup(np.array([0.0, 0, 3.0])) == FREE
         assert space.lookup(np.array([0.0, 0, 6.0])) == OCCUPIED
