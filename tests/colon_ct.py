@@ -103,7 +103,9 @@ def seen_scene(
     rng = np.random.default_rng(seed)
     corners = wall.vertices[wall.triangles].astype(np.float64)
     # The whole colon is metres of wall: only what is near to seen triangles is sampled.
-    part = Mesh(wall.vertices, wall.triangles[_grown(wall.triangles, caster.seen_by(corners.mean(axis=1), cameras))])
+    part = Mesh(
+        wall.vertices, wall.triangles[_grown(wall.triangles, caster.seen_by(corners.mean(axis=1), cameras))]
+    )
     samples = sample_surface(part, 4 * n_gaussians, seed=seed)
     seen = samples[caster.seen_by(samples, cameras)]
     edges = part.vertices[part.triangles[:, 1:]] - part.vertices[part.triangles[:, :1]]

@@ -329,7 +329,7 @@ class FreespaceConfig(StageConfig):
         64,
         ge=1,
         le=64,
-        description="training views that are rendered: of more, those that differ most by place and direction",
+        description="training views that are rendered; of more, the most different ones",
     )
     passage_share: float = Field(
         0.15,

@@ -95,13 +95,15 @@ def carve(
     space = FreeSpace(occupancy, origin_mm, axes, voxel_mm, distance.astype(np.float32))
     _log.info("freespace: %.1f %% of %d^3 voxels of %.3g are free", 100 * space.free_share, size, voxel_mm)
     return space
+
+
 def carving_views(scene: Scene, cameras: Cameras, config: FreespaceConfig) -> Cameras:
     """The views that carve: all, or the `max_views` that differ most by place and direction.
 
     Farthest point sampling from the view nearest to the middle of all, by `extrags.cameras.pose_distances`
     in units of the depth that eight views spread over the recording see.
 
-    Source: Gonzalez 1985, Clustering to minimize the maximum intercluster distance.
+    Source: [Gonzalez1985], see docs/references.md.
     """
     if len(cameras) <= config.max_views:
         return cameras
@@ -196,5 +198,3 @@ def _nearest_error(
     np.maximum.at(largest, tuple(index.T), error_mm)
     nearest = distance_transform_edt(largest < 0, return_distances=False, return_indices=True)
     return np.asarray(largest[tuple(nearest)])
-
-

@@ -8,9 +8,7 @@ from jaxtyping import Bool, Float
 __all__ = ["box_around", "distance_to_cubes", "signed_distance"]
 
 
-def distance_to_cubes(
-    marked: Bool[np.ndarray, "x y z"], limit: float = np.inf
-) -> Float[np.ndarray, "x y z"]:
+def distance_to_cubes(marked: Bool[np.ndarray, "x y z"], limit: float = np.inf) -> Float[np.ndarray, "x y z"]:
     """Euclidean distance from each voxel's centre to the nearest cube of a marked voxel, in voxels.
 
     Exact: a cube's distance along an axis is the number of voxels less one half, and squares of the three
@@ -36,7 +34,7 @@ def box_around(marked: Bool[np.ndarray, "x y z"], margin: float) -> tuple[slice,
     """The smallest box that holds all marked voxels and those `margin` voxels beside them."""
     slices = []
     for axes in ((1, 2), (0, 2), (0, 1)):
-        line = marked.any(axis=axes)
+        line = np.asarray(marked.any(axis=axes))
         held = np.flatnonzero(line)
         if not len(held):
             return slice(0), slice(0), slice(0)

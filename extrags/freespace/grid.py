@@ -92,7 +92,7 @@ class FreeSpace(Storable):
         return self._lookup_grid(self.to_grid(points))
 
     def clearance_at(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
-        """Distance to the nearest voxel that is not free, interpolated between centres; 0 outside free space."""
+        """Distance to the nearest voxel that is not free, interpolated between centres; 0 outside."""
         from scipy.ndimage import map_coordinates
 
         grid = self.to_grid(points)
@@ -171,12 +171,11 @@ def to_grid(
     axes: Float[np.ndarray, "3 3"],
     voxel_mm: float,
 ) -> Float[np.ndarray, "*b 3"]:
+    """Continuous voxel coordinates of world positions: voxel i covers [i, i + 1)."""
     return np.asarray(rotated(points - origin_mm, axes) / voxel_mm)
 
 
-def rotated(
-    points: Float[np.ndarray, "*b 3"], matrix: Float[np.ndarray, "3 3"]
-) -> Float[np.ndarray, "*b 3"]:
+def rotated(points: Float[np.ndarray, "*b 3"], matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "*b 3"]:
     """`points @ matrix.T` without BLAS, whose rounding depends on the number of threads."""
     x, y, z = points[..., :1], points[..., 1:2], points[..., 2:]
     return np.asarray(x * matrix[:, 0] + y * matrix[:, 1] + z * matrix[:, 2])
@@ -185,5 +184,6 @@ def rotated(
 def voxel_centers(
     size: int, origin_mm: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"], voxel_mm: float
 ) -> Float[np.ndarray, "v 3"]:
+    """World positions of all voxel centres of a grid, last axis fastest."""
     index = np.stack(np.meshgrid(*[np.arange(size)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return np.asarray(origin_mm + rotated((index + 0.5) * voxel_mm, axes.T))

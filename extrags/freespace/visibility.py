@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8, UInt64
 from extrags.cameras import Cameras
 from extrags.config import FreespaceConfig
 from extrags.events import Progress, emit
-from extrags.freespace.grid import rotated, voxel_centers
+from extrags.freespace.grid import rotated
 from extrags.scene import Scene
 
 __all__ = ["ViewDepths", "seen_through", "voxel_visibility"]
@@ -141,7 +141,7 @@ def seen_through(
     if undecided.any():
         points = origin_mm + rotated((np.argwhere(undecided) + 0.5) * voxel_mm, axes.T)
         result[undecided] = voxel_visibility(scene, views.cameras, points, config) >= config.occupied_below
-    return result & within
+    return np.asarray(result & within)
 
 
 def _any_within(within: Bool[np.ndarray, "s s s"], edge: int) -> Bool[np.ndarray, "b b b"]:
@@ -220,7 +220,9 @@ def _bounds(
         step, window = window, 2 * window
 
 
-def _spread(image: Float[np.ndarray, "p q"], step: int, axis: int, least: np.ufunc) -> Float[np.ndarray, "p q"]:
+def _spread(
+    image: Float[np.ndarray, "p q"], step: int, axis: int, least: np.ufunc
+) -> Float[np.ndarray, "p q"]:
     image = np.moveaxis(image, axis, 0)
     spread = image.copy()
     least(spread[step:], image[:-step], out=spread[step:])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -21,7 +23,7 @@ def voxels_of_triangles(corners: Float[np.ndarray, "t 3 3"], size: int) -> Bool[
         corners: of the triangles in voxel coordinates, where voxel i covers [i, i + 1).
         size: voxels per axis.
 
-    Source: separating axes after Akenine-Moeller, Fast 3D Triangle-Box Overlap Testing, 2001.
+    Source: separating axes [AkenineMoller2001], see docs/references.md.
     """
     marked = np.zeros((size, size, size), dtype=bool)
     corners = _cut(corners)
@@ -37,7 +39,11 @@ def voxels_of_triangles(corners: Float[np.ndarray, "t 3 3"], size: int) -> Bool[
         within = np.arange(len(triangle)) - np.repeat(np.cumsum(count[part]) - count[part], count[part])
         shape = extent[part][triangle]
         offset = np.stack(
-            [within // (shape[:, 1] * shape[:, 2]), within // shape[:, 2] % shape[:, 1], within % shape[:, 2]],
+            [
+                within // (shape[:, 1] * shape[:, 2]),
+                within // shape[:, 2] % shape[:, 1],
+                within % shape[:, 2],
+            ],
             axis=1,
         )
         voxel = low[part][triangle] + offset
@@ -51,7 +57,7 @@ def _runs(batch: Int[np.ndarray, "t"]) -> list[tuple[int, int]]:
     if not len(batch):
         return []
     edges = [0, *(np.flatnonzero(np.diff(batch)) + 1).tolist(), len(batch)]
-    return list(zip(edges[:-1], edges[1:], strict=True))
+    return list(pairwise(edges))
 
 
 def _cut(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "u 3 3"]:
@@ -63,7 +69,9 @@ def _cut(corners: Float[np.ndarray, "t 3 3"]) -> Float[np.ndarray, "u 3 3"]:
             break
         a, b, c = np.moveaxis(corners[long], 1, 0)
         ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
-        quarters = [np.stack(parts, axis=1) for parts in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+        quarters = [
+            np.stack(parts, axis=1) for parts in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+        ]
         corners = np.concatenate([corners[~long], *quarters])
     return corners
 

@@ -40,11 +40,15 @@ POSES = ExploreConfig(trajectories=6, length=8, max_expansions=24)
 class Truth:
     """The true wall: what lies inside, how far, and what views see of it."""
 
-    def __init__(self, wall: Mesh, *, closed: bool) -> None:
+    def __init__(self, wall: Mesh) -> None:
         import open3d as o3d
 
+        triangles = o3d.utility.Vector3iVector(wall.triangles)
+        points = o3d.utility.Vector3dVector(wall.vertices.astype(np.float64))
+        self.closed = o3d.geometry.TriangleMesh(points, triangles).is_edge_manifold(
+            allow_boundary_edges=False
+        )
         self.caster = RayCaster(wall.vertices, wall.triangles)
-        self.closed = closed
         self._tensor = o3d.core.Tensor.from_numpy
         self._scene = o3d.t.geometry.RaycastingScene()
         self._scene.add_triangles(
@@ -73,7 +77,9 @@ class Truth:
         return seen
 
 
-def measured(space: FreeSpace, truth: Truth, cameras: Cameras, everyone: Cameras | None = None) -> dict[str, Any]:
+def measured(
+    space: FreeSpace, truth: Truth, cameras: Cameras, everyone: Cameras | None = None
+) -> dict[str, Any]:
     """Agreement of the free voxels with the truth."""
     centers = space.voxel_centers()
     free = space.occupancy.ravel() == FREE
@@ -84,7 +90,7 @@ def measured(space: FreeSpace, truth: Truth, cameras: Cameras, everyone: Cameras
         outside = free & (inside_mm <= 0)
         deepest = float(-inside_mm[outside].min()) if outside.any() else 0.0
     else:
-        # Without an inside, what no view of the whole recording sees in front of the wall counts.
+        # An open wall has no inside: what no view of the whole recording sees in front of it is told.
         known = true if everyone is None else truth.seen(centers, everyone)
         outside = free & ~known
         deepest = float(inside_mm[outside].max()) if outside.any() else 0.0
@@ -97,8 +103,8 @@ def measured(space: FreeSpace, truth: Truth, cameras: Cameras, everyone: Cameras
         "iou": round(float((free & true).sum() / max(1, (free | true).sum())), 4),
         "recall": round(float((free & true).sum() / max(1, true.sum())), 4),
         "recall_off_the_wall": round(float((free & clear).sum() / max(1, clear.sum())), 4),
-        "outside": int(outside.sum()),
-        "deepest_outside_mm": round(deepest, 3),
+        ("outside" if truth.closed else "seen_by_none"): int(outside.sum()),
+        ("deepest_outside_mm" if truth.closed else "farthest_from_the_wall_mm"): round(deepest, 3),
         "clearance_over_mm": round(float(over.max()), 3) if free.any() else None,
     }
 
@@ -109,7 +115,9 @@ def poses_measured(
     """Poses of an exploration from there: how many lie outside, or nearer to the wall than said."""
     found = explore(scene, sequence, config, freespace=space)
     # The first view of each trajectory is a real one.
-    virtual = np.concatenate([np.zeros(1, bool), found.trajectory[1:] == found.trajectory[:-1]])[: len(found.trajectory)]
+    virtual = np.concatenate([np.zeros(1, bool), found.trajectory[1:] == found.trajectory[:-1]])[
+        : len(found.trajectory)
+    ]
     centers = found.cameras.centers[virtual]
     if not len(centers):
         return {"poses": 0}
@@ -161,7 +169,7 @@ def cost(options: argparse.Namespace) -> list[dict[str, Any]]:
 def colon(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Stretches of the CT colon."""
     ct = ColonCT.read(data_roots()[0], triangles="100k")
-    truth = Truth(ct.wall, closed=True)
+    truth = Truth(ct.wall)
     rows = []
     for begin, end in STRETCHES_MM[: options.stretches]:
         scene, sequence = ct.stretch(begin, end, n_gaussians=options.gaussians[0], noise_mm=options.noise_mm)
@@ -176,8 +184,10 @@ def sequences(options: argparse.Namespace) -> list[dict[str, Any]]:
         sequence = read(name)
         surface = true_surface(sequence)
         assert surface is not None
-        truth = Truth(surface.mesh, closed=False)
-        scene = seen_scene(surface.mesh, sequence.training_cameras, options.gaussians[0], noise_mm=options.noise_mm)
+        truth = Truth(surface.mesh)
+        scene = seen_scene(
+            surface.mesh, sequence.training_cameras, options.gaussians[0], noise_mm=options.noise_mm
+        )
         rows += _carved(name, scene, sequence, truth, options)
     return rows
 
@@ -185,21 +195,18 @@ def sequences(options: argparse.Namespace) -> list[dict[str, Any]]:
 def withheld(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Reconstructed without measured depth; clearance knows the depth's uncertainty."""
     from extrags.config import PROFILES
+    from extrags.depth.training_depth import with_training_depth
     from extrags.pipeline import run_pipeline
 
     rows = []
     for name in options.sequences:
-        config = PROFILES["quick"]
-        ingest = config.ingest.model_copy(update={"withhold_depth": True})
-        config = config.model_copy(update={"ingest": ingest})
         sequence = read(name)
-        result = run_pipeline(sequence, config, until="surface")
         surface = true_surface(sequence)
         assert surface is not None
-        assert result.coarse is not None
-        rows += _carved(
-            f"{name} depth withheld", result.coarse, result.sequence, Truth(surface.mesh, closed=False), options
-        )
+        result = run_pipeline(sequence.without_training_depth(), PROFILES["quick"], until="surface")
+        assert result.depth is not None
+        estimated = with_training_depth(result.sequence.training_part(), result.depth)
+        rows += _carved(f"{name}, depth withheld", result.coarse, estimated, Truth(surface.mesh), options)
     return rows
 
 
@@ -211,14 +218,11 @@ def _carved(
     rows = []
     for size in options.sizes:
         begun = time.perf_counter()
-        space = carve(
-            scene,
-            mesh,
-            cameras,
-            FreespaceConfig(grid_size=size),
-            surface_error_mm=surface_error_mm(mesh, sequence),
-        )
+        error_mm = surface_error_mm(mesh, sequence)
+        space = carve(scene, mesh, cameras, FreespaceConfig(grid_size=size), surface_error_mm=error_mm)
         row: dict[str, Any] = {"name": name, "size": size, "seconds": round(time.perf_counter() - begun, 2)}
+        if error_mm is not None:
+            row["surface_error_mm"] = round(float(np.median(error_mm)), 3)
         row |= measured(space, truth, cameras, sequence.cameras)
         if options.poses:
             row |= poses_measured(space, truth, scene, sequence, POSES)

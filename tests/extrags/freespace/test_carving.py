@@ -14,8 +14,13 @@ from extrags.freespace import FREE, OCCUPIED, UNKNOWN, FreeSpace, carve, voxel_v
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.surface import Mesh
-
-from tests.extrags.exploration.tube import scene_of_points, small_freespace, small_mesh, small_tube, square_camera
+from tests.extrags.exploration.tube import (
+    scene_of_points,
+    small_freespace,
+    small_mesh,
+    small_tube,
+    square_camera,
+)
 
 AXES = rotation_about(np.array([1.0, 2.0, -1.0]), 0.7)
 

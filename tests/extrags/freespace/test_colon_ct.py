@@ -25,7 +25,8 @@ def test_free_space_lies_inside_and_poses_have_the_room_they_are_said_to_have(
     scene, sequence = colon.stretch(begin_mm, begin_mm + 30, views=16, n_gaussians=6000, width=120, height=96)
     cameras = sequence.training_cameras
     space = carve(scene, fuse_surface(scene, cameras), cameras, FreespaceConfig(grid_size=64))
-    truth = Truth(colon.wall, closed=True)
+    truth = Truth(colon.wall)
+    assert truth.closed
     found = measured(space, truth, cameras)
     assert found["outside"] == 0
     assert found["iou"] > 0.55

@@ -18,7 +18,14 @@ from extrags.freespace.passages import reachable
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.surface import Mesh, fuse_surface
-from tests.extrags.exploration.tube import Tube, centre_line, make_tube, scene_of_points, small_mesh, small_tube
+from tests.extrags.exploration.tube import (
+    Tube,
+    centre_line,
+    make_tube,
+    scene_of_points,
+    small_mesh,
+    small_tube,
+)
 
 CONFIG = FreespaceConfig(grid_size=64, render_width=96)
 

@@ -15,9 +15,7 @@ from tests.extrags.exploration.tube import small_freespace, small_tube
 @pytest.mark.parametrize(("size", "top_views"), [(20, 3), (33, 1), (40, 3)])
 def test_equals_the_full_evaluation(size: int, top_views: int, threshold: float) -> None:
     tube, space = small_tube(), small_freespace()
-    config = FreespaceConfig(
-        grid_size=size, top_views=top_views, occupied_below=threshold, render_width=40
-    )
+    config = FreespaceConfig(grid_size=size, top_views=top_views, occupied_below=threshold, render_width=40)
     voxel_mm = space.voxel_mm * space.grid_size / size
     grid = (space.origin_mm, space.axes, voxel_mm)
     views = ViewDepths.rendered(tube.scene, tube.cameras, config)
@@ -34,9 +32,7 @@ def test_decides_only_what_is_asked() -> None:
     grid = (space.origin_mm, space.axes, space.voxel_mm)
     asked = np.random.default_rng(0).random((32, 32, 32)) < 0.3
     everything = seen_through(tube.scene, views, *grid, np.ones_like(asked), config)
-    np.testing.assert_array_equal(
-        seen_through(tube.scene, views, *grid, asked, config), everything & asked
-    )
+    np.testing.assert_array_equal(seen_through(tube.scene, views, *grid, asked, config), everything & asked)
 
 
 def test_more_views_that_see_a_voxel_keep_it() -> None:
