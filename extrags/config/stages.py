@@ -325,6 +325,18 @@ class FreespaceConfig(StageConfig):
         2.0, gt=0, description="unseen voxels this near to the mesh are occupied, farther ones unknown"
     )
     render_width: int = Field(160, ge=16, description="width of the renders in pixels")
+    max_views: int = Field(
+        64,
+        ge=1,
+        le=64,
+        description="training views that are rendered; of more, the most different ones",
+    )
+    passage_share: float = Field(
+        0.15,
+        ge=0,
+        description="free space that a ball of this radius, in median rendered depths, cannot reach from the "
+        "training cameras is unknown: it lies behind a hole in the wall; 0 asks for a connection alone",
+    )
 
 
 Visibility = Literal["blending", "frustum"]
