@@ -179,8 +179,16 @@ PAPER_SHARED = frozenset(
         # The published code gives lengths by other rules, in units of its grid.
         "explore.step_share",
         "explore.safety_share",
-        "explore.max_hole_share",
         "explore.visible_weight",
+        # Of the score by error, which it does not use.
+        "explore.probe_views",
+        "explore.probe_shift",
+        "explore.probe_turn_deg",
+        "explore.sufficient_resolution",
+        "explore.hole_error",
+        "explore.unresolved_error",
+        "explore.destinations",
+        "explore.min_view_gain",
         "finetune.seed",
         "finetune.judge.iterations_share",  # switched off
         "finetune.judge.leave_out_every",
@@ -221,7 +229,10 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "explore.fold_penalty": 0.6,
         "explore.top_candidates": 3,
         "explore.wave": 1,
+        "explore.wave_kept_share": 0.0,
         "explore.min_gain_share": 0.0,
+        "explore.max_training_views": 100_000,
+        "explore.max_hole_share": 0.5,
         "explore.max_saturated_share": 1.0,
         "explore.max_expansions": 10_000,
         "enhance.references": 1,

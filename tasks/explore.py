@@ -1,8 +1,8 @@
 """explore: virtual trajectories in waves of parallel branches.
 
-`start` measures the scene and chooses the anchors; each `branch` is searched independently from the coverage snapshot of its wave;
-`merge` accepts branches and writes the state of the next wave; `explore` collects the accepted trajectories.
-`next.json` lists the anchors of the next wave, so that the flow need not read arrays.
+`start` measures the scene and chooses the anchors; each `branch` is searched independently from the coverage
+snapshot of its wave; `merge` accepts branches and writes the state of the next wave; `explore` collects the
+accepted trajectories. `next.json` lists the anchors of the next wave, so that the flow need not read arrays.
 """
 
 from __future__ import annotations

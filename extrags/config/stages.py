@@ -384,7 +384,7 @@ class ExploreConfig(StageConfig):
         "wherever it projects into the image, as the published code",
     )
     max_hole_share: float = Field(
-        0.5,
+        0.75,
         gt=0,
         le=1,
         description="a candidate with a larger share of empty pixels is rejected; one without any surface "
@@ -398,9 +398,9 @@ class ExploreConfig(StageConfig):
     )
     score: Literal["error", "pairs"] = Field(
         "error",
-        description="what a view is worth. error: error it takes from views off the trajectory, by the pixels "
-        "in which they show surface that is missing or was seen with fewer pixels; pairs: newly covered "
-        "(Gaussian, direction) pairs, as in the paper",
+        description="what a view is worth. error: error it takes from views off the trajectory, by the "
+        "pixels in which they show surface that is missing or was seen with fewer pixels; pairs: newly "
+        "covered (Gaussian, direction) pairs, as in the paper",
     )
     probe_views: int = Field(
         512, ge=1, description="score=error: views off the trajectory by which error is measured"
@@ -437,7 +437,7 @@ class ExploreConfig(StageConfig):
         4.0,
         ge=0,
         description="score=pairs: worth of a voxel where a view through a hole leaves known space, in voxels "
-        "of known surface: missing surface has no Gaussians that could count as covered; 0 is the paper's rule",
+        "of known surface: missing surface has no Gaussians to be covered; 0 is the paper's rule",
     )
     darkness_weight: float = Field(
         0.0, ge=0, description="lambda_l of the illumination weight; 0.5 in the paper; 0 switches it off"
@@ -451,9 +451,7 @@ class ExploreConfig(StageConfig):
     fold_steps: int = Field(
         3, ge=1, description="moves the net rotation is taken over; 1 is the paper's inter-step rule"
     )
-    fold_penalty: float = Field(
-        1.0, gt=0, le=1, description="eta; 0.6 in the paper; 1 switches the term off"
-    )
+    fold_penalty: float = Field(1.0, gt=0, le=1, description="eta; 0.6 in the paper; 1 switches the term off")
     top_candidates: int = Field(
         14,
         ge=1,

@@ -90,7 +90,7 @@ class Approaches:
         here = np.broadcast_to(pose[:3, :3], (len(poses), 3, 3))
         turns = rotation_angle_deg(here, poses[:, :3, :3]) / self.turn_deg
         # A hair less: a way of exactly two steps takes two views, whatever the rounding.
-        return np.maximum(1, np.ceil(np.maximum(steps, turns) - 1e-6)).astype(np.int64)
+        return np.asarray(np.maximum(1, np.ceil(np.maximum(steps, turns) - 1e-6)), dtype=np.int64)
 
 
 def straight_way(
@@ -108,6 +108,8 @@ def straight_way(
     share = np.arange(1, views + 1) / views
     turn = Rotation.from_matrix(start[:3, :3].T @ end[:3, :3]).as_rotvec()
     poses = np.broadcast_to(np.eye(4), (views, 4, 4)).copy()
-    poses[:, :3, :3] = orthonormalised(start[:3, :3] @ Rotation.from_rotvec(share[:, None] * turn).as_matrix())
+    poses[:, :3, :3] = orthonormalised(
+        start[:3, :3] @ Rotation.from_rotvec(share[:, None] * turn).as_matrix()
+    )
     poses[:, :3, 3] = start[:3, 3] + share[:, None] * (end[:3, 3] - start[:3, 3])
     return poses

@@ -26,7 +26,7 @@ from extrags.raster import Rendering
 from extrags.scene import Scene
 from extrags.thresholds import HOLE_ALPHA
 
-__all__ = ["Sizes", "SizeModel", "measure_sizes", "probe_cameras", "sizes_in"]
+__all__ = ["SizeModel", "Sizes", "measure_sizes", "probe_cameras", "sizes_in"]
 
 SMALLEST_SIZE_PX = 0.05
 """A Gaussian with fewer pixels in a view does not count as shown by it."""

@@ -1,4 +1,4 @@
-"""What the search has to know of a scene, measured once: depth unit, coverage, expected error, destinations."""
+"""What the search has to know of a scene, measured once."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class SceneMeasurements(Storable):
     @property
     def removable_error(self) -> float:
         """Error of views off the trajectory that virtual views could take away; 0 with `score=pairs`."""
-        if isinstance(self.value, PairValue):
+        if not isinstance(self.value, ErrorValue):
             return 0.0
         return float(np.sum(self.value.error * (1 - self.known), dtype=np.float64))
 

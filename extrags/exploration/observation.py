@@ -12,7 +12,7 @@ from extrags.cameras import Cameras
 from extrags.config import ExploreConfig
 from extrags.exploration.coverage import view_pairs
 from extrags.exploration.darkness import dark_direction, luminance
-from extrags.exploration.expected_error import Sizes, SizeModel, sizes_in
+from extrags.exploration.expected_error import SizeModel, Sizes, sizes_in
 from extrags.exploration.frontier import Frontier
 from extrags.exploration.seen import Seen
 from extrags.scene import Scene

@@ -123,7 +123,7 @@ class Branch(Storable):
         anchor: index of the training view it starts from (its position among the training views).
         poses: `world_from_camera` of the views, the start first, [L', 4, 4]; L' <= L.
         moves: name of the move that led to each further view, L' - 1 of them.
-        values: worth of what each further view newly shows, against the snapshot and the views before, [L' - 1].
+        values: worth of what each further view shows beyond the snapshot and the views before, [L' - 1].
         seen: rows that the views show beyond the snapshot: N Gaussians, then F frontier voxels.
         pairs: all (Gaussian, direction) pairs the views cover, packed, [N].
         expansions: states expanded.

@@ -218,9 +218,7 @@ class WaveState(Storable):
                 f"the wave has the anchors {anchors}, but the branches start from "
                 f"{tuple(branch.anchor for branch in branches)}"
             )
-        merge = merge_wave(
-            self.known, self.pairs, branches, self.value, least=self.least, room=self.room
-        )
+        merge = merge_wave(self.known, self.pairs, branches, self.value, least=self.least, room=self.room)
         again, rejected = [], []
         for index, branch in enumerate(branches):
             alone = self.value.gain(self.known, branch.seen)

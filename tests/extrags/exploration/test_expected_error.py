@@ -153,16 +153,16 @@ class TestMeasureScene:
                 ready.scene, ready.measured.training, ready.freespace, ready.config, loaded
             )
             start = loaded.training.world_from_camera[START]
-            one, other = (
-                grow_branch(c, start, c.measured.known, START) for c in (ready, again)
-            )
+            one, other = (grow_branch(c, start, c.measured.known, START) for c in (ready, again))
             np.testing.assert_array_equal(one.poses, other.poses)
             assert one.values == other.values
 
     def test_many_training_views_are_measured_in_part(self):
         tube = small_tube()
         poses = np.repeat(tube.cameras.world_from_camera, 5, axis=0)
-        cameras = Cameras(np.repeat(tube.cameras.K, 5, axis=0), poses, tube.cameras.width, tube.cameras.height)
+        cameras = Cameras(
+            np.repeat(tube.cameras.K, 5, axis=0), poses, tube.cameras.width, tube.cameras.height
+        )
         config = error_config(max_training_views=10)
         frontier = frontier_of(tube.scene, small_freespace(), config)
         measured = measure_scene(tube.scene, cameras, small_freespace(), config, frontier)
@@ -292,9 +292,7 @@ class TestExplore:
             found = explore(
                 tube.scene, tube.sequence, error_config(), freespace=small_freespace(), map=pool.map
             )
-        np.testing.assert_array_equal(
-            found.cameras.world_from_camera, explored().cameras.world_from_camera
-        )
+        np.testing.assert_array_equal(found.cameras.world_from_camera, explored().cameras.world_from_camera)
         np.testing.assert_array_equal(found.values, explored().values)
 
     def test_waves_lose_little_against_one_at_a_time(self):

@@ -161,7 +161,6 @@ class TestMergeWave:
         )
         assert merge.accepted == ()
 
-
     def test_a_branch_that_the_others_left_too_little_waits_for_another_turn(self):
         first, second = np.array([15, 0, 0, 0], np.uint32), np.array([12, 1, 0, 0], np.uint32)
         nothing = np.zeros(4, np.uint32)
