@@ -260,6 +260,7 @@ def _space(inputs: ReportInputs) -> dict[str, Any]:
         "exploration": _exploration(inputs),
         "exploration_absent": inputs.why_absent("trajectories", "explore"),
         "gain_chart": None,
+        "gain_title": None,
         "voxel": None,
         "unit": unit,
     }
@@ -283,11 +284,31 @@ def _space(inputs: ReportInputs) -> dict[str, Any]:
         found["voxel"] = f"{size}³ voxels of {inputs.grid.voxel_mm:.3g} {unit}"
     if inputs.exploration and inputs.exploration["trajectories"]:
         paths = inputs.exploration["trajectories"]
-        pairs = max(1, inputs.exploration["pairs"])
         found["gain_chart"] = gain_chart(
-            [path["gain"] / pairs for path in paths], trajectory_colors(len(paths))
+            [_worth_percent(path, inputs.exploration) for path in paths],
+            trajectory_colors(len(paths)),
+            title=GAIN_TITLES[_score(inputs.exploration)],
         )
+        found["gain_title"] = GAIN_TITLES[_score(inputs.exploration)]
     return found
+
+
+GAIN_TITLES = {
+    "error": "Removable error that each trajectory takes away (% of all)",
+    "pairs": "Newly covered (Gaussian, direction) pairs per trajectory (% of all)",
+}
+"""By what a view is worth, `explore.score`."""
+
+
+def _score(summary: Mapping[str, Any]) -> str:
+    return str(summary.get("score", "pairs"))
+
+
+def _worth_percent(path: Mapping[str, Any], summary: Mapping[str, Any]) -> float:
+    """What a trajectory adds: of the error that views could take away, or of all pairs."""
+    if _score(summary) == "error":
+        return 100 * path["value"] / max(summary["removable_error"], 1e-12)
+    return 100 * path["gain"] / max(1, summary["pairs"])
 
 
 def _exploration(inputs: ReportInputs) -> dict[str, Any] | None:
@@ -306,15 +327,24 @@ def _exploration(inputs: ReportInputs) -> dict[str, Any] | None:
                 "start": inputs.sequence.frame_name(said["anchor_frame"]) if said else "",
                 "views": len(poses),
                 "length": number(length, 1),
-                "gain": count(said.get("gain")) if said else "",
+                "gain": f"{_worth_percent(said, summary):.2f} %" if said else "",
                 "reason": said.get("reason", ""),
             }
         )
     facts = []
     if summary:
         share = summary["coverage_share"]
-        facts = [
-            ("Virtual views", count(summary["virtual_views"])),
+        facts = [("Virtual views", count(summary["virtual_views"]))]
+        if _score(summary) == "error":
+            removable, removed = summary["removable_error"], summary["removed_error"]
+            facts += [
+                (
+                    "Error of views off the trajectory that virtual views could take away",
+                    f"{100 * removable:.2f} %",
+                ),
+                ("Taken away", f"{100 * removed / max(removable, 1e-12):.0f} % of it"),
+            ]
+        facts += [
             ("Coverage before", f"{100 * share['before']:.2f} %"),
             ("Coverage after", f"{100 * share['after']:.2f} %"),
             ("Renders spent", count(summary["renders"])),

@@ -191,21 +191,22 @@ def views_chart(
         return svg_image(figure)
 
 
-def gain_chart(gains: Sequence[float | int], colors: Sequence[str]) -> DataImage:
+def gain_chart(percent: Sequence[float], colors: Sequence[str], *, title: str) -> DataImage:
     """What each trajectory added, in the order of acceptance.
 
     Args:
-        gains: newly covered share of all (Gaussian, direction) pairs.
+        percent: what each of them adds.
         colors: of the trajectories, as in the figures of the scene.
+        title: of what it is a share.
     """
     with drawing_style():
         figure = _figure(9.6, 1.9)
         axes = figure.add_subplot()
-        order = np.arange(len(gains)) + 1
-        axes.bar(order, 100 * np.asarray(gains, dtype=np.float64), color=list(colors), width=0.7)
-        axes.set_title("Newly covered (Gaussian, direction) pairs per trajectory (% of all)")
+        order = np.arange(len(percent)) + 1
+        axes.bar(order, np.asarray(percent, dtype=np.float64), color=list(colors), width=0.7)
+        axes.set_title(title)
         axes.set_xlabel("trajectory, in the order of acceptance")
-        axes.set_xlim(0.4, max(len(gains), 8) + 0.6)
+        axes.set_xlim(0.4, max(len(percent), 8) + 0.6)
         axes.xaxis.get_major_locator().set_params(integer=True)
         return svg_image(figure)
 

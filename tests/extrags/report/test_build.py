@@ -92,6 +92,25 @@ def test_a_loss_is_called_a_loss(inputs: ReportInputs) -> None:
     assert "\N{MINUS SIGN}2.50 worse from 22.50" in text
 
 
+def test_error_that_trajectories_take_away_is_told(inputs: ReportInputs) -> None:
+    paths = [
+        {**path, "value": value}
+        for path, value in zip(inputs.exploration["trajectories"], (0.02, 0.004), strict=False)
+    ]
+    by_error = {
+        **inputs.exploration,
+        "trajectories": paths,
+        "score": "error",
+        "removable_error": 0.04,
+        "removed_error": 0.024,
+    }
+    text = Page(build_report(replace(inputs, exploration=by_error), CONFIG)).text
+    assert "4.00 %" in text
+    assert "60 % of it" in text
+    assert "50.00 %" in text
+    assert "10.00 %" in text
+
+
 def test_what_the_plan_left_out_is_named_with_its_reason(inputs: ReportInputs) -> None:
     plan = {
         "measurements": {"hole_share": 0.0004},
