@@ -6,7 +6,7 @@ Reading belongs to `data_catalog`, a layer above the library: no other module of
 from __future__ import annotations
 
 from data_catalog import read, register_reader
-from extrags.assessment import ScenePlan, assess
+from extrags.assessment import assess
 from extrags.cameras import Cameras
 from extrags.config import (
     PROFILES,
@@ -41,6 +41,7 @@ from extrags.raster import Rendering, rasterize
 from extrags.restoration.backends import register_backend
 from extrags.restoration.trajectories import restore
 from extrags.scene import Scene
+from extrags.scene_plan import ScenePlan
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.surface import Mesh, fuse_surface
 from extrags.training import TrainingResult, finetune, reconstruct

@@ -23,7 +23,6 @@ from extrags.config import PipelineConfig
 from extrags.errors import CaptureError, ConfigError
 
 if TYPE_CHECKING:
-    from extrags.assessment import Decision, ScenePlan
     from extrags.baselines.uc_nerf.training import UcNerfResult
     from extrags.confidence import PerceptualDifference
     from extrags.depth.estimate import DepthEstimate
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from extrags.pseudo_views import PseudoViews
     from extrags.restoration.protocol import Enhancer
     from extrags.scene import Scene
+    from extrags.scene_plan import Decision, ScenePlan
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
     from extrags.training import TrainingResult

@@ -251,7 +251,7 @@ class SequenceRun(Pipeline):
 
     def assess(self) -> None:
         """What the scene lacks, and the plan."""
-        from extrags.assessment import ScenePlan
+        from extrags.scene_plan import ScenePlan
 
         with self._stage("assess") as row:
             coverage = self.config.explore.coverage

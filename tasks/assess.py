@@ -49,6 +49,6 @@ def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig, coverage
 @stage("plan", version=3)
 def plan(slot: Slot, measured: Ref, config: PipelineConfig) -> None:
     """Derive the plan from the measurements and the budgets of the run; writes `plan.json`."""
-    from extrags.assessment import decide
+    from extrags.scene_plan import decide
 
     slot.save(decide(slot.load_json(MEASUREMENTS, measured), config))

@@ -62,7 +62,6 @@ def report(
         profile: name of the profile they started from.
         rows: `{stage, state, seconds, reason, made_seconds}` of each stage.
     """
-    from extrags.assessment import ScenePlan
     from extrags.depth.estimate import DepthEstimate
     from extrags.exploration import Exploration
     from extrags.freespace import FreeSpace
@@ -70,6 +69,7 @@ def report(
     from extrags.pseudo_views import PseudoViews
     from extrags.report.build import build_pages
     from extrags.report.inputs import ReportInputs
+    from extrags.scene_plan import ScenePlan
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 

@@ -307,8 +307,8 @@ def _score(summary: Mapping[str, Any]) -> str:
 def _worth_percent(path: Mapping[str, Any], summary: Mapping[str, Any]) -> float:
     """What a trajectory adds: of the error that views could take away, or of all pairs."""
     if _score(summary) == "error":
-        return 100 * path["value"] / max(summary["removable_error"], 1e-12)
-    return 100 * path["gain"] / max(1, summary["pairs"])
+        return float(100 * path["value"] / max(summary["removable_error"], 1e-12))
+    return float(100 * path["gain"] / max(1, summary["pairs"]))
 
 
 def _exploration(inputs: ReportInputs) -> dict[str, Any] | None:

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.assessment import ScenePlan, assess, decide, probe_views
+from extrags.assessment import assess, probe_views
 from extrags.cameras import rotation_angle_deg
 from extrags.config import AssessConfig, EnhanceConfig, ExploreConfig, PipelineConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.scene import Scene
+from extrags.scene_plan import ScenePlan, decide
 
 from .exploration.tube import Tube, make_ball, make_tube, small_tube
 

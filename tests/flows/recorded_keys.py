@@ -12,9 +12,9 @@ from contextlib import nullcontext
 from typing import Any
 from unittest.mock import patch
 
-from extrags.assessment import ScenePlan, decide
 from extrags.config import PipelineConfig
 from extrags.finetuning_judge import Judgement
+from extrags.scene_plan import ScenePlan, decide
 from extrags.store import Manifest, Ref, digest_of
 from flows.runners import Call, Result
 from flows.wiring import SequenceRun
