@@ -26,7 +26,7 @@ from tasks.depth import keyed_settings as keyed_depth_settings
 from tasks.enhance import assemble, judging_settings, restore, restoring_settings, train
 from tasks.enhance import keyed_settings as keyed_enhance_settings
 from tasks.evaluate import METRICS_FILE, measure, render
-from tasks.explore import NEXT, branch, explore, merge, start
+from tasks.explore import branch, explore, merge, next_anchors, start
 from tasks.finetune import finetune, finetuning_settings, judge
 from tasks.freespace import freespace
 from tasks.ingest import ingest, training_frames
@@ -285,12 +285,12 @@ class SequenceRun(Pipeline):
             inputs = {**self._scene_inputs(), "freespace": space, "config": self.config.explore}
             self.refs["waves"] = search = self._run_task(row, Call(start, inputs))
             shared = {name: inputs[name] for name in ("scene", "freespace", "config")} | {"search": search}
-            while anchors := self.store.load_json(NEXT, self.refs["waves"])["anchors"]:
+            while anchors := next_anchors(self._manifest("waves").counts):
                 state = self.refs["waves"]
                 calls = [Call(branch, {**shared, "state": state, "anchor": anchor}) for anchor in anchors]
                 branches = self._run_tasks(row, calls)
                 self.refs["waves"] = self._run_task(row, Call(merge, {"state": state, "branches": branches}))
-                accepted = self.store.load_json(NEXT, self.refs["waves"])["accepted"]
+                accepted = int(self._manifest("waves").counts["accepted"] or 0)
                 self._report_progress(row, "running", accepted, self.config.explore.trajectories)
             collected = {**inputs, "search": search, "state": self.refs["waves"]}
             self.refs["explore"] = self._run_task(row, Call(explore, collected))

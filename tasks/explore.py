@@ -2,11 +2,13 @@
 
 `start` measures the scene and chooses the anchors; each `branch` is searched independently from the coverage
 snapshot of its wave; `merge` accepts branches and writes the state of the next wave; `explore` collects the
-accepted trajectories. `next.json` lists the anchors of the next wave, so that the flow need not read arrays.
+accepted trajectories. The manifest of
+a state names the anchors of the next wave (`next_anchors`), so that the flow need not read arrays.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from extrags.config import ExploreConfig
@@ -16,14 +18,14 @@ from tasks.stage import stage
 if TYPE_CHECKING:
     from extrags.exploration import SearchContext, WaveState
 
-__all__ = ["NEXT", "branch", "explore", "merge", "start"]
+__all__ = ["branch", "explore", "merge", "next_anchors", "start"]
 
-NEXT = "next.json"
+NEXT_ANCHORS = "next_anchors"
 
 
-@stage("explore-start", version=4)
+@stage("explore-start", version=5)
 def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig) -> None:
-    """Measure the scene and choose the anchors; writes `search/`, `state/` and `next.json`."""
+    """Measure the scene and choose the anchors; writes `search/` and `state/`."""
     from extrags.exploration import prepare_search, start_exploration
     from extrags.freespace import FreeSpace
     from extrags.scene import Scene
@@ -50,9 +52,9 @@ def branch(
     slot.counts.update(views=len(grown), renders=grown.renders)
 
 
-@stage("explore-merge", version=3)
+@stage("explore-merge", version=4)
 def merge(slot: Slot, state: Ref, branches: list[Ref]) -> None:
-    """Accept the branches of a wave; writes the next `state/` and `next.json`."""
+    """Accept the branches of a wave; writes the next `state/`."""
     from extrags.exploration import Branch, WaveState
 
     before = slot.load(WaveState, state)
@@ -97,4 +99,10 @@ def _prepared(slot: Slot, scene: Ref, freespace: Ref, search: Ref, config: Explo
 
 def _write_state(slot: Slot, state: WaveState) -> None:
     slot.save(state)
-    slot.save_json(NEXT, {"anchors": list(state.next_wave()), "accepted": len(state.branches)})
+    anchors = " ".join(str(anchor) for anchor in state.next_wave())
+    slot.counts.update({NEXT_ANCHORS: anchors, "accepted": len(state.branches)})
+
+
+def next_anchors(counts: Mapping[str, float | int | str | None]) -> list[int]:
+    """Anchors that grow together next, by the counts in the manifest of a state; none: it is the last."""
+    return [int(anchor) for anchor in str(counts[NEXT_ANCHORS] or "").split()]

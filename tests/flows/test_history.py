@@ -168,7 +168,7 @@ class TestFlow:
             "name": "weekly",
         }
         first = benchmark(**given, refresh=True)
-        seconds = {item.key: item.seconds for item in store.ls("coarse*")}
+        made = {item.key: (item.started, item.seconds) for item in store.ls("coarse*")}
         assert first["regressions"] == []
         # Were the runs before much better, the next one would be a regression: its run fails.
         (last,) = history_of(store, "weekly")
@@ -186,7 +186,7 @@ class TestFlow:
         found = history_of(store, "weekly")
         assert len(found) == 5
         assert found[-1]["cases"][0]["figures"] == found[-2]["cases"][0]["figures"]
-        assert {item.key: item.seconds for item in store.ls("coarse*")} != seconds
+        assert {item.key: (item.started, item.seconds) for item in store.ls("coarse*")} != made
         page = str(error).rpartition("page: ")[2]
         assert "5 runs that measured anew" in Path(page).read_text()
         # From the store: nothing is measured, nothing is added.
