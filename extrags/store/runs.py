@@ -58,8 +58,13 @@ class RunRecord:
         folder.mkdir(parents=True, exist_ok=True)
         self._path = folder / f"{secrets.token_hex(8)}.json"
         self._file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
-        fcntl.flock(self._file, fcntl.LOCK_EX)
-        self._write()
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX)
+            self._write()
+        except OSError:
+            # A full disk takes the name of a file, and nothing into it.
+            self._end()
+            raise
 
     def add(self, keys: Iterable[str]) -> None:
         """Artefacts that the run uses."""
@@ -71,9 +76,15 @@ class RunRecord:
 
     def close(self) -> None:
         """The run has ended, well or not. The same artefacts again replace the record of the former run."""
-        if self._keys:
-            name = _PREFIX + digest_of([self._sequence, sorted(self._keys)])
-            write_record(self._store, name, self._content())
+        try:
+            if self._keys:
+                name = _PREFIX + digest_of([self._sequence, sorted(self._keys)])
+                write_record(self._store, name, self._content())
+        finally:
+            # Held on to, the lock would tell of a run that goes on for as long as this process lives.
+            self._end()
+
+    def _end(self) -> None:
         self._path.unlink(missing_ok=True)
         os.close(self._file)
 

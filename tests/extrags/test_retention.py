@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -221,6 +222,27 @@ def test_a_store_that_cannot_be_written_is_only_read(
     unwritable(Path(store.root) / "runs")
     with recorded_run(store, "phantom/0") as record:
         assert record is None
+
+
+@pytest.mark.parametrize("when", ["at the beginning", "at the end"])
+def test_a_run_that_cannot_be_recorded_holds_no_lock(
+    store: Store, when: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = len(os.listdir("/proc/self/fd"))
+    with monkeypatch.context() as patched:
+        if when == "at the beginning":
+            patched.setattr(os, "pwrite", full)
+        else:
+            patched.setattr("extrags.store.runs.write_record", full)
+        with recorded_run(store, "phantom/0") as record:
+            assert (record is None) == (when == "at the beginning")
+            if record is not None:
+                record.add(["toy-v1-x"])
+    assert active_runs(store) == []
+    assert len(os.listdir("/proc/self/fd")) == before
 
 
 def test_a_record_is_plain_json(store: Store) -> None:
