@@ -29,4 +29,4 @@ def test_killed_it_ends_as_if_undisturbed(kind: str, count: int) -> None:
     assert counts["trials"] == counts["exit code 0"] == count
     assert not any(counts.get(wrong) for wrong in ("other artefacts", "damaged", "left behind"))
     assert found["flow runs that the server takes for running"] == 0
-    assert sum(found["hits by stage"].values()) > count / 2
+    assert sum(found["hits by stage"].values()) >= count / 2
