@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 
 from extrags.cameras import Cameras, rotation_about
@@ -23,14 +22,12 @@ from extrags.exploration.frontier import Frontier
 from extrags.exploration.seen import ErrorValue, Seen
 from extrags.freespace import FREE, FreeSpace
 from extrags.raster import Rendering
-from extrags.scene import Scene
 from extrags.thresholds import HOLE_ALPHA
 
 __all__ = ["SizeModel", "Sizes", "measure_sizes", "probe_cameras", "sizes_in"]
 
 SMALLEST_SIZE_PX = 0.05
 """A Gaussian with fewer pixels in a view does not count as shown by it."""
-VIEWS_PER_BATCH = 16
 ROUNDING = 1e-5
 """Clearances are of single precision, and interpolated."""
 SHORTEST_SHIFT = 0.02
@@ -139,16 +136,6 @@ def sizes_in(rendering: Rendering, cameras: Cameras, frontier: Frontier) -> list
                 np.concatenate([sums[index, gaussians], pixels.astype(np.float32)]),
             )
         )
-    return found
-
-
-def rendered_sizes(scene: Scene, cameras: Cameras, frontier: Frontier) -> list[Sizes]:
-    """Sizes of all rows in views, which are rendered in batches."""
-    found: list[Sizes] = []
-    with torch.no_grad():
-        for start in range(0, len(cameras), VIEWS_PER_BATCH):
-            batch = cameras[start : start + VIEWS_PER_BATCH]
-            found += sizes_in(scene.render(batch, visibility=True, sh_degree=0), batch, frontier)
     return found
 
 

@@ -6,19 +6,19 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt32
 
 from extrags.cameras import Cameras
 from extrags.config import ExploreConfig
 from extrags.exploration.coverage import view_pairs
 from extrags.exploration.darkness import dark_direction, luminance
-from extrags.exploration.expected_error import SizeModel, Sizes, sizes_in
+from extrags.exploration.expected_error import Sizes, sizes_in
 from extrags.exploration.frontier import Frontier
 from extrags.exploration.seen import Seen
 from extrags.scene import Scene
 from extrags.thresholds import HOLE_ALPHA
 
-__all__ = ["Observation", "observe", "seen_pairs", "seen_sizes"]
+__all__ = ["Observation", "gaussian_words", "observe", "seen_pairs"]
 
 NEAR_SHARE = 0.5
 """A candidate is too near when more than this share of its surface pixels is inside the safety margin."""
@@ -158,11 +158,6 @@ def seen_pairs(
     return Seen(row, np.concatenate([words, further]))
 
 
-def gaussian_words(scene: Scene, observation: Observation, directions: int) -> np.ndarray:
-    """Of each visible Gaussian, the direction it is seen from, packed."""
+def gaussian_words(scene: Scene, observation: Observation, directions: int) -> UInt32[np.ndarray, "m"]:
+    """Of each visible Gaussian, the direction it is seen from, packed; `directions` is D."""
     return view_pairs(scene, observation.pose[:3, 3], observation.visible, directions)
-
-
-def seen_sizes(observation: Observation, model: SizeModel) -> Seen:
-    """How well a view resolves each row."""
-    return model.seen(observation.sizes)
