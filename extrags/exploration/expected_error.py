@@ -24,12 +24,12 @@ from extrags.freespace import FREE, FreeSpace
 from extrags.raster import Rendering
 from extrags.thresholds import HOLE_ALPHA
 
-__all__ = ["SizeModel", "Sizes", "measure_sizes", "probe_cameras", "sizes_in"]
+__all__ = ["CLEARANCE_ROUNDING", "SizeModel", "Sizes", "measure_sizes", "probe_cameras", "sizes_in"]
 
 SMALLEST_SIZE_PX = 0.05
 """A Gaussian with fewer pixels in a view does not count as shown by it."""
-ROUNDING = 1e-5
-"""Clearances are of single precision, and interpolated."""
+CLEARANCE_ROUNDING = 1e-5
+"""Share by which a clearance may fall short: it is of single precision, and interpolated."""
 SHORTEST_SHIFT = 0.02
 """Probes are shifted by at least this share of the depth unit, or turned in place."""
 
@@ -89,7 +89,7 @@ def probe_cameras(
     count = config.probe_views
     which = np.arange(count) * len(cameras) // count
     poses = cameras.world_from_camera[which].copy()
-    needed = np.minimum(margin_mm, freespace.clearance_at(poses[:, :3, 3])) * (1 - ROUNDING)
+    needed = np.minimum(margin_mm, freespace.clearance_at(poses[:, :3, 3])) * (1 - CLEARANCE_ROUNDING)
     for index in range(count):
         axis, side = _directions(generator)
         turn, shift = np.radians(config.probe_turn_deg) * generator.uniform(), generator.uniform()

@@ -16,6 +16,7 @@ from extrags.config import ExploreConfig
 from extrags.errors import ShapeError
 from extrags.events import Progress, emit
 from extrags.exploration.approach import Approaches
+from extrags.exploration.expected_error import CLEARANCE_ROUNDING
 from extrags.exploration.frontier import Frontier
 from extrags.exploration.measurements import SceneMeasurements, frontier_of, measure_scene
 from extrags.exploration.observation import Observation, gaussian_words, observe, seen_pairs
@@ -31,8 +32,6 @@ __all__ = ["Branch", "SearchContext", "grow_branch", "prepare_search"]
 
 APPROACH = "approach"
 """Name of the moves on a straight way to a destination."""
-ROUNDING = 1e-5
-"""Clearances are of single precision, and interpolated."""
 SAME_POSE_SHARE = 0.25
 """Poses nearer than this share of a step and of a turn are the same pose."""
 
@@ -107,7 +106,7 @@ class SearchContext:
                 there every move that does not go nearer still is allowed.
         """
         # A hair less: a camera that keeps its distance does so in any unit and any frame of the world.
-        needed = min(self.margin_mm, clearance_mm) * (1 - ROUNDING)
+        needed = min(self.margin_mm, clearance_mm) * (1 - CLEARANCE_ROUNDING)
         return np.asarray(
             (self.freespace.lookup(ends) == FREE)
             & (self.freespace.clearance_at(ends) >= needed)
