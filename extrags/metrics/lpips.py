@@ -180,15 +180,24 @@ class Lpips:
         return [torch.cat(layers) for layers in zip(*parts, strict=True)]
 
     def _differences_of_chunk(self, first: Tensor, second: Tensor) -> list[Tensor]:
+        return self.compared(list(self.activations(torch.cat([first, second]))))
+
+    def compared(self, activations: list[Tensor]) -> list[Float[Tensor, "n hl wl"]]:
+        """The difference map of each layer, from the activations of twice N images, the first N with the others.
+
+        Args:
+            activations: of all images, from `activations`.
+        """
         layers = []
-        for index, tap in enumerate(self._activations(torch.cat([first, second]))):
+        for index, tap in enumerate(activations):
             unit = tap / (tap.square().sum(1, keepdim=True).sqrt() + _NORM_EPS)
             one, other = unit.chunk(2)
             head = self.weights[f"lin{index}"].reshape(1, -1, 1, 1)
             layers.append(((one - other).square() * head).sum(1))
         return layers
 
-    def _activations(self, images: Float[Tensor, "n h w 3"]) -> Iterator[Tensor]:
+    def activations(self, images: Float[Tensor, "n h w 3"]) -> Iterator[Float[Tensor, "n c hl wl"]]:
+        """What the backbone's layers give for images in [0, 1], layer by layer."""
         shift = images.new_tensor(_CHANNEL_SHIFT)
         scale = images.new_tensor(_CHANNEL_SCALE)
         x = ((2 * images - 1 - shift) / scale).movedim(-1, 1).contiguous()

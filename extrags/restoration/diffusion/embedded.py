@@ -18,12 +18,19 @@ from extrags.restoration.description import description_fields, read_description
 from extrags.restoration.diffusion.network import RestorationNetwork, build_network
 from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.diffusion.rectified_flow import Sampled, sample
+from extrags.restoration.diffusion.texture_transfer import PatchFeatures
 from extrags.restoration.diffusion.weights import WEIGHTS, find_weights
 from extrags.restoration.protocol import Clip, Restoration
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
 from extrags.threads import in_threads
-from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers, condition
+from extrags.view_synthesis.conditioning import (
+    COLOR_CENTER,
+    COLOR_SCALE,
+    CONDITION_CHANNELS,
+    Layers,
+    condition,
+)
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 
@@ -31,6 +38,8 @@ __all__ = ["EmbeddedEnhancer", "pretrained"]
 
 FORMAT = 2
 """Raised when a saved restorer cannot be read by newer code."""
+PATCHES = "patches.safetensors"
+COLOR_STEPS = 255
 CANDIDATE_STEPS = (1, 4)
 """More steps never gained on held-out pairs; which of these does differs from scene to scene."""
 VIEWS_AT_ONCE = 4
@@ -43,7 +52,8 @@ class EmbeddedEnhancer:
     Args:
         network: in evaluation mode.
         steps: of the sampler.
-        samples: drawn per view and averaged; their spread adds to the expected error.
+        samples: drawn per view; their spread adds to the expected error. Their mean is the restored view, but
+            with `drawing` it is the first.
         seed: of the noise, together with the clip's index.
         half_precision: convolutions in bfloat16.
         gamut: hues of the scene's real frames, bounds of the restored ones.
@@ -51,6 +61,9 @@ class EmbeddedEnhancer:
         error_model: the expected error, from the network's own and from what it was given.
         calibration: curve from the expected error to the error it makes.
         deterministic: trained as a plain regression: no noise, one step.
+        drawing: one of the plausible views is restored instead of their mean; generative networks only.
+        patches: parts of the scene's real frames, which a generative network takes texture from, in [0, 1],
+            [R, 3, S, S]; None without.
     """
 
     network: RestorationNetwork
@@ -63,19 +76,33 @@ class EmbeddedEnhancer:
     error_model: ErrorModel = field(default_factory=ErrorModel)
     calibration: Calibration = field(default_factory=Calibration)
     deterministic: bool = False
+    drawing: bool = False
+    patches: Float[Tensor, "r 3 s s"] | None = None
 
     name = "embedded"
 
-    def with_settings(self, config: EnhanceConfig, gamut: Gamut) -> EmbeddedEnhancer:
-        """The same network under a scene's settings."""
+    def with_settings(
+        self, config: EnhanceConfig, gamut: Gamut, patches: Float[Tensor, "r 3 s s"] | None = None
+    ) -> EmbeddedEnhancer:
+        """The same network under a scene's settings.
+
+        Args:
+            config: settings.
+            gamut: hues of the scene's real frames.
+            patches: parts of these frames; a network that is not generative has no use for them.
+        """
         steps = self.steps if config.steps == "auto" else config.steps
+        samples = 1 if config.samples == "mean" else config.samples
+        generative = self.network.generative
         return replace(
             self,
             steps=1 if self.deterministic else steps,
-            samples=1 if self.deterministic else config.samples,
+            samples=1 if self.deterministic else samples,
             seed=config.seed,
             half_precision=chosen_precision(config) == "bfloat16",
             gamut=gamut,
+            drawing=generative and config.samples != "mean",
+            patches=patches if generative else None,
         )
 
     def candidate_steps(self, config: EnhanceConfig) -> tuple[int, ...]:
@@ -96,10 +123,12 @@ class EmbeddedEnhancer:
             draws.append(self.restored_layers(clip.layers, clip.transfer, noise, steps=self.steps))
         colors = torch.stack([draw.rgb for draw in draws])
         spread = colors.std(dim=0, correction=0).mean(dim=1, keepdim=True)
+        # The mean of drawn views would have no texture: the others only tell how far views may differ.
+        shown = colors[0] if self.drawing else colors.mean(dim=0)
         error = torch.stack([draw.error for draw in draws]).mean(dim=0)
         expected = torch.hypot(error, spread)[:, 0].contiguous().numpy()
         return Restoration(
-            colors.mean(dim=0).permute(0, 2, 3, 1).contiguous().numpy(),
+            shown.permute(0, 2, 3, 1).contiguous().numpy(),
             self.calibration.applied(expected),
             self.provenance,
             draws[0].depth_mm[:, 0].contiguous().numpy(),
@@ -121,14 +150,23 @@ class EmbeddedEnhancer:
             noise: shared by all views.
             steps: of the sampler.
         """
+        features = self._patch_features()
 
         def restored_group(first: int) -> Sampled:
             group = layers[first : first + VIEWS_AT_ONCE]
             with torch.no_grad():
                 conditioning = condition(group, transfer)
             start = noise.expand(len(conditioning.base), -1, -1, -1)
+            renewed = torch.Generator().manual_seed(self.seed)
             restored = sample(
-                self.network, conditioning, start, steps=steps, half_precision=self.half_precision
+                self.network,
+                conditioning,
+                start,
+                steps=steps,
+                half_precision=self.half_precision,
+                drawing=self.drawing,
+                patches=None if features is None else features.expanded(len(start)),
+                renewed=renewed if self.drawing else None,
             )
             rgb = self.gamut.bounded(restored.rgb)
             error = self.error_model.applied(error_features(group, rgb, restored.error))
@@ -156,6 +194,13 @@ class EmbeddedEnhancer:
         generator = np.random.default_rng([self.seed, 3, clip, index])
         return torch.from_numpy(generator.standard_normal((1, 3, height, width), dtype=np.float32))
 
+    def _patch_features(self) -> PatchFeatures | None:
+        if self.patches is None or not self.network.generative:
+            return None
+        normalised = (self.patches - COLOR_CENTER) / COLOR_SCALE
+        with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=self.half_precision):
+            return self.network.texture.encode(normalised[None])
+
     @property
     def provenance(self) -> dict[str, Any]:
         """Settings behind restored views, ready for JSON."""
@@ -165,6 +210,7 @@ class EmbeddedEnhancer:
             "samples": self.samples,
             "seed": self.seed,
             "precision": "bfloat16" if self.half_precision else "float32",
+            "drawing": self.drawing,
             "validation": self.record.get("validation", {}),
             "scene_training_kept": self.record.get("scene_training_kept"),
         }
@@ -184,6 +230,8 @@ class EmbeddedEnhancer:
             for name, value in self.network.state_dict().items()
         }
         save_file(weights, str(path / WEIGHTS))
+        if self.patches is not None:
+            save_file({"patches": (self.patches * COLOR_STEPS).round().to(torch.uint8)}, str(path / PATCHES))
         description = {
             "backend": self.name,
             "format": FORMAT,
@@ -197,6 +245,8 @@ class EmbeddedEnhancer:
             "error_model": self.error_model.as_dict(),
             "calibration": self.calibration.as_dict(),
             "deterministic": self.deterministic,
+            "generative": self.network.generative,
+            "drawing": self.drawing,
             "record": self.record,
         }
         write_description(path, description)
@@ -224,7 +274,12 @@ class EmbeddedEnhancer:
             )
         with description_fields(description_file):
             first, second, third = description["widths"]
-            network = build_network(CONDITION_CHANNELS, (first, second, third), torch.Generator())
+            network = build_network(
+                CONDITION_CHANNELS,
+                (first, second, third),
+                torch.Generator(),
+                generative=bool(description.get("generative", False)),
+            )
             error_model = description["error_model"]
             enhancer = cls(
                 network.eval(),
@@ -237,6 +292,8 @@ class EmbeddedEnhancer:
                 ErrorModel(tuple(error_model["weights"]), float(error_model["offset"])),
                 Calibration(**{k: tuple(v) for k, v in description["calibration"].items()}),
                 bool(description["deterministic"]),
+                bool(description.get("drawing", False)),
+                _read_patches(weights_file.with_name(PATCHES)),
             )
         try:
             network.load_state_dict(
@@ -245,6 +302,20 @@ class EmbeddedEnhancer:
         except (OSError, RuntimeError, ValueError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return enhancer
+
+
+def _read_patches(file: Path) -> Float[Tensor, "r 3 s s"] | None:
+    """Patches of a scene's restorer; None where there is no such file.
+
+    Raises:
+        WeightsError: when the file holds no patches.
+    """
+    if not file.exists():
+        return None
+    try:
+        return load_safetensors(file)["patches"].float() / COLOR_STEPS
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise WeightsError(f"{file}: not the patches of a scene's frames ({error})") from error
 
 
 def pretrained(config: EnhanceConfig) -> EmbeddedEnhancer | None:

@@ -7,6 +7,9 @@ Two-by-two pixel blocks become channels at the entrance (full resolution costs m
 group normalisation and SiLU, the diffusion time by feature-wise scale and shift, attention at the
 coarsest level only. All residual branches and the output start at zero, so that an untrained network
 returns its base image.
+
+The generative form of the network can do two things more: it takes texture from patches of the scene's own
+frames (`TextureTransfer`), and it is told whether the mean of all plausible views is asked for or one of them.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
+
+from extrags.restoration.diffusion.texture_transfer import PatchFeatures, TextureTransfer
 
 __all__ = ["OUTPUT_CHANNELS", "SIZE_MULTIPLE", "RestorationNetwork", "build_network"]
 
@@ -79,12 +84,16 @@ class RestorationNetwork(nn.Module):
     Args:
         condition_channels: channels of the conditioning.
         widths: channels of the three levels; multiples of 8.
+        generative: with texture transfer, and able to draw one of many plausible views.
     """
 
-    def __init__(self, condition_channels: int, widths: tuple[int, int, int]) -> None:
+    def __init__(
+        self, condition_channels: int, widths: tuple[int, int, int], *, generative: bool = False
+    ) -> None:
         super().__init__()
         self.condition_channels = condition_channels
         self.widths = widths
+        self.generative = generative
         fine, middle, coarse = widths
         blocks = UNSHUFFLE**2
         self.time = nn.Sequential(
@@ -105,24 +114,47 @@ class RestorationNetwork(nn.Module):
         self.up_last = ResidualBlock(2 * fine, fine)
         self.norm = nn.GroupNorm(NORM_GROUPS, fine)
         self.exit = nn.Conv2d(fine, OUTPUT_CHANNELS * blocks, 3, padding=1)
+        if generative:
+            self.drawing = nn.Linear(1, TIME_WIDTH, bias=False)
+            self.texture = TextureTransfer(widths)
 
     def forward(
         self,
         condition: Float[Tensor, "n c h w"],
         noisy: Float[Tensor, "n 3 h w"],
         time: Float[Tensor, "n"],
+        drawing: Float[Tensor, "n"] | None = None,
+        patches: PatchFeatures | None = None,
     ) -> Float[Tensor, "n 5 h w"]:
-        """Residual colours, normalised as `noisy`; residual log-depth; log-error."""
+        """Residual colours, normalised as `noisy`; residual log-depth; log-error.
+
+        Args:
+            condition: conditioning.
+            noisy: a point of the path from the clean view to noise.
+            time: its place there, 1 at the noise.
+            drawing: 1 for one of the plausible views, 0 for their mean; None is 0. Counts in the generative
+                form only.
+            patches: features of patches of the scene's frames; None takes no texture from them. Counts in
+                the generative form only.
+        """
         embedded = self.time(_sinusoids(time))
+        if self.generative and drawing is not None:
+            embedded = embedded + self.drawing(drawing[:, None])
         packed = functional.pixel_unshuffle(torch.cat([condition, noisy], dim=1), UNSHUFFLE)
         entered = self.entrance(packed.contiguous(memory_format=torch.channels_last))
         fine = self.down_fine(entered, embedded)
         middle = self.down_middle(self.to_middle(fine), embedded)
         coarse = self.down_coarse(self.to_coarse(middle), embedded)
-        coarse = self.up_coarse(self.attention(coarse), embedded)
+        coarse = self.attention(coarse)
+        taken = self.texture(coarse, patches) if self.generative and patches is not None else None
+        coarse = self.up_coarse(coarse if taken is None else coarse + taken.coarse, embedded)
         hidden = self.from_coarse(_doubled(coarse))
+        if taken is not None:
+            hidden = hidden + taken.middle
         hidden = self.up_middle(torch.cat([hidden, middle], dim=1), embedded)
         hidden = self.from_middle(_doubled(hidden))
+        if taken is not None:
+            hidden = hidden + taken.fine
         hidden = self.up_fine(torch.cat([hidden, fine], dim=1), embedded)
         hidden = self.up_last(torch.cat([hidden, entered], dim=1), embedded)
         hidden = self.exit(functional.silu(self.norm(hidden)))
@@ -146,14 +178,39 @@ class RestorationNetwork(nn.Module):
             elif isinstance(module, SelfAttention):
                 nn.init.zeros_(module.out.weight)
         nn.init.zeros_(self.exit.weight)
+        if self.generative:
+            nn.init.zeros_(self.drawing.weight)
+            self.texture.initialise()
+
+    def widened(self, condition_channels: int) -> RestorationNetwork:
+        """The generative form of this network with more conditioning channels, which it does not use yet.
+
+        Args:
+            condition_channels: of the wider network; its first ones are those of this network.
+        """
+        wider = build_network(
+            condition_channels, self.widths, torch.Generator().manual_seed(0), generative=True
+        )
+        own = {name: value.clone() for name, value in self.state_dict().items()}
+        old = own["entrance.weight"].unflatten(1, (-1, UNSHUFFLE**2))
+        new = old.new_zeros(len(old), condition_channels + 3, *old.shape[2:])
+        new[:, : self.condition_channels] = old[:, : self.condition_channels]
+        new[:, -3:] = old[:, -3:]
+        own["entrance.weight"] = new.flatten(1, 2)
+        wider.load_state_dict({**wider.state_dict(), **own})
+        return wider
 
 
 def build_network(
-    condition_channels: int, widths: tuple[int, int, int], generator: torch.Generator
+    condition_channels: int,
+    widths: tuple[int, int, int],
+    generator: torch.Generator,
+    *,
+    generative: bool = False,
 ) -> RestorationNetwork:
     """A network whose weights come from `generator` alone (no global random state is touched)."""
     with torch.device("meta"):
-        network = RestorationNetwork(condition_channels, widths)
+        network = RestorationNetwork(condition_channels, widths, generative=generative)
     # Not `to_empty`, which loads torch's symbolic shapes, and with them sympy.
     empty = {name: torch.empty(value.shape) for name, value in network.state_dict().items()}
     network.load_state_dict(empty, assign=True)
@@ -162,7 +219,9 @@ def build_network(
 
 
 def _sinusoids(time: Tensor) -> Tensor:
-    frequencies = torch.exp(torch.arange(TIME_FEATURES // 2) * (-math.log(1000) / (TIME_FEATURES // 2 - 1)))
+    frequencies = torch.exp(
+        torch.arange(TIME_FEATURES // 2, device=time.device) * (-math.log(1000) / (TIME_FEATURES // 2 - 1))
+    )
     angles = time[:, None].float() * 1000 * frequencies
     return torch.cat([angles.sin(), angles.cos()], dim=1)
 

@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import copy
+import logging
+import math
+import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
+from torch import Tensor
 
+from extrags.array_files import load_safetensors
 from extrags.config.base import StageConfig
-from extrags.errors import ConfigError
+from extrags.devices import chosen_device
+from extrags.errors import ConfigError, WeightsError
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import with_error_model
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetwork, build_network
+from extrags.restoration.diffusion.network_training import NetworkTraining, TrainingSettings
 from extrags.restoration.diffusion.precision import has_fast_half_precision
-from extrags.restoration.diffusion.rectified_flow import TrainingSettings, train_network
 from extrags.restoration.diffusion.validation import validation_scores
 from extrags.restoration.training_data.augmentation import CropSampler, MixedSampler
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
@@ -30,6 +37,8 @@ __all__ = ["PretrainingConfig", "pretrain"]
 
 ANY_HUE = Gamut(0.0, 1e6, 0.0, 1e6)
 MAX_STEPS = 4
+
+logger = logging.getLogger(__name__)
 
 
 class PretrainingConfig(StageConfig):
@@ -49,7 +58,27 @@ class PretrainingConfig(StageConfig):
     perceptual_weight: float = Field(0.15, gt=0, description="of that distance")
     error_weight: float = Field(0.02, gt=0, description="of the expected error's likelihood")
     deterministic: bool = Field(False, description="a plain regression instead of a diffusion")
+    generative: bool = Field(
+        False, description="draws plausible views as well as their mean, with texture from the scene's frames"
+    )
+    drawn_share: float = Field(0.7, ge=0, le=1, description="share of the steps that train drawing")
+    drawn_perceptual_weight: float = Field(1.0, gt=0, description="of the perceptual distance in these")
+    adversarial_weight: float = Field(0.1, ge=0, description="of the adversary in these")
+    adversary_rate: float = Field(4e-4, gt=0, description="learning rate of the adversary")
+    patches: int = Field(6, ge=1, description="patches of the scene's frames beside each crop")
+    patch_px: int = Field(64, ge=32, multiple_of=8, description="side of a patch")
+    device: str = Field("cpu", description="where the network is trained: cpu, cuda, cuda:1, ...")
+    most_seconds: float = Field(
+        math.inf, gt=0, description="the training ends after this time, however many steps it has made"
+    )
+    checkpoint_seconds: float = Field(300, gt=0, description="between two checkpoints")
     seed: int = Field(0, ge=0)
+
+    @model_validator(mode="after")
+    def _generative_needs_perception(self) -> PretrainingConfig:
+        if self.generative and (self.deterministic or not self.perceptual):
+            raise ValueError("generative needs the perceptual distance, and does not go with deterministic")
+        return self
 
 
 def pretrain(
@@ -58,16 +87,20 @@ def pretrain(
     start: EmbeddedEnhancer | None = None,
     *,
     stage: str = "pretrain",
+    checkpoint: Path | None = None,
 ) -> EmbeddedEnhancer:
     """Train on pretraining scenes; the last ones validate it and calibrate the expected error of one step.
 
-    The same files, settings and number of threads give the same weights.
+    The same files, settings and number of threads give the same weights on one machine; a training that went on
+    from a checkpoint draws other crops than one that was never interrupted.
 
     Args:
         files: pretraining scenes in order; as many as the settings say.
         config: budget.
         start: restorer whose weights are trained further; None starts from random weights.
         stage: named in progress events.
+        checkpoint: file that the training is written to every now and then, and goes on from if it is there;
+            it may have been written on another device. None keeps none.
 
     Raises:
         ConfigError: when the number of files does not fit the settings.
@@ -79,12 +112,12 @@ def pretrain(
             f"{len(files)} pretraining scenes found, settings say {config.scenes}, of which "
             f"{config.validation_scenes} are for validation"
         )
-    perceptual = Lpips.load(net="squeeze") if config.perceptual else None
+    device = chosen_device(config.device, "pretraining.device")
+    perceptual = Lpips.load(net="squeeze").to(device) if config.perceptual else None
     samplers = [_sampler(file, config, n) for n, file in enumerate(files[: -config.validation_scenes])]
-    mixed = MixedSampler(samplers, batch=config.batch, seed=config.seed)
     generator = torch.Generator().manual_seed(config.seed)
-    network = _starting_network(config, start, generator)
-    half = has_fast_half_precision()
+    network = _starting_network(config, start, generator).to(device)
+    half = has_fast_half_precision() if device.type == "cpu" else True
     settings = TrainingSettings(
         config.iterations,
         config.learning_rate,
@@ -94,8 +127,19 @@ def pretrain(
         config.error_weight,
         deterministic=config.deterministic,
         ema_decay=config.ema_decay,
+        drawn_share=config.drawn_share if config.generative else 0.0,
+        drawn_perceptual_weight=config.drawn_perceptual_weight,
+        adversarial_weight=config.adversarial_weight,
+        adversary_rate=config.adversary_rate,
     )
-    network, history = train_network(network, mixed.draw, settings, generator, stage=stage)
+    training = NetworkTraining(network, settings, generator, stage=stage)
+    if checkpoint is not None and checkpoint.exists():
+        training.restore(_read_checkpoint(checkpoint))
+        generator.manual_seed(config.seed + training.iteration)
+        logger.info("%s: going on from %s, step %d", stage, checkpoint, training.iteration)
+    mixed = MixedSampler(samplers, batch=config.batch, seed=config.seed + training.iteration)
+    _train(training, mixed, config, checkpoint)
+    network, history = training.finished().cpu(), training.history
     record: dict[str, Any] = {
         "pretraining": config.model_dump(mode="json"),
         "before": None if start is None else start.record,
@@ -106,6 +150,44 @@ def pretrain(
         network, 1, 1, config.seed, half, ANY_HUE, record, deterministic=config.deterministic
     )
     return _scored(trained, files[-config.validation_scenes :])
+
+
+def _train(
+    training: NetworkTraining, sampler: MixedSampler, config: PretrainingConfig, checkpoint: Path | None
+) -> None:
+    """Steps until iterations or time are spent; batches are drawn while the network computes."""
+    begun = written = time.monotonic()
+    with ThreadPoolExecutor(1) as ahead:
+        following = ahead.submit(sampler.draw)
+        while training.iteration < config.iterations:
+            batch = following.result()
+            following = ahead.submit(sampler.draw)
+            training.step(batch)
+            now = time.monotonic()
+            if checkpoint is not None and now - written > config.checkpoint_seconds:
+                _write_checkpoint(training, checkpoint)
+                written = now
+            if now - begun > config.most_seconds:
+                break
+        following.cancel()
+    if checkpoint is not None:
+        _write_checkpoint(training, checkpoint)
+
+
+def _write_checkpoint(training: NetworkTraining, file: Path) -> None:
+    from safetensors.torch import save_file
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_suffix(".partial")
+    save_file(training.state(), str(partial))
+    partial.replace(file)
+
+
+def _read_checkpoint(file: Path) -> dict[str, Tensor]:
+    try:
+        return load_safetensors(file)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise WeightsError(f"{file}: not the checkpoint of a pretraining ({error})") from error
 
 
 def _sampler(file: Path, config: PretrainingConfig, number: int) -> CropSampler:
@@ -119,6 +201,8 @@ def _sampler(file: Path, config: PretrainingConfig, number: int) -> CropSampler:
         crop_px=config.crop,
         side_multiple=SIZE_MULTIPLE,
         seed=config.seed * 100_003 + number,
+        frames=scene.frames if config.generative else None,
+        patches=(config.patches, config.patch_px),
     )
 
 
@@ -126,13 +210,16 @@ def _starting_network(
     config: PretrainingConfig, start: EmbeddedEnhancer | None, generator: torch.Generator
 ) -> RestorationNetwork:
     if start is None:
-        return build_network(CONDITION_CHANNELS, config.channels, generator)
+        return build_network(CONDITION_CHANNELS, config.channels, generator, generative=config.generative)
     if start.network.widths != config.channels or start.deterministic != config.deterministic:
         raise ConfigError(
             f"the weights to start from have channels {start.network.widths}, deterministic is "
             f"{start.deterministic}; the settings say {config.channels} and {config.deterministic}"
         )
-    return copy.deepcopy(start.network)
+    network = copy.deepcopy(start.network)
+    if config.generative and not network.generative:
+        return network.widened(CONDITION_CHANNELS)
+    return network
 
 
 def _scored(enhancer: EmbeddedEnhancer, files: Sequence[Path]) -> EmbeddedEnhancer:

@@ -12,6 +12,7 @@ from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.events import MetricRecorded, emit
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
+from extrags.restoration.diffusion.patches import choose_patches
 from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.diffusion.validation import validation_scores
 from extrags.restoration.protocol import Enhancer
@@ -45,7 +46,8 @@ def scene_restorer(
     start = pretrained(config)
     transfer = gather_references(scene, sequence, sequence.train).transfer
     if start is not None and config.train_iterations == 0:
-        untouched = start.with_settings(config, _scene_gamut(sequence))
+        patches = choose_patches(sequence) if start.network.generative else None
+        untouched = start.with_settings(config, _scene_gamut(sequence), patches)
         if not config.judge or len(sequence.train) < MIN_FRAMES:
             return untouched
         # Nothing is trained, so all leave-out pairs validate; synthetic ones would favour filling holes.

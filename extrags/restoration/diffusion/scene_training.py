@@ -15,7 +15,7 @@ from extrags.events import MetricRecorded, emit
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import with_calibration
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE, build_network
-from extrags.restoration.diffusion.rectified_flow import TrainingSettings, train_network
+from extrags.restoration.diffusion.network_training import TrainingSettings, train_network
 from extrags.restoration.diffusion.validation import validation_pairs, validation_scores
 from extrags.restoration.training_data.augmentation import CropSampler
 from extrags.restoration.training_data.pairs import Pairs

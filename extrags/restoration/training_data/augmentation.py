@@ -15,7 +15,7 @@ from extrags.restoration.training_data.pairs import Pairs
 from extrags.view_synthesis.conditioning import Conditioning, Layers, condition
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["Batch", "CropSampler", "MixedSampler", "cut_out", "drop_references"]
+__all__ = ["Batch", "CropSampler", "MixedSampler", "cut_out", "drop_references", "unconfirmed"]
 
 PASTED_HOLES = 0.5
 """Probability of another pair's holes."""
@@ -40,17 +40,34 @@ class Batch:
         clean: the true view, in [0, 1], [N, 3, H, W].
         weight: of each pixel's error, [N, 1, H, W].
         depth_mm: true z-depth, 0 where unknown, [N, 1, H, W].
+        invented: share of each pixel that neither the rendering nor a real view confirms, [N, 1, H, W].
+        patches: parts of real frames of the same scene, in [0, 1], [N, R, 3, S, S]; None without.
     """
 
     conditioning: Conditioning
     clean: Float[Tensor, "n 3 h w"]
     weight: Float[Tensor, "n 1 h w"]
     depth_mm: Float[Tensor, "n 1 h w"]
+    invented: Float[Tensor, "n 1 h w"]
+    patches: Float[Tensor, "n r 3 s s"] | None = None
+
+    def to(self, device: torch.device) -> Batch:
+        """The same on a device."""
+        given = self.conditioning
+        return Batch(
+            Conditioning(given.channels.to(device), given.base.to(device), given.depth_mm.to(device)),
+            self.clean.to(device),
+            self.weight.to(device),
+            self.depth_mm.to(device),
+            self.invented.to(device),
+            None if self.patches is None else self.patches.to(device),
+        )
 
     @staticmethod
     def concatenated(parts: list[Batch]) -> Batch:
-        """Join crops of the same size."""
+        """Join crops of the same size; patches stay where all parts have some."""
         conditionings = [part.conditioning for part in parts]
+        patches = [part.patches for part in parts if part.patches is not None]
         return Batch(
             Conditioning(
                 torch.cat([part.channels for part in conditionings]),
@@ -60,6 +77,8 @@ class Batch:
             torch.cat([part.clean for part in parts]),
             torch.cat([part.weight for part in parts]),
             torch.cat([part.depth_mm for part in parts]),
+            torch.cat([part.invented for part in parts]),
+            torch.cat(patches) if len(patches) == len(parts) else None,
         )
 
 
@@ -73,6 +92,8 @@ class CropSampler:
         crop_px: side of a crop; images smaller than that give smaller crops.
         side_multiple: of which a crop's side must be a multiple; the network's.
         seed: of all random draws.
+        frames: real frames of the scene that patches are taken from, in [0, 1], [F, 3, H, W]; None without.
+        patches: how many of them per crop, and the side of each in pixels.
 
     Raises:
         ConfigError: when the images are too small for any crop, or no pair is left to train on.
@@ -87,7 +108,11 @@ class CropSampler:
         crop_px: int,
         side_multiple: int,
         seed: int,
+        frames: Float[Tensor, "f 3 h w"] | None = None,
+        patches: tuple[int, int] = (0, 0),
     ) -> None:
+        self._frames = frames
+        self._patches = patches
         self._pairs = pairs.subset(np.flatnonzero(~pairs.validation))
         if len(self._pairs) == 0:
             raise ConfigError("all pairs are for validation; none is left to train on")
@@ -106,16 +131,45 @@ class CropSampler:
 
     def draw(self) -> Batch:
         """The next batch."""
-        crops = [self._crop(self._next()) for _ in range(self._batch)]
-        layers, clean, weight, depth = (torch.cat(part) for part in zip(*crops, strict=True))
-        return Batch(condition(Layers(layers), self._transfer), clean, weight, depth)
+        crops, patches = [], []
+        for _ in range(self._batch):
+            gain = self._gain()
+            crops.append(self._crop(self._next(), gain))
+            if self._frames is not None:
+                patches.append(self._cut_patches(self._frames, gain))
+        data, clean, weight, depth = (torch.cat(part) for part in zip(*crops, strict=True))
+        layers = Layers(data)
+        return Batch(
+            condition(layers, self._transfer),
+            clean,
+            weight,
+            depth,
+            unconfirmed(layers),
+            torch.stack(patches) if patches else None,
+        )
+
+    def _cut_patches(
+        self, frames: Float[Tensor, "f 3 h w"], gain: Float[Tensor, "1 3 1 1"]
+    ) -> Float[Tensor, "r 3 s s"]:
+        """Parts of random frames: any place, as seen from anywhere."""
+        count, side = self._patches
+        height, width = frames.shape[-2:]
+        side = min(side, height, width)
+        cut = []
+        for _ in range(count):
+            frame = int(self._generator.integers(len(frames)))
+            top = int(self._generator.integers(height - side + 1))
+            left = int(self._generator.integers(width - side + 1))
+            part = frames[frame : frame + 1, :, top : top + side, left : left + side].float()
+            cut.append(_random_symmetry((part * gain).clamp(0, 1), self._generator))
+        return torch.cat(cut)
 
     def _next(self) -> int:
         if not self._order:
             self._order = self._generator.permutation(len(self._pairs)).tolist()
         return self._order.pop()
 
-    def _crop(self, index: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def _crop(self, index: int, gain: Float[Tensor, "1 3 1 1"]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         generator, pairs = self._generator, self._pairs
         top, left = self._corner()
         window = (..., slice(top, top + self._side), slice(left, left + self._side))
@@ -124,7 +178,9 @@ class CropSampler:
         clean = pairs.target[index : index + 1][window]
         weight = pairs.weight[index : index + 1][window]
         depth = pairs.depth_mm[index : index + 1][window]
-        layers, clean = self._relit(layers, clean)
+        for name in ("rendered", "nearest", "blend"):
+            layers.get(name).mul_(gain).clamp_(0, 1)
+        clean = (clean * gain).clamp(0, 1)
         if generator.random() < PASTED_HOLES:
             other = int(generator.integers(len(pairs)))
             row, column = self._corner()
@@ -148,13 +204,11 @@ class CropSampler:
             int(self._generator.integers(width - self._side + 1)),
         )
 
-    def _relit(self, layers: Layers, clean: Tensor) -> tuple[Layers, Tensor]:
+    def _gain(self) -> Float[Tensor, "1 3 1 1"]:
+        """Another exposure and another white balance."""
         exposure = self._generator.normal(0, EXPOSURE_JITTER)
         gains = np.exp(exposure + self._generator.normal(0, COLOR_JITTER, 3)).astype(np.float32)
-        gain = torch.from_numpy(gains)[None, :, None, None]
-        for name in ("rendered", "nearest", "blend"):
-            layers.get(name).mul_(gain).clamp_(0, 1)
-        return layers, (clean * gain).clamp(0, 1)
+        return torch.from_numpy(gains)[None, :, None, None]
 
     def _half_plane(self) -> Float[Tensor, "1 1 h w"]:
         angle = self._generator.uniform(0, 2 * math.pi)
@@ -183,6 +237,11 @@ class MixedSampler:
         """The next batch."""
         chosen = self._generator.integers(len(self._samplers), size=self._batch)
         return Batch.concatenated([self._samplers[int(scene)].draw() for scene in chosen])
+
+
+def unconfirmed(layers: Layers) -> Float[Tensor, "v 1 h w"]:
+    """Share of each pixel that is to be invented: neither the rendering nor a real view confirms it."""
+    return layers.get("uncertainty") * (1 - layers.get("blend_weight"))
 
 
 def cut_out(layers: Layers, kept: Float[Tensor, "1 1 h w"], *, unseen: bool) -> Layers:

@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.errors import ShapeError, WeightsError
@@ -30,6 +32,7 @@ PRETRAINING_DATA_VERSION = 1
 """Raised by hand whenever the same scene and settings give other pairs."""
 ITERATIONS = (400, 2000)
 """Range of the random number of iterations, so that renderings of different quality occur."""
+MAX_FRAMES = 24
 GAUSSIANS = (0.35, 1.0)
 """Range of the random share of the starting points and of the limit on Gaussians."""
 
@@ -41,10 +44,12 @@ class PretrainingScene:
     Args:
         pairs: renderings with the truth; none is for validation.
         transfer: how brightness changes with distance in this scene.
+        frames: some of the frames it was reconstructed from, in [0, 1], [F, 3, H, W]; None in older files.
     """
 
     pairs: Pairs
     transfer: LightTransfer
+    frames: Float[Tensor, "f 3 h w"] | None = None
 
     def save(self, path: Path, *, origin: str = "") -> None:
         """Write one safetensors file: colours and layers in half precision.
@@ -63,6 +68,8 @@ class PretrainingScene:
             "depth_mm": self.pairs.depth_mm.half(),
             "frame": torch.from_numpy(np.asarray(self.pairs.frame, dtype=np.int64)),
         }
+        if self.frames is not None:
+            tensors["frames"] = (self.frames * 255).round().to(torch.uint8)
         if light is not None:
             tensors.update(
                 {f"light.{name}": value.detach().clone() for name, value in light.parameters().items()}
@@ -112,6 +119,7 @@ class PretrainingScene:
                 light = NearFieldLight(**values, reference_distance=scales["reference_distance"])
             transfer = LightTransfer(light, scales["exponent"], scales["scale_mm"])
             count = len(tensors["frame"])
+            frames = tensors["frames"].half() / 255 if "frames" in tensors else None
             pairs = Pairs(
                 Layers(tensors["layers"].float()),
                 tensors["target"].float() / 255,
@@ -123,7 +131,7 @@ class PretrainingScene:
             )
         except (OSError, SafetensorError, KeyError, ValueError, TypeError, ShapeError) as error:
             raise WeightsError(f"{path}: not the pairs of a pretraining scene ({error})") from error
-        return cls(pairs, transfer)
+        return cls(pairs, transfer, frames)
 
 
 def make_pretraining_scene(
@@ -160,4 +168,6 @@ def make_pretraining_scene(
     observation = observe_views(scene, references, sequence.cameras[frames], count=config.references)
     pairs = pair_views(sequence, observation.layers, frames, synthetic=False)
     pairs.validation[:] = False
-    return PretrainingScene(pairs, references.transfer)
+    shown = sequence.train[np.linspace(0, len(sequence.train) - 1, MAX_FRAMES).round().astype(int)]
+    rgb = sequence.rgb[np.unique(shown)].astype(np.float32) / 255
+    return PretrainingScene(pairs, references.transfer, torch.from_numpy(rgb).permute(0, 3, 1, 2))

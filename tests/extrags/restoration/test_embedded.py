@@ -14,13 +14,12 @@ from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import render_clips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
-from extrags.restoration.diffusion.rectified_flow import (
-    Predicted,
+from extrags.restoration.diffusion.network_training import (
     TrainingSettings,
     restoration_loss,
-    sample,
     train_network,
 )
+from extrags.restoration.diffusion.rectified_flow import Predicted, sample
 from extrags.restoration.diffusion.scene_restorer import better_of_both
 from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.protocol import Clip, Enhancer
@@ -79,7 +78,7 @@ class TestTraining:
         clean = torch.rand(3, 3, 4, 4, generator=torch.Generator().manual_seed(5))
         clean = torch.nn.functional.interpolate(clean, size=(32, 32), mode="bilinear")
         far = torch.full((3, 1, 32, 32), 30.0)
-        batch = Batch(conditioning, clean, torch.ones(3, 1, 32, 32), far)
+        batch = Batch(conditioning, clean, torch.ones(3, 1, 32, 32), far, torch.zeros(3, 1, 32, 32))
         network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
         noise = torch.randn(3, 3, 32, 32, generator=torch.Generator().manual_seed(9))
 
@@ -101,7 +100,8 @@ class TestTraining:
     def test_a_diverging_loss_is_named(self) -> None:
         conditioning = _conditioning(1, 32, 32)
         broken = Conditioning(conditioning.channels, conditioning.base * torch.nan, conditioning.depth_mm)
-        batch = Batch(broken, conditioning.base, torch.ones(1, 1, 32, 32), conditioning.depth_mm)
+        weight = torch.ones(1, 1, 32, 32)
+        batch = Batch(broken, conditioning.base, weight, conditioning.depth_mm, torch.zeros_like(weight))
         network = build_network(CONDITION_CHANNELS, WIDTHS, torch.Generator().manual_seed(1))
         with pytest.raises(DivergedError, match="iteration 0"):
             train_network(network, lambda: batch, TrainingSettings(3, 1e-3, False), torch.Generator())
@@ -113,7 +113,7 @@ class TestTraining:
         weight = torch.ones(1, 1, 16, 16)
         weight[..., :10] = 0
         depth = torch.full((1, 1, 16, 16), 20.0)
-        batch = Batch(_conditioning(1, 16, 16), clean, weight, depth)
+        batch = Batch(_conditioning(1, 16, 16), clean, weight, depth, torch.zeros_like(weight))
         predicted = Predicted(wrong, depth.log(), torch.zeros(1, 1, 16, 16))
         assert restoration_loss(predicted, batch, PLAIN) < 1e-2
 
@@ -123,14 +123,17 @@ class TestTraining:
         depth[..., :8] = 0
         wrong = torch.full((1, 1, 16, 16), 20.0)
         wrong[..., :8] = 1e3
-        batch = Batch(_conditioning(1, 16, 16), clean, torch.ones(1, 1, 16, 16), depth)
+        batch = Batch(
+            _conditioning(1, 16, 16), clean, torch.ones(1, 1, 16, 16), depth, torch.zeros(1, 1, 16, 16)
+        )
         predicted_error = torch.zeros(1, 1, 16, 16)
         assert restoration_loss(Predicted(clean, wrong.log(), predicted_error), batch, PLAIN) < 1e-2
         assert restoration_loss(Predicted(clean, wrong.log() + 0.5, predicted_error), batch, PLAIN) > 0.02
 
     def test_the_expected_error_is_cheapest_when_true(self) -> None:
         clean = torch.full((1, 3, 16, 16), 0.5)
-        batch = Batch(_conditioning(1, 16, 16), clean, torch.ones(1, 1, 16, 16), torch.zeros(1, 1, 16, 16))
+        nothing = torch.zeros(1, 1, 16, 16)
+        batch = Batch(_conditioning(1, 16, 16), clean, torch.ones(1, 1, 16, 16), nothing, nothing)
         costs = [
             float(
                 restoration_loss(
