@@ -169,9 +169,9 @@ class EnhanceConfig(StageConfig):
     )
     samples: Annotated[int, Field(ge=1, le=16)] | Literal["mean"] = Field(
         1,
-        description="mean: the mean of all plausible views, which is smooth where nothing was seen; a number: "
-        "so many of them are drawn, of which the first is used, and their spread adds to the expected error. "
-        "Weights that are not generative give the mean of what they draw",
+        description="mean: the mean of all plausible views, which is smooth where nothing was seen; a "
+        "number: so many of them are drawn, of which the first is used, and their spread adds to the "
+        "expected error. Weights that are not generative give the mean of what they draw",
     )
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto", description="of the convolutions; auto: bfloat16 where the processor computes it faster"

@@ -183,7 +183,7 @@ class Lpips:
         return self.compared(list(self.activations(torch.cat([first, second]))))
 
     def compared(self, activations: list[Tensor]) -> list[Float[Tensor, "n hl wl"]]:
-        """The difference map of each layer, from the activations of twice N images, the first N with the others.
+        """The difference map of each layer, of the first N of twice N images with the others.
 
         Args:
             activations: of all images, from `activations`.

@@ -9,7 +9,8 @@ coarsest level only. All residual branches and the output start at zero, so that
 returns its base image.
 
 The generative form of the network can do two things more: it takes texture from patches of the scene's own
-frames (`TextureTransfer`), and it is told whether the mean of all plausible views is asked for or one of them.
+frames (`TextureTransfer`), and it is told whether the mean of all plausible views is asked for or one of
+them.
 """
 
 from __future__ import annotations

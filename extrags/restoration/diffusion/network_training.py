@@ -1,8 +1,8 @@
 r"""Training of the restorer's network: losses, and the loop.
 
 The mean of all plausible views and one of them are two tasks of one network. For the mean, every pixel is
-compared with the truth. A drawn view is compared pixel by pixel only where something confirms it; what is to be
-invented has to agree with the truth in its coarse colours and depth, and to look like it: by a perceptual
+compared with the truth. A drawn view is compared pixel by pixel only where something confirms it; what is to
+be invented has to agree with the truth in its coarse colours and depth, and to look like it: by a perceptual
 distance, and to an adversary (`extrags.restoration.diffusion.adversary`) that learns beside it.
 """
 
@@ -87,7 +87,7 @@ class NetworkTraining:
         stage: named in progress events.
 
     Raises:
-        ValueError: when views are to be drawn without a perceptual distance, whose backbone the adversary uses.
+        ValueError: when views are to be drawn without a perceptual distance: the adversary uses its backbone.
     """
 
     def __init__(

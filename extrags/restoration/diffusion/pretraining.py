@@ -91,8 +91,8 @@ def pretrain(
 ) -> EmbeddedEnhancer:
     """Train on pretraining scenes; the last ones validate it and calibrate the expected error of one step.
 
-    The same files, settings and number of threads give the same weights on one machine; a training that went on
-    from a checkpoint draws other crops than one that was never interrupted.
+    The same files, settings and number of threads give the same weights on one machine; a training that
+    went on from a checkpoint draws other crops than one that was never interrupted.
 
     Args:
         files: pretraining scenes in order; as many as the settings say.

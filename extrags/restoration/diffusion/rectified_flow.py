@@ -4,9 +4,9 @@ With the clean image z_0 and noise e, both normalised, :math:`z_t = (1 - t) z_0 
 and the network predicts z_0 as a residual to the base image. This is the diffusion prior of [ExtraGS, eq. 4
 and 5] in another parametrisation of the same Gaussian family: a signal-to-noise ratio per t, and a
 prediction from which the noise follows. At t = 1 there is no signal, so a single step is a regression;
-several steps are DDIM's deterministic sampler in terms of the path. A generative network that is asked for one
-of the plausible views gives a whole one at any t; its steps mix the view with noise anew each time, as those of
-consistency models do.
+several steps are DDIM's deterministic sampler in terms of the path. A generative network that is asked for
+one of the plausible views gives a whole one at any t; its steps mix the view with noise anew each time, as
+those of consistency models do.
 
 Source of the latter: Song et al., "Consistency models", ICML 2023, algorithm 1.
 """

@@ -1,9 +1,9 @@
 """Texture from the scene's own frames: features of their patches, fetched by similarity.
 
 What training never saw still looks like this patient's mucosa. Patches of real frames are encoded once per
-scene; every place of the U-Net's coarsest level looks for the patch features most like its own, and takes from
-there what they were at each level: at the coarse one the attended mean, at the finer ones a copy of the block
-that lies at the best match, so that its texture stays sharp.
+scene; every place of the U-Net's coarsest level looks for the patch features most like its own, and takes
+from there what they were at each level: at the coarse one the attended mean, at the finer ones a copy of the
+block that lies at the best match, so that its texture stays sharp.
 
 Source: hard and soft attention of Yang et al., "Learning texture transformer network for image
 super-resolution", CVPR 2020.
@@ -90,6 +90,7 @@ class PatchEncoder(nn.Module):
         self.coarse = _Block(coarse)
 
     def forward(self, patches: Float[Tensor, "b 3 s s"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Features at 1/2, 1/4 and 1/8 of the patches' side."""
         packed = functional.pixel_unshuffle(patches, 2)
         fine = self.fine(self.entrance(packed.contiguous(memory_format=torch.channels_last)))
         middle = self.middle(self.to_middle(fine))

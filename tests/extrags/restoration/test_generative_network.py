@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -139,7 +140,11 @@ class TestAdversary:
 
 
 class TestTrainingOfDrawing:
-    SETTINGS = {"learning_rate": 2e-3, "half_precision": False, "drawn_share": 1.0}
+    SETTINGS: ClassVar[dict[str, Any]] = {
+        "learning_rate": 2e-3,
+        "half_precision": False,
+        "drawn_share": 1.0,
+    }
 
     def test_the_loss_of_drawn_views_falls(self, perceptual: Lpips) -> None:
         settings = TrainingSettings(40, perceptual=perceptual, **self.SETTINGS)
