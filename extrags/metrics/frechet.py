@@ -5,8 +5,7 @@ kinds of it equally often. Features are those of LPIPS's backbone, one vector pe
 few images and parts of images suffice; figures are comparable for the same backbone, layer and number of
 vectors only, and not with the literature's FID, whose Inception network sees whole images.
 
-Source: Heusel et al., "GANs trained by a two time-scale update rule converge to a local Nash equilibrium",
-NeurIPS 2017, equation 6.
+Source: [Heusel2017, eq. 6].
 """
 
 from __future__ import annotations

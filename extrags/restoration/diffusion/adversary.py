@@ -4,9 +4,7 @@ Small heads on the frozen features of the perceptual distance's backbone judge t
 shallow network of its own sees the pixels. Both know where the view was to be invented, and count there. The
 backbone's features, made for photographs, spare the adversary most of its training.
 
-Source: features of a frozen backbone, Sauer et al., "Projected GANs converge faster", NeurIPS 2021; the hinge
-loss with spectral normalisation, Miyato et al., "Spectral normalization for generative adversarial networks",
-ICLR 2018.
+Source: features of a frozen backbone [Sauer2021]; spectral normalisation [Miyato2018].
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ several steps are DDIM's deterministic sampler in terms of the path. A generativ
 one of the plausible views gives a whole one at any t; its steps mix the view with noise anew each time, as
 those of consistency models do.
 
-Source of the latter: Song et al., "Consistency models", ICML 2023, algorithm 1.
+Source of the latter: [SongConsistency2023, algorithm 1].
 """
 
 from __future__ import annotations

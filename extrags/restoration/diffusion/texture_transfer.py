@@ -5,8 +5,7 @@ scene; every place of the U-Net's coarsest level looks for the patch features mo
 from there what they were at each level: at the coarse one the attended mean, at the finer ones a copy of the
 block that lies at the best match, so that its texture stays sharp.
 
-Source: hard and soft attention of Yang et al., "Learning texture transformer network for image
-super-resolution", CVPR 2020.
+Source: hard and soft attention of [YangTTSR2020].
 """
 
 from __future__ import annotations
