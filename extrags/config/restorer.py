@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from extrags.config.backends import BACKEND_NAME, backend_schema, backend_summaries
 from extrags.config.base import StageConfig
@@ -127,6 +127,9 @@ class CheckpointConfig(StageConfig):
     timeout_s: float = Field(3600.0, gt=0, description="of one clip, loading included; longer is an error")
 
 
+MOST_SAMPLES = 16
+
+
 class EnhanceConfig(StageConfig):
     """Restoration of the virtual views."""
 
@@ -167,7 +170,7 @@ class EnhanceConfig(StageConfig):
         description="sampling steps; auto: those of the weights, or, after training on the scene, 1 or 4, as "
         "its validation pairs decide",
     )
-    samples: Annotated[int, Field(ge=1, le=16)] | Literal["mean"] = Field(
+    samples: int | Literal["mean"] = Field(
         1,
         description="mean: the mean of all plausible views, which is smooth where nothing was seen; a "
         "number: so many of them are drawn, of which the first is used, and their spread adds to the "
@@ -202,6 +205,13 @@ class EnhanceConfig(StageConfig):
     pretrained: PretrainedConfig = PretrainedConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
     seed: int = Field(0, ge=0, description="seed of all random sampling")
+
+    @field_validator("samples")
+    @classmethod
+    def _few_samples(cls, samples: int | Literal["mean"]) -> int | Literal["mean"]:
+        if samples != "mean" and not 1 <= samples <= MOST_SAMPLES:
+            raise ValueError(f"expected mean, or a number from 1 to {MOST_SAMPLES}")
+        return samples
 
     def batches(self, trajectories: int) -> int:
         """Number of batches that so many trajectories, of which `max_views` at most, are restored in."""
