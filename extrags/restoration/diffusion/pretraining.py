@@ -6,9 +6,10 @@ import copy
 import logging
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,8 @@ from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetw
 from extrags.restoration.diffusion.network_training import NetworkTraining, TrainingSettings
 from extrags.restoration.diffusion.precision import has_fast_half_precision
 from extrags.restoration.diffusion.validation import validation_scores
-from extrags.restoration.training_data.augmentation import CropSampler, MixedSampler
+from extrags.restoration.training_data.augmentation import Batch, CropSampler, MixedSampler
+from extrags.restoration.training_data.parallel import drawn_in_processes
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
@@ -68,6 +70,9 @@ class PretrainingConfig(StageConfig):
     patches: int = Field(6, ge=1, description="patches of the scene's frames beside each crop")
     patch_px: int = Field(64, ge=32, multiple_of=8, description="side of a patch")
     device: str = Field("cpu", description="where the network is trained: cpu, cuda, cuda:1, ...")
+    drawing_processes: int = Field(
+        0, ge=0, description="processes that cut crops ahead, at most one per scene; 0: a thread does"
+    )
     most_seconds: float = Field(
         math.inf, gt=0, description="the training ends after this time, however many steps it has made"
     )
@@ -114,7 +119,6 @@ def pretrain(
         )
     device = chosen_device(config.device, "pretraining.device")
     perceptual = Lpips.load(net="squeeze").to(device) if config.perceptual else None
-    samplers = [_sampler(file, config, n) for n, file in enumerate(files[: -config.validation_scenes])]
     generator = torch.Generator().manual_seed(config.seed)
     network = _starting_network(config, start, generator).to(device)
     half = has_fast_half_precision() if device.type == "cpu" else True
@@ -137,13 +141,15 @@ def pretrain(
         training.restore(_read_checkpoint(checkpoint))
         generator.manual_seed(config.seed + training.iteration)
         logger.info("%s: going on from %s, step %d", stage, checkpoint, training.iteration)
-    mixed = MixedSampler(samplers, batch=config.batch, seed=config.seed + training.iteration)
-    _train(training, mixed, config, checkpoint)
+    sampler = partial(_mixed_sampler, files[: -config.validation_scenes], config, training.iteration)
+    with drawn_in_processes(sampler, config.drawing_processes) as draw:
+        _train(training, draw, config, checkpoint)
     network, history = training.finished().cpu(), training.history
     record: dict[str, Any] = {
         "pretraining": config.model_dump(mode="json"),
         "before": None if start is None else start.record,
         "threads": torch.get_num_threads(),
+        "iterations_made": training.iteration,
         "history": history[:: max(1, len(history) // 200)],
     }
     trained = EmbeddedEnhancer(
@@ -153,15 +159,18 @@ def pretrain(
 
 
 def _train(
-    training: NetworkTraining, sampler: MixedSampler, config: PretrainingConfig, checkpoint: Path | None
+    training: NetworkTraining,
+    draw: Callable[[], Batch],
+    config: PretrainingConfig,
+    checkpoint: Path | None,
 ) -> None:
     """Steps until iterations or time are spent; batches are drawn while the network computes."""
     begun = written = time.monotonic()
     with ThreadPoolExecutor(1) as ahead:
-        following = ahead.submit(sampler.draw)
+        following = ahead.submit(draw)
         while training.iteration < config.iterations:
             batch = following.result()
-            following = ahead.submit(sampler.draw)
+            following = ahead.submit(draw)
             training.step(batch)
             now = time.monotonic()
             if checkpoint is not None and now - written > config.checkpoint_seconds:
@@ -188,6 +197,17 @@ def _read_checkpoint(file: Path) -> dict[str, Tensor]:
         return load_safetensors(file)
     except (OSError, RuntimeError, ValueError) as error:
         raise WeightsError(f"{file}: not the checkpoint of a pretraining ({error})") from error
+
+
+def _mixed_sampler(
+    files: Sequence[Path], config: PretrainingConfig, iteration: int, number: int, processes: int
+) -> Callable[[], Batch]:
+    """What draws batches from every n-th scene, for one of n processes."""
+    samplers = [
+        _sampler(file, config, index) for index, file in enumerate(files) if index % processes == number
+    ]
+    seed = config.seed + iteration + 1_000_003 * number
+    return MixedSampler(samplers, batch=config.batch, seed=seed).draw
 
 
 def _sampler(file: Path, config: PretrainingConfig, number: int) -> CropSampler:

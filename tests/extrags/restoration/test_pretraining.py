@@ -104,3 +104,28 @@ class TestPretraining:
     def test_the_number_of_scenes_is_checked(self, files: list[Path]) -> None:
         with pytest.raises(ConfigError, match="2 pretraining scenes found, settings say 3"):
             pretrain(files[:2], TINY)
+
+    def test_processes_draw_batches_in_turn(self, files: list[Path]) -> None:
+        config = TINY.model_copy(update={"iterations": 3, "drawing_processes": 2})
+        first, second = (pretrain(files, config).network.state_dict() for _ in range(2))
+        assert all(torch.equal(first[name], second[name]) for name in first)
+
+    def test_it_ends_in_time_and_goes_on_from_its_checkpoint(self, files: list[Path], tmp_path: Path) -> None:
+        checkpoint = tmp_path / "checkpoint.safetensors"
+        short = TINY.model_copy(update={"most_seconds": 1e-3})
+        assert pretrain(files, short, checkpoint=checkpoint).record["iterations_made"] == 1
+        assert pretrain(files, short, checkpoint=checkpoint).record["iterations_made"] == 2
+
+    def test_a_generative_network_starts_from_a_plain_one(
+        self, files: list[Path], shared_data: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("EXTRAGS_LPIPS_WEIGHTS", str(shared_data / "lpips_weights"))
+        plain = pretrain(files, TINY)
+        wider = {"generative": True, "perceptual": True, "drawn_share": 1.0, "iterations": 2}
+        enhancer = pretrain(files, TINY.model_copy(update=wider | {"patch_px": 32}), plain)
+        assert enhancer.network.generative
+        assert not torch.equal(enhancer.network.exit.weight, plain.network.exit.weight)
+
+    def test_drawing_needs_the_perceptual_distance(self) -> None:
+        with pytest.raises(ValueError, match="needs the perceptual distance"):
+            PretrainingConfig(generative=True, perceptual=False)
