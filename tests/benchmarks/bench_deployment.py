@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from extrags.store import Manifest, Store
+from extrags.store.manifest import MANIFEST
 from tests.flows.killing import free_port, wait_for
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -57,15 +58,15 @@ def descendants(process: int) -> list[int]:
     return [*children, *(below for child in children for below in descendants(child))]
 
 
-def busy_seconds(manifests: Sequence[Manifest], begun: float, ended: float) -> float:
+def busy_seconds(store: Path, manifests: Sequence[Manifest], begun: float, ended: float) -> float:
     """Time within which at least one stage was at work."""
-    spans = sorted(
-        (start, start + manifest.seconds)
-        for manifest in manifests
-        for start in [datetime.datetime.fromisoformat(manifest.started).timestamp()]
-    )
+    spans = []
+    for manifest in manifests:
+        # When it was written: `started` has whole seconds only, which would make gaps where there are none.
+        end = (store / "artefacts" / manifest.key / MANIFEST).stat().st_mtime
+        spans.append((end - manifest.seconds, end))
     busy, reached = 0.0, begun
-    for start, end in spans:
+    for start, end in sorted(spans):
         busy += max(0.0, min(end, ended) - max(start, reached))
         reached = max(reached, min(end, ended))
     return busy
@@ -218,7 +219,7 @@ def run(folder: Path, sequences: Sequence[str], workers: int, cores: Sequence[in
         begun = datetime.datetime.fromisoformat(state["start_time"]).timestamp()
         end = datetime.datetime.fromisoformat(state["end_time"]).timestamp()
         mine = {*sequences[index::workers], state["name"]}
-        busy = busy_seconds([item for item in manifests if item.label in mine], begun, end)
+        busy = busy_seconds(site.store, [item for item in manifests if item.label in mine], begun, end)
         per_run.append(
             {
                 "state": state["state"]["name"],
