@@ -5,17 +5,10 @@ from __future__ import annotations
 from typing import Literal
 
 from extrags.config.baselines import UcNerfConfig
+from extrags.config.coarse import CoarseConfig, DensifyConfig, OptimiserConfig
+from extrags.config.exploration import ExploreConfig
 from extrags.config.restorer import EnhanceConfig
-from extrags.config.stages import (
-    CoarseConfig,
-    DensifyConfig,
-    EvaluateConfig,
-    ExploreConfig,
-    FinetuneConfig,
-    IngestConfig,
-    OptimiserConfig,
-    PipelineConfig,
-)
+from extrags.config.stages import EvaluateConfig, FinetuneConfig, IngestConfig, PipelineConfig
 from extrags.errors import ConfigError
 
 __all__ = ["PROFILES", "ProfileName", "profile_config"]
