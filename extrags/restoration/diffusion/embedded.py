@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from extrags.restoration.diffusion.texture_transfer import PatchFeatures
 from extrags.restoration.diffusion.weights import WEIGHTS, find_weights
 from extrags.restoration.protocol import Clip, Restoration
 from extrags.restoration.uncertainty.calibration import Calibration
+from extrags.restoration.uncertainty.domain import Domain
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
 from extrags.threads import in_threads
 from extrags.view_synthesis.conditioning import (
@@ -40,6 +42,7 @@ FORMAT = 2
 """Raised when a saved restorer cannot be read by newer code."""
 PATCHES = "patches.safetensors"
 COLOR_STEPS = 255
+MOST_MODESTY = 3.0
 CANDIDATE_STEPS = (1, 4)
 """More steps never gained on held-out pairs; which of these does differs from scene to scene."""
 VIEWS_AT_ONCE = 4
@@ -64,6 +67,8 @@ class EmbeddedEnhancer:
         drawing: one of the plausible views is restored instead of their mean; generative networks only.
         patches: parts of the scene's real frames, which a generative network takes texture from, in [0, 1],
             [R, 3, S, S]; None without.
+        domain: what it was trained on, by which a scene is told to be of that world or not; None where that
+            is not known.
     """
 
     network: RestorationNetwork
@@ -78,6 +83,7 @@ class EmbeddedEnhancer:
     deterministic: bool = False
     drawing: bool = False
     patches: Float[Tensor, "r 3 s s"] | None = None
+    domain: Domain | None = None
 
     name = "embedded"
 
@@ -129,7 +135,7 @@ class EmbeddedEnhancer:
         expected = torch.hypot(error, spread)[:, 0].contiguous().numpy()
         return Restoration(
             shown.permute(0, 2, 3, 1).contiguous().numpy(),
-            self.calibration.applied(expected),
+            self.calibration.applied(expected) * self.modesty,
             self.provenance,
             draws[0].depth_mm[:, 0].contiguous().numpy(),
         )
@@ -194,6 +200,26 @@ class EmbeddedEnhancer:
         generator = np.random.default_rng([self.seed, 3, clip, index])
         return torch.from_numpy(generator.standard_normal((1, 3, height, width), dtype=np.float32))
 
+    def described(self, patches: Float[Tensor, "r 3 s s"]) -> Float[np.ndarray, "r c"]:
+        """Features of patches that tell one world from another; for generative networks."""
+        with torch.no_grad():
+            return np.asarray(
+                self.network.texture.describe((patches.float() - COLOR_CENTER) / COLOR_SCALE).double()
+            )
+
+    @cached_property
+    def domain_score(self) -> float | None:
+        """How far the scene is from what was trained on: above 1 outside; None where that is not known."""
+        if self.domain is None or self.patches is None:
+            return None
+        return self.domain.score(self.described(self.patches))
+
+    @property
+    def modesty(self) -> float:
+        """Factor of the expected error outside the known world."""
+        score = self.domain_score
+        return 1.0 if score is None else min(max(score, 1.0), MOST_MODESTY)
+
     def _patch_features(self) -> PatchFeatures | None:
         if self.patches is None or not self.network.generative:
             return None
@@ -211,6 +237,7 @@ class EmbeddedEnhancer:
             "seed": self.seed,
             "precision": "bfloat16" if self.half_precision else "float32",
             "drawing": self.drawing,
+            "domain_score": self.domain_score,
             "validation": self.record.get("validation", {}),
             "scene_training_kept": self.record.get("scene_training_kept"),
         }
@@ -247,6 +274,7 @@ class EmbeddedEnhancer:
             "deterministic": self.deterministic,
             "generative": self.network.generative,
             "drawing": self.drawing,
+            "domain": None if self.domain is None else self.domain.as_dict(),
             "record": self.record,
         }
         write_description(path, description)
@@ -294,6 +322,7 @@ class EmbeddedEnhancer:
                 bool(description["deterministic"]),
                 bool(description.get("drawing", False)),
                 _read_patches(weights_file.with_name(PATCHES)),
+                None if description.get("domain") is None else Domain.from_dict(description["domain"]),
             )
         try:
             network.load_state_dict(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.validation import validation_pairs
@@ -40,21 +41,23 @@ def with_calibration(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTr
 
 
 def with_error_model(
-    enhancer: EmbeddedEnhancer, scenes: Sequence[tuple[Pairs, LightTransfer]]
+    enhancer: EmbeddedEnhancer, scenes: Sequence[tuple[Pairs, LightTransfer, Float[Tensor, "r 3 s s"] | None]]
 ) -> EmbeddedEnhancer:
     """The restorer with error model and calibration curve fitted to pairs of many scenes.
 
     Args:
         enhancer: trained.
-        scenes: pairs that were not trained on, and how brightness changes with distance in each.
+        scenes: pairs that were not trained on, how brightness changes with distance in each, and patches of
+            its frames.
     """
     plain = replace(enhancer, error_model=ErrorModel(), calibration=Calibration())
     features, errors = [], []
-    for pairs, transfer in scenes:
+    for pairs, transfer, patches in scenes:
+        with_patches = replace(plain, patches=patches)
         for view in range(len(pairs)):
             layers, weight = pairs.layers[view], pairs.weight[view : view + 1]
             noise = plain.noise(pairs.size, view, 0)
-            restored = plain.restored_layers(layers, transfer, noise, steps=plain.steps)
+            restored = with_patches.restored_layers(layers, transfer, noise, steps=plain.steps)
             error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
             mean, share = cell_means(error, weight)
             each = error_features(layers, restored.rgb, restored.error)
@@ -62,7 +65,9 @@ def with_error_model(
             features.append(np.stack(columns, axis=1)[share > MIN_VALID_SHARE])
             errors.append(mean[share > MIN_VALID_SHARE])
     fitted = replace(plain, error_model=ErrorModel.fitted(np.concatenate(features), np.concatenate(errors)))
-    cells = [cell_errors(fitted, pairs, transfer) for pairs, transfer in scenes]
+    cells = [
+        cell_errors(replace(fitted, patches=patches), pairs, transfer) for pairs, transfer, patches in scenes
+    ]
     expected, true = (np.concatenate(part) for part in zip(*cells, strict=True))
     return replace(fitted, calibration=Calibration.fitted(expected, true))
 

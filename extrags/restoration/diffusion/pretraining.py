@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from pydantic import Field, model_validator
 from torch import Tensor
 
@@ -29,9 +30,15 @@ from extrags.restoration.diffusion.network import SIZE_MULTIPLE, RestorationNetw
 from extrags.restoration.diffusion.network_training import NetworkTraining, TrainingSettings
 from extrags.restoration.diffusion.precision import has_fast_half_precision
 from extrags.restoration.diffusion.validation import validation_scores
-from extrags.restoration.training_data.augmentation import Batch, CropSampler, MixedSampler
+from extrags.restoration.training_data.augmentation import (
+    Batch,
+    CropSampler,
+    MixedSampler,
+    random_patches,
+)
 from extrags.restoration.training_data.parallel import drawn_in_processes
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
+from extrags.restoration.uncertainty.domain import Domain
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
 
@@ -39,6 +46,8 @@ __all__ = ["PretrainingConfig", "pretrain"]
 
 ANY_HUE = Gamut(0.0, 1e6, 0.0, 1e6)
 MAX_STEPS = 4
+DOMAIN_PATCHES = 8
+"""Patches per scene that tell what the network has learned from."""
 
 logger = logging.getLogger(__name__)
 
@@ -155,7 +164,8 @@ def pretrain(
     trained = EmbeddedEnhancer(
         network, 1, 1, config.seed, half, ANY_HUE, record, deterministic=config.deterministic
     )
-    return _scored(trained, files[-config.validation_scenes :])
+    kept, unseen = files[: -config.validation_scenes], files[-config.validation_scenes :]
+    return replace(_scored(trained, unseen, config), domain=_domain(trained, kept, unseen, config))
 
 
 def _train(
@@ -242,18 +252,27 @@ def _starting_network(
     return network
 
 
-def _scored(enhancer: EmbeddedEnhancer, files: Sequence[Path]) -> EmbeddedEnhancer:
+def _scored(enhancer: EmbeddedEnhancer, files: Sequence[Path], config: PretrainingConfig) -> EmbeddedEnhancer:
     """The restorer with error model, calibration and scores from the validation scenes.
 
     Args:
-        enhancer: trained.
+        enhancer: trained; a generative one is calibrated for the views that it draws.
         files: pretraining scenes for validation.
+        config: size and seed of the patches.
     """
     candidates = (1,) if enhancer.deterministic else (1, MAX_STEPS)
-    loaded = [PretrainingScene.load(file) for file in files]
+    scenes = []
     scores: dict[str, list[dict[str, float]]] = {}
-    for scene in loaded:
-        for name, values in validation_scores(enhancer, scene.pairs, scene.transfer, candidates).items():
+    for number, file in enumerate(files):
+        scene = PretrainingScene.load(file)
+        patches = _patches(scene, config, number) if enhancer.network.generative else None
+        scenes.append((scene.pairs, scene.transfer, patches))
+        own = replace(enhancer, patches=patches)
+        found = validation_scores(own, scene.pairs, scene.transfer, candidates)
+        if enhancer.network.generative:
+            drawn = validation_scores(replace(own, drawing=True), scene.pairs, scene.transfer, candidates)
+            found |= {name.replace("embedded", "drawn"): values for name, values in drawn.items()}
+        for name, values in found.items():
             scores.setdefault(name, []).append(values)
     means: dict[str, dict[str, float]] = {}
     for name, of_scenes in scores.items():
@@ -261,4 +280,32 @@ def _scored(enhancer: EmbeddedEnhancer, files: Sequence[Path]) -> EmbeddedEnhanc
         known = {key: [one[key] for one in of_scenes if key in one] for key in ("psnr", "ssim", "psnr_hole")}
         means[name] = {key: round(float(np.mean(found)), 4) for key, found in known.items() if found}
     record = {**enhancer.record, "validation_scores": means}
-    return with_error_model(replace(enhancer, record=record), [(one.pairs, one.transfer) for one in loaded])
+    return with_error_model(replace(enhancer, record=record, drawing=enhancer.network.generative), scenes)
+
+
+def _patches(
+    scene: PretrainingScene, config: PretrainingConfig, number: int
+) -> Float[Tensor, "r 3 s s"] | None:
+    if scene.frames is None:
+        return None
+    generator = np.random.default_rng([config.seed, 7, number])
+    return random_patches(scene.frames, DOMAIN_PATCHES, config.patch_px, generator)
+
+
+def _domain(
+    enhancer: EmbeddedEnhancer, trained: Sequence[Path], unseen: Sequence[Path], config: PretrainingConfig
+) -> Domain | None:
+    """What the network was trained on, as its patch encoder sees it; None without frames or encoder."""
+    if not enhancer.network.generative:
+        return None
+
+    def features(file: Path, number: int) -> Float[np.ndarray, "r c"] | None:
+        patches = _patches(PretrainingScene.load(file), config, number)
+        return None if patches is None else enhancer.described(patches)
+
+    known = [features(file, number) for number, file in enumerate(trained)]
+    others = [features(file, len(trained) + number) for number, file in enumerate(unseen)]
+    present = [part for part in known if part is not None]
+    if not present:
+        return None
+    return Domain.fitted(np.concatenate(present), [part for part in others if part is not None])

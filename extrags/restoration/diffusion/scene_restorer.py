@@ -73,7 +73,18 @@ def better_of_both(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTran
     scores = validation_scores(enhancer, pairs, transfer, (enhancer.steps,))
     restored, filled = scores[f"embedded_{enhancer.steps}"]["psnr"], scores["classical"]["psnr"]
     emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
-    if restored < filled - MAX_LOSS_DB:
+    score = enhancer.domain_score
+    tolerated = MAX_LOSS_DB
+    if score is not None:
+        emit(MetricRecorded("enhance", "domain_score", score))
+        if score > 1:
+            # Nothing says that it does better far from the path than near it.
+            tolerated = 0.0
+            logger.warning(
+                "this scene is unlike what the restorer was trained on (%.1f times as far as it should be)",
+                score,
+            )
+    if restored < filled - tolerated:
         reason = (
             f"on leave-out pairs of this scene the embedded restorer reaches {restored:.2f} dB, blending and "
             f"filling {filled:.2f} dB"

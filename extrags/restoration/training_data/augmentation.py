@@ -15,7 +15,15 @@ from extrags.restoration.training_data.pairs import Pairs
 from extrags.view_synthesis.conditioning import Conditioning, Layers, condition
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["Batch", "CropSampler", "MixedSampler", "cut_out", "drop_references", "unconfirmed"]
+__all__ = [
+    "Batch",
+    "CropSampler",
+    "MixedSampler",
+    "cut_out",
+    "drop_references",
+    "random_patches",
+    "unconfirmed",
+]
 
 PASTED_HOLES = 0.5
 """Probability of another pair's holes."""
@@ -136,7 +144,8 @@ class CropSampler:
             gain = self._gain()
             crops.append(self._crop(self._next(), gain))
             if self._frames is not None:
-                patches.append(self._cut_patches(self._frames, gain))
+                cut = random_patches(self._frames, *self._patches, self._generator)
+                patches.append((cut * gain).clamp(0, 1))
         data, clean, weight, depth = (torch.cat(part) for part in zip(*crops, strict=True))
         layers = Layers(data)
         return Batch(
@@ -147,22 +156,6 @@ class CropSampler:
             unconfirmed(layers),
             torch.stack(patches) if patches else None,
         )
-
-    def _cut_patches(
-        self, frames: Float[Tensor, "f 3 h w"], gain: Float[Tensor, "1 3 1 1"]
-    ) -> Float[Tensor, "r 3 s s"]:
-        """Parts of random frames: any place, as seen from anywhere."""
-        count, side = self._patches
-        height, width = frames.shape[-2:]
-        side = min(side, height, width)
-        cut = []
-        for _ in range(count):
-            frame = int(self._generator.integers(len(frames)))
-            top = int(self._generator.integers(height - side + 1))
-            left = int(self._generator.integers(width - side + 1))
-            part = frames[frame : frame + 1, :, top : top + side, left : left + side].float()
-            cut.append(_random_symmetry((part * gain).clamp(0, 1), self._generator))
-        return torch.cat(cut)
 
     def _next(self) -> int:
         if not self._order:
@@ -237,6 +230,29 @@ class MixedSampler:
         """The next batch."""
         chosen = self._generator.integers(len(self._samplers), size=self._batch)
         return Batch.concatenated([self._samplers[int(scene)].draw() for scene in chosen])
+
+
+def random_patches(
+    frames: Float[Tensor, "f 3 h w"], count: int, side_px: int, generator: np.random.Generator
+) -> Float[Tensor, "r 3 s s"]:
+    """Parts of random frames: any place, seen from anywhere.
+
+    Args:
+        frames: real frames of a scene.
+        count: how many.
+        side_px: side of each; smaller where frames are smaller.
+        generator: of frames, places and symmetries.
+    """
+    height, width = frames.shape[-2:]
+    side = min(side_px, height, width)
+    cut = []
+    for _ in range(count):
+        frame = int(generator.integers(len(frames)))
+        top = int(generator.integers(height - side + 1))
+        left = int(generator.integers(width - side + 1))
+        part = frames[frame : frame + 1, :, top : top + side, left : left + side].float()
+        cut.append(_random_symmetry(part, generator))
+    return torch.cat(cut)
 
 
 def unconfirmed(layers: Layers) -> Float[Tensor, "v 1 h w"]:

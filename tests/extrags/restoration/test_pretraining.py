@@ -117,7 +117,7 @@ class TestPretraining:
         assert pretrain(files, short, checkpoint=checkpoint).record["iterations_made"] == 2
 
     def test_a_generative_network_starts_from_a_plain_one(
-        self, files: list[Path], shared_data: Path, monkeypatch: pytest.MonkeyPatch
+        self, files: list[Path], shared_data: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     ) -> None:
         monkeypatch.setenv("EXTRAGS_LPIPS_WEIGHTS", str(shared_data / "lpips_weights"))
         plain = pretrain(files, TINY)
@@ -125,6 +125,15 @@ class TestPretraining:
         enhancer = pretrain(files, TINY.model_copy(update=wider | {"patch_px": 32}), plain)
         assert enhancer.network.generative
         assert not torch.equal(enhancer.network.exit.weight, plain.network.exit.weight)
+        assert {"embedded_1", "drawn_1", "drawn_4"} <= set(enhancer.record["validation_scores"])
+        enhancer.save(tmp_path)
+        loaded = EmbeddedEnhancer.load(tmp_path)
+        patches = torch.rand(4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
+        scores = [replace(one, patches=patches).domain_score for one in (enhancer, loaded)]
+        assert scores[0] == pytest.approx(scores[1], rel=1e-4)
+        far, near = 3.0, replace(enhancer, patches=PretrainingScene.load(files[0]).frames[:4, :, :32, :32])
+        assert scores[0] > far * near.domain_score
+        assert 1 < replace(enhancer, patches=patches).modesty <= far
 
     def test_drawing_needs_the_perceptual_distance(self) -> None:
         with pytest.raises(ValueError, match="needs the perceptual distance"):
