@@ -59,7 +59,7 @@ class TrainingSettings:
         ema_decay: memory of the running mean of the weights.
         drawn_share: share of the steps that train drawing; for generative networks.
         drawn_perceptual_weight: of the perceptual distance in these.
-        adversarial_weight: of the adversary in these.
+        adversarial_weight: pull of the adversary at invented colours, relative to that of all else in these.
         adversary_rate: learning rate of the adversary.
     """
 
@@ -73,7 +73,7 @@ class TrainingSettings:
     ema_decay: float = 0.995
     drawn_share: float = 0.0
     drawn_perceptual_weight: float = 1.0
-    adversarial_weight: float = 0.1
+    adversarial_weight: float = 1.0
     adversary_rate: float = 4e-4
 
 
@@ -129,7 +129,8 @@ class NetworkTraining:
             found = self._drawn_step(predicted, batch, self.adversary)
         else:
             loss = restoration_loss(predicted, batch, settings)
-            self._descend(loss)
+            self._check(loss)
+            self._descend([loss], [None])
             found = {"loss": float(loss.detach())}
         decay = min(settings.ema_decay, (1 + self.iteration) / (10 + self.iteration))
         with torch.no_grad():
@@ -224,28 +225,37 @@ class NetworkTraining:
         adversary.requires_grad_(False)
         deceiving = adversary.generator_loss(shown, list(own), scene)
         adversary.requires_grad_(True)
-        faithful = drawn_loss(predicted, batch, settings)
-        loss = (
-            faithful + settings.drawn_perceptual_weight * perceptual + settings.adversarial_weight * deceiving
+        faithful = drawn_loss(predicted, batch) + settings.drawn_perceptual_weight * perceptual
+        self._check(faithful)
+        # Both pull at the colours; where they are invented, as strongly as the settings say, whatever the
+        # scale of the adversary's verdicts is at this stage of its own training.
+        (towards,) = torch.autograd.grad(faithful, predicted.rgb, retain_graph=True)
+        (away,) = torch.autograd.grad(deceiving, predicted.rgb)
+        pulls = [(pull * scene.invented).norm() for pull in (towards, away)]
+        balance = settings.adversarial_weight * pulls[0] / pulls[1].clamp_min(1e-12)
+        self._descend(
+            [predicted.rgb, _depth_and_error(predicted, batch, settings)],
+            [towards + balance * away, None],
         )
-        self._descend(loss)
         told = adversary.step(
             (shown.detach(), [tap.detach() for tap in own]), (clean, [tap.detach() for tap in true]), scene
         )
         return {
-            "drawn_loss": float(loss.detach()),
+            "drawn_loss": float(faithful.detach()),
             "drawn_perceptual": float(perceptual.detach()),
             "adversary": told,
         }
 
-    def _descend(self, loss: Tensor) -> None:
+    def _check(self, loss: Tensor) -> None:
         value = float(loss.detach())
         if not math.isfinite(value):
             raise DivergedError(
                 f"{self.stage}: the restorer's loss is {value} at iteration {self.iteration} "
                 "(parameter group: network)"
             )
-        loss.backward()
+
+    def _descend(self, outputs: list[Tensor], gradients: list[Tensor | None]) -> None:
+        torch.autograd.backward(outputs, gradients)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), GRADIENT_LIMIT)
         settings = self.settings
         self.optimiser.step(settings.learning_rate * _rate(self.iteration, settings.iterations))
@@ -305,8 +315,8 @@ def restoration_loss(predicted: Predicted, batch: Batch, settings: TrainingSetti
     return loss
 
 
-def drawn_loss(predicted: Predicted, batch: Batch, settings: TrainingSettings) -> Float[Tensor, ""]:
-    """What a drawn view owes to the truth: confirmed pixels, coarse colours of the others, depth, error."""
+def drawn_loss(predicted: Predicted, batch: Batch) -> Float[Tensor, ""]:
+    """What the colours of a drawn view owe to the truth: confirmed pixels, the others in coarse means."""
     weight = batch.weight
     confirmed = weight * (1 - batch.invented)
     difference = _charbonnier(predicted.rgb, batch.clean)
@@ -316,7 +326,7 @@ def drawn_loss(predicted: Predicted, batch: Batch, settings: TrainingSettings) -
     means = [functional.avg_pool2d(image * weight, side) for image in (predicted.rgb, batch.clean)]
     apart = _charbonnier(*(mean / share.clamp_min(1e-6) for mean in means))
     coarse = (apart * share).sum() / share.sum().clamp_min(1e-6)
-    return exact + coarse + _depth_and_error(predicted, batch, settings)
+    return exact + coarse
 
 
 def _charbonnier(first: Tensor, second: Tensor) -> Float[Tensor, "n 1 h w"]:

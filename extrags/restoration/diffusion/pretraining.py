@@ -74,7 +74,9 @@ class PretrainingConfig(StageConfig):
     )
     drawn_share: float = Field(0.7, ge=0, le=1, description="share of the steps that train drawing")
     drawn_perceptual_weight: float = Field(1.0, gt=0, description="of the perceptual distance in these")
-    adversarial_weight: float = Field(0.1, ge=0, description="of the adversary in these")
+    adversarial_weight: float = Field(
+        1.0, ge=0, description="pull of the adversary at invented colours, relative to all else in these"
+    )
     adversary_rate: float = Field(4e-4, gt=0, description="learning rate of the adversary")
     patches: int = Field(6, ge=1, description="patches of the scene's frames beside each crop")
     patch_px: int = Field(64, ge=32, multiple_of=8, description="side of a patch")
