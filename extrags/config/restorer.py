@@ -189,6 +189,12 @@ class EnhanceConfig(StageConfig):
         ge=1,
         description="virtual views restored at most; no more trajectories than this are planned or restored",
     )
+    keyframes: int = Field(
+        12,
+        ge=0,
+        description="virtual views restored first, one after the other; what they invent is shown to all "
+        "views (embedded and classical). 0: every view is restored alone",
+    )
     clips_per_batch: int = Field(4, ge=1, description="clips restored by one task")
     pixel_confidence: Literal["bounded", "raw"] = Field(
         "bounded",

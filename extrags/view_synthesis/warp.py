@@ -96,6 +96,7 @@ def warp_references(
     count: int,
     reference: ReferenceChoice = "covisibility",
     exposure: Float[Tensor, "v"] | None = None,
+    good_quality: float = GOOD_QUALITY,
 ) -> Warped:
     """Carry the `count` most co-visible references into each virtual view.
 
@@ -110,6 +111,7 @@ def warp_references(
         count: references blended per view.
         reference: which of them comes first.
         exposure: gain of each virtual view; None is 1, the mean of the training frames.
+        good_quality: likeness of distance and direction from which a reference is trusted completely.
 
     Source: v_nn of [ExtraGS, eq. 18] with `nearest`, see docs/references.md.
     """
@@ -120,7 +122,7 @@ def warp_references(
     chosen = torch.argsort(scores, dim=1, descending=True, stable=True)[:, : min(count, len(references))]
     gain = torch.ones(len(cameras)) if exposure is None else exposure
     parts = [
-        _warp_one(references, cameras[view], depth_mm[view], chosen[view], gain[view])
+        _warp_one(references, cameras[view], depth_mm[view], chosen[view], gain[view], good_quality)
         for view in range(len(cameras))
     ]
     nearest, nearest_weight, blend, blend_weight, log_ratio = (
@@ -151,6 +153,7 @@ def _warp_one(
     depth_mm: Float[Tensor, "1 h w"],
     chosen: Int[Tensor, "k"],
     gain: Float[Tensor, ""],
+    good_quality: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     size = depth_mm.shape[-2:]
     here = _surface(camera, depth_mm, 1)
@@ -165,7 +168,7 @@ def _warp_one(
     rgb = transfer.apply_response(transfer.invert_response(seen.rgb) * ratio[:, None])
     # Too bright for the sensor: darkened as a whole, so that the hue stays.
     rgb = rgb / rgb.amax(dim=1, keepdim=True).clamp_min(1)
-    trust = seen.weight * (seen.quality / GOOD_QUALITY).clamp(max=1)
+    trust = seen.weight * (seen.quality / good_quality).clamp(max=1)
     # Squared, because the mean of many views is blurred: the good ones shall dominate.
     votes = (seen.weight * seen.quality).square()
     luminance = rgb.mean(dim=1)

@@ -65,6 +65,7 @@ class EmbeddedEnhancer:
     deterministic: bool = False
 
     name = "embedded"
+    follows_keyframes = True
 
     def with_settings(self, config: EnhanceConfig, gamut: Gamut) -> EmbeddedEnhancer:
         """The same network under a scene's settings."""

@@ -1,0 +1,212 @@
+"""Surfaces that restored views have invented, carried into other views: invented once, seen by all.
+
+A restored view shows surfaces that no real view and no rendering knows. Its depth says where they are. They
+are carried in two steps: small discs on the invented surface are rendered into the other view, which gives
+depth to its holes; then colours are looked up as those of real views are, with the light's fall-off
+compensated and where the depths of both views agree.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from extrags.cameras import Cameras, pixel_rays
+from extrags.errors import ShapeError
+from extrags.gaussians import Gaussians
+from extrags.scene import Scene
+from extrags.threads import in_threads
+from extrags.thresholds import HOLE_ALPHA
+from extrags.view_synthesis.conditioning import Layers, feathered, known_share
+from extrags.view_synthesis.filling import completed_depth
+from extrags.view_synthesis.references import LightTransfer, ReferenceViews
+from extrags.view_synthesis.warp import depth_normals, warp_references
+
+__all__ = ["InventedViews", "with_invented"]
+
+BLENDED = 4
+"""Invented references of one view at most; those that show most of it."""
+GOOD_QUALITY = 1e-4
+"""As that of real references, but an invented surface is the same from any side: whoever sees it follows."""
+INVENTED = 0.3
+"""Share of a pixel that nothing knew, from which its surface counts as invented."""
+GRAZING = (0.1, 0.3)
+"""Cosines between ray and normal between which trust rises: a smoothly filled depth spans the gap between a
+fold and the wall behind it, and that surface is nowhere."""
+FEATHER_PX = 4.0
+"""Trust rises over so many pixels from the border of the image."""
+DISCS = 20_000
+"""Discs of one view at most; larger ones on a coarser lattice, if need be."""
+DISC_PITCHES = 0.6
+"""Radius of a disc in distances to its neighbours: without gaps, and little beyond the rim."""
+DISC_OPACITY = 0.9
+DISC_THICKNESS = 0.1
+
+
+@dataclass(frozen=True)
+class InventedViews:
+    """K restored views as references of others.
+
+    Args:
+        views: their colours, trust, depth and exposure, [K]; no Gaussian of the scene is seen in them.
+        surface: discs on what they have invented.
+    """
+
+    views: ReferenceViews
+    surface: Scene
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    @classmethod
+    def of_views(
+        cls,
+        cameras: Cameras,
+        rgb: Float[Tensor, "k 3 h w"],
+        depth_mm: Float[Tensor, "k 1 h w"],
+        unknown: Float[Tensor, "k 1 h w"],
+        exposure: Float[Tensor, "k"],
+        transfer: LightTransfer,
+    ) -> InventedViews:
+        """Prepare restored views as references.
+
+        Args:
+            cameras: of the views, at least one.
+            rgb: restored colours in [0, 1].
+            depth_mm: their z-depth without gaps.
+            unknown: share of a pixel that nothing knew before it was restored.
+            exposure: gain of each view.
+            transfer: how brightness changes with distance.
+
+        Raises:
+            ShapeError: when the numbers of views differ or there is none.
+        """
+        counts = {len(cameras), len(rgb), len(depth_mm), len(unknown), len(exposure)}
+        if len(counts) != 1 or counts == {0}:
+            raise ShapeError(f"the parts of invented views have different lengths: {sorted(counts)}")
+        rays = [torch.from_numpy(pixel_rays(cameras[view])[0].astype(np.float32)) for view in range(len(rgb))]
+        normals = [depth_normals(ray, depth) for ray, depth in zip(rays, depth_mm, strict=True)]
+        facing = torch.stack(
+            [
+                (normal * ray).sum(dim=-1).abs() / ray.norm(dim=-1)
+                for normal, ray in zip(normals, rays, strict=True)
+            ]
+        )[:, None]
+        trust = ((facing - GRAZING[0]) / (GRAZING[1] - GRAZING[0])).clamp(0, 1)
+        trust = trust * _border(cameras.height, cameras.width)
+        packed = torch.cat([rgb, trust, 1 / depth_mm.clamp_min(1e-9), torch.ones_like(trust)], dim=1)
+        views = ReferenceViews(
+            np.arange(len(rgb)),
+            cameras,
+            packed.contiguous(),
+            exposure,
+            torch.zeros(len(rgb), 0, dtype=torch.bool),
+            transfer,
+        )
+        parts = [
+            _discs(
+                cameras[view], rays[view], depth_mm[view], normals[view], unknown[view] * (trust[view] > 0)
+            )
+            for view in range(len(rgb))
+        ]
+        points, found, radius = (np.concatenate(part) for part in zip(*parts, strict=True))
+        surface = Gaussians.from_points(
+            points,
+            np.zeros_like(points),
+            radius,
+            opacity=DISC_OPACITY,
+            normals=found,
+            thickness=DISC_THICKNESS,
+        )
+        return cls(views, Scene(surface, None))
+
+
+def with_invented(
+    layers: Layers,
+    invented: InventedViews | None,
+    cameras: Cameras,
+    exposure: Float[Tensor, "v"] | None = None,
+) -> Layers:
+    """Layers with what other restored views have invented; depth, too, where only they know the surface.
+
+    Args:
+        layers: of V views; they are not changed.
+        invented: restored views; None gives the layers back.
+        cameras: the views.
+        exposure: gain of each; None is 1.
+
+    Raises:
+        ShapeError: when the numbers of views differ.
+    """
+    if len(layers) != len(cameras):
+        raise ShapeError(f"layers of {len(layers)} views, {len(cameras)} cameras")
+    if invented is None or len(invented.surface.gaussians) == 0:
+        return layers
+
+    def followed(view: int) -> Tensor:
+        gain = None if exposure is None else exposure[[view]]
+        return _followed(layers[view], invented, cameras[view], gain).data
+
+    return Layers(torch.cat(in_threads(followed, range(len(layers)))))
+
+
+def _followed(
+    layers: Layers, invented: InventedViews, camera: Cameras, exposure: Float[Tensor, "1"] | None
+) -> Layers:
+    layers = Layers(layers.data.clone())
+    alpha = layers.get("alpha")
+    with torch.no_grad():
+        rendering = invented.surface.render(camera, median_depth=True)
+    if rendering.median_depth is None:
+        raise ShapeError("the rasteriser returned no median depth")
+    share, median = rendering.alpha[:, None], rendering.median_depth[:, None]
+    # What the scene itself shows stays: an invented surface behind it is hidden, one before it is wrong.
+    only = (alpha < HOLE_ALPHA) & (share > HOLE_ALPHA) & (median > 0)
+    depth = torch.where(only, median, layers.get("depth_mm"))
+    complete = completed_depth(depth, torch.where(only, share, alpha), invented.views.transfer.scale_mm)
+    warped = warp_references(
+        invented.views,
+        camera,
+        complete,
+        count=BLENDED,
+        exposure=exposure,
+        good_quality=GOOD_QUALITY,
+    )
+    weight = feathered(warped.blend_weight) * (1 - known_share(layers)).clamp(0, 1)
+    layers.get("depth_mm").copy_(torch.where(weight > 0, depth, layers.get("depth_mm")))
+    layers.get("invented").copy_(warped.blend * (weight > 0))
+    layers.get("invented_weight").copy_(weight)
+    return layers
+
+
+def _border(height: int, width: int) -> Float[Tensor, "h w"]:
+    """1 inside, falling to 0 at the border of the image."""
+    down, along = (
+        torch.minimum(torch.arange(size) + 0.5, size - 0.5 - torch.arange(size)) for size in (height, width)
+    )
+    return (torch.minimum(down[:, None], along[None]) / FEATHER_PX).clamp(0, 1)
+
+
+def _discs(
+    camera: Cameras,
+    rays: Float[Tensor, "h w 3"],
+    depth_mm: Float[Tensor, "1 h w"],
+    normals: Float[Tensor, "h w 3"],
+    unknown: Float[Tensor, "1 h w"],
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n"]]:
+    """Centres, normals and radii of discs on the invented surface of one view."""
+    chosen = unknown[0] > INVENTED
+    stride = max(1, int(np.ceil(np.sqrt(int(chosen.sum()) / DISCS))))
+    lattice = torch.zeros_like(chosen)
+    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
+    chosen = chosen & lattice
+    ray, depth, normal = rays[chosen], depth_mm[0][chosen], normals[chosen]
+    # Seen at an angle, neighbouring pixels lie farther apart on the surface.
+    cosine = ((normal * ray).sum(dim=-1).abs() / ray.norm(dim=-1)).clamp_min(GRAZING[0])
+    pitch = stride * depth / float(camera.K[0, 0, 0]) / cosine.sqrt()
+    points = torch.from_numpy(camera.centers[0].astype(np.float32)) + ray * depth[:, None]
+    return points.numpy(), normal.numpy(), (DISC_PITCHES * pitch).numpy()
