@@ -143,7 +143,7 @@ METHODS: dict[str, Method] = {
     "zero-shot": Method("zero-shot"),
     "deterministic": Method("deterministic"),
 }
-"""Methods beside the backends as they are; every one also with a suffix, `/no-references` or `/no-keyframes`."""
+"""Methods beside the backends as they are; every one also with `/no-references` or `/no-keyframes`."""
 
 
 def check_methods(names: Iterable[str]) -> list[str]:
