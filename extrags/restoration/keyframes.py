@@ -28,7 +28,7 @@ from extrags.scene import Scene
 from extrags.store.storable import Storable
 from extrags.threads import in_threads
 from extrags.view_synthesis.conditioning import Layers, condition, filled_depth, known_share, observe_views
-from extrags.view_synthesis.invented import InventedViews, with_invented
+from extrags.view_synthesis.invented import InventedViews, evidence, with_invented
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
 
@@ -43,7 +43,7 @@ MISSING = 0.3
 DEPTH_TOLERANCE = 0.25
 """Absolute log ratio of depths at which two views are taken to see the same surface by 1/e: before they are
 restored, both depths are filled in."""
-MIN_GAIN_SHARE = 0.01
+MIN_GAIN_SHARE = 0.003
 """A keyframe sees at least this share of all that is missing, beyond what those before it see."""
 
 
@@ -325,7 +325,7 @@ def _seen(
     v = local[:, 1] / z * K[1, 1] + K[1, 2]
     inside = (local[:, 2] > 1e-6) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     grid = torch.stack([2 * u / camera.width - 1, 2 * v / camera.height - 1], dim=-1).clamp(-4, 4)
-    maps = torch.cat([depth_mm, missing])[None]
+    maps = torch.cat([depth_mm, missing * evidence(missing[None])[0]])[None]
     found = functional.grid_sample(maps, grid[None, None], mode="nearest", align_corners=False)[0, :, 0]
     agreement = torch.exp(-((z / found[0].clamp_min(1e-6)).log() / DEPTH_TOLERANCE).square())
     sharpness = (distance / local.norm(dim=-1).clamp_min(1e-9)).clamp(max=1)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
 from extrags.cameras import Cameras, pixel_rays
 from extrags.errors import ShapeError
@@ -22,11 +23,11 @@ from extrags.scene import Scene
 from extrags.threads import in_threads
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import Layers, feathered, known_share
-from extrags.view_synthesis.filling import completed_depth
+from extrags.view_synthesis.filling import completed_depth, push_pull
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 from extrags.view_synthesis.warp import depth_normals, warp_references
 
-__all__ = ["InventedViews", "with_invented"]
+__all__ = ["InventedViews", "evidence", "with_invented"]
 
 BLENDED = 4
 """Invented references of one view at most; those that show most of it."""
@@ -39,6 +40,18 @@ GRAZING = (0.1, 0.3)
 fold and the wall behind it, and that surface is nowhere."""
 FEATHER_PX = 4.0
 """Trust rises over so many pixels from the border of the image."""
+REACH = 0.25
+"""Distance from what is known, in widths of the image, over which the evidence for what was invented falls to
+1/e."""
+LEAST_EVIDENCE = 0.1
+"""Far inside a hole one view knows no better than another, and the later follows the earlier."""
+FOLLOWED = 2.0
+"""A keyframe is followed completely where its evidence is not worse than the own by more than this factor."""
+HARMONY_PX = 4
+"""Side of the blocks in which the brightness of invented and known colours is compared."""
+LARGEST_CORRECTION = 4.0
+DARKEST = 0.02
+"""Added to brightness before two of them are divided."""
 DISCS = 20_000
 """Discs of one view at most; larger ones on a coarser lattice, if need be."""
 DISC_PITCHES = 0.6
@@ -97,7 +110,7 @@ class InventedViews:
             ]
         )[:, None]
         trust = ((facing - GRAZING[0]) / (GRAZING[1] - GRAZING[0])).clamp(0, 1)
-        trust = trust * _border(cameras.height, cameras.width)
+        trust = trust * _border(cameras.height, cameras.width) * evidence(unknown)
         packed = torch.cat([rgb, trust, 1 / depth_mm.clamp_min(1e-9), torch.ones_like(trust)], dim=1)
         views = ReferenceViews(
             np.arange(len(rgb)),
@@ -176,11 +189,58 @@ def _followed(
         exposure=exposure,
         good_quality=GOOD_QUALITY,
     )
-    weight = feathered(warped.blend_weight) * (1 - known_share(layers)).clamp(0, 1)
+    missing = (1 - known_share(layers)).clamp(0, 1)
+    trust = feathered(warped.blend_weight)
+    # Near what it knows the view itself knows better than a keyframe that looked from far inside the hole.
+    weight = (FOLLOWED * trust / evidence(missing)).clamp(max=1) * missing
     layers.get("depth_mm").copy_(torch.where(weight > 0, depth, layers.get("depth_mm")))
-    layers.get("invented").copy_(warped.blend * (weight > 0))
+    layers.get("invented").copy_(_in_harmony(warped.blend, warped.blend_weight, layers) * (weight > 0))
     layers.get("invented_weight").copy_(weight)
     return layers
+
+
+def evidence(unknown: Float[Tensor, "v 1 h w"]) -> Float[Tensor, "v 1 h w"]:
+    """How well each pixel of a view can be invented: the better, the nearer to what is known.
+
+    Args:
+        unknown: share of a pixel that nothing gives.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    maps = []
+    for holes in (unknown[:, 0] > INVENTED).numpy():
+        # Without anything known there is no distance to it.
+        far = np.full(holes.shape, np.inf) if holes.all() else distance_transform_edt(holes)
+        maps.append(np.exp(-far / (REACH * holes.shape[1])).clip(LEAST_EVIDENCE))
+    return torch.from_numpy(np.stack(maps).astype(np.float32))[:, None]
+
+
+def _in_harmony(
+    color: Float[Tensor, "1 3 h w"], trust: Float[Tensor, "1 1 h w"], layers: Layers
+) -> Float[Tensor, "1 3 h w"]:
+    """Invented colours as bright as what is known around them.
+
+    The light's model and the depths are not exact. How far a keyframe is off is seen where it shows what the
+    view knows itself; this factor is extended smoothly into the hole.
+    """
+    known = known_share(layers)
+    weight = layers.get("blend_weight")
+    own = weight * layers.get("blend") + (1 - weight) * layers.get("rendered")
+    both = trust * known * (known > HOLE_ALPHA)
+
+    def in_blocks(values: Tensor) -> Tensor:
+        return functional.avg_pool2d(values, HARMONY_PX, ceil_mode=True, count_include_pad=False)
+
+    share = in_blocks(both).clamp_min(1e-6)
+    ours = in_blocks(both * own.mean(dim=1, keepdim=True) / known.clamp_min(1e-3)) / share
+    theirs = in_blocks(both * color.mean(dim=1, keepdim=True)) / share
+    limit = float(np.log(LARGEST_CORRECTION))
+    off = ((ours + DARKEST) / (theirs + DARKEST)).log().clamp(-limit, limit)
+    factor = functional.interpolate(
+        push_pull(off, in_blocks(both)), size=color.shape[-2:], mode="bilinear", align_corners=False
+    ).exp()
+    bright = color * factor
+    return bright / bright.amax(dim=1, keepdim=True).clamp_min(1)
 
 
 def _border(height: int, width: int) -> Float[Tensor, "h w"]:
