@@ -33,6 +33,9 @@ BLENDED = 4
 """Invented references of one view at most; those that show most of it."""
 GOOD_QUALITY = 1e-4
 """As that of real references, but an invented surface is the same from any side: whoever sees it follows."""
+DEPTH_TOLERANCE = 0.15
+"""As that of real references, but the depth is that of discs: on walls seen at an angle the nearer one hides
+the farther, which moves the surface a few percent towards the lens."""
 INVENTED = 0.3
 """Share of a pixel that nothing knew, from which its surface counts as invented."""
 GRAZING = (0.1, 0.3)
@@ -54,9 +57,9 @@ DARKEST = 0.02
 """Added to brightness before two of them are divided."""
 DISCS = 20_000
 """Discs of one view at most; larger ones on a coarser lattice, if need be."""
-DISC_PITCHES = 0.6
+DISC_PITCHES = 0.4
 """Radius of a disc in distances to its neighbours: without gaps, and little beyond the rim."""
-DISC_OPACITY = 0.9
+DISC_OPACITY = 0.8
 DISC_THICKNESS = 0.1
 
 
@@ -188,6 +191,7 @@ def _followed(
         count=BLENDED,
         exposure=exposure,
         good_quality=GOOD_QUALITY,
+        depth_tolerance=DEPTH_TOLERANCE,
     )
     missing = (1 - known_share(layers)).clamp(0, 1)
     trust = feathered(warped.blend_weight)
