@@ -68,9 +68,16 @@ class TestChoice:
         chosen = choose_keyframes(cameras, depth, missing, 5)
         # The second view sees a wider hole than the first and all of its; the last misses nothing.
         assert chosen[0] == 1
-        assert len(chosen) == 2
         assert chosen[1] in (2, 3)
+        assert 4 not in chosen
         assert choose_keyframes(cameras, depth, missing, 1) == chosen[:1]
+
+    def test_a_view_that_adds_nothing_is_left_out(self) -> None:
+        cameras = flat_views([0.0, 0.0, 60.0])
+        depth = torch.full((3, 1, 16, 40), 10.0)
+        missing = torch.zeros(3, 1, 16, 40)
+        missing[..., 10:16] = 1
+        assert sorted(choose_keyframes(cameras, depth, missing, 3)) == [0, 2]
 
     def test_nothing_missing_needs_none(self) -> None:
         cameras = flat_views([0.0, 1.0])

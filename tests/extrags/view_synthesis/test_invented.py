@@ -106,7 +106,7 @@ class TestInvented:
 
     def test_a_curtain_between_two_depths_is_not_trusted(self, tube: Tube) -> None:
         # A smooth ramp from 10 to 60 mm over a few pixels: what filling makes of the rim of a fold.
-        ramp = torch.linspace(-8, 8, WIDTH).sigmoid().mul(50).add(10).expand(1, 1, HEIGHT, WIDTH)
+        ramp = torch.linspace(-30, 30, WIDTH).sigmoid().mul(50).add(10).expand(1, 1, HEIGHT, WIDTH)
         views = InventedViews.of_views(
             VIEWS[:1],
             torch.full((1, 3, HEIGHT, WIDTH), 0.5),
