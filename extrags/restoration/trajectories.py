@@ -11,7 +11,7 @@ from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.backends import train_enhancer
 from extrags.restoration.clips import choose_views, make_pseudo_observations
-from extrags.restoration.keyframes import Keyframes, make_keyframes
+from extrags.restoration.keyframes import Keyframes, follows_keyframes, make_keyframes
 from extrags.restoration.protocol import Enhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -120,6 +120,8 @@ def restore_keyframes(
     Returns:
         The keyframes; none with `enhance.keyframes=0`, or for a restorer that follows none.
     """
+    if config.keyframes == 0 or not follows_keyframes(enhancer):
+        return Keyframes.none(trajectories[0])
     if references is None:
         references = gather_references(scene, sequence, sequence.train)
     views = choose_views([len(cameras) for cameras in trajectories], config.max_views)
