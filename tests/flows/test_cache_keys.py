@@ -147,9 +147,16 @@ OTHERS: dict[str, Any] = {
 """Other values where no rule gives one; None: not compared here, but in a test of its own."""
 
 BASE = PipelineConfig().with_overrides(
-    {"ingest.width": 64, "ingest.height": 51, "depth.device": "cpu", "enhance.precision": "float32"}
+    {
+        "ingest.width": 64,
+        "ingest.height": 51,
+        "depth.device": "cpu",
+        "enhance.keyframes": 2,
+        "enhance.precision": "float32",
+    }
 )
-"""What depends on the machine is settled; what `auto` becomes is tested beside the stages."""
+"""What depends on the machine is settled; what `auto` becomes is tested beside the stages. With
+keyframes, which have a stage of their own."""
 
 
 @pytest.fixture(autouse=True)

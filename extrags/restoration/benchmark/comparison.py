@@ -43,6 +43,7 @@ __all__ = [
     "NO_KEYFRAMES",
     "NO_REFERENCES",
     "RECIPES",
+    "WITH_KEYFRAMES",
     "Method",
     "bench_enhance",
     "check_methods",
@@ -54,8 +55,11 @@ __all__ = [
 
 NO_REFERENCES = "/no-references"
 """Suffix of a method's name: the same restorer, not told what real views see."""
-NO_KEYFRAMES = "/no-keyframes"
-"""Suffix of a method's name: the same restorer, every view restored alone."""
+WITH_KEYFRAMES, NO_KEYFRAMES = "/keyframes", "/no-keyframes"
+"""Suffixes of a method's name: the same restorer with keyframes, or every view restored alone; without
+either it is as the settings say."""
+USUAL_KEYFRAMES = 12
+"""Of a method with keyframes where the settings have none."""
 
 SCENE_ITERATIONS = 220
 """Steps on the scene's own pairs where the profile trains on none."""
@@ -143,7 +147,7 @@ METHODS: dict[str, Method] = {
     "zero-shot": Method("zero-shot"),
     "deterministic": Method("deterministic"),
 }
-"""Methods beside the backends as they are; every one also with `/no-references` or `/no-keyframes`."""
+"""Methods beside the backends as they are; every one also with a suffix, `/keyframes` for instance."""
 
 
 def check_methods(names: Iterable[str]) -> list[str]:
@@ -158,13 +162,16 @@ def check_methods(names: Iterable[str]) -> list[str]:
     if unknown or not chosen:
         raise ConfigError(
             f"unknown methods {', '.join(unknown) or '(none named)'}; expected {', '.join(known)}, "
-            f"each also with {NO_REFERENCES} or {NO_KEYFRAMES} behind it"
+            f"each also with {NO_REFERENCES}, {WITH_KEYFRAMES} or {NO_KEYFRAMES} behind it"
         )
     return chosen
 
 
 def _plain(name: str) -> str:
-    return name.removesuffix(NO_REFERENCES).removesuffix(NO_KEYFRAMES)
+    for suffix in (NO_REFERENCES, NO_KEYFRAMES, WITH_KEYFRAMES):
+        if name.endswith(suffix):
+            return name.removesuffix(suffix)
+    return name
 
 
 def prepared(
@@ -226,7 +233,7 @@ def compare_methods(
         scene: its coarse scene.
         sequence: with the held-out frames; restorers are given the training frames alone.
         config: settings; `enhance` and `coarse` count.
-        methods: names. Keyframes are chosen among the held-out views, as many as the settings say.
+        methods: names. Keyframes are chosen among the held-out views.
         lpips: LPIPS by backbone; None leaves it out.
 
     Returns:
@@ -248,9 +255,7 @@ def compare_methods(
     cases = []
     restorers = prepared(methods, scene, training, config.enhance, config.coarse)
     for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
-        keyed = config.enhance
-        if name.endswith(NO_KEYFRAMES):
-            keyed = keyed.model_copy(update={"keyframes": 0})
+        keyed = _keyed(name, config.enhance)
         begun = time.perf_counter()
         keyframes = clip_keyframes(scene, references, clips, enhancer, keyed)
         keyframe_seconds = time.perf_counter() - begun
@@ -274,6 +279,16 @@ def compare_methods(
         logger.info("bench enhance: %s %s %.2f dB", sequence.name, name, figures["psnr"] or 0.0)
         emit(Progress("bench enhance", done, len(methods)))
     return cases
+
+
+def _keyed(name: str, config: EnhanceConfig) -> EnhanceConfig:
+    """The settings with the number of keyframes of a method."""
+    count = config.keyframes
+    if name.endswith(NO_KEYFRAMES):
+        count = 0
+    elif name.endswith(WITH_KEYFRAMES):
+        count = count or USUAL_KEYFRAMES
+    return config.model_copy(update={"keyframes": count})
 
 
 def clip_keyframes(
@@ -309,7 +324,8 @@ def bench_enhance(
     Args:
         sequences: with poses and held-out frames.
         config: settings of `coarse` and `enhance`, seeds included.
-        methods: names of `METHODS` or of backends, possibly with `/no-references` or `/no-keyframes`.
+        methods: names of `METHODS` or of backends, possibly with a suffix: `/no-references`, `/keyframes` or
+            `/no-keyframes`.
         lpips: LPIPS by backbone; None leaves it out.
 
     Returns:

@@ -419,10 +419,10 @@ class TestWithoutReferences:
 
 
 class TestBench:
-    CONFIG = PipelineConfig(enhance=EnhanceConfig(references=4, seed=3, keyframes=2))
+    CONFIG = PipelineConfig(enhance=EnhanceConfig(references=4, seed=3))
 
     def test_cases(self, tube: Tube) -> None:
-        methods = ["none", "classical/no-keyframes", "classical/no-references", "classical"]
+        methods = ["none", "classical", "classical/no-references", "classical/keyframes"]
         cases = compare_methods(tube.scene, tube.sequence, self.CONFIG, methods, None)
         assert [case["method"] for case in cases] == methods
         for case in cases:
