@@ -27,7 +27,7 @@ from extrags.events import MetricRecorded, Progress, emit
 from extrags.metrics.image import psnr_per_image
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.protocol import Enhancer
-from extrags.restoration.trajectories import restore_batch
+from extrags.restoration.trajectories import restored_batches
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.store.storable import Storable
@@ -246,11 +246,10 @@ def _restored(
 ) -> PseudoViews:
     fewer = enhance.model_copy(update={"max_views": max_views})
     measure = PerceptualDifference.available() if measure is None else measure
-    batches = fewer.batches(len(trajectories))
-    parts = []
-    for batch in range(batches):
-        parts.append(restore_batch(scene, sequence, trajectories, enhancer, fewer, batch, measure))
-        emit(Progress("finetune-judge", batch + 1, batches))
+    parts: list[PseudoViews] = []
+    for part in restored_batches(scene, sequence, trajectories, enhancer, fewer, measure):
+        parts.append(part)
+        emit(Progress("finetune-judge", len(parts), fewer.batches(len(trajectories))))
     return PseudoViews.concatenated(parts).quantised()
 
 

@@ -238,6 +238,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "enhance.references": 1,
         "enhance.reference": "nearest",
         "enhance.iou": "reference",
+        "enhance.keyframes": 0,
         "enhance.pixel_confidence": "raw",
         "finetune.loss": "paper",
         # With these two the colour terms are L1 + (1 - SSIM).

@@ -38,7 +38,7 @@ EXPECTED_SECONDS: dict[StageName, dict[str, float]] = {
     "surface": {"surface": 1.2},
     "freespace": {"freespace": 1.2},
     "explore": {"explore": 25.0},
-    "enhance": {"enhance-train": 15.0, "enhance-restore": 35.0, "enhance": 4.0},
+    "enhance": {"enhance-train": 15.0, "enhance-keyframes": 5.0, "enhance-restore": 35.0, "enhance": 4.0},
     "finetune": {"finetune-judge": 18.0, "finetune": 25.0},
     "evaluate": {"evaluate-render": 8.0, "evaluate": 15.0},
     "report": {"report": 8.0},

@@ -23,7 +23,15 @@ from tasks.assess import assess, measuring_settings, plan, planning_settings
 from tasks.coarse import coarse, refined_frames
 from tasks.depth import depth, depth_frames, triangulation_settings
 from tasks.depth import keyed_settings as keyed_depth_settings
-from tasks.enhance import assemble, judging_settings, restore, restoring_settings, train
+from tasks.enhance import (
+    assemble,
+    judging_settings,
+    keyframe_settings,
+    keyframes,
+    restore,
+    restoring_settings,
+    train,
+)
 from tasks.enhance import keyed_settings as keyed_enhance_settings
 from tasks.evaluate import METRICS_FILE, measure, render
 from tasks.explore import branch, explore, merge, next_anchors, start
@@ -309,10 +317,18 @@ class SequenceRun(Pipeline):
             self.refs["restorer"] = self._run_task(row, Call(train, inputs))
             weights, *_ = self._weights()
             settings = restoring_settings(given)
-            shared = {
+            views = {
                 **self._scene_inputs(),
                 "explore": self.refs["explore"],
                 "restorer": self.refs["restorer"],
+            }
+            followed = None
+            if given.keyframes > 0:
+                inputs = {**views, "config": keyframe_settings(given)}
+                followed = self._run_task(row, Call(keyframes, inputs))
+            shared = {
+                **views,
+                "keyframes": followed,
                 "config": settings,
                 "weights_digest": weights.digest,
                 "weights": weights,

@@ -1,4 +1,7 @@
-"""enhance: trains the restorer, restores clips in batches, and concatenates the pseudo-observations."""
+"""enhance: trains the restorer, restores keyframes, then clips in batches, and concatenates these.
+
+`keyframes` restores a few views one after the other; every batch of clips follows them, and no other batch.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,16 @@ from extrags.store import Ref, Slot
 from tasks.stage import stage
 from tasks.weights import Weights, restorer_digest
 
-__all__ = ["assemble", "judging_settings", "keyed_settings", "restore", "restoring_settings", "train"]
+__all__ = [
+    "assemble",
+    "judging_settings",
+    "keyed_settings",
+    "keyframe_settings",
+    "keyframes",
+    "restore",
+    "restoring_settings",
+    "train",
+]
 
 RESTORER = "restorer"
 
@@ -17,6 +29,9 @@ _OF_RESTORATION = frozenset(
     {"clips_per_batch", "iou", "max_views", "pixel_confidence", "reference", "references"}
 )
 """Settings that the stage `enhance-restore` reads itself; all others work through the restorer."""
+
+_OF_KEYFRAMES = frozenset({"keyframes", "max_views", "reference", "references"})
+"""Settings that the stage `enhance-keyframes` reads itself."""
 
 _OF_EMBEDDED = frozenset(
     {
@@ -85,9 +100,14 @@ def restoring_settings(config: EnhanceConfig) -> EnhanceConfig:
     return _only(config, _OF_RESTORATION)
 
 
+def keyframe_settings(config: EnhanceConfig) -> EnhanceConfig:
+    """The settings that `keyframes` reads, all others at their defaults."""
+    return _only(config, _OF_KEYFRAMES)
+
+
 def judging_settings(config: EnhanceConfig) -> EnhanceConfig:
     """The settings that the judge of the fine-tuning restores with: it has a number of views of its own."""
-    return _only(config, _OF_RESTORATION - {"clips_per_batch", "max_views"})
+    return _only(config, (_OF_RESTORATION | _OF_KEYFRAMES) - {"clips_per_batch", "max_views"})
 
 
 def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
@@ -95,7 +115,7 @@ def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=6, ignore=("given",))
+@stage("enhance-train", version=7, ignore=("given",))
 def train(
     slot: Slot,
     scene: Ref,
@@ -137,22 +157,52 @@ def train(
     train_enhancer(slot.load(Scene, scene), frames, config, coarse).save(slot.path / RESTORER)
 
 
+@stage("enhance-keyframes", version=1)
+def keyframes(
+    slot: Slot, scene: Ref, sequence: Ref, explore: Ref, restorer: Ref, config: EnhanceConfig
+) -> None:
+    """Choose and restore the views that all batches follow; writes `keyframes/`.
+
+    There are none where nothing is missing, or the restorer does not follow any.
+    """
+    from extrags.exploration import Exploration
+    from extrags.restoration.backends import load_enhancer
+    from extrags.restoration.trajectories import restore_keyframes
+    from extrags.scene import Scene
+    from extrags.sequence import EndoscopicSequence
+
+    found = restore_keyframes(
+        slot.load(Scene, scene),
+        slot.load(EndoscopicSequence, sequence),
+        slot.load(Exploration, explore).trajectories,
+        load_enhancer(slot.open(restorer) / RESTORER),
+        config,
+    )
+    slot.save(found)
+    slot.counts["views"] = len(found)
+
+
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=5, ignore=("weights",))
+@stage("enhance-restore", version=6, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,
     sequence: Ref,
     explore: Ref,
     restorer: Ref,
+    keyframes: Ref | None,
     batch: int,
     config: EnhanceConfig,
     weights_digest: str | None,
     weights: Weights,
 ) -> None:
-    """Render and restore one batch of trajectories and compute its confidences; writes `pseudo/`."""
+    """Render and restore one batch of trajectories and compute its confidences; writes `pseudo/`.
+
+    Without keyframes, every view is restored alone.
+    """
     from extrags.exploration import Exploration
     from extrags.restoration.backends import load_enhancer
+    from extrags.restoration.keyframes import Keyframes
     from extrags.restoration.trajectories import restore_batch
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
@@ -165,6 +215,7 @@ def restore(
         config,
         batch,
         weights.perceptual_difference(),
+        keyframes=None if keyframes is None else slot.load(Keyframes, keyframes),
     )
     slot.save(views)
     slot.counts["views"] = len(views)

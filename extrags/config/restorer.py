@@ -195,6 +195,13 @@ class EnhanceConfig(StageConfig):
         ge=1,
         description="virtual views restored at most; no more trajectories than this are planned or restored",
     )
+    keyframes: int = Field(
+        0,
+        ge=0,
+        description="virtual views restored first, one after the other; what they invent is shown to all "
+        "views (embedded and classical); 12 is a usual number. 0: every view is restored alone. Where it was "
+        "measured, the final scene gained on some sequences and lost on others",
+    )
     clips_per_batch: int = Field(4, ge=1, description="clips restored by one task")
     pixel_confidence: Literal["bounded", "raw"] = Field(
         "bounded",

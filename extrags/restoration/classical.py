@@ -37,6 +37,7 @@ class ClassicalEnhancer:
     reason: str = ""
 
     name = "classical"
+    follows_keyframes = True
 
     def restore(self, clip: Clip) -> Restoration:
         """Restore all views of a clip."""

@@ -19,6 +19,7 @@ from extrags.pseudo_views import PseudoViews
 from extrags.restoration.protocol import Clip, Enhancer, Restoration, restore_clips
 from extrags.scene import Scene
 from extrags.view_synthesis.conditioning import condition, observe_views
+from extrags.view_synthesis.invented import InventedViews, with_invented
 from extrags.view_synthesis.references import ReferenceViews
 
 __all__ = [
@@ -71,8 +72,10 @@ def render_clips(
     reference: ReferenceChoice = "covisibility",
     iou: IouSet = "reference",
     first_index: int = 0,
+    exposure: Sequence[Float[Tensor, "t"] | None] | None = None,
+    invented: InventedViews | None = None,
 ) -> list[Clip]:
-    """Render trajectories at the mean exposure, and warp real views into them.
+    """Render trajectories, and warp real views into them.
 
     Args:
         scene: the coarse scene.
@@ -82,21 +85,27 @@ def render_clips(
         reference: which of them U_img compares with.
         iou: set that their overlap is divided by.
         first_index: index of the first clip; a batch of many passes where it begins.
+        exposure: gain of each view of each trajectory; None is 1, the mean of the training frames.
+        invented: what restored keyframes show where nothing else knows the surface.
     """
     clips = []
     for offset, cameras in enumerate(trajectories):
         if len(cameras) == 0:
             continue
-        observation = observe_views(scene, references, cameras, count=count, reference=reference)
+        gain = None if exposure is None else exposure[offset]
+        observation = observe_views(
+            scene, references, cameras, count=count, reference=reference, exposure=gain
+        )
         confidence = image_confidence(observation.seen, references.seen[observation.reference], iou)
         clips.append(
             Clip(
                 index=first_index + offset,
                 cameras=cameras,
-                layers=observation.layers,
+                layers=with_invented(observation.layers, invented, cameras, gain),
                 transfer=references.transfer,
                 reference=observation.reference.numpy(),
                 image_confidence=confidence.numpy().astype(np.float32),
+                exposure=None if gain is None else gain.numpy(),
             )
         )
     return clips
@@ -171,6 +180,7 @@ def make_pseudo_observations(
     reference: ReferenceChoice = "covisibility",
     iou: IouSet = "reference",
     first_index: int = 0,
+    invented: InventedViews | None = None,
 ) -> PseudoViews:
     """Render, restore and weigh trajectories: the work of one batch of clips.
 
@@ -184,6 +194,7 @@ def make_pseudo_observations(
         reference: which of them U_img compares with.
         iou: set that their overlap is divided by.
         first_index: index of the first clip.
+        invented: what restored keyframes show where nothing else knows the surface.
 
     Raises:
         ShapeError: when there is no view at all.
@@ -198,6 +209,7 @@ def make_pseudo_observations(
             reference=reference,
             iou=iou,
             first_index=first_index + offset,
+            invented=invented,
         )
         if clips:
             parts.append(pseudo_observations(clips, restore_clips(enhancer, clips), measure))

@@ -32,6 +32,7 @@ class Clip:
         transfer: how brightness changes with distance in this scene.
         reference: position among the training frames of the one that sees most of the same surface, [T].
         image_confidence: U_img of each view, [T].
+        exposure: gain of each view; None is 1, the mean of the training frames, [T].
 
     Raises:
         ShapeError: when the numbers of views differ.
@@ -43,9 +44,12 @@ class Clip:
     transfer: LightTransfer
     reference: Int[np.ndarray, "t"]
     image_confidence: Float[np.ndarray, "t"]
+    exposure: Float[np.ndarray, "t"] | None = None
 
     def __post_init__(self) -> None:
         counts = {len(self.cameras), len(self.layers), len(self.reference), len(self.image_confidence)}
+        if self.exposure is not None:
+            counts.add(len(self.exposure))
         if len(counts) != 1:
             raise ShapeError(f"the parts of clip {self.index} have different lengths: {sorted(counts)}")
 
@@ -76,7 +80,9 @@ class Restoration:
 class Enhancer(Protocol):
     """Restores renderings of one scene: removes artefacts and fills holes.
 
-    `name` is that of the backend that loads it again.
+    `name` is that of the backend that loads it again. One that makes use of what keyframes have invented
+    (`Layers.get("invented")`, folded into the base image of `condition`) says so by a further attribute
+    `follows_keyframes = True`; without it there are no keyframes.
     """
 
     @property

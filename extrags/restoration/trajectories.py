@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from extrags.cameras import Cameras
@@ -11,13 +11,15 @@ from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.backends import train_enhancer
 from extrags.restoration.clips import choose_views, make_pseudo_observations
+from extrags.restoration.keyframes import Keyframes, follows_keyframes, make_keyframes
 from extrags.restoration.protocol import Enhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.threads import one_torch_thread
 from extrags.view_synthesis.gather import gather_references
+from extrags.view_synthesis.references import ReferenceViews
 
-__all__ = ["restore", "restore_batch"]
+__all__ = ["restore", "restore_batch", "restore_keyframes", "restored_batches"]
 
 
 def restore(
@@ -51,11 +53,80 @@ def restore(
         enhancer = train_enhancer(scene, sequence, config, CoarseConfig() if coarse is None else coarse)
     measure = PerceptualDifference.available() if measure is None else measure
     trajectories = [cameras for cameras in trajectories if len(cameras) > 1]
-    parts = [
-        restore_batch(scene, sequence, trajectories, enhancer, config, batch, measure)
-        for batch in range(config.batches(len(trajectories)))
-    ]
+    parts = list(restored_batches(scene, sequence, trajectories, enhancer, config, measure))
     return PseudoViews.concatenated(parts).quantised()
+
+
+def restored_batches(
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    trajectories: Sequence[Cameras],
+    enhancer: Enhancer,
+    config: EnhanceConfig,
+    measure: PerceptualDifference,
+) -> Iterator[PseudoViews]:
+    """Restore keyframes, then one batch of clips after the other.
+
+    Args:
+        scene: the coarse scene.
+        sequence: its frames; only training frames are used.
+        trajectories: all of them, the real start of each first.
+        enhancer: the scene's restorer.
+        config: as `restore_batch`.
+        measure: behind the pixel-level confidence.
+
+    Yields:
+        The views of each batch.
+
+    Raises:
+        ShapeError: when a batch has no view at all.
+    """
+    references = gather_references(scene, sequence, sequence.train)
+    keyframes = restore_keyframes(scene, sequence, trajectories, enhancer, config, references=references)
+    for batch in range(config.batches(len(trajectories))):
+        yield restore_batch(
+            scene,
+            sequence,
+            trajectories,
+            enhancer,
+            config,
+            batch,
+            measure,
+            keyframes=keyframes,
+            references=references,
+        )
+
+
+@one_torch_thread()
+def restore_keyframes(
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    trajectories: Sequence[Cameras],
+    enhancer: Enhancer,
+    config: EnhanceConfig,
+    *,
+    references: ReferenceViews | None = None,
+) -> Keyframes:
+    """Choose and restore the views that all clips will follow, among those that will be restored.
+
+    Args:
+        scene: the coarse scene.
+        sequence: its frames; only training frames are used.
+        trajectories: all of them, the real start of each first; at least one.
+        enhancer: the scene's restorer.
+        config: number of keyframes and of views.
+        references: training views of the scene, where they are gathered already.
+
+    Returns:
+        The keyframes; none with `enhance.keyframes=0`, or for a restorer that follows none.
+    """
+    if config.keyframes == 0 or not follows_keyframes(enhancer):
+        return Keyframes.none(trajectories[0])
+    if references is None:
+        references = gather_references(scene, sequence, sequence.train)
+    views = choose_views([len(cameras) for cameras in trajectories], config.max_views)
+    clips = [cameras[chosen] for cameras, chosen in zip(trajectories, views, strict=True)]
+    return make_keyframes(scene, references, clips, enhancer, config)
 
 
 @one_torch_thread()
@@ -67,6 +138,9 @@ def restore_batch(
     config: EnhanceConfig,
     batch: int,
     measure: PerceptualDifference,
+    *,
+    keyframes: Keyframes | None = None,
+    references: ReferenceViews | None = None,
 ) -> PseudoViews:
     """Render, restore and weigh one batch of trajectories; batches are independent of each other.
 
@@ -78,6 +152,8 @@ def restore_batch(
         config: number of views and of clips per batch, and the form of the pixel-level confidence.
         batch: which batch.
         measure: behind the pixel-level confidence; whether it is `raw` is the settings' to say.
+        keyframes: restored views that all batches follow (`restore_keyframes`); None for none.
+        references: training views of the scene, where they are gathered already.
 
     Raises:
         ShapeError: when the batch has no view at all.
@@ -85,9 +161,11 @@ def restore_batch(
     views = choose_views([len(cameras) for cameras in trajectories], config.max_views)
     first = batch * config.clips_per_batch
     chosen = range(first, min(first + config.clips_per_batch, len(trajectories)))
+    if references is None:
+        references = gather_references(scene, sequence, sequence.train)
     return make_pseudo_observations(
         scene,
-        gather_references(scene, sequence, sequence.train),
+        references,
         [trajectories[index][views[index]] for index in chosen],
         enhancer,
         replace(measure, raw=config.pixel_confidence == "raw"),
@@ -95,4 +173,5 @@ def restore_batch(
         reference=config.reference,
         iou=config.iou,
         first_index=first,
+        invented=None if keyframes is None else keyframes.invented(references.transfer),
     )

@@ -27,10 +27,14 @@ from extrags.view_synthesis.warp import warp_references
 
 __all__ = [
     "CONDITION_CHANNELS",
+    "INVENTED_CHANNELS",
     "LAYER_CHANNELS",
     "Conditioning",
     "Layers",
     "condition",
+    "feathered",
+    "filled_depth",
+    "known_share",
     "observe_views",
 ]
 
@@ -46,9 +50,13 @@ _SLICES = {
     "blend_weight": slice(14, 15),
     "log_ratio": slice(15, 16),
     "ray_length": slice(16, 17),
+    "invented": slice(17, 20),
+    "invented_weight": slice(20, 21),
 }
-LAYER_CHANNELS = 17
+LAYER_CHANNELS = 21
 CONDITION_CHANNELS = 20
+INVENTED_CHANNELS = 4
+"""Further channels of a network that is told apart what was invented from what real views saw."""
 
 COLOR_CENTER = 0.35
 COLOR_SCALE = 0.45
@@ -67,10 +75,11 @@ class Layers:
     """Raw observations of V virtual views.
 
     Args:
-        data: [V, 17, H, W]: `rendered` (3; black behind), `alpha`, `depth_mm` (0 where nothing was hit),
+        data: [V, 21, H, W]: `rendered` (3; black behind), `alpha`, `depth_mm` (0 where nothing was hit),
             `spread` (relative deviation of depth within a pixel), `uncertainty`, `nearest` (3) and its
             weight, `blend` (3) and its weight, `log_ratio` of distances, `ray_length` (distance per
-            z-depth).
+            z-depth), `invented` (3; what restored keyframes show of surfaces that nothing else knows) and
+            its weight, zero where there is none.
 
     Raises:
         ShapeError: for another number of channels.
@@ -112,9 +121,9 @@ class Conditioning:
     """Network input and starting image of V views.
 
     Args:
-        channels: [V, 20, H, W].
-        base: blend of real views where they see the surface, else the rendering, holes filled; in
-            [0, 1], [V, 3, H, W].
+        channels: [V, 20, H, W]; [V, 24, H, W] with invented references apart.
+        base: blend of real views where they see the surface, else the rendering, else what keyframes have
+            invented, holes filled; in [0, 1], [V, 3, H, W].
         depth_mm: z-depth without gaps, [V, 1, H, W].
     """
 
@@ -207,9 +216,11 @@ def _observe_one(
         nearest=warped.nearest,
         nearest_weight=warped.nearest_weight,
         blend=warped.blend * (warped.blend_weight > 0),
-        blend_weight=_feathered(warped.blend_weight),
+        blend_weight=feathered(warped.blend_weight),
         log_ratio=warped.log_ratio * (warped.blend_weight > 0),
         ray_length=ray_length,
+        invented=torch.zeros_like(warped.blend),
+        invented_weight=torch.zeros_like(alpha),
     )
     return Observation(layers, warped.reference, rendering.visibility_max > SEEN_WEIGHT)
 
@@ -251,7 +262,7 @@ def _known_and_spread(
     return share, torch.where(alpha > 0.02, spread, torch.zeros(())).clamp(0, 1)
 
 
-def condition(layers: Layers, transfer: LightTransfer) -> Conditioning:
+def condition(layers: Layers, transfer: LightTransfer, *, folded: bool = True) -> Conditioning:
     """Channels and base image from raw layers.
 
     Gaps are filled with the light divided out, so that a filled surface gets darker with its distance as
@@ -260,36 +271,58 @@ def condition(layers: Layers, transfer: LightTransfer) -> Conditioning:
     Args:
         layers: raw observations, possibly with holes cut into them.
         transfer: how brightness changes with distance.
+        folded: invented references appear as a blend of real views would, for a network that knows no
+            others. False gives the blend of real views alone, and `INVENTED_CHANNELS` more channels.
     """
-    alpha = layers.get("alpha")
-    depth = completed_depth(layers.get("depth_mm"), alpha, transfer.scale_mm)
+    depth = filled_depth(layers, transfer.scale_mm)
     falloff = transfer.falloff(depth * layers.get("ray_length"), 1 / layers.get("ray_length"))
     falloff = falloff.clamp(1 / FALLOFF_LIMIT, FALLOFF_LIMIT)
     weight = layers.get("blend_weight")
+    known, invented_weight = known_share(layers), layers.get("invented_weight")
     color = weight * layers.get("blend") + (1 - weight) * layers.get("rendered")
-    known = weight + (1 - weight) * alpha
+    # Without an invented reference these sums add zero: every bit stays.
+    color = color + invented_weight * layers.get("invented")
+    known = known + invented_weight
     solid = _within_range(color / known.clamp_min(1e-3))
     base = _within_range(
         transfer.apply_response(push_pull(transfer.invert_response(solid) / falloff, known) * falloff)
     )
-    channels = torch.cat(
-        [
-            _normalised(layers.get("rendered")),
-            alpha,
-            (depth / transfer.scale_mm).log(),
-            layers.get("spread") / SPREAD_LIMIT,
-            layers.get("uncertainty"),
-            _normalised(layers.get("nearest")) * layers.get("nearest_weight"),
-            layers.get("nearest_weight"),
-            _normalised(layers.get("blend")) * weight,
-            weight,
-            layers.get("log_ratio"),
-            falloff.log(),
-            _normalised(base),
-        ],
-        dim=1,
-    )
-    return Conditioning(channels, base, depth)
+    blend = _normalised(layers.get("blend")) * weight
+    invented = _normalised(layers.get("invented")) * invented_weight
+    channels = [
+        _normalised(layers.get("rendered")),
+        layers.get("alpha"),
+        (depth / transfer.scale_mm).log(),
+        layers.get("spread") / SPREAD_LIMIT,
+        layers.get("uncertainty"),
+        _normalised(layers.get("nearest")) * layers.get("nearest_weight"),
+        layers.get("nearest_weight"),
+        blend + invented if folded else blend,
+        weight + invented_weight if folded else weight,
+        layers.get("log_ratio"),
+        falloff.log(),
+        _normalised(base),
+    ]
+    if not folded:
+        channels += [invented, invented_weight]
+    return Conditioning(torch.cat(channels, dim=1), base, depth)
+
+
+def known_share(layers: Layers) -> Float[Tensor, "v 1 h w"]:
+    """How far real views or the rendering give the colour of a pixel, in [0, 1]."""
+    weight = layers.get("blend_weight")
+    return weight + (1 - weight) * layers.get("alpha")
+
+
+def filled_depth(layers: Layers, scale_mm: float) -> Float[Tensor, "v 1 h w"]:
+    """z-depth without gaps: where only a keyframe knows the surface, it is as sure as its colour.
+
+    Args:
+        layers: raw observations.
+        scale_mm: depth of a view of which nothing is known.
+    """
+    sure = torch.maximum(layers.get("alpha"), layers.get("invented_weight"))
+    return completed_depth(layers.get("depth_mm"), sure, scale_mm)
 
 
 def _within_range(color: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
@@ -297,7 +330,7 @@ def _within_range(color: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n 3 h w"]:
     return color.clamp_min(0) / color.amax(dim=1, keepdim=True).clamp_min(1)
 
 
-def _feathered(weight: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h w"]:
+def feathered(weight: Float[Tensor, "n 1 h w"]) -> Float[Tensor, "n 1 h w"]:
     """Weight that falls smoothly towards its gaps, and never exceeds what it was."""
     window = gaussian_weights(1.0, 3)
     return torch.minimum(weight, filter_separable(weight, window, window).clamp_min(0))

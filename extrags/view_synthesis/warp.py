@@ -96,6 +96,8 @@ def warp_references(
     count: int,
     reference: ReferenceChoice = "covisibility",
     exposure: Float[Tensor, "v"] | None = None,
+    good_quality: float = GOOD_QUALITY,
+    depth_tolerance: float = AGREEMENT,
 ) -> Warped:
     """Carry the `count` most co-visible references into each virtual view.
 
@@ -110,17 +112,27 @@ def warp_references(
         count: references blended per view.
         reference: which of them comes first.
         exposure: gain of each virtual view; None is 1, the mean of the training frames.
+        good_quality: likeness of distance and direction from which a reference is trusted completely.
+        depth_tolerance: relative depth difference at which the weight of a reference falls to 1/e.
 
     Source: v_nn of [ExtraGS, eq. 18] with `nearest`, see docs/references.md.
     """
-    scores = covisibility(references, cameras, depth_mm)
+    scores = covisibility(references, cameras, depth_mm, depth_tolerance)
     if reference == "nearest":
         apart = pose_distances(cameras, references.cameras, references.transfer.scale_mm)
         scores[torch.arange(len(cameras)), torch.from_numpy(apart.argmin(axis=1))] = torch.inf
     chosen = torch.argsort(scores, dim=1, descending=True, stable=True)[:, : min(count, len(references))]
     gain = torch.ones(len(cameras)) if exposure is None else exposure
     parts = [
-        _warp_one(references, cameras[view], depth_mm[view], chosen[view], gain[view])
+        _warp_one(
+            references,
+            cameras[view],
+            depth_mm[view],
+            chosen[view],
+            gain[view],
+            good_quality,
+            depth_tolerance,
+        )
         for view in range(len(cameras))
     ]
     nearest, nearest_weight, blend, blend_weight, log_ratio = (
@@ -130,7 +142,10 @@ def warp_references(
 
 
 def covisibility(
-    references: ReferenceViews, cameras: Cameras, depth_mm: Float[Tensor, "v 1 h w"]
+    references: ReferenceViews,
+    cameras: Cameras,
+    depth_mm: Float[Tensor, "v 1 h w"],
+    depth_tolerance: float = AGREEMENT,
 ) -> Float[Tensor, "v r"]:
     """How much of each virtual view each reference has seen well, in [0, 1].
 
@@ -140,7 +155,9 @@ def covisibility(
     everything = torch.arange(len(references))
     rows = []
     for view in range(len(cameras)):
-        seen = _look_up(references, everything, _surface(cameras[view], depth_mm[view], LATTICE_PX))
+        seen = _look_up(
+            references, everything, _surface(cameras[view], depth_mm[view], LATTICE_PX), depth_tolerance
+        )
         rows.append((seen.weight * seen.quality).mean(dim=1))
     return torch.stack(rows)
 
@@ -151,10 +168,12 @@ def _warp_one(
     depth_mm: Float[Tensor, "1 h w"],
     chosen: Int[Tensor, "k"],
     gain: Float[Tensor, ""],
+    good_quality: float,
+    depth_tolerance: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     size = depth_mm.shape[-2:]
     here = _surface(camera, depth_mm, 1)
-    seen = _look_up(references, chosen, here)
+    seen = _look_up(references, chosen, here, depth_tolerance)
     transfer = references.transfer
     facing = (here.normal * here.direction).sum(dim=-1)
     ratio = transfer.falloff(here.distance, here.axis_cosine, facing)[None] / transfer.falloff(
@@ -165,7 +184,7 @@ def _warp_one(
     rgb = transfer.apply_response(transfer.invert_response(seen.rgb) * ratio[:, None])
     # Too bright for the sensor: darkened as a whole, so that the hue stays.
     rgb = rgb / rgb.amax(dim=1, keepdim=True).clamp_min(1)
-    trust = seen.weight * (seen.quality / GOOD_QUALITY).clamp(max=1)
+    trust = seen.weight * (seen.quality / good_quality).clamp(max=1)
     # Squared, because the mean of many views is blurred: the good ones shall dominate.
     votes = (seen.weight * seen.quality).square()
     luminance = rgb.mean(dim=1)
@@ -229,6 +248,7 @@ def _look_up(
     references: ReferenceViews,
     chosen: Int[Tensor, "k"],
     surface: _Surface,
+    depth_tolerance: float = AGREEMENT,
 ) -> _Seen:
     """Colour and trust of a surface in the chosen references."""
     points = surface.points
@@ -244,13 +264,15 @@ def _look_up(
     width, height = references.cameras.width, references.cameras.height
     # Pixel centres at +0.5 and align_corners=False are the same convention.
     grid = torch.stack([2 * u / width - 1, 2 * v / height - 1], dim=-1)[:, None].clamp(-4, 4)
-    image = references.packed if len(index) == len(references) else references.packed[chosen]
+    # Without a copy where all are asked for in their order.
+    everything = np.array_equal(index, np.arange(len(references)))
+    image = references.packed if everything else references.packed[chosen]
     sampled = functional.grid_sample(image, grid, mode="bilinear", align_corners=False)[:, :, 0]
     # The inverse depth is linear across a plane; between a fold and what it hides it agrees with neither.
     known = sampled[:, 5] > 0.999
     inverse = torch.where(known, sampled[:, 4], torch.ones(()))
     difference = (z * inverse - 1).abs()
-    agreement = torch.exp(-(difference / AGREEMENT).square())
+    agreement = torch.exp(-(difference / depth_tolerance).square())
     agreement = ((agreement - 0.05) / 0.95).clamp_min(0)
     weight = torch.where(in_front & known, agreement * sampled[:, 3], torch.zeros(()))
     away = points - references.centers[chosen][:, None]

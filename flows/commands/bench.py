@@ -108,8 +108,8 @@ def _add_enhance(parser: Parser) -> None:
         metavar="METHOD",
         help="none, classical, embedded (as the settings say), embedded-1, embedded-4 (steps), zero-shot "
         "(pretrained weights alone), scene-trained (trained further on the scene), scratch (trained on the "
-        "scene alone), deterministic (the same as a plain regression), each also with /no-references behind "
-        "it (default: none classical embedded)",
+        "scene alone), deterministic (the same as a plain regression), each also with /no-references, "
+        "/keyframes or /no-keyframes behind it (default: none classical embedded)",
     )
     add_profile(parser, "quick")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")
@@ -277,7 +277,8 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
     measured = [figure for figure in figures("restoration") if any(figure.key in case for case in cases)]
     header = ["method", *(figure.label for figure in measured)]
     header += ["well", "hole", "observed", "unobserved", "kept PSNR", "kept well"]
-    header += ["changed", "flicker", "rank corr.", "s/frame", "prepared in s"]
+    header += ["changed", "flicker", "error flicker", "invented within", "invented across"]
+    header += ["rank corr.", "s/frame", "prepared in s"]
     for sequence in dict.fromkeys(case["sequence"] for case in cases):
         chosen = [case for case in cases if case["sequence"] == sequence]
         shares = ", ".join(f"{name} {share:.0%}" for name, share in chosen[0]["pixel_share"].items())
@@ -290,6 +291,7 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
             row = [case["method"], *(case.get(figure.key) for figure in measured)]
             row += [case[part]["psnr"] for part in ("well", "hole", "observed", "unobserved")]
             row += [kept["psnr"], kept["well"]["psnr"], case["changed_share"], case["flicker"]]
+            row += [case["error_flicker"], *(case["inconsistency"][name] for name in ("within", "across"))]
             row += [None if calibration is None else calibration["rank_correlation"]]
             rows.append([*row, case["seconds_per_frame"], case["prepare_seconds"]])
         _print(header, rows)

@@ -49,6 +49,7 @@ FOLLOWS = {
         "explore-branch",
         "explore",
         "enhance-train",
+        "enhance-keyframes",
         "enhance-restore",
         "finetune-judge",
         "finetune",
@@ -61,8 +62,9 @@ FOLLOWS = {
     "explore-start": ["explore-branch", "explore-merge"],
     "explore-branch": ["explore-merge"],
     "explore-merge": ["explore"],
-    "explore": ["enhance-restore", "finetune-judge", "report"],
-    "enhance-train": ["enhance-restore", "finetune-judge"],
+    "explore": ["enhance-keyframes", "enhance-restore", "finetune-judge", "report"],
+    "enhance-train": ["enhance-keyframes", "enhance-restore", "finetune-judge"],
+    "enhance-keyframes": ["enhance-restore"],
     "enhance-restore": ["enhance"],
     "enhance": ["finetune", "report"],
     # Of the judgement only the amount that is kept counts later.
@@ -76,6 +78,7 @@ FOLLOWS = {
 """Stages by what reads their artefacts; `after-coarse` reads the scene and the training frames."""
 
 EXPLORE = ("explore-start", "explore-branch", "explore")
+RESTORE = ("enhance-keyframes", "enhance-restore")
 ALL_AFTER_COARSE = ("depth", "uc-nerf", "coarse", "uc-nerf-render", "assess")
 
 DIRECTLY: dict[str, tuple[str, ...]] = {
@@ -91,13 +94,13 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "uc_nerf.enabled": ALL_AFTER_COARSE,
     "uc_nerf.*": (),  # Reads nothing here; below.
     "assess.min_hole_share": ("plan",),
-    "assess.full_budget_share": ("plan", *EXPLORE, "enhance-restore"),
-    "assess.force": ("plan", *EXPLORE, "enhance-restore"),
+    "assess.full_budget_share": ("plan", *EXPLORE, *RESTORE),
+    "assess.force": ("plan", *EXPLORE, *RESTORE),
     "assess.*": ("assess",),
     "surface.*": ("surface",),
     "freespace.*": ("freespace",),
-    "explore.trajectories": ("plan", *EXPLORE, "enhance-restore"),
-    "explore.length": ("plan", *EXPLORE, "enhance-restore"),
+    "explore.trajectories": ("plan", *EXPLORE, *RESTORE),
+    "explore.length": ("plan", *EXPLORE, *RESTORE),
     "explore.directions": ("assess", *EXPLORE),
     "explore.visible_weight": ("assess", *EXPLORE),
     "explore.visibility": ("assess", *EXPLORE),
@@ -105,10 +108,11 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "explore.*": EXPLORE,
     "enhance.backend": ("enhance-train",),
     "enhance.pretrained_weights": (),  # By content, below.
-    "enhance.max_views": ("plan", "enhance-restore"),
+    "enhance.keyframes": ("enhance-keyframes", "finetune-judge"),
+    "enhance.max_views": ("plan", *RESTORE),
     "enhance.clips_per_batch": ("enhance-restore",),
-    "enhance.references": ("enhance-train", "enhance-restore", "finetune-judge"),
-    "enhance.reference": ("enhance-train", "enhance-restore", "finetune-judge"),
+    "enhance.references": ("enhance-train", *RESTORE, "finetune-judge"),
+    "enhance.reference": ("enhance-train", *RESTORE, "finetune-judge"),
     "enhance.iou": ("enhance-restore", "finetune-judge"),
     "enhance.pixel_confidence": ("enhance-restore", "finetune-judge"),
     "enhance.caption.*": (),  # The embedded backend reads none of these; below.
@@ -143,9 +147,16 @@ OTHERS: dict[str, Any] = {
 """Other values where no rule gives one; None: not compared here, but in a test of its own."""
 
 BASE = PipelineConfig().with_overrides(
-    {"ingest.width": 64, "ingest.height": 51, "depth.device": "cpu", "enhance.precision": "float32"}
+    {
+        "ingest.width": 64,
+        "ingest.height": 51,
+        "depth.device": "cpu",
+        "enhance.keyframes": 2,
+        "enhance.precision": "float32",
+    }
 )
-"""What depends on the machine is settled; what `auto` becomes is tested beside the stages."""
+"""What depends on the machine is settled; what `auto` becomes is tested beside the stages. With
+keyframes, which have a stage of their own."""
 
 
 @pytest.fixture(autouse=True)

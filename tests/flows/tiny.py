@@ -63,6 +63,7 @@ TINY: dict[str, Any] = {
     "enhance.channels": [8, 8, 16],
     # A network of these widths, not the bundled one: trained from nothing in seconds.
     "enhance.pretrained_weights": "none",
+    "enhance.keyframes": 2,
     "enhance.max_views": 4,
     "enhance.clips_per_batch": 1,
     # Fewer, and the judge would keep real views alone: nothing after it would rest on the virtual ones.

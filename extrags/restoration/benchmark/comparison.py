@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import torch
 
 from extrags.config import CoarseConfig, EnhanceConfig, PipelineConfig
 from extrags.config.backends import BACKENDS
@@ -27,21 +28,26 @@ from extrags.restoration.benchmark.evaluation import (
 )
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.scene_training import train_on_scene
-from extrags.restoration.protocol import Enhancer
+from extrags.restoration.keyframes import Keyframes, following, make_keyframes
+from extrags.restoration.protocol import Clip, Enhancer
 from extrags.restoration.training_data.pairs import make_pairs
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training import reconstruct
 from extrags.training.pose_refinement import with_refined_poses
 from extrags.view_synthesis.gather import gather_references
+from extrags.view_synthesis.references import ReferenceViews
 
 __all__ = [
     "METHODS",
+    "NO_KEYFRAMES",
     "NO_REFERENCES",
     "RECIPES",
+    "WITH_KEYFRAMES",
     "Method",
     "bench_enhance",
     "check_methods",
+    "clip_keyframes",
     "coarse_scene",
     "compare_methods",
     "prepared",
@@ -49,6 +55,11 @@ __all__ = [
 
 NO_REFERENCES = "/no-references"
 """Suffix of a method's name: the same restorer, not told what real views see."""
+WITH_KEYFRAMES, NO_KEYFRAMES = "/keyframes", "/no-keyframes"
+"""Suffixes of a method's name: the same restorer with keyframes, or every view restored alone; without
+either it is as the settings say."""
+USUAL_KEYFRAMES = 12
+"""Of a method with keyframes where the settings have none."""
 
 SCENE_ITERATIONS = 220
 """Steps on the scene's own pairs where the profile trains on none."""
@@ -136,7 +147,7 @@ METHODS: dict[str, Method] = {
     "zero-shot": Method("zero-shot"),
     "deterministic": Method("deterministic"),
 }
-"""Methods beside the backends as they are; every one also with the suffix `/no-references`."""
+"""Methods beside the backends as they are; every one also with a suffix, `/keyframes` for instance."""
 
 
 def check_methods(names: Iterable[str]) -> list[str]:
@@ -147,13 +158,20 @@ def check_methods(names: Iterable[str]) -> list[str]:
     """
     chosen = list(dict.fromkeys(names))
     known = [*METHODS, *BACKENDS]
-    unknown = [name for name in chosen if name.removesuffix(NO_REFERENCES) not in known]
+    unknown = [name for name in chosen if _plain(name) not in known]
     if unknown or not chosen:
         raise ConfigError(
             f"unknown methods {', '.join(unknown) or '(none named)'}; expected {', '.join(known)}, "
-            f"each also with {NO_REFERENCES} behind it"
+            f"each also with {NO_REFERENCES}, {WITH_KEYFRAMES} or {NO_KEYFRAMES} behind it"
         )
     return chosen
+
+
+def _plain(name: str) -> str:
+    for suffix in (NO_REFERENCES, NO_KEYFRAMES, WITH_KEYFRAMES):
+        if name.endswith(suffix):
+            return name.removesuffix(suffix)
+    return name
 
 
 def prepared(
@@ -181,7 +199,7 @@ def prepared(
     """
     made: dict[str, tuple[Enhancer, float]] = {}
     for name in check_methods(names):
-        plain = name.removesuffix(NO_REFERENCES)
+        plain = _plain(name)
         method = METHODS.get(plain, Method(plain))
         if method.recipe not in made:
             recipe = RECIPES.get(method.recipe) or _of_backend(method.recipe)
@@ -215,12 +233,13 @@ def compare_methods(
         scene: its coarse scene.
         sequence: with the held-out frames; restorers are given the training frames alone.
         config: settings; `enhance` and `coarse` count.
-        methods: names.
+        methods: names. Keyframes are chosen among the held-out views.
         lpips: LPIPS by backbone; None leaves it out.
 
     Returns:
         One case per method: `{sequence, seed, method, steps, psnr, ssim, lpips_alex, well, hole, ...,
-        seconds_per_frame, prepare_seconds, pixel_share, views}`; see `RestorerBenchmark.figures`.
+        seconds_per_frame, prepare_seconds, keyframes, keyframe_seconds, pixel_share, views}`; see
+        `RestorerBenchmark.figures`.
 
     Raises:
         CaptureError: without held-out frames, or too few to train on.
@@ -236,7 +255,12 @@ def compare_methods(
     cases = []
     restorers = prepared(methods, scene, training, config.enhance, config.coarse)
     for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
-        restored = restore_views(enhancer, clips)
+        keyed = _keyed(name, config.enhance)
+        begun = time.perf_counter()
+        keyframes = clip_keyframes(scene, references, clips, enhancer, keyed)
+        keyframe_seconds = time.perf_counter() - begun
+        invented = keyframes.invented(references.transfer)
+        restored = restore_views(enhancer, [following(clip, invented) for clip in clips])
         figures = benchmark.figures(restored)
         cases.append(
             {
@@ -246,6 +270,8 @@ def compare_methods(
                 "steps": restored.provenance.get("steps"),
                 **figures,
                 "prepare_seconds": seconds,
+                "keyframes": len(keyframes),
+                "keyframe_seconds": keyframe_seconds,
                 "pixel_share": benchmark.pixel_share,
                 "views": len(benchmark.truth),
             }
@@ -253,6 +279,37 @@ def compare_methods(
         logger.info("bench enhance: %s %s %.2f dB", sequence.name, name, figures["psnr"] or 0.0)
         emit(Progress("bench enhance", done, len(methods)))
     return cases
+
+
+def _keyed(name: str, config: EnhanceConfig) -> EnhanceConfig:
+    """The settings with the number of keyframes of a method."""
+    count = config.keyframes
+    if name.endswith(NO_KEYFRAMES):
+        count = 0
+    elif name.endswith(WITH_KEYFRAMES):
+        count = count or USUAL_KEYFRAMES
+    return config.model_copy(update={"keyframes": count})
+
+
+def clip_keyframes(
+    scene: Scene,
+    references: ReferenceViews,
+    clips: Sequence[Clip],
+    enhancer: Enhancer,
+    config: EnhanceConfig,
+) -> Keyframes:
+    """The keyframes of clips that are rendered already, at the exposure of each view.
+
+    Args:
+        scene: the coarse scene.
+        references: its training views.
+        clips: all of them, in the order of their indices.
+        enhancer: the restorer.
+        config: how many keyframes.
+    """
+    exposure = [None if clip.exposure is None else torch.from_numpy(clip.exposure) for clip in clips]
+    cameras = [clip.cameras for clip in clips]
+    return make_keyframes(scene, references, cameras, enhancer, config, exposure=exposure)
 
 
 def bench_enhance(
@@ -267,7 +324,8 @@ def bench_enhance(
     Args:
         sequences: with poses and held-out frames.
         config: settings of `coarse` and `enhance`, seeds included.
-        methods: names of `METHODS` or of backends, possibly with `/no-references`.
+        methods: names of `METHODS` or of backends, possibly with a suffix: `/no-references`, `/keyframes` or
+            `/no-keyframes`.
         lpips: LPIPS by backbone; None leaves it out.
 
     Returns:

@@ -18,9 +18,8 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.nn import functional
 
-from extrags.cameras import Cameras, pixel_rays
+from extrags.cameras import Cameras
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.metrics.exposure import align_exposure
 from extrags.metrics.image import mean_of_known, psnr
@@ -28,6 +27,14 @@ from extrags.metrics.lpips import LpipsByNet
 from extrags.metrics.photometric import photometric_values
 from extrags.metrics.protocol import COLOR_LEVELS, MIN_REGION_SHARE
 from extrags.metrics.registry import figures, metric_named
+from extrags.restoration.benchmark.inconsistency import (
+    SMALLEST_SHARE,
+    Motion,
+    carried,
+    invented_inconsistency,
+    motion,
+    view_pairs,
+)
 from extrags.restoration.clips import as_images, as_planes, keep_known, render_clips
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.training_data.augmentation import drop_references
@@ -35,7 +42,7 @@ from extrags.restoration.uncertainty.reliability_diagram import calibration, cel
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.thresholds import HOLE_ALPHA
-from extrags.view_synthesis.conditioning import Layers, observe_views
+from extrags.view_synthesis.conditioning import Layers
 from extrags.view_synthesis.references import ReferenceViews
 
 __all__ = [
@@ -53,8 +60,6 @@ CLIP_VIEWS = 8
 WELL_SEEN_ALPHA, WELL_SEEN_UNCERTAINTY = 0.9, 0.5
 CHANGED = 4 / 255
 """A pixel is changed where a channel differs from the rendering by more than this."""
-SAME_SURFACE = 0.03
-"""Two frames show the same point where their true depths agree to this share."""
 
 
 @dataclass(frozen=True)
@@ -135,13 +140,15 @@ def held_out_clips(
     borders = np.flatnonzero(np.diff(recording[frames])) + 1
     for run in np.split(np.arange(len(frames)), borders):
         for part in np.array_split(run, -(-len(run) // length)):
-            cameras = sequence.cameras[frames[part]]
-            (clip,) = render_clips(scene, references, [cameras], count=count, first_index=len(clips))
             gain = gains[torch.from_numpy(part)]
-            if bool((gain != 1).any()):
-                seen = observe_views(scene, references, cameras, count=count, exposure=gain)
-                clip = replace(clip, layers=seen.layers)
-            clips.append(clip)
+            clips += render_clips(
+                scene,
+                references,
+                [sequence.cameras[frames[part]]],
+                count=count,
+                first_index=len(clips),
+                exposure=[gain if bool((gain != 1).any()) else None],
+            )
     return clips
 
 
@@ -231,23 +238,6 @@ def restore_views(enhancer: Enhancer, clips: Sequence[Clip]) -> RestoredViews:
 
 
 @dataclass(frozen=True)
-class _Motion:
-    """Where the pixels of one view lie in the view before it.
-
-    Args:
-        before: index of the view before.
-        view: index of the view.
-        grid: positions as `grid_sample` takes them, [1, H, W, 2].
-        common: pixels that both views see, [H, W].
-    """
-
-    before: int
-    view: int
-    grid: Tensor
-    common: Tensor
-
-
-@dataclass(frozen=True)
 class RestorerBenchmark:
     """Clips with their true views, on which any number of restorers is compared.
 
@@ -287,7 +277,9 @@ class RestorerBenchmark:
             raw restoration, its `aligned_psnr` (the best gain of each image divided out: the exposure of
             another recording cannot be known), the same tree of the target of the fine-tuning in `kept`, and
             `changed_share` (of the target's pixels inside the mask), `flicker`, `error_flicker`,
-            `seconds_per_frame`, `calibration` (see `calibration`; None without prediction) with
+            `inconsistency: {within, across, of_photographs}` of what was invented (in both views a hole, or
+            never observed; see `invented_inconsistency`), `seconds_per_frame`, `calibration` (see
+            `calibration`; None without prediction) with
             `rank_correlation_of`: the rank correlation of the error with what else could predict it.
 
         Raises:
@@ -310,6 +302,7 @@ class RestorerBenchmark:
             "kept": self._compared(target),
             "changed_share": float(changed[mask].float().mean()) if bool(mask.any()) else None,
             **self._flicker(rgb),
+            "inconsistency": self._inconsistency(rgb),
             "seconds_per_frame": restored.seconds_per_frame,
             "calibration": found,
             "rank_correlation_of": {
@@ -383,11 +376,11 @@ class RestorerBenchmark:
             return {"flicker": None, "error_flicker": None}
         stacks = {"own": images, "real": self._truth, "error": images - self._truth}
         totals, count = dict.fromkeys(stacks, 0.0), 0
-        for motion in self._motions:
+        for pair in self._motions:
             for name, stack in stacks.items():
-                difference = (stack[motion.view] - _carried(stack[motion.before], motion.grid)).abs()
-                totals[name] += float(difference[motion.common].double().mean(dim=-1).sum())
-            count += int(motion.common.sum())
+                difference = (stack[pair.view] - carried(stack[pair.other], pair.grid)).abs()
+                totals[name] += float(difference[pair.common].double().mean(dim=-1).sum())
+            count += int(pair.common.sum())
         if count == 0:
             return {"flicker": None, "error_flicker": None}
         return {
@@ -396,35 +389,45 @@ class RestorerBenchmark:
         }
 
     @cached_property
-    def _motions(self) -> list[_Motion]:
+    def _motions(self) -> list[Motion]:
         if self.truth.depth_mm is None:
             return []
-        cameras = Cameras.concatenated([clip.cameras for clip in self.clips])
-        owner = np.repeat(np.arange(len(self.clips)), [len(clip) for clip in self.clips])
-        neighbours = np.flatnonzero(owner[1:] == owner[:-1]) + 1
-        return [_motion(cameras, self.truth.depth_mm, self.truth.mask, int(view)) for view in neighbours]
+        depth, mask = self.truth.depth_mm, self.truth.mask
+        neighbours = np.flatnonzero(self._owner[1:] == self._owner[:-1]) + 1
+        return [motion(self._cameras, depth, mask, int(view), int(view) - 1) for view in neighbours]
 
+    def _inconsistency(self, images: Float[Tensor, "v h w 3"]) -> dict[str, float | None]:
+        """Of what was invented, by the views that are compared, and of the photographs themselves."""
+        within, across = self._invented_motions
+        return {
+            "within": invented_inconsistency(images, self._truth, within),
+            "across": invented_inconsistency(images, self._truth, across),
+            "of_photographs": invented_inconsistency(self._truth, self._truth, within + across),
+        }
 
-def _motion(
-    cameras: Cameras, depth_mm: Float[np.ndarray, "v h w"], mask: Bool[np.ndarray, "v h w"], view: int
-) -> _Motion:
-    here, before = cameras[view], cameras[view - 1]
-    points = here.centers[0] + pixel_rays(here)[0] * depth_mm[view][..., None].astype(np.float64)
-    (pixels,), (z,) = before.project(points)
-    pixels = np.where(z[..., None] > 0, pixels, -1)
-    u, v = pixels[..., 0], pixels[..., 1]
-    width, height = cameras.width, cameras.height
-    # Half a pixel inside the border: nothing is sampled from beyond it.
-    inside = (u >= 0.5) & (u <= width - 0.5) & (v >= 0.5) & (v <= height - 0.5)
-    row = np.clip(v, 0, height - 1).astype(np.int64)
-    column = np.clip(u, 0, width - 1).astype(np.int64)
-    there = depth_mm[view - 1][row, column]
-    same = (there > 0) & (depth_mm[view] > 0) & (np.abs(z - there) < SAME_SURFACE * np.maximum(there, 1e-9))
-    common = inside & same & mask[view] & mask[view - 1][row, column]
-    grid = np.stack([2 * u / width - 1, 2 * v / height - 1], axis=-1).clip(-4, 4).astype(np.float32)
-    return _Motion(view - 1, view, torch.from_numpy(grid)[None], torch.from_numpy(common))
+    @cached_property
+    def _invented_motions(self) -> tuple[list[Motion], list[Motion]]:
+        """Pairs of views within clips, and across them, that show the same invented surface."""
+        depth = self.truth.depth_mm
+        if depth is None:
+            return [], []
+        invented = self.regions["hole"].numpy()
+        if self.truth.observed is not None:
+            invented = invented | self.regions["unobserved"].numpy()
+        within, across = (
+            [motion(self._cameras, depth, invented, view, other) for other, view in pairs]
+            for pairs in view_pairs(self._owner)
+        )
+        smallest = SMALLEST_SHARE * self._cameras.width * self._cameras.height
+        return (
+            [pair for pair in within if int(pair.common.sum()) >= smallest],
+            [pair for pair in across if int(pair.common.sum()) >= smallest],
+        )
 
+    @cached_property
+    def _cameras(self) -> Cameras:
+        return Cameras.concatenated([clip.cameras for clip in self.clips])
 
-def _carried(image: Float[Tensor, "h w 3"], grid: Float[Tensor, "1 h w 2"]) -> Float[Tensor, "h w 3"]:
-    stack = image.permute(2, 0, 1)[None]
-    return functional.grid_sample(stack, grid, padding_mode="border", align_corners=False)[0].permute(1, 2, 0)
+    @cached_property
+    def _owner(self) -> Int[np.ndarray, "v"]:
+        return np.repeat(np.arange(len(self.clips)), [len(clip) for clip in self.clips])

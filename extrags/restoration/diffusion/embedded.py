@@ -86,6 +86,7 @@ class EmbeddedEnhancer:
     domain: Domain | None = None
 
     name = "embedded"
+    follows_keyframes = True
 
     def with_settings(
         self, config: EnhanceConfig, gamut: Gamut, patches: Float[Tensor, "r 3 s s"] | None = None

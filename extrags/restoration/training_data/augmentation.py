@@ -31,6 +31,8 @@ HALF_PLANE = 0.35
 """Probability that one side of a random line is a hole."""
 REFERENCE_DROPOUT = 0.35
 """Probability that all real views are removed."""
+INVENTED_KEPT = 0.5
+"""Probability that a hole which is cut leaves what keyframes have invented there."""
 EXPOSURE_JITTER = 0.3
 COLOR_JITTER = 0.1
 """Standard deviations of the logarithm of a common and a per-channel gain. They are large because virtual
@@ -171,7 +173,7 @@ class CropSampler:
         clean = pairs.target[index : index + 1][window]
         weight = pairs.weight[index : index + 1][window]
         depth = pairs.depth_mm[index : index + 1][window]
-        for name in ("rendered", "nearest", "blend"):
+        for name in ("rendered", "nearest", "blend", "invented"):
             layers.get(name).mul_(gain).clamp_(0, 1)
         clean = (clean * gain).clamp(0, 1)
         if generator.random() < PASTED_HOLES:
@@ -181,14 +183,27 @@ class CropSampler:
                 other : other + 1, :, row : row + self._side, column : column + self._side
             ]
             # In half of the holes real views may still see the surface.
-            layers = cut_out(layers, _random_symmetry(alpha, generator), unseen=generator.random() < 0.5)
+            layers = cut_out(
+                layers,
+                _random_symmetry(alpha, generator),
+                unseen=generator.random() < 0.5,
+                keep_invented=self._keeps_invented(layers),
+            )
         if generator.random() < HALF_PLANE:
-            layers = cut_out(layers, self._half_plane(), unseen=True)
+            layers = cut_out(
+                layers, self._half_plane(), unseen=True, keep_invented=self._keeps_invented(layers)
+            )
         if generator.random() < REFERENCE_DROPOUT:
             layers = drop_references(layers)
         everything = _random_symmetry(torch.cat([layers.data, clean, weight, depth], dim=1), generator)
         data, clean, weight, depth = everything.split((layers.data.shape[1], 3, 1, 1), dim=1)
         return data, clean, weight, depth
+
+    def _keeps_invented(self, layers: Layers) -> bool:
+        """Drawn only where there is something to keep: other pairs see the draws they always saw."""
+        if not bool((layers.get("invented_weight") > 0).any()):
+            return False
+        return bool(self._generator.random() < INVENTED_KEPT)
 
     def _corner(self) -> tuple[int, int]:
         height, width = self._pairs.target.shape[-2:]
@@ -260,18 +275,24 @@ def unconfirmed(layers: Layers) -> Float[Tensor, "v 1 h w"]:
     return layers.get("uncertainty") * (1 - layers.get("blend_weight"))
 
 
-def cut_out(layers: Layers, kept: Float[Tensor, "1 1 h w"], *, unseen: bool) -> Layers:
+def cut_out(
+    layers: Layers, kept: Float[Tensor, "1 1 h w"], *, unseen: bool, keep_invented: bool = False
+) -> Layers:
     """Cut holes into layers as a rendering would show them.
 
     Args:
         layers: changed in place.
         kept: 1 where the view stays as it is, 0 in the hole.
         unseen: also no real view sees the surface there.
+        keep_invented: what keyframes have invented stays, with the depth of its surface.
     """
     solid = kept.clamp(0, 1)
+    invented = layers.get("invented_weight")
+    if not keep_invented:
+        invented.mul_(solid)
     for name in ("rendered", "alpha"):
         layers.get(name).mul_(solid)
-    layers.get("depth_mm").mul_((solid > 0.02).float())
+    layers.get("depth_mm").mul_(((solid > 0.02) | (invented > 0)).float())
     uncertainty = layers.get("uncertainty")
     uncertainty.copy_(1 - (1 - uncertainty) * solid)
     if unseen:

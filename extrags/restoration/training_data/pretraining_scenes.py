@@ -28,7 +28,7 @@ from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["PretrainingScene", "make_pretraining_scene"]
 
-PRETRAINING_DATA_VERSION = 1
+PRETRAINING_DATA_VERSION = 2
 """Raised by hand whenever the same scene and settings give other pairs."""
 ITERATIONS = (400, 2000)
 """Range of the random number of iterations, so that renderings of different quality occur."""

@@ -25,6 +25,7 @@ from extrags.restoration.benchmark.evaluation import (
     held_out_clips,
     restore_views,
 )
+from extrags.restoration.benchmark.inconsistency import view_pairs
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import keep_known
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
@@ -210,6 +211,52 @@ def walk() -> tuple[RestorerBenchmark, np.ndarray]:
     return RestorerBenchmark([clip], truth), points
 
 
+class TestInconsistency:
+    """The walk is one clip whose every pixel is a hole."""
+
+    def test_the_truth_agrees_whatever_its_exposure(self, walk: tuple[RestorerBenchmark, np.ndarray]) -> None:
+        benchmark, _ = walk
+        for gain in (1.0, 0.6):
+            found = benchmark.evaluate(Given(benchmark.truth.rgb * gain))["inconsistency"]
+            assert found["within"] < 6e-3
+            assert found["across"] is None
+        assert found["of_photographs"] < 6e-3
+
+    def test_views_that_invent_for_themselves_do_not(
+        self, walk: tuple[RestorerBenchmark, np.ndarray]
+    ) -> None:
+        benchmark, points = walk
+        painted = np.clip((points + np.array([20, 20, 0])) / np.array([40, 40, 100]), 0, 1)
+        steady = benchmark.evaluate(Given(painted * benchmark.truth.rgb))["inconsistency"]["within"]
+        alone = np.random.default_rng(0).uniform(0.2, 1, (6, 1, 1, 3)) * np.ones_like(painted)
+        loose = benchmark.evaluate(Given(alone * benchmark.truth.rgb))["inconsistency"]["within"]
+        assert loose > 5 * steady
+
+    def test_only_what_was_invented_counts(self, walk: tuple[RestorerBenchmark, np.ndarray]) -> None:
+        benchmark, _ = walk
+        solid = benchmark.clips[0].layers.data.clone()
+        layers = Layers(solid)
+        layers.get("alpha").fill_(1.0)
+        seen = RestorerBenchmark([replace(benchmark.clips[0], layers=layers)], benchmark.truth)
+        assert seen.evaluate(Given(benchmark.truth.rgb))["inconsistency"] == {
+            "within": None,
+            "across": None,
+            "of_photographs": None,
+        }
+        half = np.zeros(benchmark.truth.mask.shape, bool)
+        half[..., : half.shape[-1] // 2] = True
+        told = RestorerBenchmark(seen.clips, replace(benchmark.truth, observed=half))
+        assert told.evaluate(Given(benchmark.truth.rgb))["inconsistency"]["within"] is not None
+
+    def test_pairs(self) -> None:
+        within, across = view_pairs(np.array([0, 0, 0, 1, 1]))
+        assert within == [(0, 1), (0, 2), (1, 2), (3, 4)]
+        assert len(across) == 6
+        _, many = view_pairs(np.arange(60))
+        assert len(many) == 400
+        assert len(set(many)) == 400
+
+
 class TestFlicker:
     def test_what_sits_on_the_wall_does_not_flicker(self, walk: tuple[RestorerBenchmark, np.ndarray]) -> None:
         benchmark, points = walk
@@ -375,7 +422,7 @@ class TestBench:
     CONFIG = PipelineConfig(enhance=EnhanceConfig(references=4, seed=3))
 
     def test_cases(self, tube: Tube) -> None:
-        methods = ["none", "classical", "classical/no-references"]
+        methods = ["none", "classical", "classical/no-references", "classical/keyframes"]
         cases = compare_methods(tube.scene, tube.sequence, self.CONFIG, methods, None)
         assert [case["method"] for case in cases] == methods
         for case in cases:
@@ -388,8 +435,9 @@ class TestBench:
             assert {"psnr", "ssim"} <= set(case["well"]) <= measured
             assert not any(key.startswith("lpips") for key in case["well"]), "nobody asked for it"
         # The gap in the wall is filled; exact references are worth something on top.
-        none, classical, alone = (case["psnr"] for case in cases)
+        none, classical, alone, _ = (case["psnr"] for case in cases)
         assert none + 10 < alone < classical - 0.5
+        assert [case["keyframes"] > 0 for case in cases] == [False, False, False, True]
         json.dumps(cases, allow_nan=False)
 
     def test_equal_recipes_are_followed_once(self, tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:

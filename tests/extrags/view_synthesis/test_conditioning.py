@@ -77,6 +77,24 @@ class TestCondition:
         base = condition(cut, tube.references.transfer).base
         assert base[..., 10:25, 20:35].min() > 0.01
 
+    def test_a_hole_may_keep_what_was_invented(self, layers: Layers) -> None:
+        before = Layers(layers.data.clone())
+        before.get("invented").fill_(0.4)
+        before.get("invented_weight").fill_(0.5)
+        kept = torch.ones(1, 1, HEIGHT, WIDTH)
+        kept[..., 10:25, 20:35] = 0
+        hole = (..., slice(10, 25), slice(20, 35))
+        parts = [
+            cut_out(Layers(before.data.clone()), kept, unseen=True, keep_invented=keep)
+            for keep in (True, False)
+        ]
+        assert torch.equal(parts[0].get("invented_weight"), before.get("invented_weight"))
+        assert torch.equal(parts[0].get("depth_mm")[hole], before.get("depth_mm")[hole])
+        assert parts[1].get("invented_weight")[hole].max() == 0
+        assert parts[1].get("depth_mm")[hole].max() == 0
+        outside = kept.expand(len(layers), -1, -1, -1) > 0
+        assert (parts[1].get("invented_weight")[outside] == 0.5).all()
+
 
 class TestClassical:
     def test_leaves_no_holes_and_beats_the_rendering(self, tube: Tube) -> None:

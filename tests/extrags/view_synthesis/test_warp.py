@@ -34,6 +34,15 @@ def test_compensated_warp_reproduces_an_exactly_lit_scene() -> None:
     assert (warped.nearest - target).abs()[near].mean() < 5e-3
 
 
+def test_all_references_in_the_order_of_their_scores() -> None:
+    # As many as are blended: the order of the choice must not part images from poses.
+    light, cameras, target, depth = _target()
+    for order in (slice(None), slice(None, None, -1)):
+        references = exact_references(tube_cameras(8)[order], light)
+        warped = warp_references(references, cameras, depth, count=len(references))
+        assert _error(warped, target) < 5e-3
+
+
 def test_the_nearest_reference_comes_first_on_request() -> None:
     light, cameras, _, depth = _target()
     references = exact_references(tube_cameras(8), light)
