@@ -30,6 +30,7 @@ from extrags.view_synthesis.conditioning import (
     COLOR_CENTER,
     COLOR_SCALE,
     CONDITION_CHANNELS,
+    INVENTED_CHANNELS,
     Layers,
     condition,
 )
@@ -42,6 +43,8 @@ FORMAT = 2
 """Raised when a saved restorer cannot be read by newer code."""
 PATCHES = "patches.safetensors"
 COLOR_STEPS = 255
+CHANNELS_OF_NETWORKS = (CONDITION_CHANNELS, CONDITION_CHANNELS + INVENTED_CHANNELS)
+"""Without and with channels of their own for what keyframes have invented."""
 MOST_MODESTY = 3.0
 CANDIDATE_STEPS = (1, 4)
 """More steps never gained on held-out pairs; which of these does differs from scene to scene."""
@@ -162,7 +165,7 @@ class EmbeddedEnhancer:
         def restored_group(first: int) -> Sampled:
             group = layers[first : first + VIEWS_AT_ONCE]
             with torch.no_grad():
-                conditioning = condition(group, transfer)
+                conditioning = condition(group, transfer, folded=self.network.folded)
             start = noise.expand(len(conditioning.base), -1, -1, -1)
             renewed = torch.Generator().manual_seed(self.seed)
             restored = sample(
@@ -295,16 +298,17 @@ class EmbeddedEnhancer:
         if not weights_file.exists():
             raise WeightsError(f"{weights_file}: no such file; train the restorer first (stage enhance)")
         description = read_description(description_file)
-        if description.get("format") != FORMAT or description.get("condition_channels") != CONDITION_CHANNELS:
+        channels = description.get("condition_channels")
+        if description.get("format") != FORMAT or channels not in CHANNELS_OF_NETWORKS:
+            readable = " or ".join(map(str, CHANNELS_OF_NETWORKS))
             raise WeightsError(
-                f"{description_file}: format {description.get('format')} with "
-                f"{description.get('condition_channels')} channels, this version reads format {FORMAT} "
-                f"with {CONDITION_CHANNELS}; train the restorer again"
+                f"{description_file}: format {description.get('format')} with {channels} channels, this "
+                f"version reads format {FORMAT} with {readable}; train the restorer again"
             )
         with description_fields(description_file):
             first, second, third = description["widths"]
             network = build_network(
-                CONDITION_CHANNELS,
+                int(description["condition_channels"]),
                 (first, second, third),
                 torch.Generator(),
                 generative=bool(description.get("generative", False)),

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from extrags.restoration.diffusion.texture_transfer import PatchFeatures, TextureTransfer
+from extrags.view_synthesis.conditioning import CONDITION_CHANNELS
 
 __all__ = ["OUTPUT_CHANNELS", "SIZE_MULTIPLE", "RestorationNetwork", "build_network"]
 
@@ -118,6 +119,11 @@ class RestorationNetwork(nn.Module):
         if generative:
             self.drawing = nn.Linear(1, TIME_WIDTH, bias=False)
             self.texture = TextureTransfer(widths)
+
+    @property
+    def folded(self) -> bool:
+        """Whether it has no channels of its own for what keyframes have invented."""
+        return self.condition_channels == CONDITION_CHANNELS
 
     def forward(
         self,

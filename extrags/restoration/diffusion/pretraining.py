@@ -39,7 +39,7 @@ from extrags.restoration.training_data.augmentation import (
 from extrags.restoration.training_data.parallel import drawn_in_processes
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 from extrags.restoration.uncertainty.domain import Domain
-from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Layers
+from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, INVENTED_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
 
 __all__ = ["PretrainingConfig", "pretrain"]
@@ -235,6 +235,7 @@ def _sampler(file: Path, config: PretrainingConfig, number: int) -> CropSampler:
         seed=config.seed * 100_003 + number,
         frames=scene.frames if config.generative else None,
         patches=(config.patches, config.patch_px),
+        folded=not config.generative,
     )
 
 
@@ -242,7 +243,8 @@ def _starting_network(
     config: PretrainingConfig, start: EmbeddedEnhancer | None, generator: torch.Generator
 ) -> RestorationNetwork:
     if start is None:
-        return build_network(CONDITION_CHANNELS, config.channels, generator, generative=config.generative)
+        channels = CONDITION_CHANNELS + (INVENTED_CHANNELS if config.generative else 0)
+        return build_network(channels, config.channels, generator, generative=config.generative)
     if start.network.widths != config.channels or start.deterministic != config.deterministic:
         raise ConfigError(
             f"the weights to start from have channels {start.network.widths}, deterministic is "
@@ -250,7 +252,7 @@ def _starting_network(
         )
     network = copy.deepcopy(start.network)
     if config.generative and not network.generative:
-        return network.widened(CONDITION_CHANNELS)
+        return network.widened(CONDITION_CHANNELS + INVENTED_CHANNELS)
     return network
 
 

@@ -104,6 +104,7 @@ class CropSampler:
         seed: of all random draws.
         frames: real frames of the scene that patches are taken from, in [0, 1], [F, 3, H, W]; None without.
         patches: how many of them per crop, and the side of each in pixels.
+        folded: what was invented appears as a blend of real views would, as `condition`.
 
     Raises:
         ConfigError: when the images are too small for any crop, or no pair is left to train on.
@@ -120,7 +121,9 @@ class CropSampler:
         seed: int,
         frames: Float[Tensor, "f 3 h w"] | None = None,
         patches: tuple[int, int] = (0, 0),
+        folded: bool = True,
     ) -> None:
+        self._folded = folded
         self._frames = frames
         self._patches = patches
         self._pairs = pairs.subset(np.flatnonzero(~pairs.validation))
@@ -151,7 +154,7 @@ class CropSampler:
         data, clean, weight, depth = (torch.cat(part) for part in zip(*crops, strict=True))
         layers = Layers(data)
         return Batch(
-            condition(layers, self._transfer),
+            condition(layers, self._transfer, folded=self._folded),
             clean,
             weight,
             depth,
