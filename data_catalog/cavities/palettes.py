@@ -1,0 +1,68 @@
+"""Colours of tissue, as linear reflectance under the endoscope's own light."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+__all__ = ["Palette", "draw_palette"]
+
+_NARROW_BAND_SHARE = 0.1
+# Base and pale reflectance, and how often.
+_MUCOSAE = (
+    ((0.62, 0.25, 0.17), (0.78, 0.46, 0.34), 3.0),
+    ((0.60, 0.20, 0.11), (0.74, 0.36, 0.22), 3.0),
+    ((0.70, 0.36, 0.24), (0.84, 0.58, 0.44), 2.0),
+    ((0.46, 0.12, 0.08), (0.62, 0.26, 0.19), 2.0),
+    ((0.66, 0.42, 0.18), (0.80, 0.58, 0.32), 1.0),
+    ((0.58, 0.27, 0.30), (0.74, 0.48, 0.48), 1.5),
+    ((0.76, 0.60, 0.50), (0.88, 0.78, 0.68), 1.0),
+)
+_CARTILAGE = ((0.72, 0.66, 0.56), (0.88, 0.85, 0.78))
+_NARROW_BAND = ((0.34, 0.40, 0.33), (0.55, 0.62, 0.52))
+
+
+@dataclass(frozen=True)
+class Palette:
+    """Colours of one scene.
+
+    Args:
+        base: of ordinary mucosa.
+        pale: of mucosa with little blood.
+        absorbed: what blood takes from red, green and blue.
+        narrow_band: whether the light is blue and green alone.
+    """
+
+    base: Float[np.ndarray, "3"]
+    pale: Float[np.ndarray, "3"]
+    absorbed: Float[np.ndarray, "3"]
+    narrow_band: bool
+
+    def seen(self, colour: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
+        """A colour of white light under this scene's light."""
+        red, green, blue = colour
+        if not self.narrow_band:
+            return np.array(colour, dtype=np.float32)
+        return np.array([0.35 * green + 0.3 * blue + 0.1 * red, 0.8 * green, 0.85 * blue], dtype=np.float32)
+
+
+def draw_palette(kind: str, rng: np.random.Generator) -> Palette:
+    """Colours for a kind of cavity."""
+    narrow_band = bool(rng.random() < _NARROW_BAND_SHARE) and kind not in ("field", "joint")
+    weights = np.array([one[2] for one in _MUCOSAE])
+    drawn = int(rng.choice(len(_MUCOSAE), p=weights / weights.sum()))
+    base, pale = _MUCOSAE[drawn][:2]
+    if kind == "joint" and rng.random() < 0.8:
+        base, pale = _CARTILAGE
+    if narrow_band:
+        base, pale = _NARROW_BAND
+    jitter = np.exp(rng.normal(0, 0.09, 3) * np.array([0.6, 1.2, 1.4])) * np.exp(rng.normal(0, 0.12))
+    absorbed = np.array([0.85, 1.1, 0.35] if narrow_band else [0.30, 1.0, 0.75])
+    return Palette(
+        np.clip(np.array(base) * jitter, 0.03, 0.92).astype(np.float32),
+        np.clip(np.array(pale) * jitter, 0.03, 0.95).astype(np.float32),
+        (absorbed * np.exp(rng.normal(0, 0.1, 3))).astype(np.float32),
+        narrow_band,
+    )

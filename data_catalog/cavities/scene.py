@@ -1,0 +1,68 @@
+"""One cavity, ready to be photographed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from data_catalog.cavities.growths import draw_growths, stamp
+from data_catalog.cavities.noise import stream
+from data_catalog.cavities.shapes import KINDS, Kind, Shape, make_shape
+from data_catalog.cavities.skin import Skin, make_skin
+from data_catalog.cavities.surface import Lattice, Wall, contour
+from data_catalog.ray_casting import RayCaster
+
+__all__ = ["NODES", "Cavity", "build_cavity", "kind_of"]
+
+NODES = 1_600_000
+"""Of the lattice that a wall is contoured on."""
+
+
+@dataclass(frozen=True)
+class Cavity:
+    """The wall of a cavity with its skin.
+
+    Args:
+        shape: before growths.
+        lattice: clearance with growths.
+        wall: the mesh.
+        rays: the mesh as a target.
+        skin: of the wall.
+    """
+
+    shape: Shape
+    lattice: Lattice
+    wall: Wall
+    rays: RayCaster
+    skin: Skin
+
+
+def kind_of(scene: int, kinds: tuple[Kind, ...] = KINDS) -> Kind:
+    """The kind of a scene: in turn, so that each is as frequent."""
+    return kinds[scene % len(kinds)]
+
+
+def build_cavity(
+    scene: int,
+    kind: Kind,
+    *,
+    nodes: int = NODES,
+    photographs: list[Float[np.ndarray, "s s 6"]] | None = None,
+) -> Cavity:
+    """Make a cavity; the same number and kind give the same one.
+
+    Args:
+        scene: seed of everything random.
+        kind: what it is like.
+        nodes: of the lattice.
+        photographs: tiles made of real frames, as `make_skin` takes them.
+    """
+    shape = make_shape(kind, stream(scene, "shape"))
+    plain = Lattice.of(shape.clearance, shape.low_mm, shape.high_mm, nodes)
+    growths = draw_growths(kind, contour(plain), shape.radius_mm, stream(scene, "growths"))
+    lattice = stamp(plain, growths) if growths else plain
+    wall = contour(lattice)
+    skin = make_skin(kind, wall, growths, lattice.step_mm, stream(scene, "skin"), photographs)
+    return Cavity(shape, lattice, wall, RayCaster(wall.vertices, wall.triangles), skin)
