@@ -212,9 +212,9 @@ def tissue_shares(
             continue
         distance = growth.distance(vertices[index])
         if growth.tissue == "hollow":
-            # The ground of a hollow, not its rim.
-            distance = -distance - 0.5 * growth.radius_mm
-            soft = 0.5 * growth.radius_mm
+            # Its ground: what lies on the hollow's own surface.
+            distance = np.abs(distance)
+            soft = 0.4 * growth.radius_mm
         else:
             soft = 0.7 * step_mm if growth.tissue == "metal" else max(0.5 * growth.foot_mm, step_mm)
         column = TISSUES.index(growth.tissue)

@@ -18,6 +18,8 @@ from data_catalog.cavities.skin import SkinValues
 
 __all__ = ["Lamps"]
 
+_COATED = 0.08
+"""Share of the relief's slope variance that is left in the film of water over it."""
 _FARTHEST_SCATTER = np.array([1.0, 0.3, 0.2], dtype=np.float32)
 
 
@@ -49,7 +51,7 @@ class Lamps:
     def random(cls, rng: np.random.Generator) -> Lamps:
         """One to three lamps off the axis."""
         count = int(rng.choice([1, 2, 3], p=(0.3, 0.5, 0.2)))
-        turn, spread = rng.uniform(0, 2 * np.pi), rng.uniform(0.6, 4.0)
+        turn, spread = rng.uniform(0, 2 * np.pi), 0.5 + 3.5 * rng.uniform() ** 1.7
         offsets = []
         for k in range(count):
             angle = turn + 2 * np.pi * k / count + rng.normal(0, 0.2)
@@ -62,8 +64,8 @@ class Lamps:
             powers,
             float(rng.uniform(0.3, 3.0)),
             float(rng.uniform(0.02, 0.3)),
-            float(rng.uniform(0.012, 0.05)),
-            float(np.exp(rng.uniform(np.log(0.05), np.log(0.22)))),
+            float(rng.uniform(0.02, 0.085)),
+            float(np.exp(rng.uniform(np.log(0.035), np.log(0.13)))),
             float(rng.uniform(0.0, 0.5)),
             float(rng.uniform(0.0, 0.4)),
         )
@@ -117,7 +119,7 @@ class Lamps:
         fresnel = self.reflectance + (1 - self.reflectance) * (1 - np.clip(_dot(to_light, half), 0, 1)) ** 5
         total = np.zeros(len(n_half), dtype=np.float32)
         for strength, alpha in ((1.0, self.roughness), (self.sheen, 0.45)):
-            squared = alpha**2 + skin.slope_variance
+            squared = alpha**2 + _COATED * skin.slope_variance
             spread = squared / (np.pi * (n_half**2 * (squared - 1) + 1) ** 2)
             k = np.sqrt(squared) / 2
             masking = 1 / ((n_light * (1 - k) + k) * (n_camera * (1 - k) + k))

@@ -89,11 +89,21 @@ def tile_noise(
 
     down, across = (max(3, min(side, round(cells * factor))) for factor in stretch)
     lattice = rng.standard_normal((down, across)).astype(np.float32)
+    # Smooth to this factor: what is coarse is interpolated twice, which is cheaper.
+    factor = 1
+    while side // (2 * factor) >= 6 * max(down, across) and side // (2 * factor) >= 64:
+        factor *= 2
+    small = side // factor
     margin = 3
     padded = np.pad(lattice, margin, mode="wrap")
     # The pitch is exact, so that both edges meet: the padded lattice is sampled at texel centres.
-    rows = (np.arange(side, dtype=np.float32) + 0.5) * (down / side) - 0.5 + margin
-    columns = (np.arange(side, dtype=np.float32) + 0.5) * (across / side) - 0.5 + margin
+    rows = (np.arange(small, dtype=np.float32) + 0.5) * (down / small) - 0.5 + margin
+    columns = (np.arange(small, dtype=np.float32) + 0.5) * (across / small) - 0.5 + margin
     grid_x, grid_y = np.meshgrid(columns, rows)
     field = cv2.remap(padded, grid_x, grid_y, cv2.INTER_CUBIC)
-    return np.asarray((field - field.mean()) / max(float(field.std()), 1e-6), dtype=np.float32)
+    field = (field - field.mean()) / max(float(field.std()), 1e-6)
+    if factor > 1:
+        large = (small + 2) * factor
+        field = cv2.resize(np.pad(field, 1, mode="wrap"), (large, large), interpolation=cv2.INTER_LINEAR)
+        field = field[factor:-factor, factor:-factor]
+    return np.ascontiguousarray(field, dtype=np.float32)

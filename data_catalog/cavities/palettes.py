@@ -17,11 +17,11 @@ _MUCOSAE = (
     ((0.70, 0.36, 0.24), (0.84, 0.58, 0.44), 2.0),
     ((0.46, 0.12, 0.08), (0.62, 0.26, 0.19), 2.0),
     ((0.66, 0.42, 0.18), (0.80, 0.58, 0.32), 1.0),
-    ((0.58, 0.27, 0.30), (0.74, 0.48, 0.48), 1.5),
+    ((0.58, 0.27, 0.27), (0.74, 0.48, 0.46), 1.5),
     ((0.76, 0.60, 0.50), (0.88, 0.78, 0.68), 1.0),
 )
 _CARTILAGE = ((0.72, 0.66, 0.56), (0.88, 0.85, 0.78))
-_NARROW_BAND = ((0.34, 0.40, 0.33), (0.55, 0.62, 0.52))
+_NARROW_BAND = ((0.40, 0.37, 0.28), (0.56, 0.58, 0.47))
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,9 @@ class Palette:
         red, green, blue = colour
         if not self.narrow_band:
             return np.array(colour, dtype=np.float32)
-        return np.array([0.35 * green + 0.3 * blue + 0.1 * red, 0.8 * green, 0.85 * blue], dtype=np.float32)
+        return np.array(
+            [0.85 * green + 0.1 * red, 0.25 * green + 0.55 * blue, 0.2 * green + 0.55 * blue], dtype=np.float32
+        )
 
 
 def draw_palette(kind: str, rng: np.random.Generator) -> Palette:
@@ -58,8 +60,10 @@ def draw_palette(kind: str, rng: np.random.Generator) -> Palette:
         base, pale = _CARTILAGE
     if narrow_band:
         base, pale = _NARROW_BAND
-    jitter = np.exp(rng.normal(0, 0.09, 3) * np.array([0.6, 1.2, 1.4])) * np.exp(rng.normal(0, 0.12))
-    absorbed = np.array([0.85, 1.1, 0.35] if narrow_band else [0.30, 1.0, 0.75])
+    jitter = np.exp(rng.normal(0, 0.09, 3) * np.array([0.6, 1.2, 1.2])) * np.exp(rng.normal(0, 0.12))
+    absorbed = np.array([0.75, 1.1, 0.95] if narrow_band else [0.30, 1.0, 0.75])
+    # Tissue under white light is never bluer than it is green.
+    jitter[2] = min(jitter[2], jitter[1] * min(1.0, base[1] / base[2]))
     return Palette(
         np.clip(np.array(base) * jitter, 0.03, 0.92).astype(np.float32),
         np.clip(np.array(pale) * jitter, 0.03, 0.95).astype(np.float32),

@@ -49,7 +49,7 @@ def build_cavity(
     kind: Kind,
     *,
     nodes: int = NODES,
-    photographs: list[Float[np.ndarray, "s s 6"]] | None = None,
+    photograph: Float[np.ndarray, "s s 6"] | None = None,
 ) -> Cavity:
     """Make a cavity; the same number and kind give the same one.
 
@@ -57,12 +57,15 @@ def build_cavity(
         scene: seed of everything random.
         kind: what it is like.
         nodes: of the lattice.
-        photographs: tiles made of real frames, as `make_skin` takes them.
+        photograph: a tile made of a real frame, for the ordinary tissue.
+
+    Raises:
+        CaptureError: when the clearance drawn has no wall.
     """
     shape = make_shape(kind, stream(scene, "shape"))
     plain = Lattice.of(shape.clearance, shape.low_mm, shape.high_mm, nodes)
     growths = draw_growths(kind, contour(plain), shape.radius_mm, stream(scene, "growths"))
     lattice = stamp(plain, growths) if growths else plain
     wall = contour(lattice)
-    skin = make_skin(kind, wall, growths, lattice.step_mm, stream(scene, "skin"), photographs)
+    skin = make_skin(kind, wall, growths, lattice.step_mm, stream(scene, "skin"), shape.radius_mm, photograph)
     return Cavity(shape, lattice, wall, RayCaster(wall.vertices, wall.triangles), skin)

@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from data_catalog.cavities.growths import TISSUES, Growth, tissue_shares
-from data_catalog.cavities.materials import TEXEL_MM, paint
+from data_catalog.cavities.canvas import TEXEL_MM
+from data_catalog.cavities.materials import paint
 from data_catalog.cavities.noise import SolidNoise
 from data_catalog.cavities.palettes import draw_palette
 from data_catalog.cavities.shapes import Kind
@@ -30,7 +31,7 @@ _PATCHES: dict[Kind, dict[str, float]] = {
     "field": {"mucosa": 0.6, "fat": 0.5, "blood": 0.4, "char": 0.3, "inflamed": 0.3, "pale": 0.3},
 }
 _MOST_PATCHES = 3
-_PHOTOGRAPHED_SHARE = 0.5
+_GROUND_SIDE, _PATCH_SIDE = 1024, 512
 _DETAIL_SCALE = 5.3
 
 
@@ -69,11 +70,12 @@ class Skin:
 
     Args:
         layers: from the ground up.
-        at_vertices: slow values at the wall's vertices: shift of the pattern (3), brightness (1), redness (1),
-            share of each tissue, and where each patch lies.
+        at_vertices: slow values at the wall's vertices: shift of the pattern (3), brightness (1), redness
+            (1), share of each tissue, and where each patch lies.
         absorbed: what blood takes from red, green and blue.
         relief: factor of all heights.
         detail: strength of what is finer than the tiles.
+        pattern_scale: factor of all patterns' size; narrow cavities have finer ones.
     """
 
     layers: tuple[_Layer, ...]
@@ -81,6 +83,7 @@ class Skin:
     absorbed: Float[np.ndarray, "3"]
     relief: float
     detail: float
+    pattern_scale: float
 
     def at(
         self,
@@ -97,7 +100,8 @@ class Skin:
             slow: `at_vertices`, interpolated.
             footprint_mm: side of the patch that one ray stands for.
         """
-        places = points + slow[:, :3]
+        places = (points + slow[:, :3]) / np.float32(self.pattern_scale)
+        footprint_mm = footprint_mm / np.float32(self.pattern_scale)
         values, gradient = lay(self.layers[0].tile, places, normals, footprint_mm, self.layers[0].axes)
         edge = values[:, 7].copy()
         for layer in self.layers[1:]:
@@ -158,7 +162,8 @@ def make_skin(
     growths: list[Growth],
     step_mm: float,
     rng: np.random.Generator,
-    photographs: list[Float[np.ndarray, "s s 6"]] | None = None,
+    radius_mm: float,
+    photograph: Float[np.ndarray, "s s 6"] | None = None,
 ) -> Skin:
     """The skin of a wall, drawn.
 
@@ -168,20 +173,20 @@ def make_skin(
         growths: which are of tissue of their own.
         step_mm: of the lattice that the wall was contoured on.
         rng: source of randomness.
-        photographs: painted tiles made of real frames, one of which may take the place of the ordinary tissue.
+        radius_mm: typical radius of the cavity.
+        photograph: a tile made of a real frame, which takes the place of the ordinary tissue.
     """
     palette = draw_palette(kind, rng)
     size = 0.6 if kind in ("airways", "oesophagus", "joint", "sinus") else 1.0
-    columns = [1.6 * SolidNoise.random(rng, 30, 7)(wall.vertices) for _ in range(3)]
+    columns = [SolidNoise.random(rng, 70, 22)(wall.vertices) for _ in range(3)]
     columns.append(rng.uniform(0.03, 0.16) * SolidNoise.random(rng, 90 * size, 18 * size)(wall.vertices))
     columns.append(rng.uniform(0.0, 0.3) * SolidNoise.random(rng, 70 * size, 9 * size)(wall.vertices))
     shares = tissue_shares(wall.vertices, growths, step_mm)
     columns += list(shares.T)
     ordinary = _ORDINARY.get(kind, "mucosa")
-    if photographs and rng.random() < _PHOTOGRAPHED_SHARE:
-        ground = photographs[int(rng.integers(len(photographs)))]
-    else:
-        ground = paint(ordinary, palette, rng)
+    ground = paint(ordinary, palette, rng, _GROUND_SIDE)
+    if photograph is not None:
+        ground = photograph
     layers = [_layer(ground, rng, -1, 0, 1, 0, 0)]
     patches = [name for name, share in _PATCHES[kind].items() if rng.random() < share]
     rng.shuffle(patches)
@@ -193,7 +198,13 @@ def make_skin(
         rim = rng.uniform(0.2, 0.9) if name == "ulcer" else 0.0
         layers.append(
             _layer(
-                paint(name, palette, rng), rng, len(columns), threshold, softness, rng.uniform(0.2, 0.5), rim
+                paint(name, palette, rng, _PATCH_SIDE),
+                rng,
+                len(columns),
+                threshold,
+                softness,
+                rng.uniform(0.2, 0.5),
+                rim,
             )
         )
         columns.append(field)
@@ -206,13 +217,14 @@ def make_skin(
             own = palette
         ragged = 0.0 if tissue == "metal" else 0.12
         soft = 0.03 if tissue == "metal" else rng.uniform(0.04, 0.15)
-        layers.append(_layer(paint(name, own, rng), rng, 5 + column, 0.5, soft, ragged, 0.0))
+        layers.append(_layer(paint(name, own, rng, _PATCH_SIDE), rng, 5 + column, 0.5, soft, ragged, 0.0))
     return Skin(
         tuple(layers),
         np.stack(columns, axis=1).astype(np.float32),
         palette.absorbed,
         float(rng.uniform(0.4, 1.4)),
         float(rng.uniform(0.02, 0.08)),
+        float(np.clip(radius_mm / 18, 0.4, 1.3) * rng.uniform(0.7, 1.2)),
     )
 
 

@@ -29,10 +29,12 @@ def grown_vessels(
         trees: how many start.
         width_texels: of the widest.
         step_texels: length of one straight piece.
-        tortuosity: standard deviation of the change of direction per piece, in radians.
+        tortuosity: standard deviation of what is added to the bend at each piece, in radians.
     """
     import cv2
 
+    # Lines start within the square and may leave it by half a side at most.
+    step_texels = min(step_texels, 0.5 * side / _STEPS)
     start = rng.uniform(0, side, (trees, 2))
     heading = rng.uniform(0, 2 * np.pi, trees)
     width = width_texels * rng.uniform(0.45, 1.0, trees)
@@ -44,9 +46,12 @@ def grown_vessels(
             break
         count = len(start)
         length = rng.integers(5, _STEPS + 1, count)
-        turns = np.cumsum(rng.normal(0, tortuosity, (count, _STEPS)), axis=1)
-        # Vessels wander about their course instead of curling up.
-        turns -= 0.5 * np.cumsum(turns, axis=1) / np.arange(1, _STEPS + 1)
+        # A change of direction lasts for some pieces, so that vessels bend instead of trembling.
+        bends = rng.normal(0, tortuosity, (count, _STEPS))
+        for piece in range(1, _STEPS):
+            bends[:, piece] += 0.8 * bends[:, piece - 1]
+        turns = np.cumsum(bends, axis=1)
+        turns -= 0.4 * np.cumsum(turns, axis=1) / np.arange(1, _STEPS + 1)
         course = heading[:, None] + turns
         moves = step_texels * np.stack([np.cos(course), np.sin(course)], axis=2)
         moves *= (np.arange(_STEPS) < length[:, None])[..., None]
@@ -65,8 +70,6 @@ def grown_vessels(
         start = np.concatenate([line[keep, -1] % side for keep in kept])
         heading = np.concatenate([way[keep] for keep, (_, way) in zip(kept, children, strict=True)])
         width = np.concatenate([child[keep] for keep, (child, _) in zip(kept, children, strict=True)])
-        # Lines start within the square and may leave it by half a side at most.
-        step_texels = min(step_texels, 0.5 * side / _STEPS)
     for half_pixels, lines in canvases.items():
         layer = np.zeros((2 * side, 2 * side), dtype=np.uint8)
         corners = [np.round((line + margin) * 2**_FRACTION_BITS).astype(np.int32) for line in lines]

@@ -19,6 +19,8 @@ UNSEEN = (0.10, 0.60)
 """Share of never-seen pixels, mean over a clip, that clips are chosen for."""
 _TRIES = 14
 _COARSE = (16, 12)
+_NEAREST_CLIP = 0.5
+"""What a clip looks at is farther than this times what the recording looks at."""
 _NEAREST_SHARE = 0.9
 """What is in the middle of the picture is farther than this times the lens's margin."""
 
@@ -110,13 +112,18 @@ def target_clips(
         train: cameras of the recording.
         clips: how many.
     """
+    usual = [
+        np.median(space.rays.cast(train.centers[k], _middle_rays(pose)).distance)
+        for k, pose in enumerate(train.world_from_camera)
+    ]
+    nearest = _NEAREST_CLIP * float(np.median(usual))
     small = Cameras(train.K, train.world_from_camera, train.width, train.height)
     poses, index = [], []
     for clip in range(clips):
         way = ("aside", "turned", "turned", "nearer", "back")[int(rng.integers(5))]
         severity, best, best_miss = 1.0, None, np.inf
         for _ in range(_TRIES):
-            drawn = _clip(space, rng, train, way, severity)
+            drawn = _clip(space, rng, train, way, severity, nearest)
             if drawn is None:
                 severity *= 0.9
                 continue
@@ -150,7 +157,7 @@ def unseen_share(rays: RayCaster, train: Cameras, views: Cameras) -> Float[np.nd
 
 
 def _clip(
-    space: FreeSpace, rng: np.random.Generator, train: Cameras, way: str, severity: float
+    space: FreeSpace, rng: np.random.Generator, train: Cameras, way: str, severity: float, nearest_mm: float
 ) -> Float[np.ndarray, "v 4 4"] | None:
     """Poses of a clip, or None when it would touch the wall or look into it."""
     base = train.world_from_camera[int(rng.integers(len(train)))]
@@ -188,9 +195,11 @@ def _clip(
     margin = max(1.0, (0.45 if way == "nearer" else 0.7) * space.margin_mm)
     if not space.clear(found[:, :3, 3], margin).all():
         return None
-    ahead = space.rays.cast(found[0, :3, 3], _middle_rays(found[2])).distance
-    if np.median(ahead) < 1.6 * margin or not np.isfinite(np.median(ahead)):
-        return None
+    for pose in (found[0], found[2], found[-1]):
+        ahead = np.median(space.rays.cast(pose[:3, 3], _middle_rays(pose)).distance)
+        # Light falls with the square of the distance: much nearer than the recording all would be white.
+        if not max(1.6 * margin, nearest_mm) < ahead < np.inf:
+            return None
     # The line of sight between the path and the clip must be free: the scope cannot pass through walls.
     offset = found[2, :3, 3] - center
     length = float(np.linalg.norm(offset))
