@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -114,7 +115,7 @@ class FreeSpace:
             weight = np.minimum(self.clearance_mm, 3 * self.margin_mm)
             visited += [int(k) for k in rng.choice(count, stops - 1, p=weight / weight.sum())]
         line: list[np.ndarray] = []
-        for start, end in zip(visited[:-1], visited[1:], strict=True):
+        for start, end in pairwise(visited):
             _, before = dijkstra(graph, directed=False, indices=start, return_predecessors=True)
             chain = [end]
             while chain[-1] != start and before[chain[-1]] >= 0:

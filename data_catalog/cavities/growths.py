@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
@@ -14,6 +16,7 @@ from data_catalog.cavities.surface import Lattice, Wall, unit
 __all__ = ["Growth", "Tissue", "draw_growths", "stamp", "tissue_shares"]
 
 Tissue = Literal["lump", "hollow", "fat", "bowel", "metal"]
+_Vector = Float[np.ndarray, "3"]
 TISSUES: tuple[Tissue, ...] = ("lump", "hollow", "fat", "bowel", "metal")
 
 
@@ -39,7 +42,7 @@ class Growth:
         if len(line) == 1:
             return np.asarray(np.sqrt(np.square(points - line[0]).sum(axis=1)) - self.radius_mm)
         nearest = np.full(len(points), np.inf, dtype=np.float32)
-        for first, last in zip(line[:-1], line[1:], strict=True):
+        for first, last in pairwise(line):
             along = last - first
             offset = points - first
             share = np.clip((offset * along).sum(axis=1) / np.square(along).sum(), 0, 1)
@@ -59,13 +62,12 @@ def draw_growths(kind: Kind, wall: Wall, radius_mm: float, rng: np.random.Genera
     """
     growths: list[Growth] = []
 
-    def place() -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    def place() -> _Place:
         vertex = int(rng.integers(len(wall.vertices)))
         return wall.vertices[vertex].astype(np.float64), wall.normals[vertex].astype(np.float64)
 
     if kind == "field":
-        for _ in range(int(rng.integers(0, 4))):
-            growths.append(_bowel(*_facing_up(place), rng))
+        growths += [_bowel(*_facing_up(place), rng) for _ in range(int(rng.integers(0, 4)))]
         for _ in range(int(rng.integers(0, 7))):
             growths += _fat(*_facing_up(place), rng)
     else:
@@ -92,7 +94,11 @@ def draw_growths(kind: Kind, wall: Wall, radius_mm: float, rng: np.random.Genera
     return growths
 
 
-def _facing_up(place) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:  # noqa: ANN001
+_Place = tuple[_Vector, _Vector]
+"""A point and the normal there."""
+
+
+def _facing_up(place: Callable[[], _Place]) -> _Place:
     """A place whose normal points at the lens of a field, or the last of twenty."""
     for _ in range(20):
         point, normal = place()
@@ -101,7 +107,7 @@ def _facing_up(place) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]: 
     return point, normal
 
 
-def _polyp(point: np.ndarray, normal: np.ndarray, rng: np.random.Generator, size: float) -> list[Growth]:
+def _polyp(point: _Vector, normal: _Vector, rng: np.random.Generator, size: float) -> list[Growth]:
     radius = size * rng.uniform(0.8, 4.5)
     if rng.random() < 0.3:
         lean = unit(normal + 0.5 * rng.standard_normal(3)).astype(np.float64)
@@ -120,7 +126,7 @@ def _polyp(point: np.ndarray, normal: np.ndarray, rng: np.random.Generator, size
     return [Growth("lump", line, radius, rng.uniform(0.4, 1.2) * radius)]
 
 
-def _fat(point: np.ndarray, normal: np.ndarray, rng: np.random.Generator) -> list[Growth]:
+def _fat(point: _Vector, normal: _Vector, rng: np.random.Generator) -> list[Growth]:
     """A heap of lobules."""
     spread, size = rng.uniform(5, 16), rng.uniform(2.5, 6)
     found = []
@@ -133,7 +139,7 @@ def _fat(point: np.ndarray, normal: np.ndarray, rng: np.random.Generator) -> lis
     return found
 
 
-def _bowel(point: np.ndarray, normal: np.ndarray, rng: np.random.Generator) -> Growth:
+def _bowel(point: _Vector, normal: _Vector, rng: np.random.Generator) -> Growth:
     """A loop that lies on the wall and winds."""
     radius = rng.uniform(6, 13)
     across = np.cross(normal, rng.standard_normal(3))
@@ -149,7 +155,11 @@ def _bowel(point: np.ndarray, normal: np.ndarray, rng: np.random.Generator) -> G
 
 
 def _instrument(
-    point: np.ndarray, normal: np.ndarray, wall: Wall, rng: np.random.Generator, radius_mm: float
+    point: _Vector,
+    normal: _Vector,
+    wall: Wall,
+    rng: np.random.Generator,
+    radius_mm: float,
 ) -> list[Growth]:
     """A shaft that comes from outside and ends before the wall, with two jaws."""
     tip = point + normal * rng.uniform(0.1, 0.6) * radius_mm

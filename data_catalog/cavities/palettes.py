@@ -45,9 +45,8 @@ class Palette:
         red, green, blue = colour
         if not self.narrow_band:
             return np.array(colour, dtype=np.float32)
-        return np.array(
-            [0.85 * green + 0.1 * red, 0.25 * green + 0.55 * blue, 0.2 * green + 0.55 * blue], dtype=np.float32
-        )
+        shown = (0.85 * green + 0.1 * red, 0.25 * green + 0.55 * blue, 0.2 * green + 0.55 * blue)
+        return np.array(shown, dtype=np.float32)
 
 
 def draw_palette(kind: str, rng: np.random.Generator) -> Palette:

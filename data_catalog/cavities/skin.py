@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.cavities.growths import TISSUES, Growth, tissue_shares
 from data_catalog.cavities.canvas import TEXEL_MM
+from data_catalog.cavities.growths import TISSUES, Growth, tissue_shares
 from data_catalog.cavities.materials import paint
 from data_catalog.cavities.noise import SolidNoise
 from data_catalog.cavities.palettes import draw_palette

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from extrags.errors import CaptureError
+
 __all__ = ["Clearance", "Lattice", "Wall", "contour", "unit"]
 
 Clearance = Callable[[Float[np.ndarray, "n 3"]], Float[np.ndarray, "n"]]
@@ -54,6 +56,12 @@ class Lattice:
             np.minimum(lattice.values, from_end.reshape(form).astype(np.float32), out=lattice.values)
         return lattice
 
+    def smoothed(self, nodes: float) -> Lattice:
+        """The clearance without what is finer than so many nodes (standard deviation of the blur)."""
+        from scipy.ndimage import gaussian_filter
+
+        return Lattice(self.low_mm, self.step_mm, gaussian_filter(self.values, nodes, truncate=3.0))
+
     def positions(self, index: Float[np.ndarray, "n 3"] | Int[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
         """Where nodes lie, in mm, float32."""
         return np.asarray(self.low_mm + self.step_mm * index, dtype=np.float32)
@@ -90,10 +98,16 @@ class Wall:
 
 
 def contour(lattice: Lattice) -> Wall:
-    """The wall where the clearance is zero."""
+    """The wall where the clearance is zero.
+
+    Raises:
+        CaptureError: when it is nowhere zero.
+    """
     import open3d as o3d
 
     volume = np.ascontiguousarray(lattice.values)
+    if not (volume.min() < 0 < volume.max()):
+        raise CaptureError("the clearance is nowhere zero: there is no wall")
     mesh = o3d.t.geometry.TriangleMesh.create_isosurfaces(o3d.core.Tensor.from_numpy(volume), [0.0])
     # The volume's last axis is the mesh's first.
     index = mesh.vertex.positions.numpy()[:, ::-1].astype(np.float64)

@@ -110,7 +110,7 @@ class Degradation:
             depth = depth.copy()
             for frame in train:
                 depth[frame] *= self._factors(depth.shape[1:], generator)
-            without = int(round(self.missing_share * len(train)))
+            without = round(self.missing_share * len(train))
             # Two frames keep theirs: something must say how far away the wall is.
             chosen = generator.permutation(train)[: max(0, min(without, len(train) - 2))]
             depth[chosen] = 0
