@@ -95,7 +95,7 @@ def _described(scene: int, setting: Setting) -> Descriptor:
     train = plain.train_frames
     return Descriptor(
         name=f"caverns/{scene}@{setting}",
-        description=f"Procedural cavern number {scene}, of a family nothing is trained on, with exact ground truth",
+        description=f"Procedural cavern number {scene} with exact ground truth; its family trains nothing",
         frames=train + plain.test_frames,
         width=plain.width,
         height=plain.height,

@@ -58,11 +58,11 @@ def build_cavern(scene: int) -> Cavern:
         offset = rng.standard_normal(3)
         offset *= rng.uniform(9, 15) / np.linalg.norm(offset)
         balls.append(_ball(rng, centers[k] + offset, rng.uniform(4, 9), 1.0))
-    for _ in range(int(rng.integers(3, 9))):
+    for _ in range(int(rng.integers(5, 12))):
         k = int(rng.integers(0, _CHAMBERS))
         offset = rng.standard_normal(3)
         offset *= rng.uniform(9, 13) / np.linalg.norm(offset)
-        balls.append(_ball(rng, centers[k] + offset, rng.uniform(1.5, 4.0), -rng.uniform(0.5, 1.2)))
+        balls.append(_ball(rng, centers[k] + offset, rng.uniform(2.0, 5.0), -rng.uniform(0.7, 1.5)))
     twist = rng.uniform(-0.02, 0.02)
     ripple, pitch = rng.uniform(0.0, 0.5), rng.uniform(5, 9)
     heading = rng.standard_normal(3)
@@ -88,7 +88,7 @@ def build_cavern(scene: int) -> Cavern:
     middle = _untwisted(middle, twist)
     reach = 19.0
     low, high = middle.min(axis=0) - reach - _MARGIN_MM, middle.max(axis=0) + reach + _MARGIN_MM
-    lattice = Lattice.of(clearance, low, high, _NODES).smoothed(0.8)
+    lattice = Lattice.of(clearance, low, high, _NODES).without_islands().smoothed(0.8)
     return Cavern(contour(lattice), lattice, middle)
 
 

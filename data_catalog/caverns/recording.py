@@ -34,7 +34,7 @@ _LOOK_AHEAD_MM = 15.0
 _STYLES: dict[str, tuple[float, float, float, float, float]] = {
     "b": (0.86, 0.0, 0.35, 6.0, 6.0),
     "sparse": (0.82, 2.3, 0.5, 26.0, 9.0),
-    "distanced": (0.88, np.pi, 0.6, 55.0, 15.0),
+    "distanced": (0.94, np.pi, 0.7, 66.0, 16.0),
 }
 _LEVEL = 0.15
 _EXPOSURE_SPREAD, _BALANCE_SPREAD, _DRIFT = 0.08, 0.02, 0.015

@@ -1,8 +1,8 @@
 r"""Texture of a cavern's wall: cells round points of the wall, with vessels between them and in spirals.
 
 For a point of the wall, :math:`F_1` and :math:`F_2` are its distances to the nearest and the second nearest
-feature point. Cells have tones of their own; along their borders, where :math:`F_2 - F_1` is small, runs a net
-of vessels; about some of the larger cells' points vessels wind in logarithmic spirals.
+feature point. Cells have tones of their own; along their borders, where :math:`F_2 - F_1` is small, runs a
+net of vessels; about some of the larger cells' points vessels wind in logarithmic spirals.
 
 Source: Worley, "A cellular texture basis function", SIGGRAPH 1996.
 """
@@ -23,11 +23,11 @@ __all__ = ["CellTexture", "make_texture"]
 
 # Pairs of linear reflectance that cells mix, and what runs between them.
 _TONES = (
-    ((0.66, 0.30, 0.21), (0.50, 0.17, 0.11)),
-    ((0.74, 0.46, 0.33), (0.60, 0.30, 0.20)),
-    ((0.55, 0.22, 0.19), (0.70, 0.40, 0.34)),
-    ((0.72, 0.50, 0.28), (0.58, 0.30, 0.17)),
-    ((0.48, 0.15, 0.10), (0.62, 0.28, 0.20)),
+    ((0.66, 0.26, 0.16), (0.50, 0.14, 0.08)),
+    ((0.74, 0.40, 0.26), (0.60, 0.24, 0.15)),
+    ((0.58, 0.18, 0.13), (0.70, 0.34, 0.25)),
+    ((0.72, 0.44, 0.20), (0.58, 0.26, 0.12)),
+    ((0.50, 0.12, 0.07), (0.62, 0.24, 0.15)),
 )
 _BLOOD = np.array([0.35, 1.05, 0.85], dtype=np.float32)
 _SMALL_MM, _LARGE_MM = (1.6, 3.6), (9.0, 16.0)
@@ -134,11 +134,13 @@ class CellTexture:
         # Where F2 - F1 is small the border is half of it away.
         border = 0.5 * (near[:, 1] - near[:, 0])
         blood = self.net * _line(border, self.net_width_mm, footprint_mm)
-        blood = np.maximum(blood, self._spirals(points, patch[:, 0], far[:, 0], footprint_mm))
+        blood = np.maximum(blood, self._spirals(points, patch[:, 0], footprint_mm))
         albedo = albedo * np.exp(self.grain * mottle[:, None] - blood[:, None] * _BLOOD)
         toward = points - self.small.tree.data[which[:, 0]].astype(np.float32)
         toward -= (toward * normals).sum(axis=1)[:, None] * normals
-        slope = (self.bump * visible / self.small.size_mm)[:, None] * toward
+        # Domes end softly, without a crease along the border.
+        dome = self.bump * visible / self.small.size_mm * np.clip(4 * border / self.small.size_mm, 0, 1)
+        slope = dome[:, None] * toward
         lost = np.square(self.bump) * 0.2 * (1 - visible)
         wet = self.wetness * np.clip(1 + 0.3 * self.small.tone[which[:, 0]] * visible, 0.3, 1.7)
         return SkinValues(
@@ -152,7 +154,6 @@ class CellTexture:
         self,
         points: Float[np.ndarray, "n 3"],
         cell: Int[np.ndarray, "n"],
-        distance: Float[np.ndarray, "n"],
         footprint_mm: Float[np.ndarray, "n"],
     ) -> Float[np.ndarray, "n"]:
         blood = np.zeros(len(points), dtype=np.float32)
@@ -166,7 +167,6 @@ class CellTexture:
         ends = np.clip(1.6 - radius / (0.42 * self.large.size_mm), 0, 1)
         width = 0.10 + 0.028 * radius
         blood[chosen] = 1.1 * ends * _line(away.astype(np.float32), width, footprint_mm[chosen])
-        del distance
         return blood
 
     def _value_noise(self, places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:

@@ -70,9 +70,9 @@ class Processor:
     def random(cls, rng: np.random.Generator) -> Processor:
         """A processor; flaws fall independently."""
         return cls(
-            saturation=float(rng.uniform(0.85, 1.25)),
+            saturation=float(rng.uniform(0.9, 1.4)),
             contrast=float(rng.uniform(-0.1, 0.45)),
-            black=float(rng.uniform(0, 0.03)),
+            black=float(rng.uniform(0, 0.02)),
             sharpening=float(rng.uniform(0.0, 1.1)) * bool(rng.random() < 0.7),
             sharpening_px=float(rng.uniform(0.6, 1.4)),
             defocus_px=float(rng.uniform(0.1, 0.6)) if rng.random() < 0.85 else float(rng.uniform(0.6, 1.1)),

@@ -67,7 +67,7 @@ def build_cavity(
     shape = make_shape(kind, stream(scene, "shape"))
     plain = Lattice.of(shape.clearance, shape.low_mm, shape.high_mm, nodes)
     growths = draw_growths(kind, contour(plain), shape.radius_mm, stream(scene, "growths"))
-    lattice = (stamp(plain, growths) if growths else plain).smoothed(_SMOOTHED)
+    lattice = (stamp(plain, growths) if growths else plain).without_islands().smoothed(_SMOOTHED)
     wall = contour(lattice)
     skin = make_skin(kind, wall, growths, lattice.step_mm, stream(scene, "skin"), shape.radius_mm, photograph)
     return Cavity(shape, lattice, wall, RayCaster(wall.vertices, wall.triangles), skin)

@@ -194,7 +194,7 @@ def make_skin(
         field = SolidNoise.random(rng, rng.uniform(25, 80) * size, rng.uniform(6, 14) * size)(wall.vertices)
         sharp = name in ("residue", "blood", "ulcer", "fat", "char")
         threshold = rng.uniform(1.3, 2.4) if sharp else rng.uniform(0.2, 1.8)
-        softness = rng.uniform(0.03, 0.12) if sharp else rng.uniform(0.08, 0.5)
+        softness = rng.uniform(0.04, 0.2) if sharp else rng.uniform(0.08, 0.5)
         rim = rng.uniform(0.2, 0.9) if name == "ulcer" else 0.0
         layers.append(
             _layer(

@@ -56,6 +56,15 @@ class Lattice:
             np.minimum(lattice.values, from_end.reshape(form).astype(np.float32), out=lattice.values)
         return lattice
 
+    def without_islands(self) -> Lattice:
+        """The lattice without solids that float in free space: all that is solid hangs together."""
+        from scipy.ndimage import label
+
+        parts, _ = label(self.values <= 0)
+        values = self.values.copy()
+        values[(parts > 0) & (parts != parts[0, 0, 0])] = 0.5 * self.step_mm
+        return Lattice(self.low_mm, self.step_mm, values)
+
     def smoothed(self, nodes: float) -> Lattice:
         """The clearance without what is finer than so many nodes (standard deviation of the blur)."""
         from scipy.ndimage import gaussian_filter
