@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -16,11 +16,13 @@ from extrags.cameras import Cameras, pixel_rays
 __all__ = ["Painted", "pinhole", "radiance", "z_depth"]
 
 
+@runtime_checkable
 class Painted(Protocol):
     """What a wall looks like."""
 
-    at_vertices: Float[np.ndarray, "v c"]
-    """Values that are interpolated between vertices and handed to `at`."""
+    @property
+    def at_vertices(self) -> Float[np.ndarray, "v c"]:
+        """Values that are interpolated between vertices and handed to `at`."""
 
     def at(
         self,

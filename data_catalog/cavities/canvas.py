@@ -117,6 +117,6 @@ class Canvas:
         )
         wanted = min(float(found), _MOST_SLOPE) if slope is None else slope
         height = height * (wanted / max(float(found), 1e-9))
-        edge = self.octaves((5, 2, 0.9, 0.4), (1, 0.8, 0.6, 0.4))
+        edge = self.octaves((5.0, 2.0, 0.9, 0.4), (1.0, 0.8, 0.6, 0.4))
         parts = [np.clip(albedo, 0.01, 0.97), wet[..., None], height[..., None], edge[..., None]]
         return np.concatenate(parts, axis=2, dtype=np.float32)

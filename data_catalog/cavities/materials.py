@@ -26,7 +26,7 @@ def paint(material: str, palette: Palette, rng: np.random.Generator, side: int) 
 def mucosa(canvas: Canvas, palette: Palette, *, blood: float = 1.0) -> Material:
     """Ordinary mucosa: blotches, mottling, vessels of three sizes, pits, villi or points."""
     rng = canvas.rng
-    density = canvas.octaves((20, 9, 4), (0.6, 1.0, 1.0))
+    density = canvas.octaves((20.0, 9.0, 4.0), (0.6, 1.0, 1.0))
     mottle = canvas.octaves((1.8, 0.9, 0.45, 0.2), (1.0, 0.9, 0.8, 0.7))
     blotched, mottled = rng.uniform(0.2, 1.4), rng.uniform(0.0, 1.0) ** 1.5
     pale = np.clip(rng.uniform(0.1, 0.7) + 0.15 * blotched * density + 0.05 * mottled * mottle, 0, 1)[
@@ -42,7 +42,7 @@ def mucosa(canvas: Canvas, palette: Palette, *, blood: float = 1.0) -> Material:
         if rng.random() < often:
             absorbed += most * rng.uniform(0.2, 1.0) * blood * cover * canvas.vessels(size)
     albedo = albedo * np.exp(-np.clip(absorbed, 0, 1.4)[..., None] * palette.absorbed)
-    height = canvas.octaves((4.0, 1.8, 0.8), (1, 0.45, 0.2)) + 0.03 * mottled * mottle + 0.3 * absorbed
+    height = canvas.octaves((4.0, 1.8, 0.8), (1.0, 0.45, 0.2)) + 0.03 * mottled * mottle + 0.3 * absorbed
     style = rng.choice(4, p=(0.4, 0.2, 0.2, 0.2))
     if style == 1:
         relief, _ = canvas.cells(rng.uniform(0.5, 1.3))
@@ -50,11 +50,11 @@ def mucosa(canvas: Canvas, palette: Palette, *, blood: float = 1.0) -> Material:
         albedo = albedo * (1 - rng.uniform(0.05, 0.28) * groove * (0.4 + 0.6 * palette.absorbed))
         height = height + rng.uniform(0.1, 0.5) * relief
     elif style == 2:
-        villi = canvas.octaves((0.7, 0.4), (1, 0.7))
+        villi = canvas.octaves((0.7, 0.4), (1.0, 0.7))
         albedo = albedo * np.exp(rng.uniform(0.02, 0.09) * villi[..., None])
         height = height + rng.uniform(0.03, 0.15) * villi
     elif style == 3:
-        points = np.clip(canvas.octaves((0.9, 0.4), (1, 0.4)) - rng.uniform(1.3, 2.2), 0, 1)
+        points = np.clip(canvas.octaves((0.9, 0.4), (1.0, 0.4)) - rng.uniform(1.3, 2.2), 0, 1)
         albedo = albedo * np.exp(-1.1 * points[..., None] * palette.absorbed)
     wet = np.clip(0.75 + 0.3 * density * rng.uniform(0, 1) + 0.1 * mottle, 0.05, 1.5)
     return canvas.packed(albedo, wet, height, slope=rng.uniform(0.04, 0.22))
@@ -64,7 +64,7 @@ def inflamed(canvas: Canvas, palette: Palette) -> Material:
     """Red, swollen mucosa with points of blood, its vessels veiled."""
     red = palette.base * np.array([0.92, 0.58, 0.62], np.float32)
     painted = mucosa(canvas, Palette(red, palette.base, palette.absorbed, palette.narrow_band), blood=0.4)
-    points = np.clip(canvas.octaves((0.9, 0.5), (1, 0.6)) - canvas.rng.uniform(1.3, 2.2), 0, 1)[..., None]
+    points = np.clip(canvas.octaves((0.9, 0.5), (1.0, 0.6)) - canvas.rng.uniform(1.3, 2.2), 0, 1)[..., None]
     painted[..., :3] *= np.exp(-1.3 * points * palette.absorbed)
     return painted
 
@@ -73,7 +73,7 @@ def pale(canvas: Canvas, palette: Palette) -> Material:
     """Pale or scarred mucosa: whitish strands, few vessels."""
     white = np.clip(0.5 * palette.pale + 0.42, 0, 0.92).astype(np.float32)
     painted = mucosa(canvas, Palette(palette.pale, white, palette.absorbed, palette.narrow_band), blood=0.6)
-    strands = np.exp(-np.square(canvas.noise(9, stretch=(1, 0.35)) / 0.35)) * canvas.rng.uniform(0, 0.25)
+    strands = np.exp(-np.square(canvas.noise(9.0, stretch=(1.0, 0.35)) / 0.35)) * canvas.rng.uniform(0, 0.25)
     painted[..., :3] = np.clip(painted[..., :3] * (1 + strands[..., None]), 0, 0.97)
     return painted
 
@@ -81,10 +81,10 @@ def pale(canvas: Canvas, palette: Palette) -> Material:
 def ulcer(canvas: Canvas, palette: Palette) -> Material:
     """A fibrin coat: white to yellow, matt, with streaks of blood."""
     rng = canvas.rng
-    coat = canvas.octaves((4, 2, 0.9, 0.4), (1, 1, 0.6, 0.35))
+    coat = canvas.octaves((4.0, 2.0, 0.9, 0.4), (1.0, 1.0, 0.6, 0.35))
     colour = palette.seen((0.78, 0.68, 0.44)) * np.exp(rng.normal(0, 0.1, 3)).astype(np.float32)
     albedo = colour * np.exp(0.12 * coat[..., None])
-    blood = np.clip(canvas.octaves((3, 1.2), (1, 0.7)) - 1.3, 0, 1)[..., None]
+    blood = np.clip(canvas.octaves((3.0, 1.2), (1.0, 0.7)) - 1.3, 0, 1)[..., None]
     albedo = albedo * np.exp(-1.5 * blood * palette.absorbed)
     return canvas.packed(albedo, np.clip(0.4 + 0.2 * coat, 0.05, 1), coat, slope=rng.uniform(0.1, 0.3))
 
@@ -100,7 +100,7 @@ def residue(canvas: Canvas, palette: Palette) -> Material:
         (0.60, 0.42, 0.2),
     )
     base = palette.seen(colours[int(rng.integers(len(colours)))])
-    lumps = canvas.octaves((4, 1.8, 0.8, 0.35), (1, 0.8, 0.5, 0.3))
+    lumps = canvas.octaves((4.0, 1.8, 0.8, 0.35), (1.0, 0.8, 0.5, 0.3))
     albedo = base * np.exp(rng.uniform(0.05, 0.3) * lumps[..., None])
     wet, height = np.clip(0.9 + 0.3 * lumps, 0.1, 1.5), 0.1 * rng.uniform(0.2, 1.0) * lumps
     if rng.random() < 0.5:
@@ -118,11 +118,11 @@ def fat(canvas: Canvas, palette: Palette) -> Material:
     """Yellow lobules with fine vessels between them."""
     rng = canvas.rng
     relief, tone = canvas.cells(rng.uniform(2.0, 5.0))
-    soft = canvas.octaves((2.5, 1.2, 0.5), (1, 0.6, 0.4))
+    soft = canvas.octaves((2.5, 1.2, 0.5), (1.0, 0.6, 0.4))
     colour = palette.seen((0.78, 0.58, 0.25)) * np.exp(rng.normal(0, 0.12, 3)).astype(np.float32)
     albedo = colour * np.exp(0.06 * tone + 0.05 * soft)[..., None] * (0.88 + 0.16 * relief[..., None])
     absorbed = rng.uniform(0.2, 0.9) * canvas.vessels("twigs") + rng.uniform(0, 0.5) * canvas.vessels("net")
-    redness = np.clip(canvas.octaves((12, 5), (1, 1)) * 0.3 + rng.uniform(-0.3, 0.3), 0, 0.6)
+    redness = np.clip(canvas.octaves((12.0, 5.0), (1.0, 1.0)) * 0.3 + rng.uniform(-0.3, 0.3), 0, 0.6)
     albedo = albedo * np.exp(-np.clip(absorbed + redness, 0, 1.3)[..., None] * palette.absorbed)
     height = relief + 0.15 * soft
     return canvas.packed(albedo, np.clip(0.8 + 0.3 * relief, 0.1, 1.3), height, slope=rng.uniform(0.15, 0.35))
@@ -133,7 +133,7 @@ def serosa(canvas: Canvas, palette: Palette) -> Material:
     rng = canvas.rng
     middle = 0.5 * (palette.base + palette.pale)
     painted = mucosa(canvas, Palette(middle, palette.pale, palette.absorbed, palette.narrow_band), blood=0.8)
-    fibres = canvas.noise(1.2, stretch=(1, 0.08)) + canvas.noise(3, stretch=(1, 0.15))
+    fibres = canvas.noise(1.2, stretch=(1.0, 0.08)) + canvas.noise(3.0, stretch=(1.0, 0.15))
     painted[..., :3] *= np.exp(rng.uniform(0.0, 0.06) * fibres[..., None])
     height = painted[..., 4] + rng.uniform(0, 0.02) * fibres
     return canvas.packed(painted[..., :3], painted[..., 3], height, slope=rng.uniform(0.03, 0.15))
@@ -141,14 +141,14 @@ def serosa(canvas: Canvas, palette: Palette) -> Material:
 
 def blood(canvas: Canvas, palette: Palette) -> Material:
     """Blood that lies on tissue: dark, smooth and shining."""
-    clots = canvas.octaves((6, 2.5, 1), (1, 0.6, 0.3))
+    clots = canvas.octaves((6.0, 2.5, 1.0), (1.0, 0.6, 0.3))
     albedo = palette.seen((0.26, 0.020, 0.016)) * np.exp(0.3 * clots[..., None])
     return canvas.packed(albedo, np.clip(1.3 + 0.2 * clots, 0.6, 1.8), clots, slope=0.06)
 
 
 def char(canvas: Canvas, palette: Palette) -> Material:
     """Coagulated tissue: black, brown and yellow."""
-    burnt = canvas.octaves((4, 1.8, 0.8, 0.35), (1, 1, 0.7, 0.5))
+    burnt = canvas.octaves((4.0, 1.8, 0.8, 0.35), (1.0, 1.0, 0.7, 0.5))
     share = 1 / (1 + np.exp(-2.2 * (burnt + canvas.rng.uniform(-0.8, 0.8))))[..., None]
     albedo = share * palette.seen((0.07, 0.045, 0.03)) + (1 - share) * palette.seen((0.52, 0.36, 0.16))
     return canvas.packed(albedo, np.clip(0.4 - 0.2 * burnt, 0.02, 0.9), burnt, slope=0.35)
@@ -157,10 +157,10 @@ def char(canvas: Canvas, palette: Palette) -> Material:
 def cartilage(canvas: Canvas, palette: Palette) -> Material:
     """White, smooth, with faint fibres and frayed places."""
     rng = canvas.rng
-    fibres = canvas.noise(5, stretch=(1, 0.12)) + canvas.noise(1.5, stretch=(1, 0.12))
-    frayed = np.clip(canvas.octaves((7, 3), (1, 0.6)) - rng.uniform(0.4, 2.0), 0, 1)
-    fine = canvas.octaves((0.8, 0.4, 0.2), (1, 0.8, 0.5))
-    tone = canvas.octaves((15, 6), (1, 0.6))
+    fibres = canvas.noise(5.0, stretch=(1.0, 0.12)) + canvas.noise(1.5, stretch=(1.0, 0.12))
+    frayed = np.clip(canvas.octaves((7.0, 3.0), (1.0, 0.6)) - rng.uniform(0.4, 2.0), 0, 1)
+    fine = canvas.octaves((0.8, 0.4, 0.2), (1.0, 0.8, 0.5))
+    tone = canvas.octaves((15.0, 6.0), (1.0, 0.6))
     albedo = palette.pale * np.exp(0.05 * tone + 0.02 * fibres + 0.1 * frayed * fine)[..., None]
     if rng.random() < 0.5:
         seen = rng.uniform(0.1, 0.5) * np.clip(canvas.vessels("twigs") * tone, 0, 1)
@@ -171,8 +171,8 @@ def cartilage(canvas: Canvas, palette: Palette) -> Material:
 
 def metal(canvas: Canvas, palette: Palette) -> Material:
     """Steel or black coating, brushed, with smears."""
-    brushed = canvas.noise(0.6, stretch=(1, 0.05))
-    smear = canvas.octaves((6, 2.5), (1, 0.6))
+    brushed = canvas.noise(0.6, stretch=(1.0, 0.05))
+    smear = canvas.octaves((6.0, 2.5), (1.0, 0.6))
     shade = canvas.rng.choice([0.03, 0.09, 0.18])
     colour = palette.seen((1.0, 0.97, 0.95))
     albedo = shade * np.exp(0.08 * brushed + 0.15 * smear)[..., None] * colour

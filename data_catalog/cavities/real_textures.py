@@ -97,7 +97,7 @@ def _tile(patch: np.ndarray, rng: np.random.Generator) -> Float[np.ndarray, "s s
     soft = cv2.GaussianBlur(fine, (0, 0), 1.5, borderType=cv2.BORDER_REFLECT_101)
     albedo, soft = _mirrored(albedo), _mirrored(soft[..., None])[..., 0]
     canvas = Canvas(rng, 2 * _PATCH)
-    wet = np.clip(0.8 + 0.2 * canvas.octaves((4, 1.5), (1, 0.5)), 0.1, 1.4)
+    wet = np.clip(0.8 + 0.2 * canvas.octaves((4.0, 1.5), (1.0, 0.5)), 0.1, 1.4)
     return canvas.packed(np.clip(albedo, 0.01, 0.9), wet, TEXEL_MM * soft, slope=rng.uniform(0.04, 0.15))
 
 

@@ -105,7 +105,7 @@ def _airways(rng: np.random.Generator) -> Shape:
             aim /= np.linalg.norm(aim)
             twigs.append((fork, fork + aim * rng.uniform(2, 4) * scale, radii[k] * rng.uniform(0.6, 0.85)))
     ring, period = rng.uniform(0.0, 0.5), rng.uniform(2.5, 4.5)
-    rough = SolidNoise.random(rng, 30, 5)
+    rough = SolidNoise.random(rng, 30.0, 5.0)
     end = starts[1, 2]
 
     def clearance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
@@ -134,7 +134,7 @@ def _field(rng: np.random.Generator) -> Shape:
     farthest = scale * float(scene.distance)
     dome = np.array([1.9 * scale, 1.9 * scale, 0.0])
     dome[2] = rng.uniform(0.8, 1.2) * scale
-    bulge = SolidNoise.random(rng, 120, 40)
+    bulge = SolidNoise.random(rng, 120.0, 40.0)
 
     def clearance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         scaled = points / dome
@@ -162,7 +162,7 @@ def _oesophagus(rng: np.random.Generator) -> Shape:
     ring, period = rng.uniform(0, 0.9), rng.uniform(5, 12)
     squeeze_at, squeeze = rng.uniform(-0.2, 0.3) * length, rng.uniform(0.0, 0.5)
     bend, bend_phase = rng.uniform(0, 9, 2), rng.uniform(0, 2 * np.pi, 2)
-    wobble, rough = SolidNoise.random(rng, 60, 15), SolidNoise.random(rng, 12, 3)
+    wobble, rough = SolidNoise.random(rng, 60.0, 15.0), SolidNoise.random(rng, 12.0, 3.0)
     roughness = rng.uniform(0.0, 0.35)
 
     def clearance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
@@ -209,7 +209,7 @@ def _sinus(rng: np.random.Generator) -> Shape:
         along *= rng.uniform(14, 32) / np.linalg.norm(along)
         middle = start + along / 2 + rng.uniform(-5, 5, 3)
         bodies.append((start, middle, start + along, rng.uniform(2.5, 6.0)))
-    bulge, rough = SolidNoise.random(rng, 40, 9), SolidNoise.random(rng, 9, 3)
+    bulge, rough = SolidNoise.random(rng, 40.0, 9.0), SolidNoise.random(rng, 9.0, 3.0)
     roughness = rng.uniform(0.05, 0.3)
 
     def clearance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
@@ -247,7 +247,7 @@ def _joint(rng: np.random.Generator) -> Shape:
     floor, dish = rng.uniform(0.35, 0.75) * axes[2], rng.uniform(0.0, 0.12)
     crescent = rng.uniform(0.5, 0.8) * axes[0]
     rim = rng.uniform(1.5, 3.0)
-    bulge, rough = SolidNoise.random(rng, 35, 8), SolidNoise.random(rng, 6, 2)
+    bulge, rough = SolidNoise.random(rng, 35.0, 8.0), SolidNoise.random(rng, 6.0, 2.0)
     roughness = rng.uniform(0.0, 0.12)
 
     def clearance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
@@ -266,10 +266,10 @@ def _joint(rng: np.random.Generator) -> Shape:
 
 def _bladder(rng: np.random.Generator) -> Shape:
     axes = rng.uniform(24, 42, 3)
-    bulge, ridges = SolidNoise.random(rng, 90, 30), SolidNoise.random(rng, 26, 11, waves=24)
+    bulge, ridges = SolidNoise.random(rng, 90.0, 30.0), SolidNoise.random(rng, 26.0, 11.0, waves=24)
     height = rng.uniform(0, 2.6) * (rng.random() < 0.6)
     width = rng.uniform(0.15, 0.4)
-    rough = SolidNoise.random(rng, 8, 3)
+    rough = SolidNoise.random(rng, 8.0, 3.0)
     roughness = rng.uniform(0.0, 0.15)
 
     def clearance(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:

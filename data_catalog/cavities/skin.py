@@ -178,20 +178,22 @@ def make_skin(
     """
     palette = draw_palette(kind, rng)
     size = 0.6 if kind in ("airways", "oesophagus", "joint", "sinus") else 1.0
-    columns = [SolidNoise.random(rng, 70, 22)(wall.vertices) for _ in range(3)]
-    columns.append(rng.uniform(0.03, 0.16) * SolidNoise.random(rng, 90 * size, 18 * size)(wall.vertices))
-    columns.append(rng.uniform(0.0, 0.3) * SolidNoise.random(rng, 70 * size, 9 * size)(wall.vertices))
+    columns = [SolidNoise.random(rng, 70.0, 22.0)(wall.vertices) for _ in range(3)]
+    columns.append(rng.uniform(0.03, 0.16) * SolidNoise.random(rng, 90.0 * size, 18.0 * size)(wall.vertices))
+    columns.append(rng.uniform(0.0, 0.3) * SolidNoise.random(rng, 70.0 * size, 9.0 * size)(wall.vertices))
     shares = tissue_shares(wall.vertices, growths, step_mm)
     columns += list(shares.T)
     ordinary = _ORDINARY.get(kind, "mucosa")
     ground = paint(ordinary, palette, rng, _GROUND_SIDE)
     if photograph is not None:
         ground = photograph
-    layers = [_layer(ground, rng, -1, 0, 1, 0, 0)]
+    layers = [_layer(ground, rng, -1, 0.0, 1.0, 0.0, 0.0)]
     patches = [name for name, share in _PATCHES[kind].items() if rng.random() < share]
     rng.shuffle(patches)
     for name in patches[:_MOST_PATCHES]:
-        field = SolidNoise.random(rng, rng.uniform(25, 80) * size, rng.uniform(6, 14) * size)(wall.vertices)
+        field = SolidNoise.random(rng, rng.uniform(25.0, 80.0) * size, rng.uniform(6, 14) * size)(
+            wall.vertices
+        )
         sharp = name in ("residue", "blood", "ulcer", "fat", "char")
         threshold = rng.uniform(1.3, 2.4) if sharp else rng.uniform(0.2, 1.8)
         softness = rng.uniform(0.04, 0.2) if sharp else rng.uniform(0.08, 0.5)

@@ -34,19 +34,21 @@ def test_numbers_give_all_kinds_and_many_sizes() -> None:
     assert any(cavity_config(index, real_textures=True).real_texture for index in range(12))
 
 
+@pytest.fixture(scope="module")
+def space(colon: Cavity) -> FreeSpace:
+    return FreeSpace.of(colon.lattice, colon.rays)
+
+
+@pytest.fixture(scope="module")
+def train(colon: Cavity, space: FreeSpace) -> Cameras:
+    shape = colon.shape
+    poses = recording_poses(
+        space, stream(0, "path"), 8, tube=shape.tube, facing=shape.facing, radius_mm=shape.radius_mm
+    )
+    return Cameras(np.repeat(pinhole(48, 32, 90.0)[None], 8, 0), poses, 48, 32)
+
+
 class TestCameras:
-    @pytest.fixture(scope="class")
-    def space(self, colon: Cavity) -> FreeSpace:
-        return FreeSpace.of(colon.lattice, colon.rays)
-
-    @pytest.fixture(scope="class")
-    def train(self, colon: Cavity, space: FreeSpace) -> Cameras:
-        shape = colon.shape
-        poses = recording_poses(
-            space, stream(0, "path"), 8, tube=shape.tube, facing=shape.facing, radius_mm=shape.radius_mm
-        )
-        return Cameras(np.repeat(pinhole(48, 32, 90)[None], 8, 0), poses, 48, 32)
-
     def test_the_recording_keeps_clear_of_the_wall(self, space: FreeSpace, train: Cameras) -> None:
         assert (space.lattice.at(train.centers) > 0).all()
         assert space.rays.clearance_mm(train.centers).min() > 0.6 * space.margin_mm

@@ -102,7 +102,7 @@ class TestPaint:
         assert coarse.std() == pytest.approx(1, abs=0.05)
         assert np.abs(np.diff(fine, axis=1)).mean() > 4 * np.abs(np.diff(coarse, axis=1)).mean()
         points = rng.uniform(-500, 500, (20_000, 3)).astype(np.float32)
-        assert SolidNoise.random(rng, 40, 10)(points).std() == pytest.approx(1, abs=0.1)
+        assert SolidNoise.random(rng, 40.0, 10.0)(points).std() == pytest.approx(1, abs=0.1)
 
     def test_what_is_finer_than_a_pixel_is_averaged_away(self) -> None:
         rng = np.random.default_rng(2)
