@@ -10,10 +10,11 @@ from jaxtyping import Float
 from data_catalog.cavities.noise import tile_noise
 from data_catalog.cavities.vessels import grown_vessels
 
-__all__ = ["TEXEL_MM", "Canvas", "Plane"]
+__all__ = ["TEXEL_MM", "Canvas", "Plane", "VesselSize"]
 
 TEXEL_MM = 0.06
 Plane = Float[np.ndarray, "s s"]
+VesselSize = Literal["arcades", "twigs", "net"]
 _MOST_SLOPE = 0.45
 
 
@@ -37,7 +38,7 @@ class Canvas:
         total = sum(weight * self.noise(size) for size, weight in zip(sizes_mm, weights, strict=True))
         return np.asarray(total / np.sqrt(np.square(weights).sum()), dtype=np.float32)
 
-    def vessels(self, size: Literal["arcades", "twigs", "net"]) -> Plane:
+    def vessels(self, size: VesselSize) -> Plane:
         """Coverage by vessels of a size, 0 to 1."""
         rng, area = self.rng, (self.size_mm / 60) ** 2
         trees, width, step, tortuosity = {

@@ -128,7 +128,7 @@ class FreeSpace:
             # Where a smoothed corner comes too near to the wall, it is smoothed less.
             share = gaussian_filter1d(kept.astype(np.float64), 3.0, mode="nearest")[:, None] * kept[:, None]
             points = share * smooth + (1 - share) * points
-        return points[self.clear(points, 0.8 * self.margin_mm)]
+        return np.asarray(points[self.clear(points, 0.8 * self.margin_mm)])
 
 
 def _evenly(points: Float[np.ndarray, "n 3"], step_mm: float) -> Float[np.ndarray, "k 3"]:

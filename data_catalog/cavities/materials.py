@@ -10,11 +10,17 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.cavities.canvas import Canvas
+from data_catalog.cavities.canvas import Canvas, VesselSize
 from data_catalog.cavities.palettes import Palette
 
 __all__ = ["MATERIALS", "paint"]
 
+_VESSELS: tuple[tuple[VesselSize, float, float], ...] = (
+    ("arcades", 0.6, 1.3),
+    ("twigs", 0.65, 1.1),
+    ("net", 0.5, 0.8),
+)
+"""Sizes of vessels, how often they show, and how much light they take at most."""
 Material = Float[np.ndarray, "s s 6"]
 
 
@@ -38,9 +44,10 @@ def mucosa(canvas: Canvas, palette: Palette, *, blood: float = 1.0) -> Material:
     albedo = albedo * np.exp(haze[..., None] * (0.3 + 0.7 * palette.absorbed))
     cover = np.clip(0.75 + 0.3 * density, 0.15, 1.2)
     absorbed = np.zeros_like(density)
-    for size, often, most in (("arcades", 0.6, 1.3), ("twigs", 0.65, 1.1), ("net", 0.5, 0.8)):
+    for size, often, most in _VESSELS:
         if rng.random() < often:
-            absorbed += most * rng.uniform(0.2, 1.0) * blood * cover * canvas.vessels(size)
+            shown = np.float32(most * rng.uniform(0.2, 1.0) * blood)
+            absorbed = absorbed + shown * cover * canvas.vessels(size)
     albedo = albedo * np.exp(-np.clip(absorbed, 0, 1.4)[..., None] * palette.absorbed)
     height = canvas.octaves((4.0, 1.8, 0.8), (1.0, 0.45, 0.2)) + 0.03 * mottled * mottle + 0.3 * absorbed
     style = rng.choice(4, p=(0.4, 0.2, 0.2, 0.2))

@@ -19,7 +19,6 @@ __all__ = ["TILE_CHANNELS", "Tile", "lay"]
 
 TILE_CHANNELS = 8
 """Linear reflectance (3), wetness, slopes along u and v, their mean square, noise for edges."""
-_SHARPNESS = 7
 _LOOKUP_WIDTH = 1024
 _NEGLIGIBLE = 0.03
 
@@ -101,9 +100,9 @@ class Tile:
             y = np.zeros(rows * _LOOKUP_WIDTH, dtype=np.float32)
             x[:count] = u * size + 0.5
             y[:count] = tops[chosen] + v * size + 0.5
-            x, y = x.reshape(rows, -1), y.reshape(rows, -1)
+            grid = x.reshape(rows, -1), y.reshape(rows, -1)
             for half, image in enumerate(self.stacked):
-                found = cv2.remap(image, x, y, cv2.INTER_LINEAR).reshape(-1, 4)[:count]
+                found = cv2.remap(image, *grid, cv2.INTER_LINEAR).reshape(-1, 4)[:count]
                 result[:, 4 * half : 4 * half + 4] += weight * found
         return result
 
@@ -128,24 +127,25 @@ def lay(
         Channels as in `TILE_CHANNELS` (slopes are the tile's own and mean nothing any more), and the gradient
         in space, [N, 3].
     """
-    local = np.stack([_along(points, axis) for axis in axes], axis=1)
-    facing = np.abs(np.stack([_along(normals, axis) for axis in axes], axis=1)) ** _SHARPNESS
-    weights = facing / np.maximum(facing.sum(axis=1, keepdims=True), 1e-12)
-    weights[weights < _NEGLIGIBLE] = 0
-    weights /= weights.sum(axis=1, keepdims=True)
+    facing = [_along(normals, axis) ** 2 for axis in axes]
+    # The eighth power of the cosine, by squaring: a general power would take longest of all here.
+    facing = [(one * one) ** 2 for one in facing]
+    total = np.maximum(facing[0] + facing[1] + facing[2], 1e-12)
+    shares = [np.where(one < _NEGLIGIBLE * total, np.float32(0), one) for one in facing]
+    total = np.maximum(shares[0] + shares[1] + shares[2], 1e-12)
     values = np.zeros((len(points), TILE_CHANNELS), dtype=np.float32)
     gradient = np.zeros((len(points), 3), dtype=np.float32)
     for side in range(3):
         first, second = (side + 1) % 3, (side + 2) % 3
-        chosen = np.flatnonzero(weights[:, side])
+        chosen = np.flatnonzero(shares[side])
         if not len(chosen):
             continue
         # Each side has a place of its own in the tile, or a corner of a box would mirror itself.
-        shift = 0.37 * side * tile.side * tile.texel_mm
-        found = tile.sample(
-            local[chosen, first] + shift, local[chosen, second] + 0.61 * shift, footprint_mm[chosen]
-        )
-        weight = weights[chosen, side, None]
+        shift = np.float32(0.37 * side * tile.side * tile.texel_mm)
+        places = points[chosen]
+        u, v = _along(places, axes[first]) + shift, _along(places, axes[second]) + np.float32(0.61) * shift
+        found = tile.sample(u, v, footprint_mm[chosen])
+        weight = (shares[side][chosen] / total[chosen])[:, None]
         values[chosen] += weight * found
         gradient[chosen] += weight * (found[:, 4:5] * axes[first] + found[:, 5:6] * axes[second])
     return values, gradient

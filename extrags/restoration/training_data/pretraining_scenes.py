@@ -228,7 +228,8 @@ def _reference_frames(sequence: EndoscopicSequence) -> ReferenceFrames:
 
 def _camera_tensors(name: str, cameras: Cameras) -> dict[str, torch.Tensor]:
     def tensor(values: Float[np.ndarray, "*n"]) -> torch.Tensor:
-        return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))
+        # A copy: safetensors refuses tensors that share memory.
+        return torch.from_numpy(np.array(values, dtype=np.float64))
 
     return {
         f"{name}.K": tensor(cameras.K),
