@@ -142,11 +142,11 @@ class CellTexture:
         dome = self.bump * visible / self.small.size_mm * np.clip(4 * border / self.small.size_mm, 0, 1)
         slope = dome[:, None] * toward
         lost = np.square(self.bump) * 0.2 * (1 - visible)
-        wet = self.wetness * np.clip(1 + 0.3 * self.small.tone[which[:, 0]] * visible, 0.3, 1.7)
+        wet = np.full(len(points), self.wetness, dtype=np.float32)
         return SkinValues(
             np.clip(albedo, 0.01, 0.95).astype(np.float32),
             unit(normals + slope),
-            wet.astype(np.float32),
+            wet,
             lost.astype(np.float32),
         )
 
