@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from data_catalog.c3vd.dataset import C3vdDataset
+from data_catalog.caverns.dataset import CavernsDataset
 from data_catalog.checks import check_sequence
 from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
 from data_catalog.folders import FolderDataset
@@ -22,12 +23,17 @@ from extrags.sequence import EndoscopicSequence
 
 __all__ = ["DATASETS", "describe", "list_sequences", "read", "resolve", "source_fingerprint"]
 
-DATASETS: tuple[Dataset, ...] = (FolderDataset(), PhantomDataset(), C3vdDataset())
+DATASETS: tuple[Dataset, ...] = (
+    FolderDataset(),
+    PhantomDataset(),
+    CavernsDataset(),
+    C3vdDataset(),
+)
 """Folders first: a path that exists wins over a name spelled the same."""
 
 
 def list_sequences() -> tuple[Descriptor, ...]:
-    """Every named sequence; of the phantom's endless scenes, the first few."""
+    """Every named sequence; of endless families (phantom, caverns), the first few scenes."""
     return tuple(item for dataset in DATASETS for item in dataset.entries())
 
 
@@ -48,10 +54,10 @@ def resolve(name_or_path: str | Path) -> Source:
     """Find what a user named.
 
     Args:
-        name_or_path: `phantom/3@sparse` (without a setting: `sparse`), `sinus/hopkins`, `simcol3d/s1`,
-            `c3vdv2/c1_cecum_t1@sparse`, `FOLDER/SCENE@sparse` for videos in a folder of their own
-            (`SCENE_v1`, `SCENE_v2`; registered or not), or a path to a folder, a video or a DICOM file. A
-            path that exists wins over a name spelled the same.
+        name_or_path: `phantom/3@sparse` (without a setting: `sparse`), `caverns/0@distanced`,
+            `sinus/hopkins`, `simcol3d/s1`, `c3vdv2/c1_cecum_t1@sparse`, `FOLDER/SCENE@sparse` for videos in
+            a folder of their own (`SCENE_v1`, `SCENE_v2`; registered or not), or a path to a folder, a video
+            or a DICOM file. A path that exists wins over a name spelled the same.
 
     Raises:
         UnknownSequenceError: neither a known name nor an existing path; suggests the nearest name.
@@ -103,10 +109,10 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
         config: the settings it will be read with.
 
     Returns:
-        Plain JSON: for the phantom its settings and generator version; for a folder the reader's name and
-        version, and name, size and BLAKE2b digest of each file the reader looks at; for two videos under a
-        split manifest the same of both, and the manifest's line. Where the settings name a calibration file,
-        size and digest of it.
+        Plain JSON: for phantom and caverns their settings and generator version; for a folder the reader's
+        name and version, and name, size and BLAKE2b digest of each file the reader looks at; for two videos
+        under a split manifest the same of both, and the manifest's line. Where the settings name a
+        calibration file, size and digest of it.
 
     Raises:
         SourceError: the folder is not readable as a sequence.

@@ -166,9 +166,10 @@ def _scales(sequence: str, config: PipelineConfig) -> Mapping[StageName, float]:
     ingest: Any = config.ingest
     frames = min(about.frames, ingest.max_frames or about.frames)
     pixels: float = about.width * about.height
-    if ingest.width and ingest.height and about.format == "phantom":
+    rendered = about.format in ("phantom", "caverns")
+    if ingest.width and ingest.height and rendered:
         pixels = ingest.width * ingest.height
-    elif about.format != "phantom":
+    elif not rendered:
         pixels = pixels / (ingest.downscale or max(1, round(about.width / USUAL_WIDTH))) ** 2
     by_pixels = pixels / REFERENCE_PIXELS
     by_frames = by_pixels * frames / REFERENCE_FRAMES

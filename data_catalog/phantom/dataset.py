@@ -8,6 +8,7 @@ from typing import Any, get_args
 
 from data_catalog.dataset import Descriptor, Source
 from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig, Setting
+from data_catalog.rendered_size import rendered_size
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, UnknownSequenceError
 from extrags.sequence import EndoscopicSequence
@@ -16,7 +17,6 @@ __all__ = ["PhantomDataset", "phantom_config"]
 
 _NAME = re.compile(r"phantom/(?P<scene>\d+)(?:@(?P<setting>\w+))?")
 _LISTED_SCENES = 4
-_SMALLEST_PX = 16
 
 
 class PhantomDataset:
@@ -70,19 +70,7 @@ def phantom_config(source: Source, config: IngestConfig) -> PhantomConfig:
     if found is None:
         raise ConfigError(f"{source.name} is not a phantom")
     plain = PhantomConfig()
-    if config.width is not None:
-        width = config.width
-        height = config.height or max(_SMALLEST_PX, round(width * plain.height / plain.width))
-    elif config.height is not None:
-        raise ConfigError("ingest.height needs ingest.width")
-    else:
-        downscale = config.downscale or 1
-        width, height = plain.width // downscale, plain.height // downscale
-    if width < _SMALLEST_PX or height < _SMALLEST_PX:
-        raise ConfigError(
-            f"an image of {width} x {height} pixels is too small; "
-            f"expected at least {_SMALLEST_PX} x {_SMALLEST_PX}"
-        )
+    width, height = rendered_size(config, plain.width, plain.height)
     scene, setting = found
     return PhantomConfig(
         scene=scene, setting=setting, width=width, height=height, max_frames=config.max_frames

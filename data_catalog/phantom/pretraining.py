@@ -1,8 +1,8 @@
 """Scenes to pretrain the restorer on: colons of the phantom's family that are never evaluated.
 
-Each differs from the catalogue's scenes in anatomy, mucosa, lamps, sensor, camera, number of frames and
-quality of the depth. It is recorded once, as a training recording; what is to be restored are views far
-off that path, photographed without noise at the recording's mean exposure.
+Each differs from the catalogue's scenes in anatomy, mucosa, lamps, sensor, camera and number of frames. It is
+recorded once, as a training recording; what is to be restored are clips of views far off that path,
+photographed without noise at the recording's mean exposure.
 """
 
 from __future__ import annotations
@@ -18,14 +18,17 @@ from data_catalog.phantom.imaging import recording_sensor
 from data_catalog.phantom.recording import TRAINS, Phantom
 from data_catalog.phantom.trajectories import camera_path
 from extrags.cameras import Cameras, rotation_about
+from extrags.restoration.training_data.recordings import PretrainingRecording
 from extrags.sequence import EndoscopicSequence, Split
 
-__all__ = ["FIRST_PRETRAINING_SCENE", "pretraining_scene_config", "pretraining_sequence"]
+__all__ = ["FIRST_PRETRAINING_SCENE", "pretraining_recording", "pretraining_scene_config"]
 
 FIRST_PRETRAINING_SCENE = 100_000
 """Pretraining scenes are numbered from here; the catalogue's scenes lie far below."""
 _SIZES = ((160, 128), (144, 144), (176, 112), (160, 128), (136, 128))
-_TARGETS: tuple[tuple[str, int], ...] = (("between", 6), ("sparse", 10), ("distanced", 20), ("searching", 12))
+_CLIP_VIEWS = 5
+_CLIPS: tuple[tuple[str, int], ...] = (("between", 1), ("sparse", 2), ("distanced", 4), ("searching", 3))
+"""Clips on each path; their views follow each other."""
 
 
 def pretraining_scene_config(index: int) -> PhantomConfig:
@@ -47,13 +50,8 @@ def pretraining_scene_config(index: int) -> PhantomConfig:
     )
 
 
-def pretraining_sequence(index: int) -> EndoscopicSequence:
-    """A pretraining scene with its views to restore.
-
-    Returns:
-        Training frames first; the test frames are the views to restore, with exact depth. The training
-        frames' depth carries up to two percent of smooth and of white noise.
-    """
+def pretraining_recording(index: int) -> PretrainingRecording:
+    """A pretraining scene with its clips of views to restore; training frames come first."""
     config = pretraining_scene_config(index)
     phantom = Phantom(config)
     rng = stream(config.scene, "variation", 2)
@@ -75,13 +73,12 @@ def pretraining_sequence(index: int) -> EndoscopicSequence:
     depth = np.stack([phantom.z_depth(cameras[k]) for k in range(len(cameras))])
     valid = np.isfinite(depth)
     depth = np.where(valid, depth, 0)
-    depth[: len(train)] *= _depth_noise(rng, depth[: len(train)].shape)
     truth: dict[str, Any] = {
         "generator_version": GENERATOR_VERSION,
         "phantom": config.model_dump(),
         "exposure": exposures,
     }
-    return EndoscopicSequence(
+    sequence = EndoscopicSequence(
         name=f"pretraining/{index}",
         rgb=np.stack(rgb),
         K=cameras.K,
@@ -94,14 +91,17 @@ def pretraining_sequence(index: int) -> EndoscopicSequence:
         metric=True,
         truth=truth,
     )
+    clip = np.repeat(np.arange(len(targets) // _CLIP_VIEWS), _CLIP_VIEWS)
+    return PretrainingRecording(sequence, clip, "phantom")
 
 
 def _target_cameras(phantom: Phantom, rng: np.random.Generator) -> Cameras:
     """Views to restore: between the training frames, on both evaluating paths, and looking about."""
     config = phantom.config
     parts = []
-    for kind, count in _TARGETS:
-        share = np.sort(rng.uniform(0.03, 0.97, count))
+    for kind, clips in _CLIPS:
+        start = rng.uniform(0.03, 0.92, (clips, 1))
+        share = (start + rng.uniform(0.003, 0.012, (clips, 1)) * np.arange(_CLIP_VIEWS)).ravel()
         recording = "b" if kind == "between" else "a"
         setting: Setting = "sparse" if kind == "sparse" else "distanced"
         path = config.model_copy(update={"setting": setting})
@@ -109,11 +109,15 @@ def _target_cameras(phantom: Phantom, rng: np.random.Generator) -> Cameras:
         if kind == "searching":
             inner = camera_path(path, phantom.wall, phantom.rays, "b", share)
             # Between the two paths the lens is clear of the wall: the lumen is wide there.
-            mix = rng.uniform(0, 1, (count, 1))
+            mix = np.repeat(rng.uniform(0, 1, (clips, 1)), _CLIP_VIEWS, axis=0)
             poses = poses.copy()
             poses[:, :3, 3] = mix * poses[:, :3, 3] + (1 - mix) * inner[:, :3, 3]
-            for k in range(count):
-                poses[k, :3, :3] = inner[k, :3, :3] @ _random_turn(rng)
+            for clip in range(clips):
+                turn, axis = _random_turn(rng), rng.standard_normal(3)
+                step = np.radians(rng.uniform(0.5, 5))
+                for view in range(_CLIP_VIEWS):
+                    k = clip * _CLIP_VIEWS + view
+                    poses[k, :3, :3] = inner[k, :3, :3] @ turn @ rotation_about(axis, step * view)
         parts.append(poses)
     poses = np.concatenate(parts)
     K = phantom.intrinsics(config.width, config.height)
@@ -124,16 +128,3 @@ def _random_turn(rng: np.random.Generator) -> Float[np.ndarray, "3 3"]:
     heading, tilt, roll = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(0, 100)), rng.uniform(-1, 1)
     across = np.array([np.cos(heading), np.sin(heading), 0.0])
     return np.asarray(rotation_about(across, tilt) @ rotation_about(np.array([0.0, 0.0, 1.0]), roll))
-
-
-def _depth_noise(rng: np.random.Generator, shape: tuple[int, ...]) -> Float[np.ndarray, "f h w"]:
-    """Factors near one: waves of some twenty pixels, and white noise; none in a third of the scenes."""
-    import cv2
-
-    frames, height, width = shape
-    if rng.random() < 1 / 3:
-        return np.ones(shape)
-    smooth, white = rng.uniform(0, 0.02), rng.uniform(0, 0.02)
-    coarse = rng.standard_normal((frames, 7, 9))
-    waves = np.stack([cv2.resize(part, (width, height), interpolation=cv2.INTER_CUBIC) for part in coarse])
-    return np.asarray(np.exp(smooth * waves + white * rng.standard_normal(shape)))

@@ -45,7 +45,7 @@ def cell_features(
             for index, activation in enumerate(lpips.activations(image)):
                 if index == LAYER:
                     share = functional.adaptive_avg_pool2d(
-                        inside[:, None].to(activation), activation.shape[-2:]
+                        inside[:, None].to(activation), (activation.shape[-2], activation.shape[-1])
                     )[:, 0]
                     found.append(activation.permute(0, 2, 3, 1)[share >= MIN_SHARE])
                     break

@@ -6,8 +6,9 @@ import argparse
 import json
 import os
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,26 +17,138 @@ from flows.commands.common import set_up_logging
 from flows.commands.options import Parser
 
 if TYPE_CHECKING:
+    from data_catalog.cavities.pretraining import CavityConfig
+    from data_catalog.phantom.config import PhantomConfig
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
+    from extrags.restoration.training_data.recordings import PretrainingRecording
 
 __all__ = ["add_arguments", "pretrain"]
+
+
+SOURCES = ("phantom", "cavities")
+"""Families of pretraining scenes."""
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """Which pretraining scene is meant.
+
+    Args:
+        family: one of `SOURCES`.
+        index: its number within the family, from 0.
+        size_factor: how many times wider and higher pictures of cavities are.
+        real_textures: whether some cavities wear tissue of real frames.
+    """
+
+    family: str
+    index: int
+    size_factor: int = 1
+    real_textures: bool = False
+
+    @property
+    def file_name(self) -> str:
+        """Of its file."""
+        return f"{self.family}_{self.index:05d}.safetensors"
+
+    @property
+    def config(self) -> PhantomConfig | CavityConfig:
+        """What the scene is like."""
+        if self.family == "phantom":
+            from data_catalog.phantom.pretraining import pretraining_scene_config
+
+            return pretraining_scene_config(self.index)
+        from data_catalog.cavities.pretraining import cavity_config
+
+        return cavity_config(self.index, size_factor=self.size_factor, real_textures=self.real_textures)
+
+    @property
+    def origin(self) -> str:
+        """What the scene depends on, as text: a scene made otherwise is made again."""
+        from data_catalog.cavities.pretraining import GENERATOR_VERSION as CAVITY_VERSION
+        from data_catalog.phantom.config import GENERATOR_VERSION as PHANTOM_VERSION
+        from extrags.config import profile_config
+        from extrags.restoration.training_data.pretraining_scenes import PRETRAINING_DATA_VERSION
+
+        quick = profile_config("quick")
+        parts = {
+            "family": self.family,
+            "generator": PHANTOM_VERSION if self.family == "phantom" else CAVITY_VERSION,
+            "data": PRETRAINING_DATA_VERSION,
+            "scene": self.config.model_dump(mode="json"),
+            "coarse": quick.coarse.model_dump(mode="json"),
+            "references": quick.enhance.references,
+        }
+        return json.dumps(parts, sort_keys=True)
+
+    @property
+    def seed(self) -> int:
+        """Of the degradation and the reconstruction: families do not share their draws."""
+        return self.index + 1_000_000 * SOURCES.index(self.family)
+
+    def recording(self) -> PretrainingRecording:
+        """Photograph the scene."""
+        if self.family == "phantom":
+            from data_catalog.phantom.pretraining import pretraining_recording
+
+            return pretraining_recording(self.index)
+        from data_catalog.cavities.pretraining import CavityConfig, cavity_recording
+
+        config = self.config
+        assert isinstance(config, CavityConfig)
+        return cavity_recording(config)
+
+
+def scene_sources(given: argparse.Namespace, count: int) -> list[SceneSource]:
+    """The first scenes of the families asked for, which take turns."""
+    made = dict.fromkeys(SOURCES, 0)
+    sources = []
+    for number in range(count):
+        family = given.kinds[number % len(given.kinds)]
+        sources.append(SceneSource(family, made[family], given.size_factor, given.real_textures))
+        made[family] += 1
+    return sources
 
 
 def add_arguments(parser: Parser) -> None:
     """The options of `extrags pretrain`."""
     parser.description = (
-        "Make pretraining scenes (colons that are never evaluated), reconstruct them, and train the restorer "
-        "on views far off their paths. This is how the weights of the package were made; hours on two cores. "
-        "Pretraining scenes that are in the folder already are taken from there."
+        "Make pretraining scenes (procedural cavities that are never evaluated), reconstruct them, and train "
+        "the restorer on views far off their paths. This is how the weights of the package were made; hours "
+        "on two cores. Pretraining scenes that are in the folder already are taken from there."
     )
     parser.set_defaults(command=pretrain)
-    parser.add_argument("--out", required=True, metavar="FOLDER", help="where the weights go")
+    parser.add_argument(
+        "--out", metavar="FOLDER", help="where the weights go; needed unless only scenes are made"
+    )
     parser.add_argument(
         "--scenes-folder",
         default=".extrags/pretraining",
         metavar="FOLDER",
-        help="where pretraining scenes are kept, 40 MB each (default: %(default)s)",
+        help="where pretraining scenes are kept, 30 to 120 MB each (default: %(default)s)",
     )
+    parser.add_argument(
+        "--kinds",
+        nargs="+",
+        choices=SOURCES,
+        default=list(SOURCES),
+        metavar="KIND",
+        help="families of scenes, which take turns: phantom (colons), cavities (colon, stomach, oesophagus, "
+        "airways, sinus, joint, bladder, laparoscopic field); named twice, a family is twice as frequent "
+        "(default: phantom cavities)",
+    )
+    parser.add_argument(
+        "--size-factor",
+        type=int,
+        default=1,
+        metavar="N",
+        help="pictures of cavities are so many times wider and higher (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--real-textures",
+        action="store_true",
+        help="a third of the cavities wear tissue of real laparoscopy frames, which must be had",
+    )
+    parser.add_argument("--scenes-only", action="store_true", help="make the scenes, and train nothing")
     parser.add_argument("--scenes", type=int, metavar="N", help="pretraining scenes (default: 86)")
     parser.add_argument(
         "--validation-scenes", type=int, metavar="N", help="how many of them validate only (default: 6)"
@@ -101,8 +214,12 @@ def pretrain(given: argparse.Namespace) -> int:
     checked(given, config)
     # As things are now: in some hours the working tree may be another.
     about: dict[str, Any] = {"command": _command(given), "machine": machine()}
+    sources = scene_sources(given, config.scenes)
     with progress_bars(terminal=terminal):
-        files = make_scenes(Path(given.scenes_folder), config.scenes, given.workers)
+        files = make_scenes(Path(given.scenes_folder), sources, given.workers)
+        if given.scenes_only:
+            console().print(f"{len(files)} scenes in {given.scenes_folder}")
+            return 0
         if given.threads is not None:
             torch.set_num_threads(given.threads)
         enhancer = trained(files, config, start)
@@ -120,6 +237,7 @@ def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
     Raises:
         ConfigError: for settings that do not fit each other, or a folder that cannot be written.
         WeightsError: when the perceptual distance has no weights.
+        SourceNotFoundError: when real textures are asked for and not on this machine.
     """
     from extrags.metrics.lpips_weights import find_weights
 
@@ -127,41 +245,54 @@ def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
         raise ConfigError(
             f"{config.validation_scenes} of {config.scenes} scenes are for validation; none is left to train"
         )
-    for name in ("workers", "threads"):
+    for name in ("workers", "threads", "size_factor"):
         value = getattr(given, name)
         if value is not None and value < 1:
-            raise ConfigError(f"--{name} {value}: expected 1 or more")
-    if config.perceptual:
+            raise ConfigError(f"--{name.replace('_', '-')} {value}: expected 1 or more")
+    if given.out is None and not given.scenes_only:
+        raise ConfigError("--out: where do the weights go? (--scenes-only makes scenes alone)")
+    if given.real_textures:
+        from data_catalog.cavities.real_textures import texture_files
+
+        texture_files()
+    if config.perceptual and not given.scenes_only:
         find_weights(None, "squeeze")
     for folder in (given.out, given.scenes_folder):
+        if folder is None:
+            continue
         try:
             Path(folder).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"{folder} cannot be written: {error.strerror or error}") from error
 
 
-def make_scenes(folder: Path, count: int, workers: int) -> list[Path]:
-    """Pretraining scenes 0 to count - 1 as files; those that are there and made in the same way stay.
+def make_scenes(folder: Path, sources: Sequence[SceneSource], workers: int) -> list[Path]:
+    """Pretraining scenes as files; those that are there and made in the same way stay.
 
     Args:
         folder: where they are kept.
-        count: how many.
+        sources: which scenes.
         workers: processes at once.
     """
     from extrags.events import Progress, emit
     from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 
-    files = [folder / f"{index:04d}.safetensors" for index in range(count)]
-    missing = [index for index, file in enumerate(files) if PretrainingScene.made_from(file) != origin(index)]
+    files = [folder / source.file_name for source in sources]
+    missing = [
+        (source, file)
+        for source, file in zip(sources, files, strict=True)
+        if PretrainingScene.made_from(file) != source.origin
+    ]
+    count = len(files)
     done = count - len(missing)
     emit(Progress("pretraining-scenes", done, count))
     import multiprocessing
 
     # In processes of their own: they set their numbers of threads, and a fork would take over OpenMP's.
     with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        running = [pool.submit(make_scene, index, files[index]) for index in missing]
+        running = [pool.submit(make_scene, source, file) for source, file in missing]
         try:
-            for future in running:
+            for future in as_completed(running):
                 future.result()
                 done += 1
                 emit(Progress("pretraining-scenes", done, count))
@@ -171,38 +302,21 @@ def make_scenes(folder: Path, count: int, workers: int) -> list[Path]:
     return files
 
 
-def origin(index: int) -> str:
-    """What a pretraining scene depends on, as text: a scene made otherwise is made again."""
-    from data_catalog.phantom.config import GENERATOR_VERSION
-    from data_catalog.phantom.pretraining import pretraining_scene_config
-    from extrags.config import profile_config
-    from extrags.restoration.training_data.pretraining_scenes import PRETRAINING_DATA_VERSION
-
-    quick = profile_config("quick")
-    parts = {
-        "generator": GENERATOR_VERSION,
-        "data": PRETRAINING_DATA_VERSION,
-        "phantom": pretraining_scene_config(index).model_dump(mode="json"),
-        "coarse": quick.coarse.model_dump(mode="json"),
-        "references": quick.enhance.references,
-    }
-    return json.dumps(parts, sort_keys=True)
-
-
-def make_scene(index: int, file: Path) -> None:
+def make_scene(source: SceneSource, file: Path) -> None:
     """One pretraining scene, on one thread: the same bits on every machine with the same instructions."""
+    import cv2
     import torch
 
-    from data_catalog.phantom.pretraining import pretraining_sequence
     from extrags.config import profile_config
     from extrags.raster import set_num_threads
     from extrags.restoration.training_data.pretraining_scenes import make_pretraining_scene
 
     torch.set_num_threads(1)
+    cv2.setNumThreads(1)
     set_num_threads(1)
     quick = profile_config("quick")
-    scene = make_pretraining_scene(pretraining_sequence(index), quick.enhance, quick.coarse, index)
-    scene.save(file, origin=origin(index))
+    scene = make_pretraining_scene(source.recording(), quick.enhance, quick.coarse, source.seed)
+    scene.save(file, origin=source.origin)
 
 
 def _command(given: argparse.Namespace) -> str:
@@ -222,9 +336,12 @@ def _command(given: argparse.Namespace) -> str:
         value = getattr(given, name)
         if value is not None:
             parts.append(f"--{name.replace('_', '-')} {value}")
+    parts.append(f"--kinds {' '.join(given.kinds)}")
+    if given.size_factor != 1:
+        parts.append(f"--size-factor {given.size_factor}")
     parts += [
         f"--{name.replace('_', '-')}"
-        for name in ("without_perceptual", "deterministic")
+        for name in ("real_textures", "without_perceptual", "deterministic")
         if getattr(given, name)
     ]
     return " ".join(parts)

@@ -7,11 +7,13 @@ from data_catalog.phantom import pretraining
 from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.pretraining import (
     FIRST_PRETRAINING_SCENE,
+    pretraining_recording,
     pretraining_scene_config,
-    pretraining_sequence,
 )
+from data_catalog.phantom.recording import Phantom
 from data_catalog.phantom.variation import Variation, vary
-from extrags.sequence import EndoscopicSequence
+from extrags.cameras import rotation_angle_deg
+from extrags.restoration.training_data.recordings import PretrainingRecording
 
 
 def test_without_variation_a_scene_is_the_standard_colon() -> None:
@@ -39,17 +41,18 @@ def test_pretraining_scenes_are_none_of_the_catalogue() -> None:
 
 
 @pytest.fixture(scope="module")
-def small() -> EndoscopicSequence:
+def recording() -> PretrainingRecording:
     ordinary = pretraining_scene_config(2)
     reduced = ordinary.model_copy(update={"width": 48, "height": 40, "supersample": 1, "train_every": 50})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pretraining, "pretraining_scene_config", lambda index: reduced)
-        return pretraining_sequence(2)
+        return pretraining_recording(2)
 
 
-def test_what_is_to_be_restored_is_not_trained_on(small: EndoscopicSequence) -> None:
+def test_what_is_to_be_restored_is_not_trained_on(recording: PretrainingRecording) -> None:
+    small = recording.sequence
     assert len(small.train) == 4
-    assert len(small.test) == 48
+    assert len(small.test) == 50
     assert small.depth_mm is not None
     assert (small.depth_mm[small.test] > 0).all()
     assert small.rgb[small.test].mean() > 20
@@ -60,12 +63,20 @@ def test_what_is_to_be_restored_is_not_trained_on(small: EndoscopicSequence) -> 
     assert np.median(distance.min(axis=1)) > 2
 
 
-def test_depth_noise_stays_small_and_spares_the_views_to_restore(small: EndoscopicSequence) -> None:
-    from data_catalog.phantom.recording import Phantom
+def test_the_views_of_a_clip_follow_each_other(recording: PretrainingRecording) -> None:
+    small = recording.sequence
+    assert recording.clip.tolist() == np.repeat(np.arange(10), 5).tolist()
+    poses = small.cameras.world_from_camera[small.test].reshape(10, 5, 4, 4)
+    assert np.linalg.norm(np.diff(poses[:, :, :3, 3], axis=1), axis=2).max() < 4
+    turned = rotation_angle_deg(poses[:, 1:, :3, :3], poses[:, :-1, :3, :3])
+    assert turned.max() < 40
+    # From clip to clip it is another place.
+    assert np.linalg.norm(np.diff(poses[:, 0, :3, 3], axis=0), axis=1).max() > 10
 
+
+def test_depth_is_exact(recording: PretrainingRecording) -> None:
+    small = recording.sequence
     phantom = Phantom(PhantomConfig(**small.truth["phantom"]))
     assert small.depth_mm is not None
     for frame in (int(small.train[1]), int(small.test[3])):
-        exact = phantom.z_depth(small.cameras[frame])
-        relative = np.abs(small.depth_mm[frame] / exact - 1)
-        assert relative.max() < (0.2 if frame in small.train else 1e-6)
+        np.testing.assert_array_equal(small.depth_mm[frame], phantom.z_depth(small.cameras[frame]))

@@ -158,13 +158,18 @@ class Adversary(nn.Module):
         """Verdicts of each scale, and their weights."""
         found = []
         for head, tap in zip(self.heads, TAPS, strict=True):
-            invented = functional.adaptive_avg_pool2d(scene.invented, activations[tap].shape[-2:])
+            invented = _pooled(scene.invented, activations[tap])
             found.append((head(activations[tap], invented).float(), invented + KNOWN_WEIGHT))
         logits = self.pixels(rgb, scene).float()
         return [
             *found,
-            (logits, functional.adaptive_avg_pool2d(scene.invented, logits.shape[-2:]) + KNOWN_WEIGHT),
+            (logits, _pooled(scene.invented, logits) + KNOWN_WEIGHT),
         ]
+
+
+def _pooled(share: Tensor, features: Tensor) -> Tensor:
+    """The share of each of the features' cells."""
+    return functional.adaptive_avg_pool2d(share, (features.shape[-2], features.shape[-1]))
 
 
 def _mean(values: Tensor, weight: Tensor) -> Tensor:

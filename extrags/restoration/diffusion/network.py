@@ -31,6 +31,7 @@ UNSHUFFLE = 2
 TIME_FEATURES = 64
 TIME_WIDTH = 128
 NORM_GROUPS = 8
+DRAWING_DEVIATION = 0.2
 OUTPUT_CHANNELS = 5
 """Colour residual (3), residual of the log-depth (1), logarithm of the expected error (1)."""
 SIZE_MULTIPLE = UNSHUFFLE * 4
@@ -186,7 +187,8 @@ class RestorationNetwork(nn.Module):
                 nn.init.zeros_(module.out.weight)
         nn.init.zeros_(self.exit.weight)
         if self.generative:
-            nn.init.zeros_(self.drawing.weight)
+            # From zero, both tasks would stay one for thousands of steps.
+            nn.init.normal_(self.drawing.weight, std=DRAWING_DEVIATION, generator=generator)
             self.texture.initialise()
 
     def widened(self, condition_channels: int) -> RestorationNetwork:

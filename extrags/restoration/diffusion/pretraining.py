@@ -233,7 +233,7 @@ def _sampler(file: Path, config: PretrainingConfig, number: int) -> CropSampler:
         crop_px=config.crop,
         side_multiple=SIZE_MULTIPLE,
         seed=config.seed * 100_003 + number,
-        frames=scene.frames if config.generative else None,
+        frames=(scene.references.images, scene.references.valid) if config.generative else None,
         patches=(config.patches, config.patch_px),
         folded=not config.generative,
     )
@@ -287,29 +287,22 @@ def _scored(enhancer: EmbeddedEnhancer, files: Sequence[Path], config: Pretraini
     return with_error_model(replace(enhancer, record=record, drawing=enhancer.network.generative), scenes)
 
 
-def _patches(
-    scene: PretrainingScene, config: PretrainingConfig, number: int
-) -> Float[Tensor, "r 3 s s"] | None:
-    if scene.frames is None:
-        return None
+def _patches(scene: PretrainingScene, config: PretrainingConfig, number: int) -> Float[Tensor, "r 3 s s"]:
     generator = np.random.default_rng([config.seed, 7, number])
-    return random_patches(scene.frames, DOMAIN_PATCHES, config.patch_px, generator)
+    given = scene.references
+    return random_patches(given.images, given.valid, DOMAIN_PATCHES, config.patch_px, generator)
 
 
 def _domain(
     enhancer: EmbeddedEnhancer, trained: Sequence[Path], unseen: Sequence[Path], config: PretrainingConfig
 ) -> Domain | None:
-    """What the network was trained on, as its patch encoder sees it; None without frames or encoder."""
+    """What the network was trained on, as its patch encoder sees it; None where it has none."""
     if not enhancer.network.generative:
         return None
 
-    def features(file: Path, number: int) -> Float[np.ndarray, "r c"] | None:
-        patches = _patches(PretrainingScene.load(file), config, number)
-        return None if patches is None else enhancer.described(patches)
+    def features(file: Path, number: int) -> Float[np.ndarray, "r c"]:
+        return enhancer.described(_patches(PretrainingScene.load(file), config, number))
 
     known = [features(file, number) for number, file in enumerate(trained)]
     others = [features(file, len(trained) + number) for number, file in enumerate(unseen)]
-    present = [part for part in known if part is not None]
-    if not present:
-        return None
-    return Domain.fitted(np.concatenate(present), [part for part in others if part is not None])
+    return Domain.fitted(np.concatenate(known), others)

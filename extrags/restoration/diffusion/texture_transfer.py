@@ -131,7 +131,8 @@ class TextureTransfer(nn.Module):
 
         def places(features: Tensor, block: int) -> Tensor:
             blocks = functional.pixel_unshuffle(features, block) if block > 1 else features
-            return blocks.unflatten(0, (scenes, count)).flatten(3).transpose(2, 3).flatten(1, 2)
+            placed: Tensor = blocks.unflatten(0, (scenes, count)).flatten(3).transpose(2, 3)
+            return placed.flatten(1, 2)
 
         values = places(coarse, 1)
         key = functional.normalize(self.key(values).float(), dim=-1)
@@ -179,7 +180,8 @@ def _fetched(
     features: Float[Tensor, "n p m"], index: Int[Tensor, "n q"], height: int, width: int
 ) -> Float[Tensor, "n m h w"]:
     taken = features.gather(1, index[..., None].expand(-1, -1, features.shape[2]))
-    return taken.transpose(1, 2).unflatten(2, (height, width))
+    laid: Tensor = taken.transpose(1, 2).unflatten(2, (height, width))
+    return laid
 
 
 def _enlarged(gate: Tensor, factor: int) -> Tensor:

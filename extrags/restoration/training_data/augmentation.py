@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.errors import ConfigError
@@ -39,6 +39,8 @@ COLOR_JITTER = 0.1
 views are nearer to the wall than real ones: the restorer has to keep the colour of its input, not the mean
 of the scene."""
 SMALLEST_CROP_PX = 32
+PATCH_TRIALS = 8
+"""Places tried for a patch that shows nothing but tissue; the best of them counts."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,8 @@ class CropSampler:
         crop_px: side of a crop; images smaller than that give smaller crops.
         side_multiple: of which a crop's side must be a multiple; the network's.
         seed: of all random draws.
-        frames: real frames of the scene that patches are taken from, in [0, 1], [F, 3, H, W]; None without.
+        frames: real frames of the scene that patches are taken from, in [0, 1], [F, 3, H, W], and which of
+            their pixels show tissue, [F, H, W]; None without.
         patches: how many of them per crop, and the side of each in pixels.
         folded: what was invented appears as a blend of real views would, as `condition`.
 
@@ -119,7 +122,7 @@ class CropSampler:
         crop_px: int,
         side_multiple: int,
         seed: int,
-        frames: Float[Tensor, "f 3 h w"] | None = None,
+        frames: tuple[Float[Tensor, "f 3 h w"], Bool[Tensor, "f h w"]] | None = None,
         patches: tuple[int, int] = (0, 0),
         folded: bool = True,
     ) -> None:
@@ -149,7 +152,7 @@ class CropSampler:
             gain = self._gain()
             crops.append(self._crop(self._next(), gain))
             if self._frames is not None:
-                cut = random_patches(self._frames, *self._patches, self._generator)
+                cut = random_patches(*self._frames, *self._patches, self._generator)
                 patches.append((cut * gain).clamp(0, 1))
         data, clean, weight, depth = (torch.cat(part) for part in zip(*crops, strict=True))
         layers = Layers(data)
@@ -251,12 +254,17 @@ class MixedSampler:
 
 
 def random_patches(
-    frames: Float[Tensor, "f 3 h w"], count: int, side_px: int, generator: np.random.Generator
+    frames: Float[Tensor, "f 3 h w"],
+    valid: Bool[Tensor, "f h w"],
+    count: int,
+    side_px: int,
+    generator: np.random.Generator,
 ) -> Float[Tensor, "r 3 s s"]:
-    """Parts of random frames: any place, seen from anywhere.
+    """Parts of random frames: any place that shows tissue, seen from anywhere.
 
     Args:
         frames: real frames of a scene.
+        valid: which of their pixels show tissue.
         count: how many.
         side_px: side of each; smaller where frames are smaller.
         generator: of frames, places and symmetries.
@@ -265,11 +273,18 @@ def random_patches(
     side = min(side_px, height, width)
     cut = []
     for _ in range(count):
-        frame = int(generator.integers(len(frames)))
-        top = int(generator.integers(height - side + 1))
-        left = int(generator.integers(width - side + 1))
-        part = frames[frame : frame + 1, :, top : top + side, left : left + side].float()
-        cut.append(_random_symmetry(part, generator))
+        best, most = frames[:1, :, :side, :side], -1.0
+        for _trial in range(PATCH_TRIALS):
+            frame = int(generator.integers(len(frames)))
+            top = int(generator.integers(height - side + 1))
+            left = int(generator.integers(width - side + 1))
+            rows, columns = slice(top, top + side), slice(left, left + side)
+            share = float(valid[frame, rows, columns].float().mean())
+            if share > most:
+                best, most = frames[frame : frame + 1, :, rows, columns], share
+            if share == 1:
+                break
+        cut.append(_random_symmetry(best.float(), generator))
     return torch.cat(cut)
 
 

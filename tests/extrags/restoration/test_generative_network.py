@@ -110,7 +110,7 @@ class TestWidened:
         noise, time = torch.randn(1, 3, 32, 32, generator=seeded(8)), torch.ones(1)
         with torch.no_grad():
             expected = small(given, noise, time)
-            answer = wide(torch.cat([given, more], dim=1), noise, time, torch.ones(1))
+            answer = wide(torch.cat([given, more], dim=1), noise, time, torch.zeros(1))
         torch.testing.assert_close(answer, expected, rtol=1e-4, atol=1e-5)
 
 

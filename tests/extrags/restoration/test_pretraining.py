@@ -12,6 +12,7 @@ from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.pretraining import PretrainingConfig, pretrain
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, make_pretraining_scene
+from extrags.restoration.training_data.recordings import PretrainingRecording
 from extrags.view_synthesis.references import LightTransfer
 from tests.extrags.lit_tube import Tube
 from tests.extrags.restoration.conftest import SMALL
@@ -31,8 +32,10 @@ TINY = PretrainingConfig(
 @pytest.fixture(scope="module")
 def scene(tube: Tube) -> PretrainingScene:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("extrags.restoration.training_data.pretraining_scenes.ITERATIONS", (10, 20))
-        return make_pretraining_scene(tube.sequence, SMALL, CoarseConfig(max_points=800), 3)
+        patch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (10, 20))
+        patch.setattr("extrags.restoration.training_data.degradation._WITH_LIGHT", 1.0)
+        recording = PretrainingRecording(tube.sequence, np.zeros(len(tube.sequence.test), np.int64), "tube")
+        return make_pretraining_scene(recording, SMALL, CoarseConfig(max_points=800), 3)
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +63,12 @@ class TestPretrainingScene:
         torch.testing.assert_close(loaded.pairs.target, scene.pairs.target, rtol=0, atol=1e-6)
         torch.testing.assert_close(loaded.pairs.depth_mm, scene.pairs.depth_mm, rtol=1e-3, atol=1e-3)
         assert loaded.transfer.scale_mm == scene.transfer.scale_mm
+        np.testing.assert_array_equal(loaded.clip, scene.clip)
+        np.testing.assert_array_equal(loaded.cameras.world_from_camera, scene.cameras.world_from_camera)
+        np.testing.assert_array_equal(loaded.cameras.K, scene.cameras.K)
+        np.testing.assert_array_equal(loaded.references.rgb, scene.references.rgb)
+        np.testing.assert_array_equal(loaded.references.cameras.K, scene.references.cameras.K)
+        assert (loaded.cameras.width, loaded.cameras.height) == (scene.cameras.width, scene.cameras.height)
         light, kept = loaded.transfer.light, scene.transfer.light
         assert light is not None
         assert kept is not None
@@ -68,6 +77,23 @@ class TestPretrainingScene:
     def test_a_scene_without_light_keeps_its_exponent(self, scene: PretrainingScene, tmp_path: Path) -> None:
         replace(scene, transfer=LightTransfer(None, 0.7, 12.0)).save(tmp_path / "dark.safetensors")
         assert PretrainingScene.load(tmp_path / "dark.safetensors").transfer == LightTransfer(None, 0.7, 12.0)
+
+    def test_training_frames_are_kept_as_references(self, tube: Tube, scene: PretrainingScene) -> None:
+        train = tube.sequence.train
+        assert len(train) < 24
+        np.testing.assert_array_equal(scene.references.rgb, tube.sequence.rgb[train])
+        assert len(scene.references.cameras) == len(train)
+        assert scene.cameras.centers.tolist() == tube.sequence.cameras.centers[tube.sequence.test].tolist()
+
+    def test_files_of_another_version_are_refused(
+        self, scene: PretrainingScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        module = "extrags.restoration.training_data.pretraining_scenes.PRETRAINING_DATA_VERSION"
+        monkeypatch.setattr(module, 1)
+        scene.save(tmp_path / "old.safetensors")
+        monkeypatch.undo()
+        with pytest.raises(WeightsError, match=r"old\.safetensors: .* version 1, expected 3"):
+            PretrainingScene.load(tmp_path / "old.safetensors")
 
     def test_a_foreign_file_is_named(self, tmp_path: Path) -> None:
         (tmp_path / "x.safetensors").write_bytes(b"nothing")
@@ -117,7 +143,12 @@ class TestPretraining:
         assert pretrain(files, short, checkpoint=checkpoint).record["iterations_made"] == 2
 
     def test_a_generative_network_starts_from_a_plain_one(
-        self, files: list[Path], shared_data: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+        self,
+        scene: PretrainingScene,
+        files: list[Path],
+        shared_data: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        tmp_path: Path,
     ) -> None:
         monkeypatch.setenv("EXTRAGS_LPIPS_WEIGHTS", str(shared_data / "lpips_weights"))
         plain = pretrain(files, TINY)
@@ -131,7 +162,7 @@ class TestPretraining:
         patches = torch.rand(4, 3, 32, 32, generator=torch.Generator().manual_seed(1))
         scores = [replace(one, patches=patches).domain_score for one in (enhancer, loaded)]
         assert scores[0] == pytest.approx(scores[1], rel=1e-4)
-        far, near = 3.0, replace(enhancer, patches=PretrainingScene.load(files[0]).frames[:4, :, :32, :32])
+        far, near = 3.0, replace(enhancer, patches=scene.references.images[:4, :, :32, :32])
         assert scores[0] > far * near.domain_score
         assert 1 < replace(enhancer, patches=patches).modesty <= far
 
