@@ -39,8 +39,10 @@ from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["EmbeddedEnhancer", "pretrained"]
 
-FORMAT = 2
+FORMAT = 3
 """Raised when a saved restorer cannot be read by newer code."""
+BEFORE_GENERATIVE = 2
+"""The format of restorers without generative networks, whose entries it lacks."""
 PATCHES = "patches.safetensors"
 COLOR_STEPS = 255
 CHANNELS_OF_NETWORKS = (CONDITION_CHANNELS, CONDITION_CHANNELS + INVENTED_CHANNELS)
@@ -299,7 +301,11 @@ class EmbeddedEnhancer:
             raise WeightsError(f"{weights_file}: no such file; train the restorer first (stage enhance)")
         description = read_description(description_file)
         channels = description.get("condition_channels")
-        if description.get("format") != FORMAT or channels not in CHANNELS_OF_NETWORKS:
+        if description.get("format") == BEFORE_GENERATIVE:
+            description = {"generative": False, "drawing": False, "domain": None} | description
+        if description.get("format") not in (BEFORE_GENERATIVE, FORMAT) or (
+            channels not in CHANNELS_OF_NETWORKS
+        ):
             readable = " or ".join(map(str, CHANNELS_OF_NETWORKS))
             raise WeightsError(
                 f"{description_file}: format {description.get('format')} with {channels} channels, this "
@@ -311,7 +317,7 @@ class EmbeddedEnhancer:
                 int(description["condition_channels"]),
                 (first, second, third),
                 torch.Generator(),
-                generative=bool(description.get("generative", False)),
+                generative=bool(description["generative"]),
             )
             error_model = description["error_model"]
             enhancer = cls(
@@ -325,9 +331,9 @@ class EmbeddedEnhancer:
                 ErrorModel(tuple(error_model["weights"]), float(error_model["offset"])),
                 Calibration(**{k: tuple(v) for k, v in description["calibration"].items()}),
                 bool(description["deterministic"]),
-                bool(description.get("drawing", False)),
+                bool(description["drawing"]),
                 _read_patches(weights_file.with_name(PATCHES)),
-                None if description.get("domain") is None else Domain.from_dict(description["domain"]),
+                None if description["domain"] is None else Domain.from_dict(description["domain"]),
             )
         try:
             network.load_state_dict(
