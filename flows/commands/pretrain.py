@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 __all__ = ["add_arguments", "pretrain"]
 
 
+CHECKPOINT = "checkpoint.safetensors"
 SOURCES = ("phantom", "cavities")
 """Families of pretraining scenes."""
 
@@ -176,6 +177,20 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--deterministic", action="store_true", help="a plain regression: the baseline of the diffusion"
     )
+    parser.add_argument(
+        "--generative",
+        action="store_true",
+        help="train drawing as well: plausible views with texture, not their mean alone",
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="any setting of the training, such as device=cuda, most_seconds=1200, drawing_processes=14 or "
+        "drawn_share=0.8; repeatable. A wrong name lists all of them. A training that was ended goes on from "
+        "the checkpoint in its folder",
+    )
 
 
 def pretrain(given: argparse.Namespace) -> int:
@@ -203,9 +218,10 @@ def pretrain(given: argparse.Namespace) -> int:
         "perceptual_weight": given.perceptual_weight,
         "error_weight": given.error_weight,
         "deterministic": given.deterministic,
+        "generative": given.generative,
         "seed": given.seed,
     }
-    known = {name: value for name, value in values.items() if value is not None}
+    known = {name: value for name, value in values.items() if value is not None} | _further(given.set)
     try:
         config = PretrainingConfig(**known)
     except ValueError as error:
@@ -222,13 +238,35 @@ def pretrain(given: argparse.Namespace) -> int:
             return 0
         if given.threads is not None:
             torch.set_num_threads(given.threads)
-        enhancer = trained(files, config, start)
+        checkpoint = Path(given.out) / CHECKPOINT
+        enhancer = trained(files, config, start, checkpoint=checkpoint)
         replace(enhancer, record={**enhancer.record, **about}).save(Path(given.out), half=True)
+        if enhancer.record["iterations_made"] >= config.iterations:
+            checkpoint.unlink()
     out = console()
     for method, scores in enhancer.record["validation_scores"].items():
         out.print(f"{method:12} " + "  ".join(f"{name} {value}" for name, value in scores.items()))
     out.print(f"written to {given.out}")
     return 0
+
+
+def _further(texts: Sequence[str]) -> dict[str, Any]:
+    """Settings of the training given as NAME=VALUE.
+
+    Raises:
+        ConfigError: for an unknown name, or a value that is none of its kind.
+    """
+    from extrags.config.settings import settings_of
+    from extrags.restoration.diffusion.pretraining import PretrainingConfig
+
+    known = settings_of(PretrainingConfig)
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, separator, value = text.partition("=")
+        if not separator or name not in known:
+            raise ConfigError(f"--set {text}: expected NAME=VALUE with one of {', '.join(sorted(known))}")
+        found[name] = known[name].parse(value)
+    return found
 
 
 def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
@@ -341,7 +379,8 @@ def _command(given: argparse.Namespace) -> str:
         parts.append(f"--size-factor {given.size_factor}")
     parts += [
         f"--{name.replace('_', '-')}"
-        for name in ("real_textures", "without_perceptual", "deterministic")
+        for name in ("real_textures", "without_perceptual", "deterministic", "generative")
         if getattr(given, name)
     ]
+    parts += [f"--set {text}" for text in given.set]
     return " ".join(parts)

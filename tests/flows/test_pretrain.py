@@ -127,6 +127,25 @@ def test_weights_come_with_what_they_were_made_from(
     assert record["machine"]["versions"]["torch"] == torch.__version__
     assert record["before"]["pretraining"]["iterations"] == 2
     assert EmbeddedEnhancer.load(second).network.widths == (48, 96, 160)
+    assert not list(tmp_path.glob("*/checkpoint.safetensors"))
+
+
+def test_any_setting_can_be_given_and_an_ended_training_goes_on(
+    scenes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ["pretrain", "--out", str(tmp_path / "w"), "--scenes-folder", str(scenes), "--scenes", "3"]
+    given += ["--validation-scenes", "1", "--batch", "2", "--without-perceptual", "--threads", "1"]
+    given += ["--set", "channels=8,16,16", "--set", "most_seconds=0.001"]
+    for made in (1, 2):
+        assert main(given) == 0
+        record = json.loads((tmp_path / "w" / "restorer.json").read_text())["record"]
+        assert record["iterations_made"] == made
+    assert (tmp_path / "w" / "checkpoint.safetensors").exists()
+    assert "--set channels=8,16,16" in record["command"]
+    assert main([*given, "--set", "drawn=1"]) == 2
+    assert "drawn_share" in capsys.readouterr().err
+    assert main([*given, "--set", "most_seconds=-1"]) == 2
+    assert "most_seconds" in capsys.readouterr().err
 
 
 def test_what_would_fail_after_hours_is_said_at_once(
