@@ -114,7 +114,7 @@ def test_single_frames_are_told_to_be_as_wrong_as_they_are(monkeypatch: pytest.M
     generator = torch.Generator().manual_seed(991)
     groups = []
     for kind in ("colon", "sac", "field"):
-        examples = make_examples(kind, 3, generator, (64, 80), StereoSettings(hypotheses=16))
+        examples = make_examples(kind, 2, generator, (48, 64), StereoSettings(hypotheses=16))
         assert examples is not None
         assert not len(matched([examples])[0].truth)
         groups += unmatched([examples])
@@ -140,7 +140,7 @@ def test_the_second_sweep_is_practised_too() -> None:
 
 def test_points_lie_on_the_surface_but_for_their_error() -> None:
     generator = torch.Generator().manual_seed(8)
-    scene = Cavities("field", 6, generator)
+    scene = Cavities("field", 4, generator)
     clips = photograph(scene, generator, (48, 64), 5)
     points = triangulated_points(clips, scene)
     there = (points > 0) & clips.frames.mask
