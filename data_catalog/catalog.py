@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from data_catalog.c3vd.dataset import C3vdDataset
-from data_catalog.caverns.dataset import CavernsDataset
+from data_catalog.caverns.dataset import CAVERNS
 from data_catalog.checks import check_sequence
 from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
 from data_catalog.folders import FolderDataset
-from data_catalog.phantom.dataset import PhantomDataset
+from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.specular import with_specular
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
@@ -25,8 +25,8 @@ __all__ = ["DATASETS", "describe", "list_sequences", "read", "resolve", "source_
 
 DATASETS: tuple[Dataset, ...] = (
     FolderDataset(),
-    PhantomDataset(),
-    CavernsDataset(),
+    PHANTOM,
+    CAVERNS,
     C3vdDataset(),
 )
 """Folders first: a path that exists wins over a name spelled the same."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from data_catalog.rendered_dataset import Setting
+
 __all__ = ["GENERATOR_VERSION", "PhantomConfig", "Setting", "stream"]
 
-Setting = Literal["sparse", "distanced"]
 
 GENERATOR_VERSION = 1
 """Raised by hand whenever the same settings give other pixels; part of every cache key."""

@@ -16,7 +16,7 @@ from data_catalog.catalog import (
     source_fingerprint,
 )
 from data_catalog.dataset import Source
-from data_catalog.phantom.dataset import phantom_config
+from data_catalog.phantom.dataset import PHANTOM
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError, UnknownSequenceError
 
@@ -90,24 +90,24 @@ class TestPhantomSettings:
     def test_size_follows_the_settings(self) -> None:
         source = resolve("phantom/0")
         assert (
-            phantom_config(source, IngestConfig()).width,
-            phantom_config(source, IngestConfig()).height,
+            PHANTOM.scene_config(source, IngestConfig()).width,
+            PHANTOM.scene_config(source, IngestConfig()).height,
         ) == (
             160,
             128,
         )
-        half = phantom_config(source, IngestConfig(downscale=2))
+        half = PHANTOM.scene_config(source, IngestConfig(downscale=2))
         assert (half.width, half.height) == (80, 64)
-        assert phantom_config(source, IngestConfig(width=100)).height == 80
-        assert phantom_config(source, IngestConfig(width=100, height=50)).height == 50
+        assert PHANTOM.scene_config(source, IngestConfig(width=100)).height == 80
+        assert PHANTOM.scene_config(source, IngestConfig(width=100, height=50)).height == 50
 
     def test_unusable_settings(self, posed_folder) -> None:
         with pytest.raises(ConfigError, match=r"ingest\.height needs ingest\.width"):
-            phantom_config(resolve("phantom/0"), IngestConfig(height=64))
+            PHANTOM.scene_config(resolve("phantom/0"), IngestConfig(height=64))
         with pytest.raises(ConfigError, match="too small"):
-            phantom_config(resolve("phantom/0"), IngestConfig(downscale=16))
-        with pytest.raises(ConfigError, match="is not a phantom"):
-            phantom_config(resolve(posed_folder), IngestConfig())
+            PHANTOM.scene_config(resolve("phantom/0"), IngestConfig(downscale=16))
+        with pytest.raises(ConfigError, match="is not a scene of phantom"):
+            PHANTOM.scene_config(resolve(posed_folder), IngestConfig())
 
     def test_read_applies_them(self) -> None:
         sequence = read("phantom/7@distanced", IngestConfig(width=40, max_frames=4))

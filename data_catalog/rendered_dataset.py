@@ -1,0 +1,131 @@
+"""Procedural scenes as a dataset: `FAMILY/N@sparse` and `FAMILY/N@distanced`, for every N, without files."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any, Generic, Literal, TypeVar, get_args
+
+from pydantic import BaseModel
+
+from data_catalog.dataset import Descriptor, Source
+from data_catalog.rendered_size import rendered_size
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError, UnknownSequenceError
+from extrags.sequence import EndoscopicSequence
+
+__all__ = ["RenderedDataset", "Setting"]
+
+Setting = Literal["sparse", "distanced"]
+_LISTED_SCENES = 4
+
+C = TypeVar("C", bound=BaseModel)
+
+
+class RenderedDataset(ABC, Generic[C]):
+    """A family of scenes that are rendered on request.
+
+    The settings of a scene have the fields `scene`, `setting`, `width`, `height`, `max_frames` and
+    `test_frames`.
+
+    Args:
+        name: of the family.
+        generator_version: raised whenever the same settings give another scene.
+        config_type: settings of a scene.
+        description: of scene N, with `{scene}` for its number.
+    """
+
+    def __init__(self, name: str, generator_version: int, config_type: type[C], description: str) -> None:
+        self.name = name
+        self.spelling = ", ".join(f"{name}/N@{setting}" for setting in get_args(Setting))
+        self._generator_version = generator_version
+        self._config_type = config_type
+        self._description = description
+        self._pattern = re.compile(rf"{name}/(?P<scene>\d+)(?:@(?P<setting>\w+))?")
+
+    @abstractmethod
+    def record(self, config: C, name: str) -> EndoscopicSequence:
+        """Render both recordings of a scene."""
+
+    @abstractmethod
+    def train_frames(self, config: C) -> int:
+        """Frames of the training recording."""
+
+    def entries(self) -> Iterator[Descriptor]:
+        """The first few scenes in each setting."""
+        for scene in range(_LISTED_SCENES):
+            yield from (self._described(scene, setting) for setting in get_args(Setting))
+
+    def describe(self, name: str) -> Descriptor | None:
+        """The descriptor of any scene; raises `UnknownSequenceError` for a setting that there is not."""
+        found = self._scene_and_setting(name)
+        return None if found is None else self._described(*found)
+
+    def resolve(self, name_or_path: str) -> Source | None:
+        """Any scene by name; without a setting the sparse one."""
+        found = self._scene_and_setting(name_or_path)
+        if found is None:
+            return None
+        scene, setting = found
+        return Source(name=f"{self.name}/{scene}@{setting}", dataset=self.name, format=self.name)
+
+    def fingerprint(self, source: Source, config: IngestConfig) -> dict[str, Any]:
+        """Settings and version of the generator."""
+        return {
+            "format": self.name,
+            "version": self._generator_version,
+            "config": self.scene_config(source, config).model_dump(mode="json"),
+        }
+
+    def read(self, source: Source, config: IngestConfig) -> EndoscopicSequence:
+        """Render both recordings."""
+        return self.record(self.scene_config(source, config), source.name)
+
+    def scene_config(self, source: Source, config: IngestConfig) -> C:
+        """The scene's settings that follow from the ingest settings.
+
+        Without a height, the width's own proportion (5 : 4) is kept.
+
+        Raises:
+            ConfigError: for a source of another family, or a height without a width.
+        """
+        found = self._scene_and_setting(source.name)
+        if found is None:
+            raise ConfigError(f"{source.name} is not a scene of {self.name}")
+        plain: Any = self._config_type()
+        width, height = rendered_size(config, plain.width, plain.height)
+        scene, setting = found
+        return self._config_type(
+            scene=scene, setting=setting, width=width, height=height, max_frames=config.max_frames
+        )
+
+    def _scene_and_setting(self, name: str) -> tuple[int, Setting] | None:
+        match = self._pattern.fullmatch(name)
+        if match is None:
+            return None
+        setting = match["setting"] or "sparse"
+        for known in get_args(Setting):
+            if setting == known:
+                return int(match["scene"]), known
+        raise UnknownSequenceError(
+            f"{self.name} has no setting {setting!r}; known: {', '.join(get_args(Setting))}"
+        )
+
+    def _described(self, scene: int, setting: Setting) -> Descriptor:
+        plain: Any = self._config_type()
+        train = self.train_frames(plain)
+        return Descriptor(
+            name=f"{self.name}/{scene}@{setting}",
+            description=self._description.format(scene=scene),
+            frames=train + plain.test_frames,
+            width=plain.width,
+            height=plain.height,
+            length_unit="mm",
+            axes="OpenCV camera axes, camera-to-world",
+            has_depth=True,
+            has_poses=True,
+            split=f"{train} frames of recording B train, all {plain.test_frames} of recording A evaluate",
+            licence="Apache-2.0 (generated)",
+            format=self.name,
+        )
