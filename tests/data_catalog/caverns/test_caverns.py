@@ -34,7 +34,7 @@ def test_names_are_in_the_catalogue() -> None:
     assert "caverns/0@sparse" in {descriptor.name for descriptor in list_sequences()}
     assert resolve("caverns/12").name == "caverns/12@sparse"
     assert describe("caverns/3@distanced").frames == 48
-    with pytest.raises(UnknownSequenceError, match="caverns have no setting 'far'"):
+    with pytest.raises(UnknownSequenceError, match="caverns has no setting 'far'"):
         resolve("caverns/3@far")
 
 
