@@ -169,7 +169,6 @@ class EmbeddedEnhancer:
             with torch.no_grad():
                 conditioning = condition(group, transfer, folded=self.network.folded)
             start = noise.expand(len(conditioning.base), -1, -1, -1)
-            renewed = torch.Generator().manual_seed(self.seed)
             restored = sample(
                 self.network,
                 conditioning,
@@ -178,7 +177,6 @@ class EmbeddedEnhancer:
                 half_precision=self.half_precision,
                 drawing=self.drawing,
                 patches=None if features is None else features.expanded(len(start)),
-                renewed=renewed if self.drawing else None,
             )
             rgb = self.gamut.bounded(restored.rgb)
             error = self.error_model.applied(error_features(group, rgb, restored.error))

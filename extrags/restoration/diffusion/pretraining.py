@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -80,7 +80,9 @@ class PretrainingConfig(StageConfig):
     adversary_rate: float = Field(4e-4, gt=0, description="learning rate of the adversary")
     patches: int = Field(6, ge=1, description="patches of the scene's frames beside each crop")
     patch_px: int = Field(64, ge=32, multiple_of=8, description="side of a patch")
-    device: str = Field("cpu", description="where the network is trained: cpu, cuda, cuda:1, ...")
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "cpu", description="where the network is trained; auto: cuda where there is one"
+    )
     drawing_processes: int = Field(
         0, ge=0, description="processes that cut crops ahead, at most one per scene; 0: a thread does"
     )
@@ -128,6 +130,11 @@ def pretrain(
             f"{len(files)} pretraining scenes found, settings say {config.scenes}, of which "
             f"{config.validation_scenes} are for validation"
         )
+    if config.drawing_processes > config.scenes - config.validation_scenes:
+        raise ConfigError(
+            f"drawing_processes={config.drawing_processes}: there are "
+            f"{config.scenes - config.validation_scenes} scenes to train on, and each process needs one"
+        )
     device = chosen_device(config.device, "pretraining.device")
     perceptual = Lpips.load(net="squeeze").to(device) if config.perceptual else None
     generator = torch.Generator().manual_seed(config.seed)
@@ -149,7 +156,7 @@ def pretrain(
     )
     training = NetworkTraining(network, settings, generator, stage=stage)
     if checkpoint is not None and checkpoint.exists():
-        training.restore(_read_checkpoint(checkpoint))
+        _go_on(training, checkpoint)
         generator.manual_seed(config.seed + training.iteration)
         logger.info("%s: going on from %s, step %d", stage, checkpoint, training.iteration)
     sampler = partial(_mixed_sampler, files[: -config.validation_scenes], config, training.iteration)
@@ -204,11 +211,18 @@ def _write_checkpoint(training: NetworkTraining, file: Path) -> None:
     partial.replace(file)
 
 
-def _read_checkpoint(file: Path) -> dict[str, Tensor]:
+def _go_on(training: NetworkTraining, file: Path) -> None:
+    """Take over a checkpoint.
+
+    Raises:
+        WeightsError: when the file is none, or of a training with other settings.
+    """
     try:
-        return load_safetensors(file)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise WeightsError(f"{file}: not the checkpoint of a pretraining ({error})") from error
+        training.restore(load_safetensors(file))
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        raise WeightsError(
+            f"{file}: not a checkpoint of this training ({error}); remove it to begin anew"
+        ) from error
 
 
 def _mixed_sampler(
@@ -216,13 +230,15 @@ def _mixed_sampler(
 ) -> Callable[[], Batch]:
     """What draws batches from every n-th scene, for one of n processes."""
     samplers = [
-        _sampler(file, config, index) for index, file in enumerate(files) if index % processes == number
+        _sampler(file, config, index, iteration)
+        for index, file in enumerate(files)
+        if index % processes == number
     ]
     seed = config.seed + iteration + 1_000_003 * number
     return MixedSampler(samplers, batch=config.batch, seed=seed).draw
 
 
-def _sampler(file: Path, config: PretrainingConfig, number: int) -> CropSampler:
+def _sampler(file: Path, config: PretrainingConfig, number: int, iteration: int) -> CropSampler:
     scene = PretrainingScene.load(file)
     # In half precision, as in the file: in full precision a hundred scenes would take ten gigabytes.
     pairs = replace(scene.pairs, layers=Layers(scene.pairs.layers.data.half()))
@@ -232,7 +248,8 @@ def _sampler(file: Path, config: PretrainingConfig, number: int) -> CropSampler:
         batch=1,
         crop_px=config.crop,
         side_multiple=SIZE_MULTIPLE,
-        seed=config.seed * 100_003 + number,
+        # A training that goes on must not see the same crops again.
+        seed=config.seed * 100_003 + number + 1_000_003 * iteration,
         frames=(scene.references.images, scene.references.valid) if config.generative else None,
         patches=(config.patches, config.patch_px),
         folded=not config.generative,

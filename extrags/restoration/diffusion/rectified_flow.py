@@ -33,6 +33,7 @@ DEPTH_TRUST = 0.5
 """Weight of the network's depth against the smooth filling. In the holes of virtual views each is wrong by
 14 %, with different errors; their mean is better."""
 TYPICAL_ERROR = 0.05
+NOISE_SHIFT_PX = (97, 61)
 LOG_ERROR_LIMIT = 4.0
 """The expected error starts at the typical one and stays within a factor of e to this power."""
 
@@ -76,7 +77,6 @@ def sample(
     half_precision: bool,
     drawing: bool = False,
     patches: PatchFeatures | None = None,
-    renewed: torch.Generator | None = None,
 ) -> Sampled:
     """Restore views in a fixed number of steps.
 
@@ -88,7 +88,6 @@ def sample(
         half_precision: convolutions in bfloat16.
         drawing: one of the plausible views instead of their mean; for generative networks.
         patches: features of patches of the scene's frames.
-        renewed: source of the noise of further steps when a view is drawn; None keeps the first noise.
     """
     height, width = conditioning.base.shape[-2:]
     padding = (0, -width % SIZE_MULTIPLE, 0, -height % SIZE_MULTIPLE)
@@ -112,9 +111,10 @@ def sample(
                 )
             )
             clean = (answers[-1].rgb - COLOR_CENTER) / COLOR_SCALE
-            if drawing and renewed is not None:
-                fresh = torch.randn(noise.shape[-3:], generator=renewed, device=state.device)
-                state = then * padded(fresh.expand_as(noise)) + (1 - then) * clean
+            if drawing:
+                # White noise shifted is white noise anew, and each sample has its own.
+                shifts = ((step + 1) * NOISE_SHIFT_PX[0], (step + 1) * NOISE_SHIFT_PX[1])
+                state = then * padded(noise.roll(shifts, (-2, -1))) + (1 - then) * clean
             else:
                 # The noise implied by the prediction, at the next point of the path.
                 state = (then / now) * state + (1 - then / now) * clean

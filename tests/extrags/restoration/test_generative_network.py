@@ -200,9 +200,7 @@ class TestDrawing:
 
         def drawn(seed: int) -> Tensor:
             noise = torch.randn(1, 3, 32, 32, generator=seeded(seed))
-            return sample(
-                network, given, noise, steps=3, half_precision=False, drawing=True, renewed=seeded(seed)
-            ).rgb
+            return sample(network, given, noise, steps=3, half_precision=False, drawing=True).rgb
 
         assert torch.equal(drawn(1), drawn(1))
         assert not torch.allclose(drawn(1), drawn(2), atol=1e-3)

@@ -148,6 +148,13 @@ class TestPretraining:
         short = TINY.model_copy(update={"most_seconds": 1e-3})
         assert pretrain(files, short, checkpoint=checkpoint).record["iterations_made"] == 1
         assert pretrain(files, short, checkpoint=checkpoint).record["iterations_made"] == 2
+        other = short.model_copy(update={"channels": (16, 16, 16)})
+        with pytest.raises(WeightsError, match=r"checkpoint\.safetensors: not a checkpoint of this training"):
+            pretrain(files, other, checkpoint=checkpoint)
+
+    def test_more_processes_than_scenes_are_refused(self, files: list[Path]) -> None:
+        with pytest.raises(ConfigError, match="drawing_processes=3: there are 2 scenes"):
+            pretrain(files, TINY.model_copy(update={"drawing_processes": 3}))
 
     def test_a_generative_network_starts_from_a_plain_one(
         self,
