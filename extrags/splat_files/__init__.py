@@ -7,6 +7,7 @@ light, and a PLY can keep the light beside the albedo in its header.
 from __future__ import annotations
 
 from extrags.splat_files.baking import bake_light as bake_light
+from extrags.splat_files.baking import bake_recorded_light as bake_recorded_light
 from extrags.splat_files.compressed_ply import write_compressed_ply as write_compressed_ply
 from extrags.splat_files.ply import read_ply_scene as read_ply_scene
 from extrags.splat_files.ply import write_ply_scene as write_ply_scene
@@ -17,6 +18,7 @@ from extrags.splat_files.spz import write_spz as write_spz
 
 __all__ = [
     "bake_light",
+    "bake_recorded_light",
     "read_ply_scene",
     "read_splat_file",
     "read_spz",
