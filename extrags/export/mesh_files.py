@@ -48,7 +48,9 @@ def write_mesh(colored: ColoredMesh, path: Path, *, metric: bool = True) -> None
     elif suffix == ".ply":
         _write_ply(colored, path)
     else:
-        raise ConfigError(f"a mesh is written as {', '.join(MESH_FORMATS)}; {path.name} ends in none of these")
+        raise ConfigError(
+            f"a mesh is written as {', '.join(MESH_FORMATS)}; {path.name} ends in none of these"
+        )
 
 
 def _write_ply(colored: ColoredMesh, path: Path) -> None:

@@ -20,7 +20,7 @@ _LARGEST_TEXTURE_PX = 4096
 _MOST_TEXELS, _FEWEST_TEXELS = 12, 4
 """Texels along the edge of a triangle: more would show nothing new at the size of the frames."""
 _DEPTH_TOLERANCE = 0.02
-"""A point counts as seen where it lies at most so much behind the rendered surface, as a share of its depth."""
+"""A point counts as seen where it lies at most so much behind the rendered surface, as a share of depth."""
 _MIN_FACING = 0.1
 _VIEWS_PER_BATCH = 8
 

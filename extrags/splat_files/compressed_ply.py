@@ -1,8 +1,8 @@
 """Compressed PLY of PlayCanvas: four 32-bit words per Gaussian, in chunks of 256 with bounds of their own.
 
-Elements: `chunk` (bounds of positions, logarithmic scales and colours), `vertex` (packed_position 11-10-11 bits,
-packed_rotation 2-10-10-10, packed_scale 11-10-11, packed_color 8-8-8-8 with opacity last) and, above SH degree
-0, `sh` (8 bits per coefficient, channel by channel, over [-4, 4]).
+Elements: `chunk` (bounds of positions, logarithmic scales and colours), `vertex` (packed_position 11-10-11
+bits, packed_rotation 2-10-10-10, packed_scale 11-10-11, packed_color 8-8-8-8 with opacity last) and, above SH
+degree 0, `sh` (8 bits per coefficient, channel by channel, over [-4, 4]).
 """
 
 from __future__ import annotations
@@ -39,20 +39,20 @@ def write_compressed_ply(gaussians: Gaussians, path: Path) -> None:
     opacity = gaussians.opacities.sigmoid().numpy()[order].astype(np.float64)
     columns: dict[str, np.ndarray] = {}
     shares = {}
-    for values, names, short in (
+    for values, axes, short in (
         (means, ("x", "y", "z"), "position"),
         (scales, ("scale_x", "scale_y", "scale_z"), "scale"),
         (colors, ("r", "g", "b"), "color"),
     ):
         low, high = _chunk_bounds(values)
         shares[short] = _share(values, low, high)
-        for axis, name in enumerate(names):
+        for axis, name in enumerate(axes):
             columns[f"min_{name}"], columns[f"max_{name}"] = low[:, axis], high[:, axis]
     names = [
         f"{bound}_{part}{axis}"
-        for part, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb"))
+        for part, letters in (("", "xyz"), ("scale_", "xyz"), ("", "rgb"))
         for bound in ("min", "max")
-        for axis in axes
+        for axis in letters
     ]
     chunk = np.empty(-(-n // _CHUNK), dtype=[(name, "f4") for name in names])
     for name in names:

@@ -1,8 +1,8 @@
 """SOG of PlayCanvas (version 2): attributes as lossless WebP images and a `meta.json`, in one zip.
 
-Positions are 16 bits of sign(x) ln(1 + |x|) in two images, rotations 3 x 8 bits with the largest component left
-out, scales and colours 8-bit indices into codebooks of 256 numbers, higher harmonics 16-bit indices into a
-palette whose entries are indices into a codebook again.
+Positions are 16 bits of sign(x) ln(1 + |x|) in two images, rotations 3 x 8 bits with the largest component
+left out, scales and colours 8-bit indices into codebooks of 256 numbers, higher harmonics 16-bit indices
+into a palette whose entries are indices into a codebook again.
 """
 
 from __future__ import annotations
@@ -113,9 +113,7 @@ def _codebook(values: Float[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, "n k"],
     share = (np.arange(_CODEBOOK) + 0.5) / _CODEBOOK
     centers = 0.5 * (np.quantile(flat, share) + flat[0] + share * (flat[-1] - flat[0]))
     for _ in range(_LLOYD_ROUNDS):
-        edges = np.concatenate(
-            [[0], np.searchsorted(flat, 0.5 * (centers[1:] + centers[:-1])), [len(flat)]]
-        )
+        edges = np.concatenate([[0], np.searchsorted(flat, 0.5 * (centers[1:] + centers[:-1])), [len(flat)]])
         count = np.diff(edges)
         mean = np.diff(total[edges]) / np.maximum(count, 1)
         centers = np.sort(np.where(count > 0, mean, centers))

@@ -1,9 +1,10 @@
 """SPZ, the compressed format of Niantic: fixed-point numbers, packed attribute by attribute, in gzip.
 
-Version 2 and 3 are read, version 3 is written. Layout after gzip, little-endian: magic `NGSP`, version, count,
-SH degree, fractional bits of positions, flags, a zero; then positions (3 x 24 bits), opacities (8 bits),
-colours (3 x 8), logarithms of scales (3 x 8, steps of 1/16 from -10), rotations (version 2: x, y, z of 8 bits;
-version 3: 32 bits, the largest component left out), SH coefficients (8 bits, coefficient by coefficient).
+Version 2 and 3 are read, version 3 is written. Layout after gzip, little-endian: magic `NGSP`, version,
+count, SH degree, fractional bits of positions, flags, a zero; then positions (3 x 24 bits), opacities (8
+bits), colours (3 x 8), logarithms of scales (3 x 8, steps of 1/16 from -10), rotations (version 2: x, y, z
+of 8 bits; version 3: 32 bits, the largest component left out), SH coefficients (8 bits, coefficient by
+coefficient).
 
 The format's axes are right, up, back; ours are OpenCV's right, down, forward. Positions, rotations and
 harmonics are turned by half a turn about x on the way, as the format's own tools do for PLY files.
@@ -154,4 +155,4 @@ def _three_bytes(packed: UInt8[np.ndarray, "b"]) -> Float[np.ndarray, "n 4"]:
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.rint(values).clip(0, 255).astype(np.uint8)
+    return np.asarray(np.rint(values).clip(0, 255).astype(np.uint8))
