@@ -179,13 +179,17 @@ static void forward(View* view, const Scene* scene, const Images* images) {
   for (int chunk = 0; chunk < view->chunks; ++chunk) {
     for (size_t tile = 0; tile < tiles; ++tile) starts[tile + 1] += counts[chunk * tiles + tile];
   }
-  for (size_t tile = 0; tile < tiles; ++tile) {
-    starts[tile + 1] += starts[tile];
-    uint32_t at = starts[tile];
-    for (int chunk = 0; chunk < view->chunks; ++chunk) {
-      const uint32_t count = counts[chunk * tiles + tile];
-      counts[chunk * tiles + tile] = at;
-      at += count;
+  for (size_t tile = 0; tile < tiles; ++tile) starts[tile + 1] += starts[tile];
+  // A running sum down the chunks, row by row: a column at a time would miss the caches at every step.
+  reserve(&view->scratch[0], sizeof(uint32_t) * tiles);
+  uint32_t* next = static_cast<uint32_t*>(view->scratch[0].data);
+  memcpy(next, starts, sizeof(uint32_t) * tiles);
+  for (int chunk = 0; chunk < view->chunks; ++chunk) {
+    uint32_t* row = counts + chunk * tiles;
+    for (size_t tile = 0; tile < tiles; ++tile) {
+      const uint32_t count = row[tile];
+      row[tile] = next[tile];
+      next[tile] += count;
     }
   }
   uint32_t* chunk_pairs = static_cast<uint32_t*>(view->chunk_pairs.data);
