@@ -79,6 +79,16 @@ EXTRAGS_INLINE void load_coefficients(const Scene* scene, int first, int rows, f
   }
 }
 
+// Fetches the coefficients of up to sixteen Gaussians ahead of their use: rows are read a third at a time, a
+// pattern that the processor does not foresee.
+EXTRAGS_INLINE void prefetch_coefficients(const Scene* scene, int first, int end) {
+  if (scene->sh == nullptr) return;
+  const size_t stride = 3 * static_cast<size_t>(scene->coefficients);
+  const int rows = end - first < 16 ? end - first : 16;
+  const float* source = scene->sh + stride * first;
+  for (size_t at = 0; rows > 0 && at < stride * rows; at += 16) __builtin_prefetch(source + at);
+}
+
 // The colours of sixteen Gaussians; leaves their coefficients, [48][16], for `shade_backward`.
 template <int kDegree>
 EXTRAGS_INLINE void shade(const Scene* scene, int first, int rows, const Projected& p, float* coefficients,

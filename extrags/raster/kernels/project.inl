@@ -275,6 +275,7 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
   for (int k = 0; k < 11; ++k) v_light[k] = zero;
   for (int first = begin; first < end; first += 16) {
     const int rows = rows_of(end, first);
+    if constexpr (!kColors) prefetch_coefficients(scene, first + 16, end);
     alignas(64) float gathered[256], columns[256];
     uint32_t seen = 0;
     for (int i = 0; i < 16; ++i) {
