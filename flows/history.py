@@ -21,6 +21,7 @@ from extrags.metrics.comparison import figure_of
 from extrags.store import Store, digest_of, read_records, write_record
 
 __all__ = [
+    "SAME_MACHINE",
     "BenchmarkRegressedError",
     "Tolerance",
     "append_history",
@@ -34,6 +35,7 @@ FIGURES = ("observed.psnr", "psnr")
 """The figure a run is judged by is the first of these that it has."""
 
 SAME_MACHINE = ("processor", "cores", "threads", "isa")
+"""What must be equal for run times to be comparable; keys of `extrags.raster.bench.machine`."""
 
 
 class Tolerance(BaseModel):
