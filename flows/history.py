@@ -134,7 +134,8 @@ def regressions(
     Compared is the mean over seeds of each method on each sequence, with the median of the last
     `tolerance.runs` runs that had the same settings: PSNR of all of them, run time of those on the same
     kind of machine. Run time is processor time where enough of these runs have measured it, since other work
-    on the machine hardly changes it; elapsed time otherwise. A case that fails now and did not before is worse, too.
+    on the machine hardly changes it; elapsed time otherwise. A case that fails now and did not before is
+    worse, too.
 
     Args:
         entry: of the run.

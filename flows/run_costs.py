@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from data_catalog import describe
 from extrags.config import PipelineConfig
-from extrags.errors import StoreError
+from extrags.errors import ConfigError, ExtragsError, StoreError
 from extrags.pipeline import STAGES
 from extrags.run_costs import (
     STAGE_TASKS,
@@ -17,9 +18,12 @@ from extrags.run_costs import (
     packaged_model,
     probe_seconds,
 )
+from extrags.scene_plan import ScenePlan
 from extrags.store import Manifest, Store
+from flows.expectation import read_size
+from flows.outcome import SequenceOutcome
 
-__all__ = ["RunPrediction", "StageCost", "predict_run", "recorded_costs"]
+__all__ = ["RunPrediction", "StageCost", "catalogue_work", "planned_work", "predict_run", "recorded_costs"]
 
 Record = tuple[Workload, TaskCost]
 ENOUGH_SECONDS = 10.0
@@ -51,11 +55,13 @@ class RunPrediction:
         stages: those that run.
         source: what tells how fast this machine is: `history` of the store, or a `probe`.
         records: so many records the history has.
+        unknown: stages that run and of whose cost nothing is known; not in any sum.
     """
 
     stages: list[StageCost]
     source: str
     records: int
+    unknown: list[str] = field(default_factory=list)
 
     @property
     def processor_seconds(self) -> float:
@@ -74,13 +80,14 @@ class RunPrediction:
         return max((stage.peak_mib for stage in self.stages if stage.peak_mib is not None), default=None)
 
     def to_json(self) -> dict[str, Any]:
-        """A JSON object: `{processor_seconds, seconds, peak_mib, source, records, stages: [...]}`."""
+        """A JSON object: `{processor_seconds, seconds, peak_mib, source, records, unknown, stages}`."""
         return {
             "processor_seconds": round(self.processor_seconds, 1),
             "seconds": None if self.seconds is None else round(self.seconds, 1),
             "peak_mib": None if self.peak_mib is None else round(self.peak_mib),
             "source": self.source,
             "records": self.records,
+            "unknown": self.unknown,
             "stages": [asdict(stage) for stage in self.stages],
         }
 
@@ -114,9 +121,12 @@ def predict_run(
     else:
         source, wall_pace = "probe", {}
         pace = dict.fromkeys(model.time, probe_seconds() / model.probe_s)
-    found = []
+    found, unknown = [], []
     for stage in STAGES:
         if stage not in stages:
+            continue
+        if not any(task in model.time for task in STAGE_TASKS[stage]):
+            unknown.append(stage)
             continue
         costs = [model.predict(task, work) for task in STAGE_TASKS[stage] if task in model.time]
         times = measured_scenes if stage == "evaluate" else 1
@@ -129,7 +139,57 @@ def predict_run(
                 max(peaks, default=None),
             )
         )
-    return RunPrediction(found, source, len(processor))
+    return RunPrediction(found, source, len(processor), unknown)
+
+
+def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig) -> tuple[Workload, set[str]]:
+    """Size and settings of a sequence that has been read and assessed, and the stages that will run.
+
+    Args:
+        store: with what `outcome` made.
+        outcome: of a run until `assess`, with its plan.
+        config: settings that it was started with.
+
+    Raises:
+        StoreError: when the sequence's manifest cannot be read.
+    """
+    counts = store.manifest(outcome.refs["ingest"]).counts
+    width, height, frames, train, test = (
+        float(counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
+    )
+    skipped = {row.stage for row in outcome.stages if row.state == "skipped"}
+    if outcome.plan is not None:
+        decided = ScenePlan.model_validate(
+            {name: outcome.plan[name] for name in ScenePlan.model_fields if name in outcome.plan}
+        )
+        config = decided.applied_to(config)
+        skipped |= {line.stage for line in decided.decisions if not line.run}
+    work = Workload(width * height, frames, train, test, config)
+    return work, {stage for stage in STAGES if stage not in skipped}
+
+
+def catalogue_work(
+    name: str, config: PipelineConfig, leave_out: Collection[str]
+) -> tuple[Workload, set[str]]:
+    """Size and settings of a sequence of the catalogue that has not been read, and the stages that may run.
+
+    How many frames are held out is not in the catalogue: half of them are taken to be, and all stages to run.
+
+    Raises:
+        ConfigError: for a path, of which nothing is known before it is read.
+    """
+    try:
+        about: Any = describe(name)
+    except ExtragsError as error:
+        raise ConfigError(
+            f"{name} is not in the catalogue: its size is known once it is read; leave out --before ({error})"
+        ) from error
+    width, height = read_size(about, config)
+    frames = float(min(about.frames, config.ingest.max_frames or about.frames))
+    stages = {stage for stage in STAGES if stage not in leave_out}
+    stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
+    stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
+    return Workload(float(width * height), frames, frames / 2, frames / 2, config), stages
 
 
 def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record], list[Record]]:
@@ -148,6 +208,8 @@ def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record]
     Raises:
         StoreError: when the store cannot be read.
     """
+    # All stages, so that their present versions are known; here, because this loads Prefect.
+    import flows.wiring  # noqa: F401
     from tasks.stage import stage_versions
 
     manifests = {manifest.key: manifest for manifest in store.ls()}

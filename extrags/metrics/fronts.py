@@ -20,7 +20,7 @@ SCENE = CELL[:4]
 """Figures are compared within a scene at one size: what is measured on other pixels is another figure."""
 
 
-def front_of(points: Sequence[tuple[float, float]], *, higher_is_better: bool) -> list[int]:
+def front_of(points: Sequence[tuple[float | int, float | int]], *, higher_is_better: bool) -> list[int]:
     """Indices of the points that no other point dominates, the cheapest first.
 
     A point is dominated by another that costs no more and is no worse, and is better in one of the two
@@ -118,6 +118,6 @@ def _with_both(cells: Sequence[Mapping[str, Any]], cost: str, figure: Figure) ->
     return [cell for cell in cells if cell[cost] is not None and figure.name in cell["figures"]]
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
+def _mean(values: Sequence[float | int | None]) -> float | None:
+    known = [float(value) for value in values if value is not None]
     return fmean(known) if known and len(known) == len(values) else None

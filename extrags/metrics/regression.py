@@ -1,8 +1,8 @@
 """Two results of one benchmark: what has got worse, and what is noise.
 
 Runs of both results that have everything in common, seed and repeat included, are pairs; a difference is
-judged by the spread of the pairs' differences (one-sided t test). Where seeds or repeats do not match, the two
-samples are compared as they are (Welch's test). As very many quantities are looked at, the threshold is
+judged by the spread of the pairs' differences (one-sided t test). Where seeds or repeats do not match, the
+two samples are compared as they are (Welch's test). As very many quantities are looked at, the threshold is
 Holm's, over all of them: the chance of a single false alarm in a comparison is at most `LEVEL`. A difference
 smaller than what matters (`MATTERS`) is never a regression, however certain it is.
 """
@@ -245,9 +245,7 @@ def _words(row: _Row) -> str:
     change = f"{row.worsening:.2f} dB" if row.kind == "dB" else f"{row.worsening:.1%}"
     interval = ""
     if row.low is not None and row.high is not None:
-        ends = (
-            f"{end:.2f} dB" if row.kind == "dB" else f"{end:.1%}" for end in (row.low, row.high)
-        )
+        ends = (f"{end:.2f} dB" if row.kind == "dB" else f"{end:.1%}" for end in (row.low, row.high))
         interval = f" [{' to '.join(ends)}]"
     return (
         f"{_label(tuple(row.about.values()))}: {row.quantity} {row.before:.4g} to {row.after:.4g}, worse by "

@@ -68,9 +68,7 @@ def add_arguments(parser: Parser) -> None:
     raw: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
     summary = "run time against error of whole runs, over methods and budgets"
     bench_pipeline.add_arguments(
-        add_verb(
-            verbs, "pipeline", bench_pipeline.pipeline, summary, epilog=bench_pipeline.EXAMPLES, **raw
-        )
+        add_verb(verbs, "pipeline", bench_pipeline.pipeline, summary, epilog=bench_pipeline.EXAMPLES, **raw)
     )
     summary = "tell a regression between two results from noise"
     bench_compare.add_arguments(add_verb(verbs, "compare", bench_compare.compare, summary))

@@ -44,9 +44,10 @@ def main() -> None:
             if cost.seconds < 0.5:
                 continue
             guess = model.predict(cost.task, work)
-            memory = "" if guess.peak_mib is None or cost.peak_mib is None else (
-                f"  MiB {cost.peak_mib:7.0f} {guess.peak_mib:7.0f} {guess.peak_mib / cost.peak_mib - 1:+.0%}"
-            )
+            memory = ""
+            if guess.peak_mib is not None and cost.peak_mib is not None:
+                off = guess.peak_mib / cost.peak_mib - 1
+                memory = f"  MiB {cost.peak_mib:7.0f} {guess.peak_mib:7.0f} {off:+.0%}"
             print(
                 f"{name:8} {cost.task:16} {work.pixels:7.0f} px  s {cost.seconds:7.2f} {guess.seconds:7.2f} "
                 f"{guess.seconds / cost.seconds - 1:+.0%}{memory}"
