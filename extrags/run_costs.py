@@ -257,7 +257,7 @@ def _fit(terms: Sequence[str], records: Sequence[tuple[Workload, float]]) -> dic
 
 @cache
 def packaged_model() -> CostModel:
-    """The model that comes with this package (docs/algorithms/run_costs.md says what it was fitted to)."""
+    """The model that comes with this package; docs/benchmarks/run_time_and_error.md says what it rests on."""
     text = resources.files("extrags").joinpath("run_costs.json").read_text(encoding="utf-8")
     return CostModel.from_json(json.loads(text))
 

@@ -121,7 +121,8 @@ def predict_run(
     else:
         source, wall_pace = "probe", {}
         pace = dict.fromkeys(model.time, probe_seconds() / model.probe_s)
-    found, unknown = [], []
+    found: list[StageCost] = []
+    unknown: list[str] = []
     for stage in STAGES:
         if stage not in stages:
             continue
@@ -165,7 +166,8 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
         config = decided.applied_to(config)
         skipped |= {line.stage for line in decided.decisions if not line.run}
     work = Workload(width * height, frames, train, test, config)
-    return work, {stage for stage in STAGES if stage not in skipped}
+    wanted: set[str] = set(STAGES) - skipped
+    return work, wanted
 
 
 def catalogue_work(
@@ -186,7 +188,7 @@ def catalogue_work(
         ) from error
     width, height = read_size(about, config)
     frames = float(min(about.frames, config.ingest.max_frames or about.frames))
-    stages = {stage for stage in STAGES if stage not in leave_out}
+    stages: set[str] = set(STAGES) - set(leave_out)
     stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
     stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
     return Workload(float(width * height), frames, frames / 2, frames / 2, config), stages

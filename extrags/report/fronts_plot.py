@@ -65,7 +65,7 @@ def write_fronts_plot(
                     where="post",
                     color=QUIET,
                     linewidth=1.2,
-                    zorder=0,
+                    zorder=1.5,
                 )
                 sequence, setting, width, height = scene
                 axes.set_title(f"{sequence}{f'@{setting}' if setting else ''}, {width}x{height}")
