@@ -65,7 +65,7 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
     "finetune-judge": ("judge_iterations", "judge_iterations*pixels", "judge_iterations*gaussians"),
     "finetune": ("tuning", "tuning*pixels", "tuning*gaussians"),
     "evaluate-render": ("test", "test*pixels"),
-    "evaluate": ("one", "test", "test*pixels"),
+    "evaluate": ("one", "test", "test*pixels", "test*pixels*vgg"),
     "report": ("one", "frames*pixels"),
 }
 """Terms of the time of each task; others have a constant alone. Terms that records cannot tell apart (one
@@ -116,6 +116,8 @@ class Workload:
             "judge_iterations": judge.iterations_share * config.finetune.iterations,
             "judge_views": float(judge.views),
             "tuning": float(config.finetune.iterations),
+            # LPIPS with this backbone takes longer than all other metrics together.
+            "vgg": float("vgg" in config.evaluate.lpips_nets),
         }
 
     def term(self, name: str) -> float:

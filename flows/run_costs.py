@@ -166,8 +166,7 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
         config = decided.applied_to(config)
         skipped |= {line.stage for line in decided.decisions if not line.run}
     work = Workload(width * height, frames, train, test, config)
-    wanted: set[str] = set(STAGES) - skipped
-    return work, wanted
+    return work, {str(stage) for stage in STAGES if stage not in skipped}
 
 
 def catalogue_work(
@@ -188,7 +187,7 @@ def catalogue_work(
         ) from error
     width, height = read_size(about, config)
     frames = float(min(about.frames, config.ingest.max_frames or about.frames))
-    stages: set[str] = set(STAGES) - set(leave_out)
+    stages = {str(stage) for stage in STAGES if stage not in leave_out}
     stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
     stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
     return Workload(float(width * height), frames, frames / 2, frames / 2, config), stages
@@ -292,6 +291,12 @@ def _config(line: list[Manifest], fallback: PipelineConfig) -> PipelineConfig:
             if isinstance(settings, dict) and group not in changed:
                 known = type(getattr(fallback, group)).model_fields
                 changed[group] = {name: value for name, value in settings.items() if name in known}
+    networks = next((item.config.get("lpips_digests") for item in line if item.stage == "evaluate"), None)
+    if isinstance(networks, dict):
+        nets = tuple(sorted(networks))
+        fallback = fallback.model_copy(
+            update={"evaluate": fallback.evaluate.model_copy(update={"lpips_nets": nets})}
+        )
     try:
         return fallback.model_copy(
             update={
