@@ -99,9 +99,7 @@ class Browser:
         for kind, (x, y) in (
             ("mousePressed", start), ("mouseMoved", end), ("mouseReleased", end),
         ):  # fmt: skip
-            self.send(
-                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1
-            )
+            self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
 
     def key(self, key: str) -> None:
         """Press and release a key."""
@@ -116,7 +114,9 @@ def browser(profile: Path) -> Iterator[Browser]:
     Args:
         profile: empty folder for its files.
     """
-    program = os.environ.get("EXTRAGS_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+    program = (
+        os.environ.get("EXTRAGS_CHROMIUM") or shutil.which("chromium") or shutil.which("chromium-browser")
+    )
     if program is None:
         pytest.skip("no Chromium is installed (chromium, or EXTRAGS_CHROMIUM)")
     pytest.importorskip("websockets", reason="the browser is driven through a web socket")

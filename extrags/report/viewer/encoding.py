@@ -51,8 +51,8 @@ class Quantity:
     """
 
     values: Float[np.ndarray, "n"]
-    low: float
-    high: float
+    low: float | int
+    high: float | int
     title: str
     ends: tuple[str, str]
 
@@ -102,7 +102,7 @@ def encoded_scene(
         *_rotation_planes(picked.quats.numpy()),
         *_channel_planes("scale", picked.scales.numpy()),
         *_channel_planes("opacity", opacity[order][:, None]),
-        *_channel_planes("sh", picked.sh[:, : (kept + 1) ** 2].reshape(len(order), -1).numpy()),
+        *_channel_planes("sh", picked.sh[:, : (kept + 1) ** 2].flatten(1).numpy()),
     ]
     for quantity in quantities.values():
         share = (quantity.values[order] - quantity.low) / max(quantity.high - quantity.low, 1e-12)

@@ -1,7 +1,7 @@
-"""What a run knows of each Gaussian: which training views see it, from how many sides, and how sure it is.
+r"""What a run knows of each Gaussian: which training views see it, from how many sides, and how sure it is.
 
 Images are carried to Gaussians with the weights the rasteriser blends them with: the gradient of
-:math:`\\sum_p m_p I_p` with respect to the colour of Gaussian j is :math:`\\sum_p w_{jp} m_p`.
+:math:`\sum_p m_p I_p` with respect to the colour of Gaussian j is :math:`\sum_p w_{jp} m_p`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
 // The viewer: what is shown from where, and under which light. `window.extragsViewer` is its interface for scripts.
+const SLOW_MS = 90;
+const REST_MS = 350;
+
 class Viewer {
   constructor(root, data, shaders, worker) {
     this.root = root;
@@ -22,6 +25,8 @@ class Viewer {
     this.waiting = [];
     this.flight = null;
     this.frames = [];
+    this.coarseness = 1;
+    this.sharpening = 0;
     this.onchange = () => {};
     worker.onmessage = (event) => this.sorted(event.data);
   }
@@ -38,7 +43,7 @@ class Viewer {
     this.canvas.addEventListener("webglcontextrestored", () => window.location.reload());
     new ResizeObserver(() => this.change()).observe(this.canvas);
     this.resetLight();
-    return this.jump(this.data.groups.findIndex((group) => group.name === "held_out"), 0);
+    return this.jump(0, 0);
   }
 
   get scene() { return this.scenes[this.name]; }
@@ -87,7 +92,6 @@ class Viewer {
 
   // Into a camera of the run, at its exposure.
   jump(group, index) {
-    group = group < 0 ? 0 : group;
     const cameras = this.data.groups[group].cameras;
     index = ((index % cameras.length) + cameras.length) % cameras.length;
     this.camera = { group, index };
@@ -179,7 +183,7 @@ class Viewer {
   }
 
   fit() {
-    const { canvas, data } = this, ratio = Math.min(2, window.devicePixelRatio || 1);
+    const { canvas, data } = this, ratio = Math.min(2, window.devicePixelRatio || 1) / this.coarseness;
     const width = this.native ? data.width : Math.max(1, Math.round(canvas.clientWidth * ratio));
     const height = this.native ? data.height : Math.max(1, Math.round(canvas.clientHeight * ratio));
     if (canvas.width !== width) canvas.width = width;
@@ -209,7 +213,8 @@ class Viewer {
   sorted({ scene, order }) {
     if (scene === this.name) {
       this.renderer.setOrder(order);
-      this.draw();
+      if (this.native) this.draw();
+      else this.paced();
     } else {
       this.wanted = true;
     }
@@ -217,6 +222,25 @@ class Viewer {
     if (this.wanted && scene !== this.name) this.waiting.push(...this.answered);
     else this.answered.forEach((resolve) => resolve());
     this.sort();
+  }
+
+  // A slow machine draws fewer pixels while the view moves, and all of them when it has come to rest.
+  paced() {
+    const { gl } = this.renderer, begun = performance.now();
+    this.draw();
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    const took = performance.now() - begun;
+    if (took > SLOW_MS && this.coarseness < 4) this.coarseness *= 2;
+    else if (took < SLOW_MS / 6 && this.coarseness > 1) this.coarseness /= 2;
+    window.clearTimeout(this.sharpening);
+    if (this.coarseness > 1) this.sharpening = window.setTimeout(() => this.sharp(), REST_MS);
+  }
+
+  sharp() {
+    const { coarseness } = this;
+    this.coarseness = 1;
+    if (!this.sorting) this.draw();
+    this.coarseness = coarseness;
   }
 
   draw() {
@@ -253,7 +277,7 @@ class Viewer {
     if (data.mesh) {
       const raw = Uint8Array.from(atob(data.mesh.corners), (letter) => letter.charCodeAt(0));
       const levels = new Uint16Array(raw.buffer), { low, step } = data.mesh;
-      const corners = Float32Array.from(levels, (level, k) => low[k % 3] + level * step);
+      const corners = Float32Array.from(levels, (level, k) => low[k % 3] + level * step[k % 3]);
       const tints = new Float32Array(corners.length).map((_, k) => [0.86, 0.74, 0.68][k % 3]);
       this.shapes.mesh = this.renderer.makeShape(corners, tints, gl.TRIANGLES);
     }
