@@ -1,4 +1,4 @@
-"""The interactive scene inside a page: its encoding, what is known of each Gaussian, its parts in the page."""
+"""The interactive scene of a page: its encoding, what is known of each Gaussian, its parts in the page."""
 
 from __future__ import annotations
 

@@ -7,8 +7,8 @@ block and a colour about 1/500 of the range of its neighbours. Rotations drop th
 and keep ten bits of each other one. Values known of Gaussians (the quantities) take 8 bits over a range
 common to all, 255 standing for unknown.
 
-SPZ and SOG were not used: both keep colours and harmonics in steps made for light baked into them, and clip
-albedo above what they expect.
+SPZ was not used: it keeps colours in steps of a fixed range made for light baked into them, which clips
+bright albedo. SOG needs a clustering for every page.
 """
 
 from __future__ import annotations

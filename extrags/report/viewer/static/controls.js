@@ -69,18 +69,19 @@ function connected(viewer) {
   });
 
   root.querySelectorAll('[name="scene"]').forEach((input) => {
-    input.checked = input.value === viewer.name;
-    input.addEventListener("change", () => { viewer.setScene(input.value); quantities(); });
+    input.addEventListener("change", () => viewer.setScene(input.value));
   });
   const quantity = part("quantity"), legend = part("legend");
+  let listed = null;
   const quantities = () => {
+    listed = `${viewer.name} ${viewer.quantity}`;
     quantity.replaceChildren(new Option("Colour", ""), ...viewer.scene.quantities_shown.map(({ name, title }) => new Option(title, name)));
     quantity.value = viewer.quantity;
     const item = viewer.scene.quantities_shown.find(({ name }) => name === viewer.quantity);
     legend.hidden = !item;
     if (item) [legend.firstElementChild.textContent, legend.lastElementChild.textContent] = item.ends;
   };
-  quantity.addEventListener("change", () => { viewer.setQuantity(quantity.value); quantities(); });
+  quantity.addEventListener("change", () => viewer.setQuantity(quantity.value));
 
   const cameras = part("camera");
   data.groups.forEach((group, g) => {
@@ -144,6 +145,8 @@ function connected(viewer) {
       input.disabled = !light.on;
       worded(input);
     });
+    root.querySelectorAll('[name="scene"]').forEach((input) => { input.checked = input.value === viewer.name; });
+    if (listed !== `${viewer.name} ${viewer.quantity}`) quantities();
     part("lit").checked = light.on;
     part("lit").disabled = !viewer.scene.light;
     part("pinned").checked = Boolean(viewer.lampPose);
@@ -153,5 +156,4 @@ function connected(viewer) {
     speed.textContent = recent > 2 ? `${recent} pictures/s` : "";
   }, 1000);
   viewer.onchange();
-  quantities();
 }

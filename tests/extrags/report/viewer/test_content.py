@@ -30,8 +30,7 @@ def html(drawn: ReportInputs) -> str:
 def test_page_loads_nothing_from_outside(html: str) -> None:
     page = Page(html)
     assert all(load.startswith("data:image/") for load in page.loads)
-    for scheme in ("http:", "https:", "ws:", "wss:", "//cdn"):
-        assert scheme not in html.replace("http://www.w3.org/", "")
+    assert "://" not in html.replace("http://www.w3.org/", "")
     assert not re.search(r"\b(fetch|importScripts|XMLHttpRequest|EventSource|sendBeacon)\b", html)
     assert not has_credentials(html)
     assert len(page.ids) == len(set(page.ids))

@@ -20,17 +20,20 @@ def cameras(*places: tuple[float, float, float]) -> Cameras:
     return Cameras(np.tile(K, (len(poses), 1, 1)), poses, 32, 32)
 
 
-def balls(*places: tuple[float, float, float]) -> Scene:
+def balls(*places: tuple[float, float, float], radius: tuple[float, ...] | float = 0.3) -> Scene:
     return Scene(
         Gaussians.from_points(
-            np.array(places), np.full((len(places), 3), 0.5), np.full(len(places), 0.3), opacity=0.99
+            np.array(places),
+            np.full((len(places), 3), 0.5),
+            np.broadcast_to(radius, len(places)).astype(float),
+            opacity=0.99,
         )
     )
 
 
 def test_views_and_directions() -> None:
     """The second ball stands behind the first in every view, the third outside of all."""
-    scene = balls((0.0, 0.0, 0.0), (0.0, 0.0, 1.5), (0.0, 30.0, 0.0))
+    scene = balls((0.0, 0.0, 0.0), (0.0, 0.0, 1.5), (0.0, 30.0, 0.0), radius=(0.6, 0.1, 0.3))
     # The second and the third camera are 2 degrees apart.
     seen_by = cameras((0.0, 0.0, -5.0), (-5.0, 0.0, 0.0), (-5.0, 0.0, 0.175))
     views, directions = training_coverage(scene, seen_by)
