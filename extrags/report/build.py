@@ -16,7 +16,7 @@ from extrags.report.estimated_depth import estimated_depth
 from extrags.report.inputs import ReportInputs
 from extrags.report.page import rendered_page
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
-from extrags.report.viewer.content import SCRIPTS, script_text, viewer_content
+from extrags.report.viewer.content import viewer_section
 from extrags.report.views import depth_rows, held_out_rows, virtual_rows
 from extrags.report.wording import (
     compare,
@@ -83,7 +83,7 @@ def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
         regions=_regions(inputs),
         missing_reasons=_missing_reasons(inputs),
         **_views(inputs, config),
-        **_viewer(inputs, config),
+        **viewer_section(inputs, config),
         curves=history_chart(inputs.history) if any(inputs.history.values()) else None,
         curves_absent=inputs.why_absent("history", "coarse"),
         **_space(inputs),
@@ -248,17 +248,6 @@ def _views(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:
         else None,
         "virtual_absent": inputs.why_absent("pseudo", "enhance"),
     }
-
-
-def _viewer(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:
-    content = viewer_content(inputs, round(config.viewer_mb * 1e6))
-    if config.viewer_mb == 0:
-        absent = "The settings leave the viewer out (report.viewer_mb is 0)."
-    elif inputs.sequence.world_from_camera is None:
-        absent = inputs.why_absent("poses", "poses")
-    else:
-        absent = inputs.why_absent("coarse_scene", "coarse")
-    return {"viewer": content, "viewer_absent": absent, "viewer_script": script_text(*SCRIPTS)}
 
 
 def _space(inputs: ReportInputs) -> dict[str, Any]:

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 from markupsafe import Markup
 
+from extrags.config import ReportConfig
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.raster.rendering import ALPHA_MIN, DILATION_PX2
@@ -23,7 +24,7 @@ from extrags.report.viewer.quantities import scene_quantities
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["ViewerContent", "encoded_within", "script_text", "viewer_content"]
+__all__ = ["ViewerContent", "encoded_within", "script_text", "viewer_content", "viewer_section"]
 
 SCRIPTS = ("camera.js", "decode.js", "renderer.js", "viewer.js", "controls.js", "compare.js", "start.js")
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "shape.vert", "shape.frag")
@@ -128,6 +129,18 @@ def viewer_content(inputs: ReportInputs, largest_bytes: int) -> ViewerContent | 
         width=sequence.width,
         height=sequence.height,
     )
+
+
+def viewer_section(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:
+    """What the template needs: the viewer, or the reason why there is none, and the scripts of the page."""
+    content = viewer_content(inputs, round(config.viewer_mb * 1e6))
+    if config.viewer_mb == 0:
+        absent = "The settings leave the viewer out (report.viewer_mb is 0)."
+    elif inputs.sequence.world_from_camera is None:
+        absent = inputs.why_absent("poses", "poses")
+    else:
+        absent = inputs.why_absent("coarse_scene", "coarse")
+    return {"viewer": content, "viewer_absent": absent, "viewer_script": script_text(*SCRIPTS)}
 
 
 def encoded_within(
