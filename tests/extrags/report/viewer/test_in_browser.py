@@ -196,7 +196,8 @@ def test_views_lie_on_each_other(tab: Browser) -> None:
 def test_nothing_is_wider_than_the_window(tab: Browser, width: int, height: int) -> None:
     tab.window(width, height, dark=width == 820)
     wider = tab.run(
-        "[...document.querySelectorAll('body *')].filter(item => !item.closest('nav, .scroll, .chart, details')"
+        "[...document.querySelectorAll('body *')].filter("
+        "item => !item.closest('nav, .scroll, .chart, details')"
         " && item.getBoundingClientRect().right > window.innerWidth).map(item => item.outerHTML.slice(0, 90))"
     )
     assert wider == []
