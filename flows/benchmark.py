@@ -108,7 +108,8 @@ def benchmark(
     shows as a trend. A run that fails does not stop the others.
 
     Returns:
-        `{machine, cases: [{method, profile, sequence, setting, seed, seconds, peak_mib, metrics, ...}],
+        `{machine, cases: [{method, profile, sequence, setting, seed, seconds, spent_seconds,
+        processor_seconds, peak_mib, metrics, ...}],
         comparison, regressions, report}`; `metrics` is None for a failed run, whose `error` says why.
         `comparison` is
         `extrags.metrics.comparison.compare_runs`; beside `report` stand `per_view.json` and
@@ -264,13 +265,16 @@ def run_method(
 def case_of(case: Case) -> dict[str, Any]:
     """A run as JSON.
 
-    `seconds` is what its stages took when they were made, without evaluation and report; `peak_mib` the
-    largest resident memory of the process meanwhile; `evaluation` where the figures of each view are;
+    `seconds` is what its stages took when they were made, without evaluation and report, `processor_seconds`
+    the processor time of all threads meanwhile (None where an earlier version made one of them),
+    `spent_seconds` the part of `seconds` that was spent in this run; `peak_mib` is the
+    largest resident memory of the process; `evaluation` where the figures of each view are;
     `held_out_trained_on` is true of the oracle alone.
     """
     outcome = case.outcome
     rows = [row for row in outcome.stages if row.stage not in NOT_COUNTED]
     peaks = [row.peak_mib for row in rows if row.peak_mib is not None]
+    processor = [row.processor_seconds for row in rows if row.tasks]
     name, _, setting = outcome.name.partition("@")
     failed = next((row for row in outcome.stages if row.state == "failed"), None)
     measured = outcome.final_metrics
@@ -281,6 +285,10 @@ def case_of(case: Case) -> dict[str, Any]:
         "setting": setting or None,
         "seed": case.seed,
         "seconds": round(sum(row.made_seconds for row in rows), 3),
+        "spent_seconds": round(sum(row.spent_seconds for row in rows), 3),
+        "processor_seconds": None
+        if None in processor
+        else round(sum(value for value in processor if value is not None), 3),
         "peak_mib": max(peaks) if peaks else None,
         "metrics": outcome.metrics["final"] if failed is None else None,
         "evaluation": None if measured is None else f"{measured.uri}/{METRICS_FILE}",

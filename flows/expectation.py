@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
-from typing import Any
 
 from data_catalog import Descriptor, describe
 from extrags.config import PipelineConfig
@@ -18,7 +17,7 @@ from flows.outcome_records import OutcomeRecord, outcome_records
 from flows.run_page import expected_seconds
 from tasks.run_page import duration_text
 
-__all__ = ["Expectation", "expectations", "expected_words", "longest_first"]
+__all__ = ["Expectation", "expectations", "expected_words", "longest_first", "read_size"]
 
 REFERENCE_FRAMES, REFERENCE_PIXELS = 48, 160 * 128
 """Of the sequences that `flows.run_page.EXPECTED_SECONDS` was measured on."""
@@ -163,14 +162,20 @@ def _scales(sequence: str, config: PipelineConfig) -> Mapping[StageName, float]:
         about: Descriptor = describe(sequence)
     except ExtragsError:
         return {}  # A path: nothing is known of it before it is read.
-    ingest: Any = config.ingest
-    frames = min(about.frames, ingest.max_frames or about.frames)
-    pixels: float = about.width * about.height
-    rendered = about.format in ("phantom", "caverns")
-    if ingest.width and ingest.height and rendered:
-        pixels = ingest.width * ingest.height
-    elif not rendered:
-        pixels = pixels / (ingest.downscale or max(1, round(about.width / USUAL_WIDTH))) ** 2
+    frames = min(about.frames, config.ingest.max_frames or about.frames)
+    width, height = read_size(about, config)
+    pixels = width * height
     by_pixels = pixels / REFERENCE_PIXELS
     by_frames = by_pixels * frames / REFERENCE_FRAMES
     return {stage: by_frames if stage in PER_FRAME else by_pixels for stage in STAGES}
+
+
+def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:
+    """About the width and height that a sequence of the catalogue is read at, in pixels."""
+    ingest = config.ingest
+    if ingest.width and ingest.height and about.format in ("phantom", "caverns"):
+        return ingest.width, ingest.height
+    if about.format in ("phantom", "caverns"):
+        return about.width, about.height
+    divisor = ingest.downscale or max(1, round(about.width / USUAL_WIDTH))
+    return about.width / divisor, about.height / divisor

@@ -21,6 +21,7 @@ from extrags.metrics.comparison import figure_of
 from extrags.store import Store, digest_of, read_records, write_record
 
 __all__ = [
+    "SAME_MACHINE",
     "BenchmarkRegressedError",
     "Tolerance",
     "append_history",
@@ -34,6 +35,7 @@ FIGURES = ("observed.psnr", "psnr")
 """The figure a run is judged by is the first of these that it has."""
 
 SAME_MACHINE = ("processor", "cores", "threads", "isa")
+"""What must be equal for run times to be comparable; keys of `extrags.raster.bench.machine`."""
 
 
 class Tolerance(BaseModel):
@@ -83,6 +85,7 @@ def history_entry(
                 **{key: case[key] for key in ("method", "profile", "sequence", "setting", "seed", "error")},
                 "settings": digest,
                 "seconds": case["seconds"],
+                "processor_seconds": case.get("processor_seconds"),
                 "peak_mib": case["peak_mib"],
                 "figures": {
                     figure: value
@@ -130,7 +133,9 @@ def regressions(
 
     Compared is the mean over seeds of each method on each sequence, with the median of the last
     `tolerance.runs` runs that had the same settings: PSNR of all of them, run time of those on the same
-    kind of machine. A case that fails now and did not before is worse, too.
+    kind of machine. Run time is processor time where enough of these runs have measured it, since other work
+    on the machine hardly changes it; elapsed time otherwise. A case that fails now and did not before is
+    worse, too.
 
     Args:
         entry: of the run.
@@ -158,12 +163,17 @@ def regressions(
                     f"{len(known)} runs (tolerance {tolerance.psnr_db:g} dB)"
                 )
         local = [groups[group] for groups, mine in zip(before, same, strict=True) if mine and group in groups]
-        times = [item["seconds"] for item in local if not item["error"]][-tolerance.runs :]
+        clock, kind = "processor_seconds", " of processor time"
+        timed = [item for item in local if not item["error"]][-tolerance.runs :]
+        times = [item[clock] for item in timed if item[clock] is not None]
+        if now[clock] is None or len(times) < tolerance.at_least:
+            clock, kind = "seconds", ""
+            times = [item[clock] for item in timed]
         if len(times) >= tolerance.at_least:
-            was, value = median(times), now["seconds"]
+            was, value = median(times), now[clock]
             if value - was > max(tolerance.seconds_share * was, tolerance.seconds):
                 found.append(
-                    f"{label}: {value:.1f} s, {value / was - 1:.0%} above the median {was:.1f} s of "
+                    f"{label}: {value:.1f} s{kind}, {value / was - 1:.0%} above the median {was:.1f} s of "
                     f"{len(times)} runs (tolerance {tolerance.seconds_share:.0%})"
                 )
     return found
@@ -216,6 +226,7 @@ def _groups(entry: Mapping[str, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
         group: {
             "error": next((case["error"] for case in cases if case["error"]), ""),
             "seconds": fmean(case["seconds"] for case in cases),
+            "processor_seconds": _mean([case.get("processor_seconds") for case in cases]),
             "figures": {
                 name: fmean(case["figures"][name] for case in cases)
                 for name in FIGURES
@@ -224,6 +235,12 @@ def _groups(entry: Mapping[str, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
         }
         for group, cases in grouped.items()
     }
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """None where one of them is."""
+    known = [value for value in values if value is not None]
+    return fmean(known) if len(known) == len(values) else None
 
 
 def _label(group: tuple[str, ...]) -> str:

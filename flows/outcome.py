@@ -62,6 +62,11 @@ class StageRow:
     """Why it was skipped or failed, or the reason from the plan."""
     made_seconds: float = 0.0
     """Time it took to compute its artefacts, in this or an earlier run."""
+    spent_seconds: float = 0.0
+    """The part of `made_seconds` that was spent in this run; the rest is what cached artefacts once took."""
+    processor_seconds: float | None = None
+    """Processor time of all threads while the artefacts were made, in this or an earlier run; None where an
+    earlier version made one of them and did not measure it."""
     peak_mib: float | None = None
     """Peak resident memory of the process while they were computed."""
     tasks: int = 0
@@ -77,6 +82,8 @@ class StageRow:
             "seconds": round(self.seconds, 3),
             "reason": self.reason,
             "made_seconds": round(self.made_seconds, 3),
+            "spent_seconds": round(self.spent_seconds, 3),
+            "processor_seconds": self.processor_seconds,
             "peak_mib": self.peak_mib,
             "tasks": self.tasks,
         }

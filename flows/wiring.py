@@ -454,10 +454,18 @@ class SequenceRun(Pipeline):
             peak = manifest.counts.get("peak_mib")
             if isinstance(peak, float):
                 row.peak_mib = max(row.peak_mib or 0.0, peak)
+            processor = manifest.counts.get("processor_s")
+            if not isinstance(processor, int | float):
+                row.processor_seconds = None
+            elif row.tasks == 0:
+                row.processor_seconds = float(processor)
+            elif row.processor_seconds is not None:
+                row.processor_seconds = round(row.processor_seconds + processor, 3)
             row.made_seconds += manifest.seconds
             row.made[manifest.key] = manifest.bytes
             row.tasks += 1
             if result.state == "ran":
+                row.spent_seconds += manifest.seconds
                 row.state = "ran"
         return [result.ref for result in results]
 

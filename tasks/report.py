@@ -43,7 +43,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=7, ignore=("rows",))
+@stage("report", version=8, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
@@ -69,6 +69,7 @@ def report(
     from extrags.pseudo_views import PseudoViews
     from extrags.report.build import build_pages
     from extrags.report.inputs import ReportInputs
+    from extrags.scene import Scene
     from extrags.scene_plan import ScenePlan
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
@@ -83,6 +84,7 @@ def report(
     exploration, plan = part(Exploration, "explore"), part(ScenePlan, "plan")
     trajectories = [] if exploration is None else exploration.trajectories
     curves = {stage: figures(stage, HISTORY) for stage in ("coarse", "finetune")}
+    pseudo = part(PseudoViews, "enhance")
     inputs = ReportInputs(
         name=sequence.name,
         sequence=sequence,
@@ -91,7 +93,11 @@ def report(
         coarse_metrics=figures("metrics_coarse", METRICS_FILE),
         final_metrics=figures("metrics_final", METRICS_FILE),
         depth=part(DepthEstimate, "depth"),
-        pseudo=part(PseudoViews, "enhance"),
+        pseudo=pseudo,
+        virtual_cameras=None if pseudo is None else pseudo.cameras,
+        # UC-NeRF keeps a field there, not Gaussians.
+        coarse_scene=None if config.uc_nerf.enabled else part(Scene, "coarse"),
+        final_scene=part(Scene, "finetune"),
         trajectories=[cameras.world_from_camera for cameras in trajectories],
         exploration=None if exploration is None else exploration.summary(),
         grid=part(FreeSpace, "freespace"),

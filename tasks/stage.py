@@ -33,6 +33,7 @@ from extrags.errors import ConfigError
 from extrags.store import Ref, Slot, Store, canonical, digest_of
 from tasks.locks import FlockManager
 from tasks.memory import peak_memory
+from tasks.processor_time import processor_time
 from tasks.progress import reporting
 from tasks.run_log import run_log
 from tasks.run_page import stage_page
@@ -175,9 +176,15 @@ def stage(
                 ) as slot,
             ):
                 # Workers with other numbers of threads share the store.
-                with peak_memory() as peak, kernel_threads(threads), one_torch_thread():
+                with (
+                    peak_memory() as peak,
+                    processor_time() as processor,
+                    kernel_threads(threads),
+                    one_torch_thread(),
+                ):
                     body(slot, **inputs)  # type: ignore[call-arg]
                 slot.counts["peak_mib"] = peak.mib
+                slot.counts["processor_s"] = processor.seconds
             return slot.ref
 
         own = list(inspect.signature(body).parameters.values())[1:]

@@ -223,6 +223,9 @@ class ReportConfig(StageConfig):
 
     held_out_views: int = Field(6, ge=1, description="held-out views shown")
     virtual_views: int = Field(8, ge=1, description="virtual views shown")
+    viewer_mb: float = Field(
+        8.0, ge=0, le=100, description="MB of the page that the interactive scene may take; 0 leaves it out"
+    )
 
 
 class PipelineConfig(StageConfig):

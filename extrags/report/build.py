@@ -16,6 +16,7 @@ from extrags.report.estimated_depth import estimated_depth
 from extrags.report.inputs import ReportInputs
 from extrags.report.page import rendered_page
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
+from extrags.report.viewer.content import viewer_section
 from extrags.report.views import depth_rows, held_out_rows, virtual_rows
 from extrags.report.wording import (
     compare,
@@ -43,15 +44,16 @@ _REGIONS = (
 def build_report(inputs: ReportInputs, config: ReportConfig) -> str:
     """One self-contained HTML page: numbers, images, figures, plan, times and settings.
 
-    The page needs no network and no script, and depends on its inputs only: the same inputs give the same
-    text. What is missing is left out with a sentence saying why.
+    The page needs no network and depends on its inputs only: the same inputs give the same text. What is
+    missing is left out with a sentence saying why. Its scripts, which stand in the page, draw the scene and
+    lay views on each other; all else can be read without them.
 
     Args:
         inputs: what the stages made.
         config: how many views to show.
 
     Returns:
-        HTML, below about 6 MB.
+        HTML, below about 6 MB, and what `viewer_mb` allows for the scenes.
 
     Raises:
         NonFiniteError: when an image to be shown holds NaN or infinity.
@@ -81,6 +83,7 @@ def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
         regions=_regions(inputs),
         missing_reasons=_missing_reasons(inputs),
         **_views(inputs, config),
+        **viewer_section(inputs, config),
         curves=history_chart(inputs.history) if any(inputs.history.values()) else None,
         curves_absent=inputs.why_absent("history", "coarse"),
         **_space(inputs),

@@ -9,8 +9,10 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float, Int
 
+from extrags.cameras import Cameras
 from extrags.config import PipelineConfig
 from extrags.errors import ShapeError
+from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["DepthLike", "GridLike", "MeshLike", "PseudoLike", "RendersLike", "ReportInputs"]
@@ -156,6 +158,9 @@ class ReportInputs:
         final_metrics: the same of the fine-tuned scene.
         depth: depth of the training frames that was estimated from images.
         pseudo: virtual views before and after restoration.
+        virtual_cameras: of `pseudo`, in its order.
+        coarse_scene: Gaussians of the coarse scene, for the viewer.
+        final_scene: the same of the fine-tuned scene.
         trajectories: camera-to-world poses of each virtual trajectory, its real start first, [L, 4, 4].
         exploration: `Exploration.summary()`.
         grid: occupancy.
@@ -184,6 +189,9 @@ class ReportInputs:
     final_metrics: Mapping[str, Any] | None = None
     depth: DepthLike | None = None
     pseudo: PseudoLike | None = None
+    virtual_cameras: Cameras | None = None
+    coarse_scene: Scene | None = None
+    final_scene: Scene | None = None
     trajectories: Sequence[Float[np.ndarray, "_ 4 4"]] = ()
     exploration: Mapping[str, Any] | None = None
     grid: GridLike | None = None

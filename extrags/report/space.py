@@ -18,7 +18,7 @@ from extrags.report.charts import INK, QUIET, drawing_style
 from extrags.report.encode import DataImage, png_image
 from extrags.report.inputs import GridLike, MeshLike
 
-__all__ = ["SceneFigure", "occupancy_slices", "scene_views", "trajectory_colors"]
+__all__ = ["SceneFigure", "clustered", "occupancy_slices", "scene_views", "trajectory_colors"]
 
 MAX_FACES = 20_000
 """Finer meshes are clustered: at this size of picture more would not be seen."""
@@ -144,7 +144,7 @@ def occupancy_slices(
 
 def _faces_of(mesh: MeshLike | None, grid: GridLike | None, train: Cameras) -> _Faces | None:
     if mesh is not None and len(mesh.triangles):
-        corners = _clustered(mesh.vertices.astype(np.float64), mesh.triangles)
+        corners = clustered(mesh.vertices.astype(np.float64), mesh.triangles)
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         length = np.linalg.norm(normals, axis=1)
         corners, normals = corners[length > 0], normals[length > 0] / length[length > 0, None]
@@ -156,7 +156,7 @@ def _faces_of(mesh: MeshLike | None, grid: GridLike | None, train: Cameras) -> _
     return None
 
 
-def _clustered(vertices: np.ndarray, triangles: np.ndarray) -> Float[np.ndarray, "t 3 3"]:
+def clustered(vertices: np.ndarray, triangles: np.ndarray) -> Float[np.ndarray, "t 3 3"]:
     """Triangle corners of the mesh, its vertices merged on ever coarser grids until it is small enough."""
     diameter = float(np.linalg.norm(np.ptp(vertices, axis=0)))
     cell = diameter / 400

@@ -1,6 +1,6 @@
-"""`bench raster`, `bench train`, `bench stability`, `bench enhance`; `bench pipeline` is `benchmark`.
+"""`bench raster`, `bench train`, `bench stability`, `bench enhance`.
 
-`bench explore` has a module of its own.
+`bench explore`, `bench pipeline` and `bench compare` have modules of their own.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from extrags.errors import ConfigError
 from extrags.metrics.registry import figures
-from flows.commands import bench_explore, benchmark
+from flows.commands import bench_compare, bench_explore, bench_pipeline
 from flows.commands.common import items, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_profile, add_settings, add_verb
 
@@ -33,7 +33,7 @@ A size goes with the number of Gaussians at the same place in the list."""
 def add_arguments(parser: Parser) -> None:
     """The verbs below `extrags bench`."""
     verbs = parser.add_subparsers(
-        metavar="raster|train|stability|enhance|explore|pipeline", required=True, parser_class=Parser
+        metavar="raster|train|stability|enhance|explore|pipeline|compare", required=True, parser_class=Parser
     )
     for command, summary, with_error in (
         (raster, "time and error of the rasteriser, forward and backward", True),
@@ -65,8 +65,13 @@ def add_arguments(parser: Parser) -> None:
     _add_enhance(add_verb(verbs, "enhance", enhance, "restorers beside each other on held-out views"))
     summary = "ways to choose virtual views, against the true surface"
     bench_explore.add_arguments(add_verb(verbs, "explore", bench_explore.explore, summary))
-    summary = "run time against error of whole runs: the same as `extrags benchmark`"
-    benchmark.add_arguments(add_verb(verbs, "pipeline", benchmark.benchmark, summary))
+    raw: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
+    summary = "run time against error of whole runs, over methods and budgets"
+    bench_pipeline.add_arguments(
+        add_verb(verbs, "pipeline", bench_pipeline.pipeline, summary, epilog=bench_pipeline.EXAMPLES, **raw)
+    )
+    summary = "tell a regression between two results from noise"
+    bench_compare.add_arguments(add_verb(verbs, "compare", bench_compare.compare, summary))
 
 
 def _add_kernel_cases(parser: Parser, *, with_error: bool) -> None:

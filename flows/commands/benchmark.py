@@ -1,4 +1,4 @@
-"""`benchmark` (also `bench pipeline`): methods compared over sequences and seeds."""
+"""`benchmark`: methods compared over sequences and seeds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["add_arguments", "benchmark", "parsed_seeds", "parsed_variants", "pri
 
 
 def add_arguments(parser: Parser) -> None:
-    """The options of `extrags benchmark`, and of `extrags bench pipeline`, which is the same."""
+    """The options of `extrags benchmark`."""
     from flows.methods import METHODS
 
     parser.description = (

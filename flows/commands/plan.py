@@ -1,21 +1,34 @@
-"""`plan`: which stages a scene needs, and why."""
+"""`plan`: which stages a scene needs, why, and what they will cost."""
 
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, ExtragsError
 from flows.commands.common import write_json
 from flows.commands.options import Parser, add_json, add_method, add_runner
 from flows.commands.run import execute
 
-__all__ = ["add_arguments", "plan"]
+if TYPE_CHECKING:
+    from flows.run_costs import RunPrediction
+
+__all__ = ["add_arguments", "plan", "print_prediction"]
 
 
 def add_arguments(parser: Parser) -> None:
     """The options of `extrags plan`."""
+    parser.description = (
+        "Read, reconstruct coarsely and measure a scene, say which stages it needs, and predict what each "
+        "will cost: processor time and memory of a whole run from an empty store, on this machine."
+    )
     parser.set_defaults(command=plan)
     parser.add_argument("sequence", metavar="SEQUENCE")
+    parser.add_argument(
+        "--before",
+        action="store_true",
+        help="run nothing: predict the cost of all stages from what the catalogue says of the sequence",
+    )
     add_method(parser)
     add_runner(parser)
     add_json(parser)
@@ -28,16 +41,68 @@ def plan(given: argparse.Namespace) -> int:
         ConfigError: for a method that has no plan.
     """
     from extrags.pipeline import needs_plan
+    from extrags.store import Store
+    from flows.commands.common import run_config, store_root
     from flows.methods import METHODS
 
-    if not needs_plan(METHODS[given.method].leave_out):
+    left_out = METHODS[given.method].leave_out
+    if given.before:
+        from flows.environment import prepare
+
+        config = run_config(given)
+        prepare(Store(store_root(given)).state, debug=given.debug)
+        from flows.run_costs import catalogue_work, predict_run
+
+        work, stages = catalogue_work(given.sequence, config, left_out)
+        scenes = 2 if "finetune" in stages else 1
+        predicted = predict_run(Store(store_root(given)), work, stages, measured_scenes=scenes)
+        if given.json != "-":
+            print_prediction(predicted)
+        write_json({"sequence": given.sequence, "predicted": predicted.to_json()}, given.json)
+        return 0
+    if not needs_plan(left_out):
         raise ConfigError(f"no stage of the method {given.method} depends on a plan, so it has none")
     (outcome,) = execute([given.sequence], given, until="assess").sequences
     if outcome.status == "failed":
         raise outcome.error or ExtragsError(f"{outcome.name} failed")
     from flows.console import print_plan
+    from flows.run_costs import planned_work, predict_run
 
+    store = Store(store_root(given))
+    work, stages = planned_work(store, outcome, run_config(given))
+    scenes = 2 if "finetune" in stages else 1
+    predicted = predict_run(store, work, stages, measured_scenes=scenes)
     if given.json != "-":
         print_plan(outcome)
-    write_json({"sequence": outcome.name, **(outcome.plan or {})}, given.json)
+        print_prediction(predicted)
+    write_json(
+        {"sequence": outcome.name, **(outcome.plan or {}), "predicted": predicted.to_json()}, given.json
+    )
     return 0
+
+
+def print_prediction(predicted: RunPrediction) -> None:
+    """What a run will cost, stage by stage and in all."""
+    from rich.table import Table
+
+    from flows.terminal import console
+
+    table = Table(box=None, pad_edge=False, header_style="bold", title="predicted cost of a whole run")
+    table.add_column("stage")
+    for name in ("processor s", "elapsed s", "peak MiB"):
+        table.add_column(name, justify="right")
+    rows = [(item.stage, item.processor_seconds, item.seconds, item.peak_mib) for item in predicted.stages]
+    for stage, *costs in [
+        *rows,
+        ("total", predicted.processor_seconds, predicted.seconds, predicted.peak_mib),
+    ]:
+        texts = (("-" if cost is None else f"{cost:.0f}" if cost >= 10 else f"{cost:.1f}") for cost in costs)
+        table.add_row(stage, *texts)
+    out = console()
+    out.print(table)
+    sources = {
+        "history": f"at the pace of {predicted.records} records in this store",
+        "probe": "at the speed that a short probe of this machine has shown; elapsed time is not predicted",
+    }
+    unknown = f"; not known: {', '.join(predicted.unknown)}" if predicted.unknown else ""
+    out.print(f"[dim]{sources[predicted.source]}{unknown}[/]", soft_wrap=True)

@@ -179,13 +179,17 @@ static void forward(View* view, const Scene* scene, const Images* images) {
   for (int chunk = 0; chunk < view->chunks; ++chunk) {
     for (size_t tile = 0; tile < tiles; ++tile) starts[tile + 1] += counts[chunk * tiles + tile];
   }
-  for (size_t tile = 0; tile < tiles; ++tile) {
-    starts[tile + 1] += starts[tile];
-    uint32_t at = starts[tile];
-    for (int chunk = 0; chunk < view->chunks; ++chunk) {
-      const uint32_t count = counts[chunk * tiles + tile];
-      counts[chunk * tiles + tile] = at;
-      at += count;
+  for (size_t tile = 0; tile < tiles; ++tile) starts[tile + 1] += starts[tile];
+  // A running sum down the chunks, row by row: a column at a time would miss the caches at every step.
+  reserve(&view->scratch[0], sizeof(uint32_t) * tiles);
+  uint32_t* next = static_cast<uint32_t*>(view->scratch[0].data);
+  memcpy(next, starts, sizeof(uint32_t) * tiles);
+  for (int chunk = 0; chunk < view->chunks; ++chunk) {
+    uint32_t* row = counts + chunk * tiles;
+    for (size_t tile = 0; tile < tiles; ++tile) {
+      const uint32_t count = row[tile];
+      row[tile] = next[tile];
+      next[tile] += count;
     }
   }
   uint32_t* chunk_pairs = static_cast<uint32_t*>(view->chunk_pairs.data);
@@ -251,8 +255,8 @@ static void backward(View* view, const Scene* scene, const ImageGradients* in, c
   }
 }
 
-static int64_t first_nonfinite(const float* values, int64_t count) {
-  // x - x is zero for finite x, else NaN, and a NaN stays in the sum.
+// Whether all values are finite: x - x is zero for finite x, else NaN, and a NaN stays in the sum.
+static bool all_finite(const float* values, int64_t count) {
   Vec total[4] = {Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
   int64_t i = 0;
   for (; i + 64 <= count; i += 64) {
@@ -263,9 +267,37 @@ static int64_t first_nonfinite(const float* values, int64_t count) {
   }
   float poison = sum((total[0] + total[1]) + (total[2] + total[3]));
   for (; i < count; ++i) poison += values[i] - values[i];
-  if (poison == 0.f) return -1;
-  for (i = 0; i < count; ++i) {
-    if (!(values[i] - values[i] == 0.f)) return i;
+  return poison == 0.f;
+}
+
+constexpr int64_t kFiniteValues = 1 << 18;  // a task, at least
+constexpr int kFiniteTasks = 256;           // at most
+
+struct FiniteContext {
+  const float* values;
+  int64_t count, per_task;
+  bool finite[kFiniteTasks];
+};
+
+static void finite_task(void* data, int task, int) {
+  FiniteContext& c = *static_cast<FiniteContext*>(data);
+  const int64_t begin = task * c.per_task, rest = c.count - begin;
+  c.finite[task] = all_finite(c.values + begin, rest < c.per_task ? rest : c.per_task);
+}
+
+static int64_t first_nonfinite(const float* values, int64_t count) {
+  FiniteContext c;
+  c.values = values;
+  c.count = count;
+  c.per_task = kFiniteValues;
+  while (c.per_task * kFiniteTasks < count) c.per_task *= 2;
+  const int tasks = static_cast<int>((count + c.per_task - 1) / c.per_task);
+  parallel_for(tasks, finite_task, &c);
+  for (int task = 0; task < tasks; ++task) {
+    if (c.finite[task]) continue;
+    for (int64_t i = task * c.per_task; i < count; ++i) {
+      if (!(values[i] - values[i] == 0.f)) return i;
+    }
   }
   return -1;
 }

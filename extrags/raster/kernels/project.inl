@@ -164,7 +164,8 @@ static void project_chunk(View* view, const Scene* scene, const Images* out, int
     if constexpr (kColors) {
       load_rows<3>(scene->colors + 3 * static_cast<size_t>(first), rows, color);
     } else {
-      shade<kDegree>(scene, first, rows, p, color);
+      alignas(64) float coefficients[48 * 16];
+      shade<kDegree>(scene, first, rows, p, coefficients, color);
     }
     if (view->lit) {
       Lit lit;
@@ -262,7 +263,6 @@ EXTRAGS_INLINE void apply_conic(const Projected& p, Vec inverse, Vec x, Vec y, V
 template <int kDegree, bool kColors, bool kPose>
 static void project_chunk_backward(View* view, const Scene* scene, const SceneGradients* out, int chunk) {
   const TileRect* rects = static_cast<const TileRect*>(view->rects.data);
-  const Record* records = static_cast<const Record*>(view->records.data);
   const uint32_t* starts = static_cast<const uint32_t*>(view->pair_starts.data);
   const float* pair_rows = static_cast<const float*>(view->pair_rows.data);
   const Camera& camera = view->camera;
@@ -275,6 +275,7 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
   for (int k = 0; k < 11; ++k) v_light[k] = zero;
   for (int first = begin; first < end; first += 16) {
     const int rows = rows_of(end, first);
+    if constexpr (!kColors) prefetch_coefficients(scene, first + 16, end);
     alignas(64) float gathered[256], columns[256];
     uint32_t seen = 0;
     for (int i = 0; i < 16; ++i) {
@@ -333,14 +334,12 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
                  keep(p.free_y, bend_y);
     Vec v_color[3], v_normal[3] = {zero, zero, zero};
     for (int channel = 0; channel < 3; ++channel) v_color[channel] = finite(load(columns + 96 + 16 * channel));
+    Vec albedo[3];
+    alignas(64) float coefficients[48 * 16];
+    if constexpr (!kColors) shade<kDegree>(scene, first, rows, p, coefficients, albedo);
     Lit lit;
     if (view->lit) {
-      Vec albedo[3];
-      if constexpr (kColors) {
-        load_rows<3>(scene->colors + 3 * static_cast<size_t>(first), rows, albedo);
-      } else {
-        shade<kDegree>(scene, first, rows, p, albedo);
-      }
+      if constexpr (kColors) load_rows<3>(scene->colors + 3 * static_cast<size_t>(first), rows, albedo);
       illuminate(view, p, lit);
       for (int channel = 0; channel < 3; ++channel) v_color[channel] = keep(ok, v_color[channel]);
       illuminate_backward(view, lit, albedo, v_color, v_point, v_normal, v_light);
@@ -385,14 +384,10 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
     Vec v_direction[3] = {zero, zero, zero};
     if constexpr (!kColors) {
       // No gradient where the colour was held at zero
-      alignas(64) float color[3][16] = {};
-      for (int i = 0; i < rows; ++i) {
-        for (int channel = 0; channel < 3; ++channel) color[channel][i] = records[first + i].color[channel];
-      }
       for (int channel = 0; channel < 3; ++channel) {
-        v_color[channel] = keep(ok & gt(load(color[channel]), zero), v_color[channel]);
+        v_color[channel] = keep(ok & gt(albedo[channel], zero), v_color[channel]);
       }
-      shade_backward<kDegree>(scene, out, first, rows, p, v_color, v_direction);
+      shade_backward<kDegree>(scene, out, first, rows, p, coefficients, v_color, v_direction);
       if constexpr (kDegree > 0) {
         const Vec along = fma(v_direction[0], p.direction[0],
                               fma(v_direction[1], p.direction[1], v_direction[2] * p.direction[2]));

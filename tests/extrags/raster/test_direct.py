@@ -192,3 +192,13 @@ def test_depth_confidence_scales_each_pixel(isa: str) -> None:
     assert compared == depth.numel()
     assert loss == pytest.approx(0.4 * float(expected.detach()), rel=1e-6)
     assert relative_l2(torch.from_numpy(gradient), depth.grad.double()) < 1e-6  # type: ignore[union-attr]
+
+
+def test_the_first_nonfinite_value_is_found_in_a_long_array(isa: str, threads: None) -> None:
+    set_num_threads(2)
+    values = np.zeros(1_000_003, dtype=np.float32)
+    first_nonfinite = native.compiled_kernels().first_nonfinite
+    assert first_nonfinite(values) == -1
+    for place in (1_000_002, 700_000, 262_144, 262_143, 0):
+        values[place] = np.nan if place % 2 else -np.inf
+        assert first_nonfinite(values) == place

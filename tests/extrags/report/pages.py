@@ -37,7 +37,8 @@ class Page(HTMLParser):
             self.images.append(values)
         if tag == "a":
             self.links.append(str(values["href"]))
-        if tag in {"script", "link", "iframe", "object", "embed"}:
+        # Scripts stand in the page; `src` is looked at below.
+        if tag in {"link", "iframe", "object", "embed"}:
             self.loads.append(tag)
         for name in ("src", "srcset", "data", "action", "poster"):
             if values.get(name):
@@ -48,7 +49,7 @@ class Page(HTMLParser):
         assert self.stack.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if self.stack[-1:] != ["style"]:
+        if self.stack[-1:] not in (["style"], ["script"]):
             self.words.append(data)
 
     @property

@@ -1,0 +1,262 @@
+"""Two results of one benchmark: what has got worse, and what is noise.
+
+Runs of both results that have everything in common, seed and repeat included, are pairs; a difference is
+judged by the spread of the pairs' differences (one-sided t test). Where seeds or repeats do not match, the
+two samples are compared as they are (Welch's test). As very many quantities are looked at, the threshold is
+Holm's, over all of them: the chance of a single false alarm in a comparison is at most `LEVEL`. A difference
+smaller than what matters (`MATTERS`) is never a regression, however certain it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from extrags.errors import ConfigError
+from extrags.metrics.comparison import figure_of, spread
+from extrags.metrics.registry import Figure, figures
+
+__all__ = ["COST_NAMES", "LEVEL", "MATTERS", "compare_results"]
+
+LEVEL = 0.05
+"""Chance of a false alarm in a whole comparison."""
+COST_NAMES = ("seconds", "processor_seconds", "peak_mib")
+MATTERS = {"cost": 0.05, "dB": 0.1, "other": 0.01}
+"""The smallest change that counts: share of a cost, decibels, and share of any other figure."""
+GROUP = ("method", "profile", "budget", "sequence", "setting", "width", "height")
+MACHINE = ("processor", "cores", "threads", "isa")
+
+Verdict = Literal["worse", "better", "noise", "equal", "not judged"]
+
+
+@dataclass
+class _Row:
+    about: dict[str, Any]
+    quantity: str
+    kind: str
+    paired: bool
+    n: int
+    before: float
+    after: float
+    worsening: float
+    """In the unit of `kind`: positive is worse."""
+    low: float | None
+    high: float | None
+    p_worse: float | None
+    p_better: float | None
+    verdict: Verdict = "not judged"
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            **self.about,
+            "quantity": self.quantity,
+            "unit": {"cost": "share", "dB": "dB", "other": "share"}[self.kind],
+            "paired": self.paired,
+            "n": self.n,
+            "before": self.before,
+            "after": self.after,
+            "worsening": self.worsening,
+            "interval": None if self.low is None else [self.low, self.high],
+            "verdict": self.verdict,
+        }
+
+
+def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict[str, Any]:
+    """Compare two results of `bench pipeline` or `benchmark`.
+
+    Args:
+        before: JSON of the reference: `{machine, cases}`.
+        after: of what is judged.
+
+    Returns:
+        `{level, times_judged, rows, failed, missing, regressions}`. A row has what its runs share, the
+        quantity, means, the worsening (share of a cost or figure, or dB; positive is worse), its 95 %
+        interval and a verdict: `worse`, `better`, `noise`, `equal`, or `not judged` where a single pair says
+        nothing about noise. `failed` names groups of runs that fail now and did not; `missing` those that
+        are not in `after`. Times and memory are judged on one kind of machine only. `regressions` has the
+        rows that are worse, and what fails or is missing, in words.
+
+    Raises:
+        ConfigError: for a document that is no such result, or two that have no group in common.
+    """
+    sides = [_grouped(_cases(before, "the first result")), _grouped(_cases(after, "the second result"))]
+    common = [group for group in sides[0] if group in sides[1]]
+    if not common:
+        raise ConfigError("the two results have no method, budget and sequence in common")
+    same = all(
+        dict(before.get("machine") or {}).get(key) == dict(after.get("machine") or {}).get(key)
+        for key in MACHINE
+    )
+    rows: list[_Row] = []
+    failed = []
+    for group in common:
+        was, now = (side[group] for side in sides)
+        if any(run["error"] for run in now) and not any(run["error"] for run in was):
+            error = next(run["error"] for run in now if run["error"])
+            failed.append(f"{_label(group)} fails: {error}")
+        rows += _rows(group, was, now, costs=same)
+    _judge(rows)
+    missing = [f"{_label(group)} was not run" for group in sides[0] if group not in sides[1]]
+    worse = [_words(row) for row in rows if row.verdict == "worse"]
+    return {
+        "level": LEVEL,
+        "times_judged": same,
+        "rows": [row.to_json() for row in rows],
+        "failed": failed,
+        "missing": missing,
+        "regressions": [*failed, *worse],
+    }
+
+
+def _cases(document: Mapping[str, Any], which: str) -> list[Mapping[str, Any]]:
+    cases = document.get("cases")
+    needed = {"method", "profile", "sequence", "setting", "seed", "seconds", "metrics", "error"}
+    if not isinstance(cases, list) or not cases or not all(needed <= set(case) for case in cases):
+        raise ConfigError(f"{which} is no JSON of `bench pipeline` or `benchmark`: its `cases` lack fields")
+    return cases
+
+
+def _grouped(cases: Sequence[Mapping[str, Any]]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    found: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for case in cases:
+        # Results of `benchmark` have no budgets or sizes.
+        found.setdefault(tuple(case.get(key) for key in GROUP), []).append(case)
+    return found
+
+
+def _rows(
+    group: tuple[Any, ...], was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]], *, costs: bool
+) -> list[_Row]:
+    about = dict(zip(GROUP, group, strict=True))
+    wanted: list[tuple[str, str, Figure | None]] = []
+    if costs:
+        wanted += [(name, "cost", None) for name in COST_NAMES]
+    wanted += [(figure.name, "dB" if figure.unit == "dB" else "other", figure) for figure in figures()]
+    found = []
+    for name, kind, figure in wanted:
+        sides = [_values(runs, name, figure) for runs in (was, now)]
+        if not all(sides):
+            continue
+        shared = [key for key in sides[0] if key in sides[1]]
+        paired = len(shared) == max(len(sides[0]), len(sides[1])) or len(shared) > 1
+        samples = [[side[key] for key in shared] if paired else list(side.values()) for side in sides]
+        found.append(_row(about, name, kind, figure, paired, samples))
+    return found
+
+
+def _values(runs: Sequence[Mapping[str, Any]], name: str, figure: Figure | None) -> dict[Any, float]:
+    """By seed and repeat."""
+    found = {}
+    for run in runs:
+        value = run.get(name) if figure is None else figure_of(run["metrics"], figure.name)
+        if not run["error"] and value is not None and math.isfinite(value):
+            found[run["seed"], run.get("repeat", 0)] = float(value)
+    return found
+
+
+def _row(
+    about: dict[str, Any],
+    name: str,
+    kind: str,
+    figure: Figure | None,
+    paired: bool,
+    samples: Sequence[Sequence[float]],
+) -> _Row:
+    from scipy.stats import t
+
+    sign = -1.0 if figure is not None and figure.higher_is_better else 1.0
+    before, after = (np.asarray(sample, dtype=np.float64) for sample in samples)
+    # Costs are multiplied by what slows a machine: they are compared as shares, by their logarithms.
+    logarithms = kind == "cost" and before.min() > 0 and after.min() > 0
+    if logarithms:
+        x, y = np.log(before), np.log(after)
+    else:
+        scale = 1.0 if kind == "dB" else max(abs(float(before.mean())), 1e-12)
+        x, y = before / scale, after / scale
+    low = high = worse = better = None
+    if paired:
+        difference = sign * (y - x)
+        of = spread(list(difference))
+        mean, n = of.mean, of.n
+        if of.deviation is not None:
+            low, high = of.low, of.high
+            error = of.deviation / math.sqrt(n)
+            freedom = float(n - 1)
+    else:
+        n = min(len(x), len(y))
+        mean = sign * float(y.mean() - x.mean())
+        if n > 1:
+            parts = [float(sample.var(ddof=1)) / len(sample) for sample in (x, y)]
+            error = math.sqrt(sum(parts))
+            below = sum(part**2 / (len(sample) - 1) for part, sample in zip(parts, (x, y), strict=True))
+            freedom = error**4 / below if below > 0 else float(n - 1)
+            reach = float(t.ppf(0.975, freedom)) * error
+            low, high = mean - reach, mean + reach
+    if low is not None:
+        # What is the same in every pair is certain, with whatever sign.
+        statistic = mean / error if error > 0 else math.copysign(math.inf, mean) if mean else 0.0
+        worse, better = float(t.sf(statistic, freedom)), float(t.cdf(statistic, freedom))
+
+    def share(value: float | None) -> float | None:
+        return None if value is None else math.expm1(value) if logarithms else value
+
+    return _Row(
+        about,
+        name,
+        kind,
+        paired,
+        n,
+        float(before.mean()),
+        float(after.mean()),
+        share(mean) or 0.0,
+        share(low),
+        share(high),
+        worse,
+        better,
+    )
+
+
+def _judge(rows: Sequence[_Row]) -> None:
+    """Holm's procedure in each direction, then what matters."""
+    for row in rows:
+        if row.p_worse is not None:
+            row.verdict = "noise"
+        if row.worsening == 0.0 and row.before == row.after and (row.low in (None, 0.0)):
+            row.verdict = "equal"
+    directions: tuple[tuple[str, Verdict, float], ...] = (
+        ("p_worse", "worse", 1.0),
+        ("p_better", "better", -1.0),
+    )
+    for attribute, verdict, sign in directions:
+        tested = [row for row in rows if row.verdict == "noise" and abs(row.worsening) >= MATTERS[row.kind]]
+        tested.sort(key=lambda row: float(getattr(row, attribute)))
+        for rank, row in enumerate(tested):
+            if getattr(row, attribute) > LEVEL / (len(tested) - rank):
+                break
+            if sign * row.worsening > 0:
+                row.verdict = verdict
+
+
+def _words(row: _Row) -> str:
+    change = f"{row.worsening:.2f} dB" if row.kind == "dB" else f"{row.worsening:.1%}"
+    interval = ""
+    if row.low is not None and row.high is not None:
+        ends = (f"{end:.2f} dB" if row.kind == "dB" else f"{end:.1%}" for end in (row.low, row.high))
+        interval = f" [{' to '.join(ends)}]"
+    return (
+        f"{_label(tuple(row.about.values()))}: {row.quantity} {row.before:.4g} to {row.after:.4g}, worse by "
+        f"{change}{interval}, {row.n} {'pairs' if row.paired else 'runs a side'}"
+    )
+
+
+def _label(group: tuple[Any, ...]) -> str:
+    method, profile, budget, sequence, setting, width, height = group
+    size = f", {width}x{height}" if width else ""
+    return (
+        f"{method} ({profile}{f', {budget}' if budget and budget != 'profile' else ''}) on "
+        f"{sequence}{f'@{setting}' if setting else ''}{size}"
+    )

@@ -1,0 +1,281 @@
+"""What the stages of a run will cost: seconds of processor time and peak memory, before it starts.
+
+The cost of a task is a sum of terms, each a product of numbers that are known beforehand (iterations, pixels,
+frames, Gaussians, views), with non-negative coefficients fitted to recorded runs (non-negative least squares
+on relative errors, reweighted towards least absolute ones). The coefficients in `run_costs.json` are those of
+one machine; another is slower or faster by a factor, which the history of a store or a short probe gives.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from extrags.config import PipelineConfig
+from extrags.errors import ConfigError
+
+__all__ = [
+    "MEMORY_TERMS",
+    "STAGE_TASKS",
+    "TIME_TERMS",
+    "CostModel",
+    "TaskCost",
+    "Workload",
+    "fitted",
+    "packaged_model",
+    "probe_seconds",
+]
+
+STAGE_TASKS: dict[str, tuple[str, ...]] = {
+    "ingest": ("ingest", "training-frames"),
+    "poses": ("poses",),
+    "depth": ("depth", "depth-frames"),
+    "coarse": ("coarse",),
+    "assess": ("assess", "plan"),
+    "surface": ("surface",),
+    "freespace": ("freespace",),
+    "explore": ("explore",),
+    "enhance": ("enhance-train", "enhance"),
+    "finetune": ("finetune-judge", "finetune"),
+    "evaluate": ("evaluate-render", "evaluate"),
+    "report": ("report",),
+}
+"""The tasks of each stage that are modelled. `explore` stands for all of its waves, `enhance` for the
+restoration of all batches and their assembly; evaluation counts once for each scene that is measured."""
+
+TIME_TERMS: dict[str, tuple[str, ...]] = {
+    "ingest": ("one", "frames", "frames*pixels"),
+    "poses": ("one", "frames", "frames*pixels"),
+    "depth": ("one", "train", "train*pixels"),
+    "coarse": ("one", "iterations", "iterations*pixels", "iterations*gaussians"),
+    "assess": ("one", "gaussians"),
+    "surface": ("one", "train*pixels", "gaussians"),
+    "freespace": ("one", "gaussians"),
+    "explore": ("trajectories", "trajectories*gaussians"),
+    "enhance-train": ("one", "pixels", "fold_iterations", "fold_iterations*pixels"),
+    "enhance": ("one", "views", "views*pixels"),
+    "finetune-judge": ("judge_iterations", "judge_iterations*pixels", "judge_iterations*gaussians"),
+    "finetune": ("tuning", "tuning*pixels", "tuning*gaussians"),
+    "evaluate-render": ("test", "test*pixels"),
+    "evaluate": ("one", "test", "test*pixels", "test*pixels*vgg"),
+    "report": ("one", "frames*pixels"),
+}
+"""Terms of the time of each task; others have a constant alone. Terms that records cannot tell apart (one
+number of iterations only) must not be there: the fit would give one of them the part of the other."""
+MEMORY_TERMS = ("one", "pixels", "frames*pixels", "gaussians")
+REWEIGHTED = 20
+"""Rounds of reweighting; the fit has settled by then."""
+PRIOR_RECORDS = 2.0
+"""A task's own factor on a machine counts as much as that of all tasks when it rests on so many records."""
+PROBE_ROUNDS, PROBE_REPEATS = 12, 5
+
+
+@dataclass(frozen=True)
+class Workload:
+    """The numbers that costs depend on.
+
+    Args:
+        pixels: of an image.
+        frames: of the sequence.
+        train: of them, those for training.
+        test: of them, those that are held out.
+        config: settings of all stages.
+        views: virtual views to restore; None takes the setting.
+    """
+
+    pixels: float | int
+    frames: float | int
+    train: float | int
+    test: float | int
+    config: PipelineConfig
+    views: float | int | None = None
+
+    def numbers(self) -> dict[str, float]:
+        """By name in terms. Gaussians are the limit, which densification reaches in nearly every scene."""
+        config = self.config
+        judge = config.finetune.judge
+        return {
+            "one": 1.0,
+            "pixels": float(self.pixels),
+            "frames": float(self.frames),
+            "train": float(self.train),
+            "test": float(self.test),
+            "iterations": float(config.coarse.iterations),
+            "gaussians": float(config.coarse.densify.max_gaussians),
+            "trajectories": float(config.explore.trajectories),
+            "fold_iterations": float(config.enhance.folds * config.enhance.fold_iterations),
+            "views": float(config.enhance.max_views if self.views is None else self.views),
+            "judge_iterations": judge.iterations_share * config.finetune.iterations,
+            "judge_views": float(judge.views),
+            "tuning": float(config.finetune.iterations),
+            # LPIPS with this backbone takes longer than all other metrics together.
+            "vgg": float("vgg" in config.evaluate.lpips_nets),
+        }
+
+    def term(self, name: str) -> float:
+        """A product of numbers, e.g. `iterations*pixels`."""
+        numbers = self.numbers()
+        return math.prod(numbers[factor] for factor in name.split("*"))
+
+
+@dataclass(frozen=True)
+class TaskCost:
+    """What a task cost, or will.
+
+    Args:
+        task: name.
+        seconds: of processor time.
+        peak_mib: peak resident memory of the process; None where it is not known.
+    """
+
+    task: str
+    seconds: float
+    peak_mib: float | None
+
+
+@dataclass(frozen=True)
+class CostModel:
+    """Coefficients of the costs of tasks on the reference machine.
+
+    Args:
+        time: by task and term, seconds.
+        memory: by task and term, MiB.
+        probe_s: seconds of the probe (`probe_seconds`) on the reference machine.
+    """
+
+    time: Mapping[str, Mapping[str, float]]
+    memory: Mapping[str, Mapping[str, float]]
+    probe_s: float
+
+    def predict(self, task: str, work: Workload) -> TaskCost:
+        """Cost of a task on the reference machine.
+
+        Raises:
+            ConfigError: for a task that is not in the model.
+        """
+        if task not in self.time:
+            raise ConfigError(f"no costs are known of the task {task!r}; known: {', '.join(self.time)}")
+        memory = self.memory.get(task)
+        return TaskCost(
+            task,
+            sum(factor * work.term(term) for term, factor in self.time[task].items()),
+            None if memory is None else sum(factor * work.term(term) for term, factor in memory.items()),
+        )
+
+    def pace(self, history: Sequence[tuple[Workload, TaskCost]]) -> dict[str, float]:
+        """How much longer tasks take than on the reference machine, by their records.
+
+        Args:
+            history: what was done on this machine and what it took, seconds of any one kind.
+
+        Returns:
+            A factor for every task of the model: the median of its own records, drawn towards that of all
+            tasks (weighted by time) where they are few. Empty without any record.
+        """
+        ratios: dict[str, list[float]] = {}
+        taken = expected = 0.0
+        for work, cost in history:
+            if cost.task not in self.time or cost.seconds <= 0:
+                continue
+            usual = self.predict(cost.task, work).seconds
+            if usual > 0:
+                ratios.setdefault(cost.task, []).append(math.log(cost.seconds / usual))
+                taken, expected = taken + cost.seconds, expected + usual
+        if not expected:
+            return {}
+        whole = math.log(taken / expected)
+        found = {}
+        for task in self.time:
+            own = ratios.get(task, [])
+            share = len(own) / (len(own) + PRIOR_RECORDS)
+            found[task] = math.exp(share * median(own) + (1 - share) * whole if own else whole)
+        return found
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object; see `from_json`."""
+        return {"probe_s": self.probe_s, "time": self.time, "memory": self.memory}
+
+    @staticmethod
+    def from_json(found: Mapping[str, Any]) -> CostModel:
+        """A model from the JSON of `to_json`."""
+        return CostModel(found["time"], found["memory"], float(found["probe_s"]))
+
+
+def fitted(history: Sequence[tuple[Workload, TaskCost]], probe_s: float) -> CostModel:
+    """Fit the coefficients to records.
+
+    Args:
+        history: what was done and what it took, all on one machine.
+        probe_s: what the probe took there.
+
+    Raises:
+        ConfigError: without any record of a task that has terms.
+    """
+    by_task: dict[str, list[tuple[Workload, TaskCost]]] = {}
+    for work, cost in history:
+        by_task.setdefault(cost.task, []).append((work, cost))
+    if not by_task:
+        raise ConfigError("there is no record to fit costs to")
+    time, memory = {}, {}
+    for task, records in sorted(by_task.items()):
+        timed = [(work, cost.seconds) for work, cost in records if cost.seconds > 0]
+        if timed:
+            time[task] = _fit(TIME_TERMS.get(task, ("one",)), timed)
+        sized = [(work, cost.peak_mib) for work, cost in records if cost.peak_mib]
+        if sized:
+            memory[task] = _fit(MEMORY_TERMS, sized)
+    return CostModel(time, memory, probe_s)
+
+
+def _fit(terms: Sequence[str], records: Sequence[tuple[Workload, float]]) -> dict[str, float]:
+    """Non-negative coefficients with the least sum of absolute relative errors (reweighted squares)."""
+    from scipy.optimize import nnls
+
+    value = np.array([amount for _, amount in records])
+    matrix = np.array([[work.term(term) for term in terms] for work, _ in records]) / value[:, None]
+    # Columns of one scale: products of iterations and pixels are larger than 1 by eight orders.
+    size = np.maximum(np.abs(matrix).max(axis=0), 1e-300)
+    weight = np.ones(len(value))
+    factors = np.zeros(len(terms))
+    for _ in range(REWEIGHTED):
+        root = np.sqrt(weight)
+        factors, _residual = nnls(matrix / size * root[:, None], root)
+        residual = np.abs(matrix / size @ factors - 1)
+        weight = 1 / np.maximum(residual, 0.02)
+    return {
+        term: float(f"{factor / scale:.4g}")
+        for term, factor, scale in zip(terms, factors, size, strict=True)
+        if factor > 0
+    }
+
+
+@cache
+def packaged_model() -> CostModel:
+    """The model that comes with this package; docs/benchmarks/run_time_and_error.md says what it rests on."""
+    text = resources.files("extrags").joinpath("run_costs.json").read_text(encoding="utf-8")
+    return CostModel.from_json(json.loads(text))
+
+
+def probe_seconds() -> float:
+    """Processor time of rendering and differentiating a small scene once, in seconds.
+
+    The probe takes about one second. Compare with `CostModel.probe_s` to tell how fast this machine is.
+    """
+    # Here, because it loads torch and the kernels.
+    from extrags.raster.bench import BenchSize, bench_raster
+
+    size = BenchSize(160, 128, 10_000)
+    found = [
+        bench_raster([size], peers=(), threads=(1,), rounds=PROBE_ROUNDS, with_error=False)
+        for _ in range(PROBE_REPEATS)
+    ]
+    # The least: other work on the machine shares its caches, and only ever slows.
+    return min(float(item["cases"][0]["cpu_ms"]["iteration"]) for item in found) / 1e3

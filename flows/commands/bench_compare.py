@@ -1,0 +1,89 @@
+"""`bench compare`: a regression told from noise."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from extrags.errors import ConfigError
+from flows.commands.common import write_json
+from flows.commands.options import Parser, add_json
+
+__all__ = ["add_arguments", "compare"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags bench compare`."""
+    parser.description = (
+        "Compare two results of `bench pipeline` or `benchmark`: pairs of runs with the same seed and repeat "
+        "where there are such, else the two samples. A difference is a regression when it matters (costs "
+        "5 %, 0.1 dB, other figures 1 %) and is beyond noise (t test, Holm's correction over all that is "
+        "compared, 5 %); it takes two or more seeds or repeats. Times and memory are judged on one kind of "
+        "machine only. Exit code 1 on a regression, or when runs fail that did not."
+    )
+    parser.add_argument("before", type=Path, metavar="A.json", help="the reference")
+    parser.add_argument("after", type=Path, metavar="B.json", help="what is judged")
+    parser.add_argument("--all", action="store_true", help="show what is noise or equal as well")
+    add_json(parser)
+
+
+def compare(given: argparse.Namespace) -> int:
+    """`extrags bench compare`."""
+    from extrags.metrics.regression import compare_results
+
+    found = compare_results(_read(given.before), _read(given.after))
+    if given.json != "-":
+        _print(found, every=given.all)
+    write_json(found, given.json)
+    return 1 if found["regressions"] else 0
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} is no JSON that can be read: {error}") from error
+    if not isinstance(found, dict):
+        raise ConfigError(f"{path} is no result of a benchmark: expected a JSON object")
+    return found
+
+
+def _print(found: dict[str, Any], *, every: bool) -> None:
+    from rich.table import Table
+
+    from flows.terminal import console
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for name in ("sequence", "method", "budget", "quantity", "before", "after", "worse by", "n", "verdict"):
+        table.add_column(name)
+    counts: dict[str, int] = {}
+    for row in found["rows"]:
+        counts[row["verdict"]] = counts.get(row["verdict"], 0) + 1
+        if row["verdict"] in ("worse", "better") or every:
+            name = f"{row['sequence']}@{row['setting']}" if row["setting"] else row["sequence"]
+            decibels = row["unit"] == "dB"
+            change = f"{row['worsening']:+.2f} dB" if decibels else f"{row['worsening']:+.1%}"
+            table.add_row(
+                name,
+                row["method"],
+                row["budget"] or "",
+                row["quantity"],
+                f"{row['before']:.4g}",
+                f"{row['after']:.4g}",
+                change,
+                f"{row['n']}{'' if row['paired'] else ' unpaired'}",
+                row["verdict"],
+            )
+    out = console()
+    if table.rows:
+        out.print(table)
+    for line in (*found["failed"], *found["missing"]):
+        out.print(line, markup=False, soft_wrap=True)
+    if not found["times_judged"]:
+        out.print("times and memory are not judged: the results are of different machines")
+    told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
+    out.print(f"compared: {told}", soft_wrap=True)
+    if counts.get("not judged"):
+        out.print("not judged: a single pair says nothing about noise; measure more --seeds or --repeats")

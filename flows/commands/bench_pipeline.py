@@ -1,0 +1,173 @@
+"""`bench pipeline`: run time against error of whole runs, over methods and budgets."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from extrags.errors import ConfigError
+from flows.commands.benchmark import parsed_seeds
+from flows.commands.common import items, set_up_logging, write_json
+from flows.commands.options import Parser, add_json, add_settings
+
+__all__ = ["EXAMPLES", "add_arguments", "pipeline"]
+
+EXAMPLES = """examples:
+  extrags bench pipeline phantom/11@sparse --methods coarse,extrags --vary coarse.iterations=500,1500
+  extrags bench pipeline phantom/11@sparse --budgets iterations gaussians --seeds 0,1,2 --repeats 2
+  extrags bench pipeline phantom/11@sparse --profiles quick,balanced
+  extrags bench pipeline phantom/11@sparse --vary ingest.width+ingest.height=120+96,160+128
+
+--vary NAME=V,V      each value is a budget; several --vary are combined, every value with every other
+--vary A+B=1+2,3+4   settings that change together, with a value for each (or one for all of them)
+--budgets PRESET     one thing at a time: iterations, gaussians, views (parts and multiples of the profile's),
+                     size, steps, precision
+A budget reaches the methods that have the stage and do not pin the setting."""
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags bench pipeline`."""
+    parser.description = (
+        "Run every method with every budget, measure what it costs and how good it is, and find the runs "
+        "that no other beats in both. Each run is measured in a process of its own; nothing is taken from "
+        "any store but the grid's, which begins empty. Called again, it goes on where it was. Exit code 1 "
+        "when a run failed."
+    )
+    parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
+    parser.add_argument("--methods", nargs="+", default=["coarse", "extrags"], metavar="METHOD")
+    parser.add_argument("--profiles", nargs="+", default=["quick"], metavar="PROFILE")
+    parser.add_argument("--budgets", nargs="+", default=[], metavar="PRESET")
+    parser.add_argument("--vary", action="append", default=[], metavar="NAME=V,V")
+    parser.add_argument("--seeds", nargs="+", default=["0"], metavar="N", help="e.g. 0,1,2 (default: 0)")
+    parser.add_argument(
+        "--repeats", type=int, default=1, metavar="N", help="measure everything N times (default: 1)"
+    )
+    parser.add_argument(
+        "--separate",
+        action="store_true",
+        help="make nothing once for several runs; without, what they share is made once and each is charged "
+        "its time",
+    )
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("bench-pipeline"),
+        metavar="DIR",
+        help="folder of the grid: stores, finished runs, grid.md, fronts.svg, results.json "
+        "(default: bench-pipeline)",
+    )
+    add_settings(parser)
+    add_json(parser)
+
+
+def pipeline(given: argparse.Namespace) -> int:
+    """`extrags bench pipeline`."""
+    set_up_logging(debug=given.debug, terminal=True)
+    # Read when torch is loaded; the processes of the runs inherit it.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    if given.repeats < 1:
+        raise ConfigError(f"--repeats {given.repeats}: expected 1 or more")
+    from flows.environment import prepare
+
+    folder: Path = given.output
+    prepare(folder.absolute() / "state", debug=given.debug)
+    from extrags.config import profile_config
+    from extrags.report.fronts_plot import write_fronts_plot
+    from flows.budgets import budgets_of, parsed_vary
+    from flows.pipeline_grid import cells_of, run_grid
+    from flows.preflight import preflight
+    from flows.selection import chosen_sequences
+
+    vary = [parsed_vary(text) for text in given.vary]
+    budgets = [
+        (profile, budgets_of(profile_config(profile), items(given.budgets), vary))
+        for profile in items(given.profiles)
+    ]
+    cells = cells_of(
+        [item.name for item in chosen_sequences(given.sequences)],
+        items(given.methods),
+        budgets,
+        parsed_seeds(given.seeds),
+        given.repeats,
+        given.settings or {},
+    )
+    _check_models(cells, preflight)
+    found = run_grid(cells, folder, separate=given.separate)
+    text = json.dumps(found, indent=1)
+    (folder / "results.json").write_text(text, encoding="utf-8")
+    table = grid_markdown(found)
+    (folder / "grid.md").write_text(table, encoding="utf-8")
+    if any(cell["runs"] for cell in found["cells"]):
+        for suffix in (".svg", ".png"):
+            write_fronts_plot(found, folder / f"fronts{suffix}")
+    if given.json != "-":
+        from flows.terminal import console
+
+        console().print(table, markup=False, soft_wrap=True)
+        console().print(f"results: {folder / 'results.json'}, {folder / 'fronts.svg'}", soft_wrap=True)
+    write_json(found, given.json)
+    return 1 if any(case["error"] for case in found["cases"]) else 0
+
+
+def _check_models(cells: Any, preflight: Any) -> None:
+    """Missing models and weights are said before the first run."""
+    from flows.methods import METHODS, method_config
+
+    for cell in {(cell.method, cell.profile, cell.budget): cell for cell in cells}.values():
+        config = method_config(cell.method, cell.profile, {**cell.settings, **cell.changed}, cell.seed)
+        preflight(config, "evaluate", METHODS[cell.method].leave_out)
+
+
+def grid_markdown(found: dict[str, Any]) -> str:
+    """The table of a grid: what each cell costs and how good it is, and which cells are on a front.
+
+    Args:
+        found: from `flows.pipeline_grid.run_grid`.
+    """
+    from extrags.metrics.registry import figures
+
+    shown = [
+        figure
+        for figure in figures("tables")
+        if any(figure.name in cell["figures"] for cell in found["cells"])
+    ]
+    on = _front_members(found, [figure.name for figure in shown])
+    header = ["sequence", "size", "method", "profile", "budget", "runs", "s", "processor s", "MiB"]
+    header += [figure.label for figure in shown]
+    lines = [f"| {' | '.join(header)} |", f"|{'---|' * 5}{'---:|' * (len(header) - 5)}"]
+    for cell in found["cells"]:
+        name = f"{cell['sequence']}@{cell['setting']}" if cell["setting"] else cell["sequence"]
+        row = [name, f"{cell['width']}x{cell['height']}", cell["method"], cell["profile"], cell["budget"]]
+        row += [str(cell["runs"]) + (f" ({cell['failed']} failed)" if cell["failed"] else "")]
+        row += [_number(cell[key]) for key in ("seconds", "processor_seconds", "peak_mib")]
+        for figure in shown:
+            value = cell["figures"].get(figure.name)
+            text = "-" if value is None else f"{value:.{figure.table_digits}f}"
+            row.append(f"**{text}**" if (*_identity(cell), figure.name) in on else text)
+        lines.append(f"| {' | '.join(row)} |")
+    lines += ["", "Bold: on the front of this figure against processor time, within its sequence and size."]
+    return "\n".join(lines) + "\n"
+
+
+def _front_members(found: dict[str, Any], names: list[str]) -> set[tuple[Any, ...]]:
+    from extrags.metrics.fronts import SCENE
+
+    return {
+        (*(entry[key] for key in SCENE), point["method"], point["profile"], point["budget"], entry["figure"])
+        for entry in found["fronts"]
+        if entry["cost"] == "processor_seconds" and entry["figure"] in names
+        for point in entry["front"]
+    }
+
+
+def _identity(cell: dict[str, Any]) -> tuple[Any, ...]:
+    from extrags.metrics.fronts import CELL
+
+    return tuple(cell[key] for key in CELL)
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}" if value < 1000 else f"{value:.0f}"

@@ -1,0 +1,266 @@
+"""A grid of whole runs, methods by budgets by seeds, each in a process of its own and measured there.
+
+All cells of a repeat share one store that begins empty, so that what several cells have in common (the same
+frames, the same coarse scene) is made once; each is charged the seconds that were really spent on it within
+this grid. Nothing is taken from any other store. What is finished stands in the folder of the grid: the same
+command goes on where it was interrupted.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from itertools import product
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from extrags.errors import ConfigError
+from extrags.store import digest_of
+from flows.budgets import Budget, reaching
+from flows.history import SAME_MACHINE
+
+__all__ = ["FORMAT", "Cell", "cells_of", "in_own_process", "run_cell", "run_grid"]
+
+log = logging.getLogger(__name__)
+
+FORMAT = "extrags-pipeline-grid-1"
+NOT_COUNTED = frozenset({"evaluate", "report"})
+"""Stages that are not part of a method's run time."""
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One run of a grid.
+
+    Args:
+        sequence: `DATASET/SEQUENCE[@SETTING]` or a path.
+        method: name.
+        profile: name.
+        budget: its name.
+        changed: overrides of the budget that reach the method.
+        settings: overrides of all runs.
+        seed: of all stages.
+        repeat: number of the repeat, from 0.
+    """
+
+    sequence: str
+    method: str
+    profile: str
+    budget: str
+    changed: dict[str, Any]
+    settings: dict[str, Any]
+    seed: int
+    repeat: int
+
+    @property
+    def key(self) -> str:
+        """A name for its file: the digest of everything that makes it."""
+        return digest_of({**asdict(self), "budget": ""})
+
+
+def cells_of(
+    sequences: Sequence[str],
+    methods: Sequence[str],
+    budgets: Sequence[tuple[str, Sequence[Budget]]],
+    seeds: Sequence[int],
+    repeats: int,
+    settings: dict[str, Any],
+) -> list[Cell]:
+    """The cells of a grid in the order in which they run; settings that no method takes are found here.
+
+    Args:
+        sequences: names.
+        methods: names.
+        budgets: of each profile.
+        seeds: of all stages.
+        repeats: how often everything is measured, each time from an empty store.
+        settings: overrides of all runs.
+
+    Returns:
+        Cells without repetitions: a budget that changes only what a method leaves out is the method's
+        `profile` budget.
+
+    Raises:
+        ConfigError: for an unknown method or profile, or a setting that is wrong or that the method pins.
+    """
+    from flows.methods import METHODS, method_config, pinned_settings
+
+    found: dict[str, Cell] = {}
+    for repeat, sequence, (profile, inside), seed, method in product(
+        range(repeats), sequences, budgets, seeds, methods
+    ):
+        if method not in METHODS:
+            raise ConfigError(f"no method {method!r}; known: {', '.join(METHODS)}")
+        for budget in inside:
+            pinned = pinned_settings(method)
+            changed = {
+                name: value
+                for name, value in reaching(budget, METHODS[method].leave_out).items()
+                if name not in pinned
+            }
+            name = ", ".join(f"{key}={value}" for key, value in changed.items()) or "profile"
+            method_config(method, profile, {**settings, **changed}, seed)
+            cell = Cell(sequence, method, profile, name, changed, settings, seed, repeat)
+            found.setdefault(cell.key, cell)
+    return list(found.values())
+
+
+def run_grid(
+    cells: Sequence[Cell],
+    folder: Path,
+    *,
+    separate: bool = False,
+    run: Callable[[Cell, str], dict[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """Run all cells that are not finished, and gather all.
+
+    Args:
+        cells: from `cells_of`.
+        folder: of this grid: stores and finished cells.
+        separate: give each cell a store of its own, so that nothing is shared.
+        run: what runs a cell; `in_own_process` by default.
+
+    Returns:
+        `{format, machine, sharing, cases, cells, fronts}`; `cases` as of `run_cell`, `cells` their means
+        (`extrags.metrics.fronts.means_by_cell`), `fronts` as of `extrags.metrics.fronts.fronts`.
+
+    Raises:
+        ConfigError: when the folder holds a grid of another machine, version or way of sharing.
+    """
+    from extrags.metrics.fronts import fronts, means_by_cell
+    from extrags.raster.bench import machine
+
+    about = machine()
+    run = run or in_own_process
+    _claim(folder, about, separate)
+    cases = []
+    for number, cell in enumerate(cells, 1):
+        file = folder / "cells" / f"{cell.key}.json"
+        if file.exists():
+            cases.append(json.loads(file.read_text(encoding="utf-8")))
+            continue
+        where = f"{cell.sequence}, {cell.method}, {cell.profile}, {cell.budget}, seed {cell.seed}"
+        log.info("cell %d of %d: %s", number, len(cells), where)
+        store = folder / "stores" / (cell.key if separate else f"repeat-{cell.repeat}")
+        case = run(cell, str(store.absolute()))
+        if not case["error"]:
+            # A cell that failed is tried again by the same command.
+            _write(file, case)
+        cases.append(case)
+    means = means_by_cell(cases)
+    return {
+        "format": FORMAT,
+        "machine": about,
+        "sharing": "none: a store for each cell"
+        if separate
+        else "stages that cells of a repeat have in common were made once; every cell is charged their time",
+        "cases": cases,
+        "cells": means,
+        "fronts": fronts(means),
+    }
+
+
+def in_own_process(cell: Cell, store: str) -> dict[str, Any]:
+    """`run_cell` in a new process, whose memory is that of this cell alone.
+
+    Raises:
+        BrokenProcessPool: when the process dies, for instance for lack of memory.
+    """
+    with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(run_cell, cell, store).result()
+
+
+def run_cell(cell: Cell, store: str) -> dict[str, Any]:
+    """Run a cell in this process; what fails is in the result, not raised.
+
+    Returns:
+        `{method, profile, budget, changed, sequence, setting, seed, repeat, width, height, frames, seconds,
+        processor_seconds, peak_mib, shared_seconds, load_average, stages, metrics, error}`. Seconds are
+        those of all stages but evaluation, spent within this grid; `shared_seconds` the part of them that
+        was spent by a cell before. `stages` has `{stage, state, seconds, processor_seconds, peak_mib,
+        shared_seconds}` of each, evaluation too.
+    """
+    from extrags.store import Store
+    from flows.methods import METHODS, method_config
+    from flows.runners import DirectRunner
+    from flows.wiring import run_sequence
+
+    config = method_config(cell.method, cell.profile, {**cell.settings, **cell.changed}, cell.seed)
+    outcome = run_sequence(
+        cell.sequence,
+        config,
+        store,
+        DirectRunner(store),
+        profile=cell.profile,
+        until="evaluate",
+        leave_out=METHODS[cell.method].leave_out or None,
+    )
+    ran = [row for row in outcome.stages if row.tasks]
+    counted = [row for row in ran if row.stage not in NOT_COUNTED]
+    processor = [row.processor_seconds for row in counted]
+    peaks = [row.peak_mib for row in counted if row.peak_mib is not None]
+    name, _, setting = cell.sequence.partition("@")
+    failed = next((row for row in outcome.stages if row.state == "failed"), None)
+    read = outcome.refs.get("sequence")
+    counts = {} if read is None else Store(store).manifest(read).counts
+    return {
+        "method": cell.method,
+        "profile": cell.profile,
+        "budget": cell.budget,
+        "changed": cell.changed,
+        "sequence": name,
+        "setting": setting or None,
+        "seed": cell.seed,
+        "repeat": cell.repeat,
+        **{key: counts.get(key) for key in ("width", "height", "frames")},
+        "seconds": round(sum(row.made_seconds for row in counted), 3),
+        "processor_seconds": None
+        if None in processor
+        else round(sum(value for value in processor if value is not None), 3),
+        "peak_mib": max(peaks) if peaks else None,
+        "shared_seconds": round(sum(row.made_seconds - row.spent_seconds for row in counted), 3),
+        "load_average": round(os.getloadavg()[0], 2),
+        "stages": [
+            {
+                "stage": row.stage,
+                "state": row.state,
+                "seconds": round(row.made_seconds, 3),
+                "processor_seconds": row.processor_seconds,
+                "peak_mib": row.peak_mib,
+                "shared_seconds": round(row.made_seconds - row.spent_seconds, 3),
+            }
+            for row in ran
+        ],
+        "metrics": outcome.metrics["final"] if failed is None else None,
+        "error": "" if failed is None else f"{failed.stage}: {failed.reason}",
+    }
+
+
+def _claim(folder: Path, about: dict[str, Any], separate: bool) -> None:
+    """Times of one machine and one version stand in one folder."""
+    mine = {name: about[name] for name in (*SAME_MACHINE, "versions", "commit")} | {"separate": separate}
+    file = folder / "grid.json"
+    if not file.exists():
+        _write(file, mine)
+        return
+    theirs = json.loads(file.read_text(encoding="utf-8"))
+    changed = [name for name in mine if theirs.get(name) != mine[name]]
+    if changed:
+        told = "; ".join(f"{name} was {theirs.get(name)}, is {mine[name]}" for name in changed)
+        raise ConfigError(
+            f"{folder} holds cells that were measured under other conditions ({told}); "
+            "give another folder with --output"
+        )
+
+
+def _write(file: Path, content: dict[str, Any]) -> None:
+    """Whole or not at all: an interrupted command leaves no half a cell."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_suffix(".partial")
+    partial.write_text(json.dumps(content, indent=1), encoding="utf-8")
+    partial.replace(file)

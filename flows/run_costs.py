@@ -1,0 +1,310 @@
+"""Costs of tasks on record in a store, and what a run of given settings will cost."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from data_catalog import describe
+from extrags.config import PipelineConfig
+from extrags.errors import ConfigError, ExtragsError, StoreError
+from extrags.pipeline import STAGES
+from extrags.run_costs import (
+    STAGE_TASKS,
+    CostModel,
+    TaskCost,
+    Workload,
+    packaged_model,
+    probe_seconds,
+)
+from extrags.scene_plan import ScenePlan
+from extrags.store import Manifest, Store
+from flows.expectation import read_size
+from flows.outcome import SequenceOutcome
+
+__all__ = ["RunPrediction", "StageCost", "catalogue_work", "planned_work", "predict_run", "recorded_costs"]
+
+Record = tuple[Workload, TaskCost]
+ENOUGH_SECONDS = 10.0
+"""So much work on record tells more of a machine than a probe."""
+
+
+@dataclass(frozen=True)
+class StageCost:
+    """What a stage will cost.
+
+    Args:
+        stage: name.
+        processor_seconds: of all threads.
+        seconds: elapsed, at the pace of this store's records; None where there are none.
+        peak_mib: peak resident memory of the process.
+    """
+
+    stage: str
+    processor_seconds: float
+    seconds: float | None
+    peak_mib: float | None
+
+
+@dataclass(frozen=True)
+class RunPrediction:
+    """What a run will cost, stage by stage.
+
+    Args:
+        stages: those that run.
+        source: what tells how fast this machine is: `history` of the store, or a `probe`.
+        records: so many records the history has.
+        unknown: stages that run and of whose cost nothing is known; not in any sum.
+    """
+
+    stages: list[StageCost]
+    source: str
+    records: int
+    unknown: list[str] = field(default_factory=list)
+
+    @property
+    def processor_seconds(self) -> float:
+        """Of the whole run."""
+        return sum(stage.processor_seconds for stage in self.stages)
+
+    @property
+    def seconds(self) -> float | None:
+        """Elapsed time of the whole run."""
+        known = [stage.seconds for stage in self.stages if stage.seconds is not None]
+        return sum(known) if known and len(known) == len(self.stages) else None
+
+    @property
+    def peak_mib(self) -> float | None:
+        """The largest of the stages."""
+        return max((stage.peak_mib for stage in self.stages if stage.peak_mib is not None), default=None)
+
+    def to_json(self) -> dict[str, Any]:
+        """A JSON object: `{processor_seconds, seconds, peak_mib, source, records, unknown, stages}`."""
+        return {
+            "processor_seconds": round(self.processor_seconds, 1),
+            "seconds": None if self.seconds is None else round(self.seconds, 1),
+            "peak_mib": None if self.peak_mib is None else round(self.peak_mib),
+            "source": self.source,
+            "records": self.records,
+            "unknown": self.unknown,
+            "stages": [asdict(stage) for stage in self.stages],
+        }
+
+
+def predict_run(
+    store: Store,
+    work: Workload,
+    stages: Collection[str],
+    *,
+    measured_scenes: int = 1,
+    model: CostModel | None = None,
+) -> RunPrediction:
+    """What a run will cost on this machine, when nothing of it is in the store.
+
+    Args:
+        store: its records tell how fast this machine is; without enough of them a probe does.
+        work: size of the sequence and settings.
+        stages: that will run.
+        measured_scenes: scenes that are evaluated: 2 where the coarse and a fine-tuned one are.
+        model: of the reference machine; the packaged one by default.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    model = model or packaged_model()
+    elapsed, processor = recorded_costs(store, work.config)
+    told = sum(cost.seconds for _, cost in processor)
+    if told >= ENOUGH_SECONDS:
+        source, pace = "history", model.pace(processor)
+        wall_pace = model.pace(elapsed)
+    else:
+        source, wall_pace = "probe", {}
+        pace = dict.fromkeys(model.time, probe_seconds() / model.probe_s)
+    found: list[StageCost] = []
+    unknown: list[str] = []
+    for stage in STAGES:
+        if stage not in stages:
+            continue
+        if not any(task in model.time for task in STAGE_TASKS[stage]):
+            unknown.append(stage)
+            continue
+        costs = [model.predict(task, work) for task in STAGE_TASKS[stage] if task in model.time]
+        times = measured_scenes if stage == "evaluate" else 1
+        peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
+        found.append(
+            StageCost(
+                stage,
+                times * sum(cost.seconds * pace[cost.task] for cost in costs),
+                times * sum(cost.seconds * wall_pace[cost.task] for cost in costs) if wall_pace else None,
+                max(peaks, default=None),
+            )
+        )
+    return RunPrediction(found, source, len(processor), unknown)
+
+
+def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig) -> tuple[Workload, set[str]]:
+    """Size and settings of a sequence that has been read and assessed, and the stages that will run.
+
+    Args:
+        store: with what `outcome` made.
+        outcome: of a run until `assess`, with its plan.
+        config: settings that it was started with.
+
+    Raises:
+        StoreError: when the sequence's manifest cannot be read.
+    """
+    counts = store.manifest(outcome.refs["ingest"]).counts
+    width, height, frames, train, test = (
+        float(counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
+    )
+    skipped = {row.stage for row in outcome.stages if row.state == "skipped"}
+    if outcome.plan is not None:
+        decided = ScenePlan.model_validate(
+            {name: outcome.plan[name] for name in ScenePlan.model_fields if name in outcome.plan}
+        )
+        config = decided.applied_to(config)
+        skipped |= {line.stage for line in decided.decisions if not line.run}
+    work = Workload(width * height, frames, train, test, config)
+    return work, {str(stage) for stage in STAGES if stage not in skipped}
+
+
+def catalogue_work(
+    name: str, config: PipelineConfig, leave_out: Collection[str]
+) -> tuple[Workload, set[str]]:
+    """Size and settings of a sequence of the catalogue that has not been read, and the stages that may run.
+
+    How many frames are held out is not in the catalogue: half of them are taken to be, and all stages to run.
+
+    Raises:
+        ConfigError: for a path, of which nothing is known before it is read.
+    """
+    try:
+        about: Any = describe(name)
+    except ExtragsError as error:
+        raise ConfigError(
+            f"{name} is not in the catalogue: its size is known once it is read; leave out --before ({error})"
+        ) from error
+    width, height = read_size(about, config)
+    frames = float(min(about.frames, config.ingest.max_frames or about.frames))
+    stages = {str(stage) for stage in STAGES if stage not in leave_out}
+    stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
+    stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
+    return Workload(float(width * height), frames, frames / 2, frames / 2, config), stages
+
+
+def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record], list[Record]]:
+    """Costs that the manifests of a store tell of, of tasks in their present version.
+
+    Waves of an exploration, and batches of a restoration, are added up to the artefact they lead to. Settings
+    that a manifest does not hold are the fallback's.
+
+    Args:
+        store: with artefacts that were made on this machine.
+        fallback: settings of all stages.
+
+    Returns:
+        Records with elapsed time, and those with processor time, which earlier versions did not measure.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    # All stages, so that their present versions are known; here, because this loads Prefect.
+    import flows.wiring  # noqa: F401
+    from tasks.stage import stage_versions
+
+    manifests = {manifest.key: manifest for manifest in store.ls()}
+    versions = stage_versions()
+    modelled = {task for tasks in STAGE_TASKS.values() for task in tasks}
+    elapsed, processor = [], []
+    for manifest in manifests.values():
+        if manifest.stage not in modelled or versions.get(manifest.stage) != manifest.version:
+            continue
+        work = _workload(manifest, manifests, fallback)
+        if work is None:
+            continue
+        parts = [manifest, *_parts(manifest, manifests)]
+        peaks = [float(value) for part in parts if isinstance(value := part.counts.get("peak_mib"), float)]
+        peak = max(peaks, default=None)
+        elapsed.append((work, TaskCost(manifest.stage, sum(part.seconds for part in parts), peak)))
+        spent = [part.counts.get("processor_s") for part in parts]
+        if all(isinstance(value, int | float) for value in spent):
+            seconds = sum(float(value) for value in spent if isinstance(value, int | float))
+            processor.append((work, TaskCost(manifest.stage, seconds, peak)))
+    return elapsed, processor
+
+
+def _parts(manifest: Manifest, manifests: Mapping[str, Manifest]) -> list[Manifest]:
+    """What belongs to the same work: the waves before an exploration's end, the batches of a restoration."""
+    wanted = {"explore": "explore-", "enhance": "enhance-restore"}.get(manifest.stage)
+    if wanted is None:
+        return []
+    found: dict[str, Manifest] = {}
+    open_ = [manifest]
+    while open_:
+        for key in open_.pop().input_keys.values():
+            part = manifests.get(key)
+            if part is not None and key not in found and part.stage.startswith(wanted):
+                found[key] = part
+                open_.append(part)
+    return list(found.values())
+
+
+def _workload(
+    manifest: Manifest, manifests: Mapping[str, Manifest], fallback: PipelineConfig
+) -> Workload | None:
+    """The numbers of a record: of the frames it was made from, and of the settings behind it."""
+    line = [manifest, *_ancestors(manifest, manifests)]
+    source = next((item for item in line if item.stage == "ingest"), None)
+    if source is None:
+        return None
+    counts = source.counts
+    size = [counts.get(name) for name in ("width", "height", "frames", "train", "test")]
+    if not all(isinstance(value, int | float) for value in size):
+        return None
+    width, height, frames, train, test = (float(value or 0) for value in size)
+    views = manifest.counts.get("views") if manifest.stage == "enhance" else None
+    return Workload(
+        width * height, frames, train, test, _config(line, fallback), float(views) if views else None
+    )
+
+
+def _ancestors(manifest: Manifest, manifests: Mapping[str, Manifest]) -> list[Manifest]:
+    found: dict[str, Manifest] = {}
+    open_ = [manifest]
+    while open_:
+        for key in open_.pop().input_keys.values():
+            if key in manifests and key not in found:
+                found[key] = manifests[key]
+                open_.append(manifests[key])
+    return list(found.values())
+
+
+def _config(line: list[Manifest], fallback: PipelineConfig) -> PipelineConfig:
+    """The fallback with the settings of the stages behind a record, nearest first."""
+    changed: dict[str, Any] = {}
+    for item in line:
+        own = item.stage.partition("-")[0]
+        groups = {**item.config, own: item.config.get("config")}
+        for group in ("coarse", "explore", "enhance", "finetune"):
+            settings = groups.get(group)
+            if isinstance(settings, dict) and group not in changed:
+                known = type(getattr(fallback, group)).model_fields
+                changed[group] = {name: value for name, value in settings.items() if name in known}
+    networks = next((item.config.get("lpips_digests") for item in line if item.stage == "evaluate"), None)
+    if isinstance(networks, dict):
+        nets = tuple(sorted(networks))
+        fallback = fallback.model_copy(
+            update={"evaluate": fallback.evaluate.model_copy(update={"lpips_nets": nets})}
+        )
+    try:
+        return fallback.model_copy(
+            update={
+                group: getattr(fallback, group).model_validate(
+                    {**getattr(fallback, group).model_dump(), **settings}
+                )
+                for group, settings in changed.items()
+            }
+        )
+    except ValueError as error:
+        raise StoreError(f"the settings of {line[0].key} are not those of this version: {error}") from error

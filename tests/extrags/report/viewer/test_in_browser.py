@@ -1,0 +1,211 @@
+"""A visit of the page with headless Chromium, which draws in software."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from extrags.config import ReportConfig
+from extrags.report import ReportInputs, build_report
+from tests.browser import Browser, browser
+
+pytestmark = pytest.mark.slow
+
+VIEWER = "extragsViewer.viewer"
+
+
+@pytest.fixture(scope="module")
+def tab(drawn: ReportInputs, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """The page, its scene read."""
+    folder = tmp_path_factory.mktemp("page")
+    page = folder / "report.html"
+    page.write_text(build_report(drawn, ReportConfig(held_out_views=3, virtual_views=4)), encoding="utf-8")
+    with browser(folder / "profile") as opened:
+        opened.window(1280, 900)
+        opened.open(page)
+        opened.run("extragsViewer.ready.then(() => true)")
+        yield opened
+
+
+@pytest.fixture(autouse=True)
+def no_errors(tab: Browser) -> Iterator[None]:
+    yield
+    assert tab.errors == []
+    assert all(request.startswith(("file:", "blob:", "data:")) for request in tab.requests)
+
+
+def do(tab: Browser, call: str) -> None:
+    tab.run(f"{VIEWER}.{call}.then(() => true)")
+
+
+def picture(tab: Browser) -> np.ndarray:
+    """The canvas with the pixels of the run's images, [H, W, 3] in [0, 1]."""
+    url = tab.run(f"{VIEWER}.picture(true)")
+    raw = base64.b64decode(url.split(",", 1)[1])
+    return np.asarray(Image.open(io.BytesIO(raw)).convert("RGB")) / 255
+
+
+def psnr(image: np.ndarray, other: np.ndarray) -> float:
+    return float(-10 * np.log10(max(np.square(image - other).mean(), 1e-12)))
+
+
+@pytest.mark.parametrize("name", ["coarse", "final"])
+def test_held_out_views_agree_with_the_rasteriser(tab: Browser, drawn: ReportInputs, name: str) -> None:
+    scene = drawn.coarse_scene if name == "coarse" else drawn.final_scene
+    sequence, frames = drawn.sequence, drawn.frames
+    gains = scene.light.interpolated_exposures(frames, sequence.train)
+    do(tab, f"setScene('{name}')")
+    for place in (0, len(frames) - 1):
+        do(tab, f"jump(1, {place})")
+        expected = scene.render(sequence.cameras[int(frames[place])], exposure=gains[place : place + 1])
+        drawn_here = picture(tab)
+        assert psnr(drawn_here, expected.rgb[0].clamp(0, 1).numpy()) >= 45
+        assert drawn_here.std() > 0.02
+
+
+def test_training_cameras_have_their_own_exposure(tab: Browser, drawn: ReportInputs) -> None:
+    scene = drawn.final_scene
+    do(tab, "setScene('final')")
+    do(tab, "jump(0, 4)")
+    camera = drawn.sequence.cameras[int(drawn.sequence.train[4])]
+    own = scene.render(camera, exposure=scene.light.exposures()[4:5]).rgb[0].clamp(0, 1).numpy()
+    mean = scene.render(camera).rgb[0].clamp(0, 1).numpy()
+    assert psnr(picture(tab), own) >= 45 > psnr(picture(tab), mean)
+
+
+def test_the_light_moves(tab: Browser, drawn: ReportInputs) -> None:
+    from dataclasses import replace as with_values
+
+    import torch
+
+    do(tab, "jump(0, 0)")
+    do(tab, "setLight({exposure: 1, exponent: 1.4, cosine: 1.2, offset: [0.3, 0.1, 0]})")
+    scene = drawn.final_scene
+    light = with_values(
+        scene.light,
+        log_exponent=torch.tensor(1.4).log(),
+        cosine=torch.tensor(1.2),
+        offset=torch.tensor([0.3, 0.1, 0]),
+    )
+    camera = drawn.sequence.cameras[int(drawn.sequence.train[0])]
+    expected = with_values(scene, light=light).render(camera).rgb[0].clamp(0, 1).numpy()
+    moved = picture(tab)
+    assert psnr(moved, expected) >= 45
+    do(tab, "resetLight()")
+    assert psnr(picture(tab), moved) < 35
+
+
+def test_a_lamp_left_behind_does_not_follow(tab: Browser) -> None:
+    do(tab, "jump(0, 0)")
+    do(tab, "pinLamp(true)")
+    do(tab, "jump(0, 3)")
+    behind = picture(tab)
+    do(tab, "pinLamp(false)")
+    assert psnr(picture(tab), behind) < 35
+    do(tab, "resetLight()")
+
+
+def test_orbit_by_pointer_and_keys(tab: Browser) -> None:
+    do(tab, "jump(0, 1)")
+    tab.run("document.querySelector('#viewer canvas').scrollIntoView({block: 'center', behavior: 'instant'})")
+    box = tab.run(
+        "(b => [b.x, b.y, b.width, b.height])(document.querySelector('canvas').getBoundingClientRect())"
+    )
+    middle = (box[0] + box[2] / 2, box[1] + box[3] / 2)
+    before = tab.run(f"{VIEWER}.pose")
+    about = tab.run(f"{VIEWER}.target")
+    tab.drag(middle, (middle[0] + 80, middle[1] + 30))
+    do(tab, "change()")
+    after = tab.run(f"{VIEWER}.pose")
+    assert np.abs(np.subtract(before, after)).max() > 0.05
+    assert np.allclose(tab.run(f"{VIEWER}.target"), about, atol=1e-3)
+    turn = np.reshape(after, (3, 4))[:, :3]
+    assert np.allclose(turn.T @ turn, np.eye(3), atol=1e-5)
+    for key, change in (("w", "moved"), ("ArrowLeft", "turned"), ("n", "next")):
+        pose = tab.run(f"{VIEWER}.pose")
+        tab.run("document.querySelector('#viewer canvas').focus()")
+        tab.key(key)
+        do(tab, "change()")
+        assert not np.allclose(tab.run(f"{VIEWER}.pose"), pose), change
+    assert tab.run(f"{VIEWER}.camera") == {"group": 0, "index": 2}
+    assert tab.run("document.querySelector('#viewer [data-part=status]').textContent") == "Training, b_002"
+
+
+def test_a_drawn_camera_can_be_clicked(tab: Browser) -> None:
+    do(tab, "jump(0, 0)")
+    do(tab, "show('held_out', true)")
+    lines = picture(tab)
+    found = tab.run(
+        f"(v => {{ const s = v.state(), c = v.data.groups[1].cameras[4].pose, p = [c[3], c[7], c[11]];"
+        "const m = s.view;"
+        "const t = [0, 1, 2].map(k => m[k] * p[0] + m[4 + k] * p[1] + m[8 + k] * p[2] + m[12 + k]);"
+        f"return v.pick(s.K[0] * t[0] / t[2] + s.K[2], s.K[1] * t[1] / t[2] + s.K[3], 3); }})({VIEWER})"
+    )
+    assert found["group"] == 1
+    do(tab, "show('held_out', false)")
+    assert psnr(picture(tab), lines) < 45
+
+
+@pytest.mark.parametrize("what", ["mesh", "train", "virtual"])
+def test_overlays_are_drawn(tab: Browser, what: str) -> None:
+    do(tab, "jump(0, 2)")
+    do(tab, "move([0, 0, -0.3])")
+    bare = picture(tab)
+    do(tab, f"show('{what}', true)")
+    assert psnr(picture(tab), bare) < 50
+    do(tab, f"show('{what}', false)")
+    assert psnr(picture(tab), bare) > 60
+
+
+@pytest.mark.parametrize("name", ["observed", "directions", "uncertainty", "expected_error"])
+def test_quantities_are_shown(tab: Browser, name: str) -> None:
+    do(tab, "jump(0, 2)")
+    do(tab, "setQuantity('')")
+    plain = picture(tab)
+    do(tab, f"setQuantity('{name}')")
+    assert psnr(picture(tab), plain) < 30
+    do(tab, "setQuantity('')")
+
+
+@pytest.mark.parametrize("path", [0, 1])
+def test_flight_ends_at_the_last_pose(tab: Browser, path: int) -> None:
+    tab.run(f"{VIEWER}.play({path}, 0, 60).then(() => true)")
+    last = tab.run(f"{VIEWER}.data.paths[{path}].poses.at(-1)")
+    assert np.allclose(tab.run(f"{VIEWER}.pose"), last, atol=1e-6)
+
+
+def test_views_lie_on_each_other(tab: Browser) -> None:
+    chosen = "document.querySelector('#compare [data-part={}]')"
+    labels = tab.run(f"[...{chosen.format('left')}.options].map(option => option.text)")
+    assert labels[:3] == ["Coarse", "Final", "Truth"]
+    tab.run(
+        f"(([slider, right]) => {{ slider.value = 25; slider.dispatchEvent(new Event('input'));"
+        f"right.value = 2; right.dispatchEvent(new Event('change')); }})"
+        f"([{chosen.format('divide')}, {chosen.format('right')}])"
+    )
+    assert tab.run(f"{chosen.format('over')}.style.clipPath") == "inset(0px 75% 0px 0px)"
+    assert tab.run(f"{chosen.format('under')}.firstChild.alt").endswith("as recorded")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 900), (820, 1180), (420, 900)])
+def test_nothing_is_wider_than_the_window(tab: Browser, width: int, height: int) -> None:
+    tab.window(width, height, dark=width == 820)
+    wider = tab.run(
+        "[...document.querySelectorAll('body *')].filter("
+        "item => !item.closest('nav, .scroll, .chart, details')"
+        " && item.getBoundingClientRect().right > window.innerWidth).map(item => item.outerHTML.slice(0, 90))"
+    )
+    assert wider == []
+    assert tab.run("document.documentElement.scrollWidth <= window.innerWidth")
+    tab.window(1280, 900)
+
+
+def test_speed_is_known(tab: Browser, record_property: Callable[[str, object], None]) -> None:
+    per_second = tab.run(f"{VIEWER}.speed(6)")
+    record_property("pictures_per_second", per_second)
+    assert per_second > 0.1

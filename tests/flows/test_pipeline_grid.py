@@ -1,0 +1,141 @@
+"""The grid of methods by budgets: what is charged, what is shared, going on after an interruption."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from extrags.errors import ConfigError
+from flows.budgets import Budget
+from flows.cli import main
+from flows.pipeline_grid import Cell, cells_of, run_cell, run_grid
+from tests.flows.tiny import SEQUENCE, TINY
+
+SMALL = {**TINY, "ingest.max_frames": 8}
+BUDGETS = [Budget("few", {"coarse.iterations": 10}), Budget("more", {"coarse.iterations": 20})]
+
+
+def cells(repeats: int = 1, **settings: Any) -> list[Cell]:
+    return cells_of(
+        ["phantom/0@sparse"], ["coarse"], [("quick", BUDGETS)], [0], repeats, {**SMALL, **settings}
+    )
+
+
+class TestCells:
+    def test_budgets_that_do_not_reach_a_method_are_one_cell(self) -> None:
+        budgets = [Budget("a", {"finetune.iterations": 5}), Budget("b", {"finetune.iterations": 6})]
+        found = cells_of([SEQUENCE], ["coarse", "extrags"], [("quick", budgets)], [0], 1, {})
+        assert [(cell.method, cell.budget) for cell in found] == [
+            ("coarse", "profile"),
+            ("extrags", "finetune.iterations=5"),
+            ("extrags", "finetune.iterations=6"),
+        ]
+
+    def test_wrong_settings_are_found_before_anything_runs(self) -> None:
+        with pytest.raises(ConfigError):
+            cells_of(
+                [SEQUENCE], ["coarse"], [("quick", [Budget("x", {"coarse.iterations": -1})])], [0], 1, {}
+            )
+        with pytest.raises(ConfigError, match="no method 'magic'"):
+            cells_of([SEQUENCE], ["magic"], [("quick", [Budget()])], [0], 1, {})
+
+
+class TestGrid:
+    def test_shared_stages_are_charged_with_what_they_took_here(self, tmp_path: Path) -> None:
+        found = run_grid(cells(), tmp_path, run=run_cell)
+        first, second = found["cases"]
+        assert first["error"] == second["error"] == ""
+        ingest = [next(row for row in case["stages"] if row["stage"] == "ingest") for case in (first, second)]
+        assert ingest[0]["seconds"] == ingest[1]["seconds"] > 0
+        assert [row["shared_seconds"] for row in ingest] == [0, ingest[1]["seconds"]]
+        assert first["shared_seconds"] == 0
+        assert second["shared_seconds"] == pytest.approx(ingest[1]["seconds"], abs=1e-3)
+        counted = [row for row in second["stages"] if row["stage"] != "evaluate"]
+        assert second["seconds"] == pytest.approx(sum(row["seconds"] for row in counted), abs=1e-2)
+        assert second["processor_seconds"] > 0
+        assert second["peak_mib"] > 0
+        assert (first["width"], first["height"], first["frames"]) == (48, 40, 8)
+        assert found["machine"]["versions"]["extrags"]
+        assert {entry["figure"] for entry in found["fronts"]} >= {"psnr", "ssim"}
+        # What is finished is not run again.
+        again = run_grid(cells(), tmp_path, run=_never)
+        assert again["cases"] == found["cases"]
+
+    def test_repeats_begin_with_an_empty_store(self, tmp_path: Path) -> None:
+        stores = []
+
+        def run(cell: Cell, store: str) -> dict[str, Any]:
+            stores.append(Path(store).name)
+            return _case(cell)
+
+        run_grid(cells(repeats=2), tmp_path / "shared", run=run)
+        assert stores == ["repeat-0", "repeat-0", "repeat-1", "repeat-1"]
+        stores.clear()
+        run_grid(cells(), tmp_path / "separate", separate=True, run=run)
+        assert len(set(stores)) == 2
+
+    def test_failed_cells_are_tried_again(self, tmp_path: Path) -> None:
+        run_grid(
+            cells(), tmp_path, run=lambda cell, _: {**_case(cell), "error": "coarse: no", "metrics": None}
+        )
+        tried = []
+        run_grid(cells(), tmp_path, run=lambda cell, _: tried.append(cell) or _case(cell))
+        assert len(tried) == 2
+
+    def test_another_machine_needs_another_folder(self, tmp_path: Path) -> None:
+        run_grid(cells(), tmp_path, run=lambda cell, _: _case(cell))
+        claim = json.loads((tmp_path / "grid.json").read_text())
+        (tmp_path / "grid.json").write_text(json.dumps({**claim, "processor": "another"}))
+        with pytest.raises(ConfigError, match="processor was another"):
+            run_grid(cells(), tmp_path, run=_never)
+
+
+def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = [
+        f"--set={name}={json.dumps(value)}" for name, value in SMALL.items() if name != "coarse.iterations"
+    ]
+    given = [
+        "bench",
+        "pipeline",
+        SEQUENCE,
+        "--methods",
+        "coarse",
+        "--vary",
+        "coarse.iterations=5,10",
+        *settings,
+    ]
+    assert main([*given, "--output", str(tmp_path)]) == 0
+    assert "on the front" in capsys.readouterr().out
+    assert (tmp_path / "fronts.png").stat().st_size > 1000
+    result = tmp_path / "results.json"
+    assert len(json.loads(result.read_text())["cases"]) == 2
+    assert main(["bench", "compare", str(result), str(result)]) == 0
+    worse = json.loads(result.read_text())
+    for case in worse["cases"]:
+        case["error"] = "coarse: it diverged"
+    (tmp_path / "worse.json").write_text(json.dumps(worse))
+    assert main(["bench", "compare", str(result), str(tmp_path / "worse.json")]) == 1
+    assert "it diverged" in capsys.readouterr().out
+    assert main(["bench", "compare", str(result), str(tmp_path / "none.json")]) == 2
+
+
+def _never(cell: Cell, store: str) -> dict[str, Any]:
+    raise AssertionError(f"{cell} is not to be run in {store}")
+
+
+def _case(cell: Cell) -> dict[str, Any]:
+    return {
+        **{name: getattr(cell, name) for name in ("method", "profile", "budget", "seed", "repeat")},
+        "sequence": "phantom/0",
+        "setting": "sparse",
+        "width": 48,
+        "height": 40,
+        "seconds": 1.0,
+        "processor_seconds": 1.0,
+        "peak_mib": 1.0,
+        "metrics": {"psnr": 20.0},
+        "error": "",
+    }

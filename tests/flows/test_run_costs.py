@@ -1,0 +1,72 @@
+"""Costs on record in a store, and the prediction of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from extrags.config import PipelineConfig, profile_config
+from extrags.errors import ConfigError
+from extrags.run_costs import CostModel, Workload
+from extrags.store import Store
+from flows import run_costs
+from flows.run_costs import catalogue_work, predict_run, recorded_costs
+from flows.runners import DirectRunner
+from flows.wiring import run_sequence
+from tests.flows.tiny import SEQUENCE, TINY
+
+CONFIG: PipelineConfig = profile_config("quick").with_overrides(TINY)
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    store = Store(tmp_path_factory.mktemp("costs"))
+    outcome = run_sequence(SEQUENCE, CONFIG, store.root, DirectRunner(store.root), until="explore")
+    assert outcome.status == "ok"
+    assert all(row.processor_seconds is not None for row in outcome.stages if row.tasks)
+    assert all(row.spent_seconds == pytest.approx(row.made_seconds) for row in outcome.stages)
+    return store
+
+
+def test_records_have_the_numbers_that_costs_depend_on(filled: Store) -> None:
+    elapsed, processor = recorded_costs(filled, profile_config("balanced"))
+    assert len(elapsed) == len(processor) > 5
+    work, cost = next(item for item in processor if item[1].task == "coarse")
+    numbers = work.numbers()
+    assert (numbers["pixels"], numbers["frames"], numbers["iterations"]) == (48 * 40, 24, 120)
+    assert cost.seconds > 0
+    assert cost.peak_mib
+    # The waves are part of the exploration.
+    parts = filled.ls("explore*")
+    (explore,) = [cost for _, cost in elapsed if cost.task == "explore"]
+    assert explore.seconds == pytest.approx(sum(part.seconds for part in parts), abs=0.01)
+
+
+def test_the_history_of_a_store_tells_the_pace(filled: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_costs, "ENOUGH_SECONDS", 0.0)
+    work = Workload(48 * 40, 24, 12, 12, CONFIG)
+    model = CostModel({"coarse": {"one": 1.0}, "ingest": {"one": 1.0}}, {"coarse": {"one": 300.0}}, 0.01)
+    found = predict_run(filled, work, {"ingest", "coarse", "report"}, model=model)
+    assert (found.source, found.unknown, found.peak_mib) == ("history", ["report"], 300.0)
+    _, processor = recorded_costs(filled, CONFIG)
+    spent = sum(cost.seconds for _, cost in processor if cost.task in ("ingest", "coarse"))
+    assert found.processor_seconds == pytest.approx(spent, rel=0.6)
+    assert found.seconds is not None
+
+
+def test_without_history_a_probe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run_costs, "probe_seconds", lambda: 0.03)
+    model = CostModel({"ingest": {"frames": 2.0}}, {}, 0.01)
+    work, stages = catalogue_work(SEQUENCE, CONFIG, {})
+    assert work.pixels == 48 * 40
+    assert "poses" not in stages
+    assert "depth" not in stages
+    found = predict_run(Store(tmp_path), work, {"ingest"}, model=model)
+    assert (found.source, found.seconds) == ("probe", None)
+    assert found.processor_seconds == pytest.approx(3 * 2 * 24)
+
+
+def test_nothing_is_known_of_a_path(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="not in the catalogue"):
+        catalogue_work(str(tmp_path), CONFIG, {})
