@@ -26,7 +26,7 @@ VERBS = {
     "serve": "run the deployments on this machine, on demand and on schedule",
     "plan": "measure a scene and say which stages it needs, and why",
     "report": "build the page of a finished run again, from the store",
-    "export": "write a reconstructed scene as PLY, or a sequence as COLMAP model or transforms.json",
+    "export": "write a reconstructed scene as Gaussians, mesh or video, or a sequence for COLMAP",
     "data": "what sequences there are, and whether a source is right",
     "cache": "what is in the store",
     "reconcile": "set runs that a power loss left Running to Crashed",
@@ -49,6 +49,7 @@ EXAMPLES = """examples:
   extrags evaluate phantom/0@sparse --renders my_renders/ --json -
   extrags benchmark phantom/0@sparse phantom/1@sparse --methods 3dgs,coarse --seeds 0,1,2
   extrags data check my_video.mp4 my_colmap_scene/
+  extrags export phantom/0@sparse --to spz --out scene.spz
   extrags export phantom/0@sparse --to colmap --out scene/
   extrags cache rm 'explore*'
 

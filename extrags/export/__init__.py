@@ -7,6 +7,7 @@ the catalogue's readers of these formats.
 from __future__ import annotations
 
 from extrags.export.camera_path import CameraPath as CameraPath
+from extrags.export.camera_path import flight_through as flight_through
 from extrags.export.camera_path import read_camera_path as read_camera_path
 from extrags.export.camera_path import write_camera_path as write_camera_path
 from extrags.export.mesh_files import write_mesh as write_mesh
@@ -20,6 +21,7 @@ __all__ = [
     "CameraPath",
     "ColoredMesh",
     "colored_mesh",
+    "flight_through",
     "fly_through",
     "read_camera_path",
     "write_camera_path",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from extrags.cameras import Cameras, as_rotation
 from extrags.errors import ExtragsError, SourceError, SourceNotFoundError
 
-__all__ = ["CameraPath", "read_camera_path", "write_camera_path"]
+__all__ = ["CameraPath", "flight_through", "read_camera_path", "write_camera_path"]
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _LARGEST_SIDE_PX = 8192
@@ -31,6 +32,19 @@ class CameraPath:
 
     cameras: Cameras
     fps: float = 24.0
+
+
+def flight_through(parts: Sequence[Cameras], steps: int) -> Cameras:
+    """One flight through all cameras of each part; from one part to the next it cuts.
+
+    Args:
+        parts: of one image size, e.g. the recordings of a scene, or virtual trajectories.
+        steps: from each camera to the next of its part; 1 takes the cameras themselves.
+
+    Raises:
+        ShapeError: when the image sizes differ.
+    """
+    return Cameras.concatenated([part.interpolated(steps) for part in parts])
 
 
 def write_camera_path(path: CameraPath, file: Path) -> None:

@@ -50,6 +50,7 @@ def fly_through(
     *,
     exposure: float = 1.0,
     train: Cameras | None = None,
+    colors: bool = True,
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Render every camera of a path, one picture beside the other.
 
@@ -60,19 +61,23 @@ def fly_through(
         train: with the training views, one more column: where the last scene rests on few of them. The
             share of a pixel that falls on Gaussians they hardly saw, or on none at all, from black (well
             known) over red to yellow (unknown).
+        colors: False shows that column alone.
 
     Yields:
         Frames.
+
+    Raises:
+        ConfigError: when nothing is to be shown.
     """
-    if not scenes:
-        raise ConfigError("a fly-through needs at least one scene")
+    if not scenes or (train is None and not colors):
+        raise ConfigError("a fly-through needs at least one scene, and something of it to show")
     lacking = None if train is None else unobserved(scenes[-1], train)
     gain = torch.tensor([float(exposure)])
     for index in range(len(path)):
         camera = path[index]
         columns = []
         with torch.no_grad():
-            for scene in scenes:
+            for scene in scenes if colors else ():
                 rgb = scene.render(camera, exposure=gain).rgb[0].clamp(0, 1).numpy()
                 columns.append(np.rint(rgb * 255).astype(np.uint8))
             if lacking is not None:
