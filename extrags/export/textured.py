@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
 from extrags.cameras import Cameras, project_points, transform_points
 from extrags.errors import CaptureError
@@ -18,10 +19,20 @@ __all__ = ["ColoredMesh", "colored_mesh"]
 
 _LARGEST_TEXTURE_PX = 4096
 _MOST_TEXELS, _FEWEST_TEXELS = 12, 4
-"""Texels along the edge of a triangle: more would show nothing new at the size of the frames."""
+"""Texels along the edge of a triangle."""
+_TEXELS_PER_PIXEL = 2
+"""Of all views together: more would show nothing that the views hold."""
 _DEPTH_TOLERANCE = 0.02
-"""A point counts as seen where it lies at most so much behind the rendered surface, as a share of depth."""
+"""A view colours a point that lies at most so much behind the rendered surface, as a share of depth."""
 _MIN_FACING = 0.1
+"""And whose normal turns towards it: the cosine of incidence."""
+_SEEN_EDGES = 2.0
+"""For a point to count as seen it may lie so many edges of triangles deeper than that, and turn anywhere.
+
+Fusion moves the surface by about a voxel and rounds rims off, whose normals then point aside. With the test of
+the colours 7.6 % of a mesh fused from training views alone counted as invented, with this one 0.4 %; of surface
+that virtual views alone had shown, 99.2 % instead of 99.8 %.
+"""
 _VIEWS_PER_BATCH = 8
 
 
@@ -32,7 +43,8 @@ class ColoredMesh:
     Args:
         mesh: positions and triangles.
         colors: of each vertex, [V, 3].
-        invented: of each vertex: 0 where at least one training view sees it, 1 where none does, [V].
+        invented: of each vertex: 0 where at least one training view sees it, or sees what lies behind it,
+            up to two edges of triangles; 1 where none does, [V].
         texture: an image of the whole surface, or None.
         uv: where the corners of each triangle lie in it, from its lower left corner in [0, 1], [T, 3, 2].
     """
@@ -51,7 +63,7 @@ def colored_mesh(
 
     A point takes the mean of what the views show of it, weighted by the cosine of incidence and by the
     inverse square of the distance; a view counts where its rendered depth says that it sees the point.
-    Points that no view sees take the colour of the nearest that one does.
+    Points that no view colours take the colour of the nearest that one does.
 
     Args:
         mesh: the surface.
@@ -69,25 +81,32 @@ def colored_mesh(
     normals = np.zeros_like(vertices)
     for corner in range(3):
         np.add.at(normals, mesh.triangles[:, corner], faces)
-    atlas = _Atlas.of(len(mesh.triangles)) if texture else None
-    # Vertices and texels are coloured together: every view is rendered once.
-    located, facing = [vertices], [normals]
-    if atlas is not None:
-        texels, owner = atlas.positions(corners)
-        located.append(texels)
-        facing.append(faces[owner])
     views = train if virtual is None or not len(virtual) else Cameras.concatenated([train, virtual])
-    points, directions = np.concatenate(located), _unit(np.concatenate(facing))
-    colors, weight, seen = _observed(points, directions, scene, views, len(train))
-    if not (weight > 0).any():
+    atlas: _Atlas | None = None
+    on_vertices, on_texels = _Seen(vertices, normals), _Seen(vertices[:0], normals[:0])
+    owner = np.zeros(0, dtype=np.int64)
+    if texture:
+        pixels = len(views) * views.width * views.height
+        atlas = _Atlas.of(len(mesh.triangles), _TEXELS_PER_PIXEL * pixels)
+        texels, owner = atlas.positions(corners)
+        on_texels = _Seen(texels, faces[owner])
+    slack = _SEEN_EDGES * float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
+    training = np.zeros(len(vertices), dtype=bool)
+    # Vertices and texels are coloured together: every view is rendered once.
+    for index, view in enumerate(_rendered(scene, views)):
+        shown = on_vertices.add(view, slack)
+        if index < len(train):
+            training |= shown
+        # A triangle is about as large as a pixel: where none of its corners is visible, little of it is.
+        on_texels.add(view, slack, np.flatnonzero(shown[mesh.triangles].any(axis=1)[owner]))
+    if not (on_vertices.weight > 0).any():
         raise CaptureError(f"none of the {len(views)} views sees any of the mesh")
-    colors = _filled(points, colors, weight)
-    count = len(vertices)
-    invented = np.where(seen[:count], 0, 1).astype(np.float32)
-    as_bytes = np.rint(colors.clip(0, 1) * 255).astype(np.uint8)
+    known = on_vertices.points[on_vertices.weight > 0], on_vertices.means()[on_vertices.weight > 0]
+    colors = on_vertices.filled(*known)
+    invented = np.where(training, 0, 1).astype(np.float32)
     if atlas is None:
-        return ColoredMesh(mesh, as_bytes, invented)
-    return ColoredMesh(mesh, as_bytes[:count], invented, atlas.image(as_bytes[count:]), atlas.uv())
+        return ColoredMesh(mesh, colors, invented)
+    return ColoredMesh(mesh, colors, invented, atlas.image(on_texels.filled(*known)), atlas.uv())
 
 
 @dataclass(frozen=True)
@@ -104,9 +123,12 @@ class _Atlas:
     rows: int
 
     @classmethod
-    def of(cls, triangles: int) -> _Atlas:
+    def of(cls, triangles: int, texels: int) -> _Atlas:
+        """The finest atlas with about so many texels, but with no fewer than interpolation needs."""
         pairs = -(-triangles // 2)
         for edge in range(_MOST_TEXELS, _FEWEST_TEXELS - 1, -1):
+            if edge > _FEWEST_TEXELS and pairs * edge * (edge + 1) > texels:
+                continue
             columns = max(1, int(np.ceil(np.sqrt(pairs * edge / (edge + 1)))))
             rows = -(-pairs // columns)
             if max(columns * (edge + 1), rows * edge) <= _LARGEST_TEXTURE_PX:
@@ -170,46 +192,83 @@ class _Atlas:
         return np.asarray(shares, dtype=np.float32)
 
 
-def _observed(
-    points: Float[np.ndarray, "p 3"],
-    normals: Float[np.ndarray, "p 3"],
-    scene: Scene,
-    views: Cameras,
-    n_train: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean colour of each point over the views, its weight, and whether one of the first views sees it."""
-    colors = np.zeros((len(points), 3))
-    weight = np.zeros(len(points))
-    seen = np.zeros(len(points), dtype=bool)
+@dataclass(frozen=True)
+class _View:
+    camera: Cameras
+    image: Float[np.ndarray, "h w 3"]
+    depth: Float[np.ndarray, "h w"]
+    alpha: Float[np.ndarray, "h w"]
+
+
+def _rendered(scene: Scene, views: Cameras) -> Iterator[_View]:
     for begun in range(0, len(views), _VIEWS_PER_BATCH):
         batch = views[begun : begun + _VIEWS_PER_BATCH]
         with torch.no_grad():
             rendering = scene.render(batch, median_depth=True)
-        depths = np.asarray(rendering.median_depth)
-        images, alphas = rendering.rgb.numpy(), rendering.alpha.numpy()
-        for index in range(len(batch)):
-            camera = batch[index]
-            local = transform_points(camera.viewmats[0], points)
-            with np.errstate(invalid="ignore"):
-                inside = camera.contains(project_points(local, camera.K[0])) & (local[:, 2] > 0)
-            rows = np.flatnonzero(inside)
-            pixels = project_points(local[rows], camera.K[0])
-            u, v = np.floor(pixels).astype(np.int64).T
-            depth = depths[index, v, u]
-            near = local[rows, 2] <= depth * (1 + _DEPTH_TOLERANCE)
-            toward = camera.centers[0] - points[rows]
-            distance = np.linalg.norm(toward, axis=1)
-            # The normals of the mesh point into free space, where the cameras are.
-            cosine = (toward * normals[rows]).sum(axis=1) / np.maximum(distance, 1e-30)
-            good = near & (depth > 0) & (alphas[index, v, u] > 0.5) & (cosine > _MIN_FACING)
-            rows, u, v = rows[good], u[good], v[good]
-            share = cosine[good] / distance[good] ** 2
-            weight[rows] += share
-            colors[rows] += share[:, None] * _bilinear(images[index], pixels[good])
-            if begun + index < n_train:
-                seen[rows] = True
+        depths, alphas = np.asarray(rendering.median_depth), rendering.alpha.numpy()
+        for index, image in enumerate(rendering.rgb.numpy()):
+            yield _View(batch[index], image, depths[index], alphas[index])
         emit(Progress("export", min(begun + _VIEWS_PER_BATCH, len(views)), len(views)))
-    return colors / np.maximum(weight, 1e-30)[:, None], weight, seen
+
+
+class _Seen:
+    """What views show of points, summed up.
+
+    Args:
+        points: of the surface, [P, 3].
+        normals: of any length; they point into free space, where the cameras are, [P, 3].
+    """
+
+    def __init__(self, points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"]) -> None:
+        self.points = points
+        self.normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+        self.weight = np.zeros(len(points))
+        self._sums = np.zeros((len(points), 3))
+
+    def add(
+        self, view: _View, slack: float, rows: Int[np.ndarray, "r"] | None = None
+    ) -> Bool[np.ndarray, "p"]:
+        """Add what a view shows, of some of the points or of all.
+
+        Returns:
+            Which of the points it sees, so far as `slack` behind its surface.
+        """
+        shown = np.zeros(len(self.points), dtype=bool)
+        rows = np.arange(len(self.points)) if rows is None else rows
+        camera = view.camera
+        local = transform_points(camera.viewmats[0], self.points[rows])
+        pixels = project_points(local, camera.K[0])
+        with np.errstate(invalid="ignore"):
+            inside = np.flatnonzero(camera.contains(pixels))
+        rows, pixels = rows[inside], pixels[inside]
+        u, v = np.floor(pixels).astype(np.int64).T
+        depth = view.depth[v, u]
+        surface = (depth > 0) & (view.alpha[v, u] > 0.5)
+        behind = local[inside, 2] - depth * (1 + _DEPTH_TOLERANCE)
+        shown[rows[surface & (behind <= slack)]] = True
+        toward = camera.centers[0] - self.points[rows]
+        distance = np.linalg.norm(toward, axis=1)
+        cosine = (toward * self.normals[rows]).sum(axis=1) / np.maximum(distance, 1e-30)
+        good = surface & (behind <= 0) & (cosine > _MIN_FACING)
+        share = cosine[good] / distance[good] ** 2
+        self.weight[rows[good]] += share
+        self._sums[rows[good]] += share[:, None] * _bilinear(view.image, pixels[good])
+        return shown
+
+    def means(self) -> Float[np.ndarray, "p 3"]:
+        """Mean colour of each point, black where there is none."""
+        return np.asarray(self._sums / np.maximum(self.weight, 1e-30)[:, None])
+
+    def filled(
+        self, points: Float[np.ndarray, "k 3"], colors: Float[np.ndarray, "k 3"]
+    ) -> UInt8[np.ndarray, "p 3"]:
+        """Mean colour of each point; that of the nearest of some known points where there is none."""
+        from scipy.spatial import cKDTree
+
+        means, unknown = self.means(), self.weight <= 0
+        if unknown.any():
+            means[unknown] = colors[cKDTree(points).query(self.points[unknown])[1]]
+        return np.asarray(np.rint(means.clip(0, 1) * 255).astype(np.uint8))
 
 
 def _bilinear(image: Float[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "p 2"]) -> np.ndarray:
@@ -221,19 +280,3 @@ def _bilinear(image: Float[np.ndarray, "h w 3"], pixels: Float[np.ndarray, "p 2"
     upper = image[y, x] * (1 - a)[:, None] + image[y, right] * a[:, None]
     lower = image[below, x] * (1 - a)[:, None] + image[below, right] * a[:, None]
     return np.asarray(upper * (1 - b)[:, None] + lower * b[:, None])
-
-
-def _filled(points: np.ndarray, colors: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    from scipy.spatial import cKDTree
-
-    known = weight > 0
-    if known.all():
-        return colors
-    nearest = cKDTree(points[known]).query(points[~known])[1]
-    filled = colors.copy()
-    filled[~known] = colors[known][nearest]
-    return filled
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-30))

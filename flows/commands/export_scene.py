@@ -37,9 +37,7 @@ def export_scene(given: argparse.Namespace) -> int:
     set_up_logging(debug=given.debug, terminal=terminal)
     config = run_config(given)
     if config.uc_nerf.enabled and given.to != "camera-path":
-        raise ConfigError(
-            f"the method {given.method} makes no Gaussians to write as {given.to}"
-        )
+        raise ConfigError(f"the method {given.method} makes no Gaussians to write as {given.to}")
     target = Path(given.output)
     write = {"camera-path": _camera_path, "video": _video, "mesh": _mesh, "points": _points}
     with _progress(given, terminal=terminal):
@@ -154,7 +152,9 @@ def _mesh(given: argparse.Namespace, target: Path) -> str:
     views = train if virtual is None else Cameras.concatenated([train, virtual])
     mesh = fuse_surface(scene, views, finished.config.surface)
     baked = Scene(_baked(given, finished, scene))
-    colored = colored_mesh(mesh, baked, train, virtual, texture=given.texture is not False)
+    # PLY has no texture that viewers agree on.
+    texture = given.texture is not False and target.suffix.lower() != ".ply"
+    colored = colored_mesh(mesh, baked, train, virtual, texture=texture)
     write_mesh(colored, target, metric=frames.metric)
     return (
         f"{len(mesh.vertices)} vertices, {len(mesh.triangles)} triangles, "
