@@ -29,9 +29,9 @@ _MIN_FACING = 0.1
 _SEEN_EDGES = 2.0
 """For a point to count as seen it may lie so many edges of triangles deeper than that, and turn anywhere.
 
-Fusion moves the surface by about a voxel and rounds rims off, whose normals then point aside. With the test of
-the colours 7.6 % of a mesh fused from training views alone counted as invented, with this one 0.4 %; of surface
-that virtual views alone had shown, 99.2 % instead of 99.8 %.
+Fusion moves the surface by about a voxel and rounds rims off, whose normals then point aside. With the test
+of the colours 7.6 % of a mesh fused from training views alone counted as invented, with this one 0.4 %; of
+surface that virtual views alone had shown, 99.2 % instead of 99.8 %.
 """
 _VIEWS_PER_BATCH = 8
 

@@ -59,29 +59,45 @@ def read_ply_scene(path: Path) -> Scene:
     return Scene(gaussians, None if line is None else _light(line.removeprefix(_MARK), path))
 
 
+_SHAPES: dict[str, tuple[int, ...] | None] = {
+    "log_softening": (),
+    "log_exponent": (),
+    "log_exposure": None,
+    "spread": (),
+    "cosine": (),
+    "offset": (3,),
+    "log_shoulder": (),
+}
+"""Parameters of the light, and how many numbers each is; None: any, one after the other."""
+
+
 def _light(text: bytes, path: Path) -> NearFieldLight:
     try:
         values = json.loads(text)
-        shoulder = float(values.pop("shoulder"))
-        reference = float(values.pop("reference_distance"))
+        shoulder, reference = float(values.pop("shoulder")), float(values.pop("reference_distance"))
         tensors = {name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()}
-        tensors["log_shoulder"] = torch.tensor(math.log(shoulder) if shoulder > 0 else -math.inf)
-        light = NearFieldLight(**tensors, reference_distance=reference)
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, OverflowError) as error:
         raise SourceError(
             f"the light in the header cannot be read: {error}", file=path, field="extrags_light"
         ) from error
-    shapes = {name: 1 if name in ("offset", "log_exposure") else 0 for name in light.parameters()}
-    for name, value in light.parameters().items():
-        finite = bool(torch.isfinite(value).all()) or name == "log_shoulder"
-        if value.ndim != shapes[name] or (name == "offset" and len(value) != 3) or not finite:
+    tensors["log_shoulder"] = torch.tensor(math.log(shoulder) if shoulder > 0 else -math.inf)
+    for name in sorted(_SHAPES.keys() ^ tensors.keys()):
+        what = "is missing" if name in _SHAPES else "is unknown"
+        raise SourceError(f"the light's {name} {what}", file=path, field="extrags_light")
+    for name, value in tensors.items():
+        shape = _SHAPES[name]
+        fits = value.ndim == 1 if shape is None else tuple(value.shape) == shape
+        if not fits or not (bool(torch.isfinite(value).all()) or name == "log_shoulder"):
             raise SourceError(
-                "the light in the header is not complete", file=path, field=f"extrags_light.{name}"
+                f"the light's {name} has shape {tuple(value.shape)} or is not finite",
+                file=path,
+                field=f"extrags_light.{name}",
             )
-    if not (math.isfinite(reference) and reference > 0):
+    if not (math.isfinite(reference) and reference > 0 and math.isfinite(shoulder)):
         raise SourceError(
-            f"the light's reference distance is {reference:g}; expected a positive number",
+            f"the light's reference distance is {reference:g}, its shoulder {shoulder:g}; "
+            "expected a positive and a finite number",
             file=path,
             field="extrags_light.reference_distance",
         )
-    return light
+    return NearFieldLight(**tensors, reference_distance=reference)

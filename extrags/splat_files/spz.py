@@ -122,7 +122,7 @@ def read_spz(path: Path) -> Gaussians:
     means = (fixed.view("<i4")[..., 0] >> 8) / float(1 << bits) * [1, -1, -1]
     share = (opacities.astype(np.float64) / 255).clip(1e-6, 1 - 1e-6)
     quats = (_smallest_three if version == 3 else _three_bytes)(rotations)
-    shN = (harmonics.reshape(n, -1, 3).astype(np.float32) - 128) / 128
+    shN = (harmonics.reshape(n, _REST[degree], 3).astype(np.float32) - 128) / 128
     return Gaussians(
         means=torch.from_numpy(means.astype(np.float32)),
         quats=torch.from_numpy((quats[:, [3, 0, 1, 2]] * [1, 1, -1, -1]).astype(np.float32)),
