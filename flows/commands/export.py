@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, StoreError
-from flows.commands.common import finished_run, run_config, set_up_logging
+from flows.commands.common import set_up_logging
 from flows.commands.options import Parser, add_method
 
-if TYPE_CHECKING:
-    from extrags.sequence import EndoscopicSequence
-
-__all__ = ["add_arguments", "export", "posed_sequence"]
+__all__ = ["add_arguments", "export"]
 
 GAUSSIANS = ("ply", "compressed-ply", "spz", "sog")
 COLORED = (*GAUSSIANS, "mesh", "points")
@@ -193,6 +189,7 @@ def _check(given: argparse.Namespace) -> None:
 def _sequence(given: argparse.Namespace) -> int:
     from data_catalog.readers.colmap_model import points_of, write_colmap
     from data_catalog.readers.transforms_json import write_transforms
+    from flows.commands.export_scene import posed_sequence
 
     target = Path(given.output)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -211,24 +208,3 @@ def _sequence(given: argparse.Namespace) -> int:
     count = 0 if points is None else len(points)
     print(f"{target}: {len(sequence)} frames with poses, {count} points")
     return 0
-
-
-def posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:
-    """The frames with the poses and intrinsics that the scene of a run with these settings is made with.
-
-    Where no stage changes those of the source, no run is needed.
-
-    Raises:
-        StoreError: when a stage changes them and has not run.
-    """
-    from data_catalog.catalog import read
-    from extrags.sequence import EndoscopicSequence
-    from extrags.training.reconstruction import refines_poses
-
-    config = run_config(given)
-    source = read(given.sequence, config.ingest)
-    estimated = source.world_from_camera is None or config.poses.replace_given
-    if not estimated and not refines_poses(source, config.coarse):
-        return source
-    run = finished_run(given, "poses" if config.coarse.refine_poses is False else "coarse")
-    return run.store.load(EndoscopicSequence, run.refs["sequence"])

@@ -1,4 +1,4 @@
-"""What `extrags export` writes of a finished run: Gaussians, mesh, points, camera paths, video."""
+"""What `extrags export` writes of a finished run: Gaussians, mesh, points, camera paths, video; its poses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from extrags.sequence import EndoscopicSequence
     from flows.wiring import SequenceRun
 
-__all__ = ["export_scene"]
+__all__ = ["export_scene", "posed_sequence"]
 
 
 def export_scene(given: argparse.Namespace) -> int:
@@ -229,8 +229,6 @@ def _cameras(given: argparse.Namespace, along: str, steps: int) -> Cameras:
         if not flights:
             raise ConfigError(f"--along virtual: the run of {given.sequence} has no virtual trajectories")
         return flight_through(flights, steps)
-    from flows.commands.export import posed_sequence
-
     frames = posed_sequence(given)
     chosen = np.sort(frames.train if along == "training" else frames.test)
     if not len(chosen):
@@ -244,3 +242,24 @@ def _cameras(given: argparse.Namespace, along: str, steps: int) -> Cameras:
 
 def _megabytes(target: Path) -> str:
     return f"{target.stat().st_size / 1e6:.2f} MB"
+
+
+def posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:
+    """The frames with the poses and intrinsics that the scene of a run with these settings is made with.
+
+    Where no stage changes those of the source, no run is needed.
+
+    Raises:
+        StoreError: when a stage changes them and has not run.
+    """
+    from data_catalog.catalog import read
+    from extrags.sequence import EndoscopicSequence
+    from extrags.training.reconstruction import refines_poses
+
+    config = run_config(given)
+    source = read(given.sequence, config.ingest)
+    estimated = source.world_from_camera is None or config.poses.replace_given
+    if not estimated and not refines_poses(source, config.coarse):
+        return source
+    run = finished_run(given, "poses" if config.coarse.refine_poses is False else "coarse")
+    return run.store.load(EndoscopicSequence, run.refs["sequence"])
