@@ -84,8 +84,8 @@ def import_scene(
     if ratio is not None and not 1 / _LARGEST_RATIO < ratio < _LARGEST_RATIO:
         raise SourceError(
             f"its depth is {ratio:.3g} times that of the frames (median): its unit is another, or it was "
-            f"made with other cameras; imported.scale is {config.scale:g}, and {config.scale / ratio:.4g} would "
-            "make the depths equal, for cameras of that unit",
+            f"made with other cameras. imported.scale is {config.scale:g}; {config.scale / ratio:.4g} "
+            "would make the depths equal",
             file=path,
             field="imported.scale",
         )
