@@ -16,6 +16,12 @@ from extrags.splat_files import read_ply_scene, write_ply_scene
 from tests.extrags.splat_files.conftest import psnr
 
 
+@pytest.fixture(scope="module")
+def lit(lit: Scene) -> Scene:
+    """A few Gaussians are enough."""
+    return Scene(lit.gaussians.subset(torch.arange(0, 5000, 25).clamp_max(len(lit.gaussians) - 1)), lit.light)
+
+
 def changed(path: Path, **values: object) -> None:
     """Other numbers in the light of a file."""
     head, mark, rest = path.read_bytes().partition(b"comment extrags_light ")
