@@ -170,7 +170,8 @@ def _scales(sequence: str, config: PipelineConfig) -> Mapping[StageName, float]:
     if ingest.width and ingest.height and rendered:
         pixels = ingest.width * ingest.height
     elif not rendered:
-        pixels = pixels / (ingest.downscale or max(1, round(about.width / USUAL_WIDTH))) ** 2
+        usual = max(1, round(about.width / USUAL_WIDTH)) if ingest.size == "thumbnail" else 1
+        pixels = pixels / (ingest.downscale or usual) ** 2
     by_pixels = pixels / REFERENCE_PIXELS
     by_frames = by_pixels * frames / REFERENCE_FRAMES
     return {stage: by_frames if stage in PER_FRAME else by_pixels for stage in STAGES}
