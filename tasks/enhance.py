@@ -26,11 +26,11 @@ RESTORER = "restorer"
 
 
 _OF_RESTORATION = frozenset(
-    {"clips_per_batch", "iou", "max_views", "pixel_confidence", "reference", "references"}
+    {"clips_per_batch", "iou", "max_views", "max_width", "pixel_confidence", "reference", "references"}
 )
 """Settings that the stage `enhance-restore` reads itself; all others work through the restorer."""
 
-_OF_KEYFRAMES = frozenset({"keyframes", "max_views", "reference", "references"})
+_OF_KEYFRAMES = frozenset({"keyframes", "max_views", "max_width", "reference", "references"})
 """Settings that the stage `enhance-keyframes` reads itself."""
 
 _OF_EMBEDDED = frozenset(
@@ -43,6 +43,7 @@ _OF_EMBEDDED = frozenset(
         "folds",
         "judge",
         "learning_rate",
+        "max_width",
         "precision",
         "reference",
         "references",
@@ -57,12 +58,12 @@ _OF_EMBEDDED = frozenset(
 
 _OF_TRAINING: dict[str, frozenset[str]] = {
     "embedded": _OF_EMBEDDED,
-    "classical": frozenset({"backend"}),
+    "classical": frozenset({"backend", "max_width"}),
     **dict.fromkeys(
         ("wan-vace", "stable-video", "ltx", "sd-img2img", "sd-inpaint"),
-        frozenset({"backend", "seed", "caption", "pretrained"}),
+        frozenset({"backend", "seed", "caption", "max_width", "pretrained"}),
     ),
-    "dynamicrafter": frozenset({"backend", "seed", "caption", "checkpoint"}),
+    "dynamicrafter": frozenset({"backend", "seed", "caption", "checkpoint", "max_width"}),
 }
 """Settings that the stage `enhance-train` reads, by backend; of another program's backend, all."""
 
