@@ -61,7 +61,7 @@ class Sampling(Protocol):
 
 
 def _enlarged_size(lens: Lens, config: IngestConfig, first: Sampling | None) -> tuple[int, int] | None:
-    """Size at which a pinhole of the field of view asked for keeps the central resolution; None: the lens's."""
+    """Size at which a pinhole of the given field of view keeps the central resolution; None: the lens's."""
     if config.field_of_view_deg is None or not keeps_central_resolution(config):
         return None
     if isinstance(first, LensSampling):

@@ -199,8 +199,8 @@ class EnhanceConfig(StageConfig):
         320,
         ge=32,
         le=4096,
-        description="virtual views are rendered, restored and fine-tuned on at most this wide, in pixels, with "
-        "real views and leave-out pairs of the same size; None: as wide as the frames",
+        description="virtual views are rendered, restored and fine-tuned on at most this wide, in pixels, "
+        "with real views and leave-out pairs of the same size; None: as wide as the frames",
     )
     keyframes: int = Field(
         0,
