@@ -4,7 +4,7 @@ A model of what each stage holds at its peak, in bytes per pixel, frame and Gaus
 bound for the usual case, not an average: stages that share a process keep what the largest of them took.
 
 Source: the constants were read off the peaks that runs recorded (`peak_mib` of their artefacts); see
-docs/algorithms/memory.md.
+docs/running_at_scale.md.
 """
 
 from __future__ import annotations
