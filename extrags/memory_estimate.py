@@ -31,15 +31,15 @@ STEP = 140
 """Bytes per pixel of the image of one optimisation step: rendering, loss and their gradients."""
 GAUSSIAN = 2400
 """Bytes of a Gaussian with all harmonics while it is optimised: parameters, gradients, moments, tiles."""
-PAIR = 680
+PAIR = 650
 """Bytes per pixel of a training frame while the restorer is prepared: layers of its leave-out pairs."""
 REFERENCE = 30
 """Bytes per pixel of a training frame that is carried into virtual views."""
-CLIP = 320
+CLIP = 360
 """Bytes per pixel of a view of a batch: layers, conditioning and what is made of it."""
-NETWORK = 2000
+NETWORK = 6000
 """Bytes per pixel and thread of the network's working set, four views at once."""
-PSEUDO_VIEW = 120
+PSEUDO_VIEW = 220
 """Bytes per pixel of a restored view: when batches are joined, and as a target of the fine-tuning."""
 METRICS = 2200
 """Bytes per pixel of the images that metrics are computed on at once, the features of LPIPS-VGG included."""
@@ -146,7 +146,8 @@ def estimate_memory(
         "explore": held + 8 * train * small,
         "enhance": held
         + max(
-            PAIR * train * working,
+            # The judge of the restorer runs the network beside the pairs.
+            PAIR * train * working + network,
             references + CLIP * batch_views * working + network,
             PSEUDO_VIEW * views * working,
         ),

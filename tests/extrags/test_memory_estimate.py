@@ -8,25 +8,29 @@ from extrags.config import PROFILES, profile_config
 from extrags.memory_estimate import FrameSize, estimate_memory, fitting_settings
 
 THUMBNAILS = FrameSize(60, 52, 225, 180)
+MANY = FrameSize(240, 210, 225, 180)
 FULL = FrameSize(40, 20, 675, 540)
 
 
 class TestEstimate:
     @pytest.mark.parametrize(
-        ("frames", "train", "stage", "recorded_mib"),
+        ("profile", "size", "stage", "recorded_mib"),
         [
-            (60, 52, "coarse", 735.7),
-            (60, 52, "enhance", 2196.4),
-            (60, 52, "finetune", 1401.0),
-            (240, 210, "coarse", 1118.4),
-            (240, 210, "enhance", 6153.8),
+            ("quick", THUMBNAILS, "coarse", 735.7),
+            ("quick", THUMBNAILS, "enhance", 2196.4),
+            ("quick", THUMBNAILS, "finetune", 1401.0),
+            ("quick", MANY, "coarse", 1118.4),
+            ("quick", MANY, "enhance", 6153.8),
+            ("balanced", FULL, "coarse", 1138.5),
+            ("balanced", FULL, "enhance", 3613.5),
+            ("balanced", FULL, "finetune", 3997.1),
         ],
     )
     def test_covers_recorded_peaks_without_exceeding_them_much(
-        self, frames: int, train: int, stage: str, recorded_mib: float
+        self, profile: str, size: FrameSize, stage: str, recorded_mib: float
     ) -> None:
-        """Of two recordings with profile quick at 225 x 180 pixels."""
-        found = estimate_memory(profile_config("quick"), FrameSize(frames, train, 225, 180))
+        """Of three runs on a path-traced colon, two threads each."""
+        found = estimate_memory(profile_config(profile), size)
         assert 0.9 < found.by_stage[stage] / (recorded_mib * 2**20) < 1.4
 
     @pytest.mark.parametrize("profile", sorted(PROFILES))
