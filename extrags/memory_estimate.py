@@ -3,7 +3,7 @@
 A model of what each stage holds at its peak, in bytes per pixel, frame and Gaussian. It states an upper
 bound for the usual case, not an average: stages that share a process keep what the largest of them took.
 
-Source: the constants were read off the peaks that runs recorded (`peak_mib` of their artefacts); see
+The constants were read off the peaks that runs recorded (`peak_mib` of their artefacts); see
 docs/running_at_scale.md.
 """
 
@@ -41,7 +41,7 @@ NETWORK = 6000
 """Bytes per pixel and thread of the network's working set, four views at once."""
 PSEUDO_VIEW = 220
 """Bytes per pixel of a restored view: when batches are joined, and as a target of the fine-tuning."""
-METRICS = 2200
+METRICS = 3500
 """Bytes per pixel of the images that metrics are computed on at once, the features of LPIPS-VGG included."""
 RENDERED_VIEW = 24
 """Bytes per pixel of a rendered held-out view."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -10,7 +11,6 @@ from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
 from extrags.memory_estimate import FrameSize, MemoryEstimate, estimate_memory, fitting_settings
 from extrags.pipeline import StageName
-from flows.settings import usable_cores
 
 __all__ = ["check_memory"]
 
@@ -39,7 +39,7 @@ def check_memory(
         ConfigError: when the estimate exceeds the limit; names settings that fit.
     """
     size = FrameSize(int(counts["frames"]), int(counts["train"]), int(counts["width"]), int(counts["height"]))
-    threads = usable_cores()
+    threads = len(os.sched_getaffinity(0))
     found = estimate_memory(config, size, threads=threads, until=until, leave_out=leave_out)
     what = f"{name}: {size.frames} frames of {size.width} x {size.height} px take {found}"
     log.info("%s", what)
