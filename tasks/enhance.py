@@ -58,12 +58,12 @@ _OF_EMBEDDED = frozenset(
 
 _OF_TRAINING: dict[str, frozenset[str]] = {
     "embedded": _OF_EMBEDDED,
-    "classical": frozenset({"backend", "max_width"}),
+    "classical": frozenset({"backend"}),
     **dict.fromkeys(
         ("wan-vace", "stable-video", "ltx", "sd-img2img", "sd-inpaint"),
-        frozenset({"backend", "seed", "caption", "max_width", "pretrained"}),
+        frozenset({"backend", "seed", "caption", "pretrained"}),
     ),
-    "dynamicrafter": frozenset({"backend", "seed", "caption", "checkpoint", "max_width"}),
+    "dynamicrafter": frozenset({"backend", "seed", "caption", "checkpoint"}),
 }
 """Settings that the stage `enhance-train` reads, by backend; of another program's backend, all."""
 

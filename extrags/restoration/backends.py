@@ -133,8 +133,6 @@ def train_enhancer(
         MissingDependencyError: when a pretrained backend lacks a package.
         ConfigError: when its settings do not fit.
     """
-    # What it restores later has the same size: pairs of another would tell little about that.
-    sequence = sequence.at_most_width(config.working_width(sequence.width))
     return backend_of(config.backend).prepare(scene, sequence, config, coarse)
 
 
