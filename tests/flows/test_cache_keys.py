@@ -91,6 +91,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "depth.*": ("depth",),
     "coarse.train_on": (),  # Allowed for the oracle alone; below.
     "coarse.*": ("coarse",),
+    "imported.*": (),  # Without a scene nothing is imported; below.
     "uc_nerf.enabled": ALL_AFTER_COARSE,
     "uc_nerf.*": (),  # Reads nothing here; below.
     "assess.min_hole_share": ("plan",),
@@ -110,6 +111,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "enhance.pretrained_weights": (),  # By content, below.
     "enhance.keyframes": ("enhance-keyframes", "finetune-judge"),
     "enhance.max_views": ("plan", *RESTORE),
+    "enhance.max_width": ("enhance-train", *RESTORE, "finetune-judge"),
     "enhance.clips_per_batch": ("enhance-restore",),
     "enhance.references": ("enhance-train", *RESTORE, "finetune-judge"),
     "enhance.reference": ("enhance-train", *RESTORE, "finetune-judge"),
@@ -133,6 +135,7 @@ OTHERS: dict[str, Any] = {
     "depth.completion": None,
     "depth.monocular": None,
     "coarse.train_on": None,
+    "imported.scene": None,
     "enhance.pretrained_weights": None,
     "evaluate.lpips_weights": None,
     "depth.device": "cuda",
@@ -362,6 +365,25 @@ class TestContent:
         assert changed(keys("one"), keys("copy")) == {"report"}
         present = recorded_keys(SEQUENCE, BASE)
         assert changed(keys("one"), keys("other")) == expected(stages, present)
+
+    def test_an_imported_scene(self, tmp_path: Path) -> None:
+        """It takes the place of the coarse stage: all that follows this one changes with its content."""
+
+        def keys(place: str, scale: float = 1.0) -> dict[str, list[str]]:
+            base = BASE.with_overrides(
+                {"imported.scene": str(tmp_path / place / "theirs.ply"), "imported.scale": scale}
+            )
+            return recorded_keys(SEQUENCE, base)
+
+        for place, content in (("one", b"content"), ("copy", b"content"), ("other", b"cOntent")):
+            (tmp_path / place).mkdir()
+            (tmp_path / place / "theirs.ply").write_bytes(content)
+        present = keys("one")
+        assert set(present) == {*recorded_keys(SEQUENCE, BASE), "import-scene"} - {"coarse", "refined-frames"}
+        assert changed(present, keys("copy")) == {"report"}
+        follow = with_all_that_follow(["coarse"]) & set(present) | {"import-scene", "report"}
+        assert changed(present, keys("other")) == follow
+        assert changed(present, keys("one", 2.0)) == follow
 
     def test_a_source_of_the_same_name_and_size(self, tmp_path: Path) -> None:
         source = tmp_path / "source"
