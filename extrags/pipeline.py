@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from extrags.exploration import Exploration
     from extrags.finetuning_judge import Judgement
     from extrags.freespace import FreeSpace
+    from extrags.metrics.lpips import LpipsByNet
     from extrags.metrics.protocol import EvaluationResult, RenderedViews
     from extrags.metrics.surface import TrueSurface
     from extrags.pseudo_views import PseudoViews
