@@ -405,6 +405,7 @@ class InMemoryPipeline(Pipeline):
         from extrags.poses import estimate_poses, with_estimated_poses
 
         with self._timed("poses"):
+            self.config.check_imported_has_cameras()
             sequence = self.result.sequence
             estimate = estimate_poses(sequence, self.config.poses)
             self.result.sequence = with_estimated_poses(sequence, estimate)

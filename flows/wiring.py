@@ -211,6 +211,7 @@ class SequenceRun(Pipeline):
     def poses(self) -> None:
         """The artefact `sequence` again, with poses."""
         with self._stage("poses") as row:
+            self.config.check_imported_has_cameras()
             inputs = {"sequence": self.refs["sequence"], "config": estimating_settings(self.config.poses)}
             self.refs["poses"] = self.refs["sequence"] = self._run_task(row, Call(poses, inputs))
             row.reason = str(self._manifest("poses").counts["summary"])

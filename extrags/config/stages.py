@@ -21,7 +21,7 @@ from extrags.config.imported import ImportedConfig
 from extrags.config.poses import PosesConfig
 from extrags.config.restorer import EnhanceConfig
 from extrags.config.settings import settings_of, unknown_setting
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, PoseError
 from extrags.thresholds import HOLE_ALPHA
 
 __all__ = [
@@ -286,6 +286,20 @@ class PipelineConfig(StageConfig):
             raise ConfigError(
                 "imported.scene takes the place of the coarse scene, with the source's poses; "
                 f"{', '.join(wrong)} cannot be set beside it"
+            )
+
+    def check_imported_has_cameras(self) -> None:
+        """Refuse to estimate poses for an imported scene: they would have a world of their own.
+
+        Raises:
+            PoseError: where a scene is imported.
+        """
+        if self.imported.scene is not None:
+            raise PoseError(
+                "the sequence has no poses, and an imported scene needs the cameras it was made with: poses "
+                "that are estimated here have a world of their own",
+                file=self.imported.scene,
+                field="world_from_camera",
             )
 
     def of_imported_scene(self, *, count: int, sh_degree: int, lit: bool) -> PipelineConfig:

@@ -21,7 +21,7 @@ from flows.cli import main
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
-from tests.flows.tiny import SEQUENCE, tiny_config
+from tests.flows.tiny import SEQUENCE, TINY, tiny_config
 
 Finished = tuple[str, SequenceOutcome]
 
@@ -44,6 +44,10 @@ def theirs(finished: Finished, tmp_path_factory: pytest.TempPathFactory) -> Path
     file = tmp_path_factory.mktemp("theirs") / "scene.spz"
     write_spz(bake_recorded_light(scene, frames.training_cameras), file)
     return file
+
+
+def config_arguments() -> list[str]:
+    return [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
 
 
 def config_of(file: Path, **more: Any) -> PipelineConfig:
@@ -103,11 +107,7 @@ class TestCommand:
     ) -> None:
         store = finished[0]
         imported(store, theirs)
-        settings = [
-            part
-            for name, value in tiny_settings().items()
-            for part in ("--set", f"{name}={json.dumps(value)}")
-        ]
+        settings = config_arguments()
         arguments = ["--sequence", SEQUENCE, "--profile", "quick", "--store", store, *settings]
         result = tmp_path / "out.json"
         assert main(["import", str(theirs), *arguments, "--until", "coarse", "--json", str(result)]) == 0
@@ -119,6 +119,21 @@ class TestCommand:
         again = ["export", SEQUENCE, "--scene", "coarse", *arguments[2:], "-o", str(target)]
         assert main([*again, "--imported.scene", str(theirs)]) == 0
         assert "without light" in capsys.readouterr().out
+
+    def test_with_the_cameras_of_a_colmap_folder(
+        self, finished: Finished, theirs: Path, tmp_path: Path
+    ) -> None:
+        """As others hand over what they have trained from."""
+        folder, settings = tmp_path / "workspace", config_arguments()
+        exported = ["export", SEQUENCE, "--profile", "quick", "--store", finished[0], *settings]
+        assert main([*exported, "--to", "colmap", "-o", str(folder)]) == 0
+        store = str(tmp_path / "store")
+        config = config_of(theirs)
+        outcome = run_sequence(str(folder), config, store, DirectRunner(store), until="coarse")
+        assert outcome.error is None
+        counts = Store(store).manifest(outcome.refs["coarse"]).counts
+        assert float(counts["training_psnr"] or 0) > 15
+        assert float(counts["seen_share"] or 0) > 0.9
 
     @pytest.mark.parametrize(
         ("arguments", "code", "message"),
@@ -146,9 +161,3 @@ class TestCommand:
         said = capsys.readouterr().err
         assert message in said
         assert "Traceback" not in said
-
-
-def tiny_settings() -> dict[str, Any]:
-    from tests.flows.tiny import TINY
-
-    return TINY

@@ -136,6 +136,12 @@ class TestPipeline:
         assert result.reconstruction is not None
         assert result.reconstruction.history == []
 
+    def test_poses_are_not_estimated_for_it(self, file: Path, tube: Tube) -> None:
+        """Minutes of structure from motion would end in the same refusal."""
+        config = PipelineConfig().with_overrides({"imported.scene": str(file)})
+        with pytest.raises(PoseError, match="needs the cameras it was made with"):
+            run_pipeline(replace(tube.sequence, world_from_camera=None), config, until="poses")
+
     def test_later_stages_are_of_its_kind(self) -> None:
         config = PipelineConfig().of_imported_scene(count=70_000, sh_degree=3, lit=False)
         assert not config.coarse.light.enabled
