@@ -53,6 +53,7 @@ FOLLOWS = {
         "enhance-restore",
         "finetune-judge",
         "finetune",
+        "evaluate-restore",
     ],
     "assess": ["plan"],
     # What was measured is in the plan, and so on the page.
@@ -63,14 +64,15 @@ FOLLOWS = {
     "explore-branch": ["explore-merge"],
     "explore-merge": ["explore"],
     "explore": ["enhance-keyframes", "enhance-restore", "finetune-judge", "report"],
-    "enhance-train": ["enhance-keyframes", "enhance-restore", "finetune-judge"],
+    "enhance-train": ["enhance-keyframes", "enhance-restore", "finetune-judge", "evaluate-restore"],
     "enhance-keyframes": ["enhance-restore"],
     "enhance-restore": ["enhance"],
     "enhance": ["finetune", "report"],
     # Of the judgement only the amount that is kept counts later.
     "finetune-judge": [],
     "finetune": ["evaluate-render", "report"],
-    "evaluate-render": ["evaluate", "report"],
+    "evaluate-render": ["evaluate-restore", "evaluate", "report"],
+    "evaluate-restore": ["evaluate", "report"],
     "uc-nerf-render": ["evaluate", "report"],
     "evaluate": ["report"],
     "report": [],
@@ -117,6 +119,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "enhance.reference": ("enhance-train", *RESTORE, "finetune-judge"),
     "enhance.iou": ("enhance-restore", "finetune-judge"),
     "enhance.pixel_confidence": ("enhance-restore", "finetune-judge"),
+    "enhance.seed": ("enhance-train", "evaluate-restore"),
     "enhance.caption.*": (),  # The embedded backend reads none of these; below.
     "enhance.pretrained.*": (),
     "enhance.checkpoint.*": (),
@@ -124,6 +127,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "finetune.judge.*": ("finetune-judge",),
     "finetune.iterations": ("plan", "finetune-judge", "finetune"),
     "finetune.*": ("finetune-judge", "finetune"),
+    "evaluate.restored": ("evaluate-restore",),
     "evaluate.lpips_nets": ("evaluate",),
     "evaluate.lpips_weights": (),  # By content, below.
     "report.*": (),
@@ -373,13 +377,14 @@ class TestContent:
             base = BASE.with_overrides(
                 {"imported.scene": str(tmp_path / place / "theirs.ply"), "imported.scale": scale}
             )
-            return recorded_keys(SEQUENCE, base)
+            return recorded_keys(SEQUENCE, base, has_poses=True)
 
         for place, content in (("one", b"content"), ("copy", b"content"), ("other", b"cOntent")):
             (tmp_path / place).mkdir()
             (tmp_path / place / "theirs.ply").write_bytes(content)
         present = keys("one")
-        assert set(present) == {*recorded_keys(SEQUENCE, BASE), "import-scene"} - {"coarse", "refined-frames"}
+        usual = recorded_keys(SEQUENCE, BASE, has_poses=True)
+        assert set(present) == {*usual, "import-scene"} - {"coarse", "refined-frames"}
         assert changed(present, keys("copy")) == {"report"}
         follow = with_all_that_follow(["coarse"]) & set(present) | {"import-scene", "report"}
         assert changed(present, keys("other")) == follow
