@@ -1,0 +1,10 @@
+"""All rows, in the order of the pipeline."""
+
+from __future__ import annotations
+
+from extrags.stress import steps
+from extrags.stress.rows import Row
+
+__all__ = ["ROWS"]
+
+ROWS: tuple[Row, ...] = (*steps.ROWS,)
