@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from extrags.stress import geometry, optimiser, steps
+from extrags.stress import geometry, optimiser, steps, views
 from extrags.stress.rows import Row
 
 __all__ = ["ROWS"]
 
-ROWS: tuple[Row, ...] = (*steps.ROWS, *optimiser.ROWS, *geometry.ROWS)
+ROWS: tuple[Row, ...] = (*steps.ROWS, *optimiser.ROWS, *geometry.ROWS, *views.ROWS)
