@@ -157,7 +157,7 @@ def train(
     train_enhancer(slot.load(Scene, scene), frames, config, coarse).save(slot.path / RESTORER)
 
 
-@stage("enhance-keyframes", version=1)
+@stage("enhance-keyframes", version=2)
 def keyframes(
     slot: Slot, scene: Ref, sequence: Ref, explore: Ref, restorer: Ref, config: EnhanceConfig
 ) -> None:
@@ -183,7 +183,7 @@ def keyframes(
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=6, ignore=("weights",))
+@stage("enhance-restore", version=7, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,

@@ -25,6 +25,7 @@ from extrags.restoration.diffusion.embedded import pretrained
 from extrags.restoration.diffusion.rectified_flow import sample
 from extrags.stress.inputs import FARTHEST_OFFSET_MM, GAINS, IMAGES, SCALES, image, plane_views
 from extrags.stress.rows import EPS, EXACT, FINITE, Effort, Row, Trial, differs, finite_or_refused, relative, with_threads
+from extrags.threads import in_threads
 from extrags.view_synthesis.conditioning import Layers, condition
 from extrags.view_synthesis.filling import completed_depth, push_pull
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
@@ -244,7 +245,8 @@ def _stereo(posed: PosedFrames, unit: float) -> dict[str, Any]:
     if network is not None:
         inputs = completion_inputs(posed, stereo)
         with torch.no_grad():
-            found["completed"], found["error"] = network(inputs.channels)
+            # As `estimate_depth` runs it.
+            found["completed"], found["error"] = in_threads(network, [inputs.channels])[0]
     return found
 
 
@@ -340,7 +342,7 @@ def _exact_ssim(first: Tensor, second: Tensor) -> Tensor:
     offsets = torch.arange(-5, 6, dtype=torch.float64)
     window = torch.exp(-0.5 * (offsets / 1.5) ** 2)
     kernel = torch.outer(window, window) / window.sum() ** 2
-    x, y = (np.pad(v.double().numpy(), ((5, 5), (5, 5), (0, 0)), mode="symmetric") for v in (first, second))
+    x, y = (np.pad(v.double().numpy(), ((5, 5), (5, 5), (0, 0)), mode="reflect") for v in (first, second))
     height, width = first.shape[:2]
     found = torch.zeros(height, width, dtype=torch.float64)
     for row in range(height):
@@ -367,9 +369,14 @@ def _ssim_error(effort: Effort) -> Iterator[Trial]:
 
 def _metric_repeat(effort: Effort) -> Iterator[Trial]:
     pair = image("noise", 2, 90, 120, 3), image("noise", 2, 90, 120, 3, seed=1)
-    first = with_threads(1, partial(_photometric, *pair))
+
+    def run() -> list[list[float]]:
+        # As `evaluate_views` runs it.
+        return in_threads(lambda index: _photometric(*(images[index : index + 1] for images in pair)), range(2))
+
+    first = with_threads(1, run)
     for threads in (1, 2, 4):
-        yield f"{threads} threads", differs(with_threads(threads, partial(_photometric, *pair)), first)
+        yield f"{threads} threads", differs(with_threads(threads, run), first)
 
 
 def _metric_values(effort: Effort) -> Iterator[Trial]:
