@@ -22,7 +22,18 @@ from extrags.metrics.pose import absolute_trajectory_error, relative_pose_error,
 from extrags.poses.scale import depth_scale
 from extrags.scene import Scene
 from extrags.stress.inputs import FARTHEST_OFFSET_MM, SCALES, plane_views
-from extrags.stress.rows import EPS, EXACT, FINITE, Effort, Row, Trial, differs, finite_or_refused, only_refused, with_threads
+from extrags.stress.rows import (
+    EPS,
+    EXACT,
+    FINITE,
+    Effort,
+    Row,
+    Trial,
+    differs,
+    finite_or_refused,
+    only_refused,
+    with_threads,
+)
 from extrags.surface import Mesh, fuse_depth
 
 __all__ = ["ROWS"]
@@ -32,7 +43,7 @@ CARVING = FreespaceConfig(grid_size=24, render_width=48)
 
 
 def _off_plane(unit: float, offset_mm: float) -> float:
-    """Largest distance of the mesh from the plane that was seen, in voxels and in roundings of coordinates."""
+    """Largest distance of the mesh from the plane that was seen, in half pixels and voxels."""
     cameras, depth, normal, point = plane_views(4, 48, 40, unit=unit, offset_mm=offset_mm)
     mesh = fuse_depth(cameras, depth, SURFACE)
     distance = np.abs((mesh.vertices.astype(np.float64) - point) @ normal)
@@ -108,16 +119,23 @@ def _room(unit: float, offset_mm: float, turn: np.ndarray, frames: int = 6) -> t
     local = np.stack([np.cos(angle), np.sin(angle), along], axis=1)
     move = np.full(3, offset_mm)
     points = unit * local @ turn.T + move
-    gaussians = Gaussians.from_points(points, np.full((len(points), 3), 0.5), np.full(len(points), 0.12 * unit), opacity=0.95)
+    gaussians = Gaussians.from_points(
+        points, np.full((len(points), 3), 0.5), np.full(len(points), 0.12 * unit), opacity=0.95
+    )
     # Nothing but position says where a Gaussian is: it is round.
     gaussians.scales.copy_(gaussians.scales.mean(1, keepdim=True).expand(-1, 3))
-    poses = [compose(turn, unit * turn @ np.array([0.1 * np.sin(k), 0.1 * np.cos(k), 0.4 * k]) + move) for k in range(frames)]
+    poses = [
+        compose(turn, unit * turn @ np.array([0.1 * np.sin(k), 0.1 * np.cos(k), 0.4 * k]) + move)
+        for k in range(frames)
+    ]
     K = np.array([[30.0, 0, 24], [0, 30.0, 20], [0, 0, 1]])
     cameras = Cameras(np.tile(K, (frames, 1, 1)), np.stack(poses), 48, 40)
     row, column = np.divmod(np.arange(39 * 40), 40)
     right = (column + 1) % 40
     corner = row * 40 + column, row * 40 + right, (row + 1) * 40 + column, (row + 1) * 40 + right
-    triangles = np.concatenate([np.stack([corner[0], corner[1], corner[2]], 1), np.stack([corner[1], corner[3], corner[2]], 1)])
+    triangles = np.concatenate(
+        [np.stack([corner[0], corner[1], corner[2]], 1), np.stack([corner[1], corner[3], corner[2]], 1)]
+    )
     light = NearFieldLight.initial(frames, unit)
     return Scene(gaussians, light), Mesh(points.astype(np.float32), triangles.astype(np.int32)), cameras
 
@@ -135,7 +153,10 @@ def _carving_invariance(effort: Effort) -> Iterator[Trial]:
     for name, turn in turns.items():
         for unit in SCALES:
             found = _carved(unit, 0.0, turn)
-            yield f"times {unit:g}{name}", abs(found.free_share * (found.grid_size * found.voxel_mm / unit) ** 3 / volume - 1)
+            yield (
+                f"times {unit:g}{name}",
+                abs(found.free_share * (found.grid_size * found.voxel_mm / unit) ** 3 / volume - 1),
+            )
         for offset in (1e2, 1e4, FARTHEST_OFFSET_MM):
             unit = 20.0
             found = _carved(unit, offset, turn)
@@ -167,13 +188,18 @@ def _carving_repeat(effort: Effort) -> Iterator[Trial]:
     first = with_threads(1, run)
     for threads in (1, 2, 4):
         found = with_threads(threads, run)
-        yield f"{threads} threads", differs([found.occupancy, found.clearance], [first.occupancy, first.clearance])
+        yield (
+            f"{threads} threads",
+            differs([found.occupancy, found.clearance], [first.occupancy, first.clearance]),
+        )
 
 
 def _poses(count: int, seed: int) -> np.ndarray:
     generator = np.random.default_rng(seed)
     turns = Rotation.random(count, random_state=seed).as_matrix()
-    return np.stack([compose(turn, center) for turn, center in zip(turns, generator.normal(size=(count, 3)), strict=True)])
+    return np.stack(
+        [compose(turn, center) for turn, center in zip(turns, generator.normal(size=(count, 3)), strict=True)]
+    )
 
 
 def _moved(poses: np.ndarray, scale: float, turn: np.ndarray, shift: np.ndarray) -> np.ndarray:
@@ -192,7 +218,7 @@ def _trajectories(effort: Effort) -> Iterator[Trial]:
             for offset in (0.0, FARTHEST_OFFSET_MM):
                 found = _moved(truth, scale, turn, np.full(3, offset))
                 errors = absolute_trajectory_error(found, truth)
-                # Coordinates are rounded to the size of the offset, which the alignment brings back to the unit.
+                # Coordinates are rounded to the offset, which the alignment brings back to the unit.
                 allowed = 64 * np.finfo(np.float64).eps * (1 + offset / scale)
                 place = f"seed {seed}, times {scale:g}, {offset:g} from the origin"
                 yield place, errors.rmse / allowed
@@ -211,14 +237,24 @@ def _degenerate_trajectories(effort: Effort) -> Iterator[Trial]:
     huge = _poses(10, 2)
     huge[:, :3, 3] *= 1e100
     repeated = np.repeat(_poses(1, 3), 10, axis=0)
-    given = {"on a line": line, "standing still": still, "nearly on a line": nearly, "1e-100 wide": tiny, "1e100 wide": huge, "one pose": repeated}
+    given = {
+        "on a line": line,
+        "standing still": still,
+        "nearly on a line": nearly,
+        "1e-100 wide": tiny,
+        "1e100 wide": huge,
+        "one pose": repeated,
+    }
     for name, poses in given.items():
         for other_name, other in given.items():
             place = f"{name} against {other_name}"
             yield place, finite_or_refused(partial(absolute_trajectory_error, poses, other))
             yield place, finite_or_refused(partial(relative_pose_error, poses, other))
     for count in (0, 1, 2):
-        yield f"{count} poses", finite_or_refused(partial(absolute_trajectory_error, line[:count], line[:count]))
+        yield (
+            f"{count} poses",
+            finite_or_refused(partial(absolute_trajectory_error, line[:count], line[:count])),
+        )
     for value in (math.nan, math.inf):
         spoilt = line.copy()
         spoilt[3, 0, 3] = value
@@ -232,16 +268,26 @@ def _inverted(effort: Effort) -> Iterator[Trial]:
             poses = _poses(10, seed)
             poses[:, :3, 3] *= offset
             identity = invert_poses(poses) @ poses - np.eye(4)
-            yield f"seed {seed}, {offset:g}", float(np.abs(identity).max()) / (32 * np.finfo(np.float64).eps * max(offset, 1))
+            yield (
+                f"seed {seed}, {offset:g}",
+                float(np.abs(identity).max()) / (32 * np.finfo(np.float64).eps * max(offset, 1)),
+            )
 
 
 def _observations(unit: float, outliers: float, seed: int) -> dict[str, Any]:
     generator = np.random.default_rng(seed)
     cameras, depth, _, _ = plane_views(3, 32, 24)
-    frame, row, column = generator.integers(3, size=90), generator.integers(24, size=90), generator.integers(32, size=90)
+    frame, row, column = (
+        generator.integers(3, size=90),
+        generator.integers(24, size=90),
+        generator.integers(32, size=90),
+    )
     seen = depth[frame, row, column].astype(np.float64)
     K = cameras.K[0]
-    local = np.stack([(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], np.ones(90)], 1) * seen[:, None]
+    local = (
+        np.stack([(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], np.ones(90)], 1)
+        * seen[:, None]
+    )
     pose = cameras.world_from_camera[frame]
     points = np.einsum("oij,oj->oi", pose[:, :3, :3], local) + pose[:, :3, 3]
     points = np.where(generator.random((90, 1)) < outliers, 1e6 * generator.normal(size=(90, 3)), points)
@@ -277,7 +323,9 @@ def _lenses(effort: Effort) -> Iterator[Trial]:
         for strength in (0.0, 1e-12, 0.1, 1.0, 10.0, 1e4):
             for focal in (0.01, 1.0, 40.0, 1e6):
                 parameters = [
-                    focal if name.startswith("f") else {"cx": 24.0, "cy": 20.0}.get(name, strength * generator.normal())
+                    focal
+                    if name.startswith("f")
+                    else {"cx": 24.0, "cy": 20.0}.get(name, strength * generator.normal())
                     for name in names
                 ]
 
@@ -288,7 +336,10 @@ def _lenses(effort: Effort) -> Iterator[Trial]:
                     inside = np.where(plan.valid, plan.u, 1.0), np.where(plan.valid, plan.v, 1.0)
                     return [plan.K, depth, *inside]
 
-                yield f"{model}, focal length {focal:g} px, distortion {strength:g}", finite_or_refused(planned)
+                yield (
+                    f"{model}, focal length {focal:g} px, distortion {strength:g}",
+                    finite_or_refused(planned),
+                )
 
 
 def _depth_samples(effort: Effort) -> Iterator[Trial]:
@@ -307,7 +358,13 @@ def _rows() -> Iterator[Row]:
     yield Row("TSDF", "1 to 1000 frames", planar, 1.0, _frames)
     yield Row("TSDF", "depth with zeros, outliers, steps", "meshes not finite", FINITE, _spoilt_depth)
     yield Row("TSDF", "repeat and threads", "results that differ", EXACT, _fused_repeat)
-    yield Row("carving", "scale, offset, rotation", "relative difference of the free volume", 0.25, _carving_invariance)
+    yield Row(
+        "carving",
+        "scale, offset, rotation",
+        "relative difference of the free volume",
+        0.25,
+        _carving_invariance,
+    )
     yield Row("carving", "extreme views and surfaces", "grids not finite", FINITE, _carving_extremes)
     yield Row("carving", "repeat and threads", "results that differ", EXACT, _carving_repeat)
     yield Row("poses", "similar trajectories", "error over that of rounding", 1.0, _trajectories)

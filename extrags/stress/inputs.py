@@ -102,7 +102,9 @@ def lit_tube(n: int = 200, width: int = 40, height: int = 32, *, seed: int = 3, 
         "opacities": torch.logit(base["opacities"]),
         "sh": base["sh"],
     }
-    return LitScene(parameters, base["viewmats"][0], base["Ks"][0], base["target"][0], depth, light if lit else None)
+    return LitScene(
+        parameters, base["viewmats"][0], base["Ks"][0], base["target"][0], depth, light if lit else None
+    )
 
 
 def random_lit_scene(seed: int, *, wild: bool = False) -> LitScene:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
-from functools import partial
+from functools import cache, partial
 
 import torch
 from torch import Tensor
@@ -14,7 +14,18 @@ from torch import Tensor
 from extrags.config import DensifyConfig
 from extrags.raster.adam import SelectiveAdam
 from extrags.stress.inputs import LitScene, random_lit_scene
-from extrags.stress.rows import EPS, EXACT, FINITE, Effort, Row, Trial, all_finite, differs, finite_or_refused, with_threads
+from extrags.stress.rows import (
+    EPS,
+    EXACT,
+    FINITE,
+    Effort,
+    Row,
+    Trial,
+    all_finite,
+    differs,
+    finite_or_refused,
+    with_threads,
+)
 from extrags.stress.steps import autograd_step, native_step
 from extrags.training.density import DefaultStrategy
 from extrags.training.relocation import MCMCStrategy, compute_relocation
@@ -116,7 +127,8 @@ def _extreme_parameters(seed: int) -> dict[str, Tensor]:
     low[:, 0] = torch.empty(n).uniform_(-3, 3, generator=generator)
     return {
         "means": torch.randn(n, 3, generator=generator),
-        "quats": torch.randn(n, 4, generator=generator) * 10 ** torch.empty(n, 1).uniform_(-15, 15, generator=generator),
+        "quats": torch.randn(n, 4, generator=generator)
+        * 10 ** torch.empty(n, 1).uniform_(-15, 15, generator=generator),
         "scales": low,
         "opacities": torch.empty(n).uniform_(-120, 120, generator=generator),
         "sh0": torch.randn(n, 1, 3, generator=generator),
@@ -137,15 +149,19 @@ def _rounds(effort: Effort) -> Iterator[Trial]:
         strategy._gradient = torch.full((64,), 1e3)
         strategy._count = torch.ones(64)
 
-        def split(strategy: DefaultStrategy = strategy, adam: SelectiveAdam | None = None) -> dict[str, Tensor]:
-            adam = _adam_of(parameters) if adam is None else adam
+        def split(
+            strategy: DefaultStrategy = strategy, parameters: dict[str, Tensor] = parameters
+        ) -> dict[str, Tensor]:
+            adam = _adam_of(parameters)
             strategy.decide(adam.parameters, 500).apply(adam)
             return adam.parameters
 
         yield f"clone and split, seed {seed}", finite_or_refused(split)
         mcmc = MCMCStrategy(config, 2.0, 1000, seed=seed)
 
-        def relocate(mcmc: MCMCStrategy = mcmc) -> dict[str, Tensor]:
+        def relocate(
+            mcmc: MCMCStrategy = mcmc, parameters: dict[str, Tensor] = parameters
+        ) -> dict[str, Tensor]:
             adam = _adam_of(parameters)
             mcmc.relocate(adam.parameters).apply(adam)
             mcmc.grow(adam.parameters).apply(adam)
@@ -202,7 +218,9 @@ def _drift_scene(lit: bool) -> LitScene:
     }
     K = torch.tensor([[14.0, 0, 8], [0, 14.0, 6], [0, 0, 1]])
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    target = torch.stack([0.5 + 0.4 * torch.sin(0.7 * columns + c) * torch.cos(0.5 * rows - c) for c in range(3)], -1)
+    target = torch.stack(
+        [0.5 + 0.4 * torch.sin(0.7 * columns + c) * torch.cos(0.5 * rows - c) for c in range(3)], -1
+    )
     light = torch.tensor([1.2, 1.0, 0.9, 0.05, 1.0, 1.0, 0.6, 0.02, -0.02, 0.0, 0.5, 1.5]) if lit else None
     truth = 1.2 + 0.03 * columns.float() + 0.02 * rows.float()
     return replace(
@@ -210,7 +228,8 @@ def _drift_scene(lit: bool) -> LitScene:
     )
 
 
-def training_drift(iterations: int, *, lit: bool = True, points: int = 24) -> list[Drift]:
+@cache
+def training_drift(iterations: int, *, lit: bool = True, points: int = 24) -> tuple[Drift, ...]:
     """Train in float32, in float64, and in float64 from a start that differs by a rounding.
 
     Training is a chaotic map: what differs by a rounding differs more with every step. Float32 is good
@@ -244,7 +263,7 @@ def training_drift(iterations: int, *, lit: bool = True, points: int = 24) -> li
                     abs(losses[2] / losses[0] - 1),
                 )
             )
-    return found
+    return tuple(found)
 
 
 class _Training:
@@ -267,7 +286,9 @@ class _Training:
         return float(found["loss"])
 
     def distance(self, others: dict[str, Tensor]) -> float:
-        squares = [(value.double() - others[name].double()).square().sum() for name, value in self.values.items()]
+        squares = [
+            (value.double() - others[name].double()).square().sum() for name, value in self.values.items()
+        ]
         return math.sqrt(float(sum(squares)))
 
 
@@ -288,7 +309,13 @@ def _rows() -> Iterator[Row]:
     yield Row("densification", "extreme Gaussians", "results that are not finite", FINITE, _rounds)
     for lit in (False, True):
         name = f"float32 to float64, {'lit' if lit else 'unlit'}"
-        yield Row("training", name, "difference of the loss, over 1 % or ten times that of a start a rounding away", 1.0, partial(_training, lit))
+        yield Row(
+            "training",
+            name,
+            "difference of the loss, over 1 % or ten times that of a start a rounding away",
+            1.0,
+            partial(_training, lit),
+        )
 
 
 ROWS = tuple(_rows())

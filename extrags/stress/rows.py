@@ -186,7 +186,7 @@ def _same(first: np.ndarray, second: np.ndarray) -> bool:
 
 
 def all_finite(values: Any) -> bool:
-    """Whether nothing in arrays, tensors, numbers, and lists, dicts and dataclasses of them is NaN or infinite."""
+    """Whether arrays, numbers, and lists, dicts and dataclasses of them hold no NaN and no infinity."""
     return all(bool(np.isfinite(array).all()) for array in _arrays(values))
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -26,7 +25,18 @@ from extrags.stress.inputs import (
     lit_tube,
     random_lit_scene,
 )
-from extrags.stress.rows import EPS, EXACT, FINITE, Effort, Row, Trial, all_finite, differs, relative, with_threads
+from extrags.stress.rows import (
+    EPS,
+    EXACT,
+    FINITE,
+    Effort,
+    Row,
+    Trial,
+    all_finite,
+    differs,
+    relative,
+    with_threads,
+)
 
 __all__ = ["ROWS", "autograd_step", "native_step", "over_allowed"]
 
@@ -45,9 +55,7 @@ def native_step(scene: LitScene) -> Found:
     lit = scene.light is not None
     step = DirectStep(lit=lit)
     step.bind({name: value.float().contiguous() for name, value in scene.parameters.items()})
-    target = Target(
-        scene.viewmat.double().numpy(), scene.K.double().numpy(), scene.target, depth=scene.depth
-    )
+    target = Target(scene.viewmat.double().numpy(), scene.K.double().numpy(), scene.target, depth=scene.depth)
     loss = step.run(
         target,
         sh_degree=math.isqrt(scene.parameters["sh"].shape[1]) - 1,
@@ -58,7 +66,10 @@ def native_step(scene: LitScene) -> Found:
         near=_near(scene),
         pose=True,
     )
-    found = {"loss": torch.tensor(loss, dtype=torch.float64), "viewmat": torch.from_numpy(step.viewmat_gradient[:3])}
+    found = {
+        "loss": torch.tensor(loss, dtype=torch.float64),
+        "viewmat": torch.from_numpy(step.viewmat_gradient[:3]),
+    }
     found |= {name: value.clone() for name, value in step.gradients.items()}
     return {**found, "light": torch.from_numpy(step.light_gradient[:11].copy())} if lit else found
 
@@ -96,7 +107,9 @@ def autograd_step(scene: LitScene, dtype: torch.dtype = torch.float64, *, rounde
     )
     if loss.requires_grad:
         loss.backward()
-    found = {name: leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for name, leaf in leaves.items()}
+    found = {
+        name: leaf.grad if leaf.grad is not None else torch.zeros_like(leaf) for name, leaf in leaves.items()
+    }
     pose = torch.zeros(3, 4, dtype=dtype) if viewmat.grad is None else viewmat.grad[:3]
     found |= {"loss": loss.detach(), "viewmat": pose}
     if light is not None:
@@ -105,7 +118,9 @@ def autograd_step(scene: LitScene, dtype: torch.dtype = torch.float64, *, rounde
 
 
 def _light(row: Tensor) -> CameraLight:
-    return CameraLight(row[None, :3], row[3], row[4], row[5], row[6], row[7:10], row[10], float(row[11].detach()))
+    return CameraLight(
+        row[None, :3], row[3], row[4], row[5], row[6], row[7:10], row[10], float(row[11].detach())
+    )
 
 
 def _depth_scale(scene: LitScene) -> float:
@@ -138,7 +153,9 @@ def over_allowed(scene: LitScene) -> float:
         there = autograd_step(touched)
         explained += [_errors(there, exact), _errors(autograd_step(touched, torch.float32), there)]
     allowed = {
-        name: max(floors[name], FLOAT32_FACTOR * max(_finite_or_zero(one.get(name, 0.0)) for one in explained))
+        name: max(
+            floors[name], FLOAT32_FACTOR * max(_finite_or_zero(one.get(name, 0.0)) for one in explained)
+        )
         for name in errors
     }
     return max(errors[name] / allowed[name] for name in errors)
@@ -184,7 +201,10 @@ def _offsets(lit: bool) -> Iterator[tuple[str, LitScene]]:
     for scale in (1.0, 20.0):
         for offset in (1e2, 1e4, FARTHEST_OFFSET_MM):
             scene = lit_tube(lit=lit).scaled(scale)
-            yield f"{offset:g} from the origin, times {scale:g}", scene.moved(torch.tensor([offset, -offset, offset]))
+            yield (
+                f"{offset:g} from the origin, times {scale:g}",
+                scene.moved(torch.tensor([offset, -offset, offset])),
+            )
 
 
 def _gains(lit: bool) -> Iterator[tuple[str, LitScene]]:
@@ -202,8 +222,9 @@ def _images(lit: bool) -> Iterator[tuple[str, LitScene]]:
     scene = lit_tube(lit=lit)
     black = torch.full_like(scene.parameters["sh"], 0.0)
     black[:, 0] = -10
-    yield "black rendering of a black image", replace(
-        scene.with_parameters(sh=black), target=image("black", 32, 40, 3)
+    yield (
+        "black rendering of a black image",
+        replace(scene.with_parameters(sh=black), target=image("black", 32, 40, 3)),
     )
 
 
@@ -307,7 +328,10 @@ def _invariance(lit: bool, effort: Effort) -> Iterator[Trial]:
         rotation = torch.linalg.matrix_exp(turn - turn.T)
         turned = _rotated(scene, rotation)
         allowed = max(LOSS_TOLERANCE, FLOAT32_FACTOR * relative(autograd_step(turned)["loss"], here))
-        yield f"rotation, seed {seed}", relative(native_step(turned)["loss"], native_step(scene)["loss"]) / allowed
+        yield (
+            f"rotation, seed {seed}",
+            relative(native_step(turned)["loss"], native_step(scene)["loss"]) / allowed,
+        )
         if lit:
             larger = native_step(scene.scaled(1024.0))["loss"]
             yield f"unit, seed {seed}", relative(larger, native_step(scene)["loss"]) / LOSS_TOLERANCE
@@ -344,11 +368,17 @@ def _repeated(lit: bool, effort: Effort) -> Iterator[Trial]:
         scene = random_lit_scene(seed) if lit else replace(random_lit_scene(seed), light=None)
         first = with_threads(1, partial(native_step, scene))
         for threads in (1, 2, 3, 8):
-            yield f"seed {seed}, {threads} threads", differs(with_threads(threads, partial(native_step, scene)), first)
+            yield (
+                f"seed {seed}, {threads} threads",
+                differs(with_threads(threads, partial(native_step, scene)), first),
+            )
     scene = lit_tube(5000, 120, 90, lit=lit)
     first = with_threads(1, partial(native_step, scene))
     for threads in (1, 2, 3, 8):
-        yield f"5000 Gaussians, {threads} threads", differs(with_threads(threads, partial(native_step, scene)), first)
+        yield (
+            f"5000 Gaussians, {threads} threads",
+            differs(with_threads(threads, partial(native_step, scene)), first),
+        )
 
 
 def _axis(name: str, effort: Effort) -> Iterator[Trial]:
@@ -369,7 +399,9 @@ def _rows() -> Iterator[Row]:
         for case, scenes in CASES.items():
             yield Row(part, case, ALLOWED, 1.0, partial(_compared, partial(scenes, lit)))
         yield Row(part, "1 to 1e6 Gaussians", ALLOWED, 1.0, partial(_counts, lit))
-        yield Row(part, "rigid motion and unit", "change of the loss, " + ALLOWED, 1.0, partial(_invariance, lit))
+        yield Row(
+            part, "rigid motion and unit", "change of the loss, " + ALLOWED, 1.0, partial(_invariance, lit)
+        )
         yield Row(part, "repeat and threads", "results that differ", EXACT, partial(_repeated, lit))
     yield Row("lit step", "exposure x16 and /16", ALLOWED, 1.0, partial(_compared, partial(_gains, True)))
     yield Row("lit step", "random scenes", ALLOWED, 1.0, _random)

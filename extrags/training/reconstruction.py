@@ -28,7 +28,7 @@ __all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent", "s
 logger = logging.getLogger(__name__)
 
 SHALLOWEST = 20 * NEAR
-"""Typical depth, in world units, below which the near plane would cut off what a scene without light shows."""
+"""Typical depth, in world units, below which the near plane would cut off parts of a scene without light."""
 
 
 def reconstruct(
@@ -72,8 +72,8 @@ def reconstruct(
     light = None
     if not config.light.enabled and depth < SHALLOWEST:
         raise CaptureError(
-            f"{sequence.name}: the typical depth is {depth:.3g} units, too small for a scene without light, of "
-            f"which nothing nearer than {NEAR:g} is rendered; scale poses and depth up, or let it have a light"
+            f"{sequence.name}: the typical depth is {depth:.3g} units, too small without light, as "
+            f"nothing nearer than {NEAR:g} is rendered; scale poses and depth up, or enable coarse.light"
         )
     if config.light.enabled:
         light = NearFieldLight.initial(len(chosen), depth, config.light)
