@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import partial
 
@@ -18,8 +19,8 @@ from extrags.training import reconstruct
 
 __all__ = ["ROWS"]
 
-SAME_DB = 0.5
-"""Reconstructions whose PSNR differs by this are equally good: two seeds differ by about as much."""
+LEVELS = 255
+"""Of the images' eight bits: reconstructions whose errors differ by less than one level are equally good."""
 CONFIG = CoarseConfig(iterations=200, max_points=300, sh_degree=0, densify=DensifyConfig(max_gaussians=400))
 UNIT_MM = 20.0
 FRAMES = (1, 2, 10, 100, 1000)
@@ -57,7 +58,7 @@ def _sequence(
 
 
 def _quality(sequence: EndoscopicSequence, *, lit: bool = True) -> float:
-    """PSNR of the first training views."""
+    """Root of the mean squared error of the first training views, in levels."""
     config = CONFIG.model_copy(update={"light": CONFIG.light.model_copy(update={"enabled": lit})})
     scene = reconstruct(sequence, config).scene
     shown = sequence.cameras[:4]
@@ -65,23 +66,22 @@ def _quality(sequence: EndoscopicSequence, *, lit: bool = True) -> float:
         exposure = None if scene.light is None else scene.light.exposures()[:4]
         rgb = scene.render(shown, exposure=exposure).rgb.clamp(0, 1)
     found = psnr(rgb, torch.from_numpy(sequence.rgb[: len(shown)].astype(np.float32) / 255))
-    return 0.0 if found is None else found
+    return math.inf if found is None else LEVELS * 10 ** (-found / 20)
 
 
 def _units(effort: Effort) -> Iterator[Trial]:
     base = _quality(_sequence(6))
     for scale in SCALES:
-        yield f"times {scale:g}", abs(_quality(_sequence(6, unit=scale)) - base) / SAME_DB
+        yield f"times {scale:g}", abs(_quality(_sequence(6, unit=scale)) - base)
     for offset in (1e2, 1e4, FARTHEST_OFFSET_MM):
-        loss = base - _quality(_sequence(6, offset_mm=offset))
-        yield f"{offset:g} from the origin", abs(loss) / SAME_DB
+        yield f"{offset:g} from the origin", abs(_quality(_sequence(6, offset_mm=offset)) - base)
 
 
 def _without_light(effort: Effort) -> Iterator[Trial]:
     base = _quality(_sequence(6), lit=False)
     for scale in SCALES:
         try:
-            yield f"times {scale:g}", abs(_quality(_sequence(6, unit=scale), lit=False) - base) / SAME_DB
+            yield f"times {scale:g}", abs(_quality(_sequence(6, unit=scale), lit=False) - base)
         except ExtragsError as error:
             yield f"times {scale:g}, refused: {error}", 0.0
 
@@ -116,8 +116,20 @@ def _parameters(sequence: EndoscopicSequence) -> dict[str, torch.Tensor]:
 
 
 ROWS = (
-    Row("reconstruction", "scale 1e-3 to 1e4, offset to 1e5", "change of PSNR over 0.5 dB", 1.0, _units),
-    Row("reconstruction", "scale 1e-3 to 1e4, no light", "change of PSNR over 0.5 dB", 1.0, _without_light),
+    Row(
+        "reconstruction",
+        "scale 1e-3 to 1e4, offset to 1e5",
+        "change of the error, in levels of 8 bits",
+        1.0,
+        _units,
+    ),
+    Row(
+        "reconstruction",
+        "scale 1e-3 to 1e4, no light",
+        "change of the error, in levels of 8 bits",
+        1.0,
+        _without_light,
+    ),
     Row("reconstruction", "images without content, 1 to 1000 frames", "scenes not finite", FINITE, _extremes),
     Row("reconstruction", "repeat and threads", "results that differ", EXACT, _repeat),
 )
