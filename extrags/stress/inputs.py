@@ -122,8 +122,8 @@ def random_lit_scene(seed: int, *, wild: bool = False) -> LitScene:
     def log_uniform(low: float, high: float, *shape: int) -> Tensor:
         return uniform(math.log(low), math.log(high), *shape).exp()
 
-    n = int(uniform(1, 40))
-    width, height = int(uniform(1, 24)), int(uniform(1, 20))
+    n = int(uniform(1.0, 40.0))
+    width, height = int(uniform(1.0, 24.0)), int(uniform(1.0, 20.0))
     unit = float(log_uniform(1e-3, 1e4))
     focal = log_uniform(1.0, 1e3) if wild else width * log_uniform(0.4, 2.0)
     K = torch.eye(3)
@@ -142,7 +142,7 @@ def random_lit_scene(seed: int, *, wild: bool = False) -> LitScene:
     scales = shape.log()
     light = torch.cat(
         [
-            log_uniform(1 / 16, 16, 1) * uniform(0.7, 1.3, 3),
+            log_uniform(1 / 16, 16.0, 1) * uniform(0.7, 1.3, 3),
             log_uniform(1e-4, 2.0, 1),
             uniform(0.2, 2.2, 1),
             uniform(0.0, 3.0, 1),
@@ -152,9 +152,9 @@ def random_lit_scene(seed: int, *, wild: bool = False) -> LitScene:
             torch.tensor([unit]) * log_uniform(0.3, 3.0, 1),
         ]
     )
-    logits = uniform(-120, 120, n) if wild else uniform(-4, 6, n)
+    logits = uniform(-120.0, 120.0, n) if wild else uniform(-4.0, 6.0, n)
     truth = uniform(0.2, 6.0, height, width) * unit
-    truth[uniform(0, 1, height, width) < 0.3] = 0
+    truth[uniform(0.0, 1.0, height, width) < 0.3] = 0
     sh = 0.3 * torch.randn(n, 4, 3, generator=generator)
     sh[:, 0] += 0.5
     quats = torch.randn(n, 4, generator=generator)
@@ -165,7 +165,7 @@ def random_lit_scene(seed: int, *, wild: bool = False) -> LitScene:
         "opacities": logits,
         "sh": sh * float(log_uniform(1e-3, 1e3)) if wild else sh,
     }
-    return LitScene(parameters, viewmat, K, uniform(0, 1, height, width, 3), truth, light)
+    return LitScene(parameters, viewmat, K, uniform(0.0, 1.0, height, width, 3), truth, light)
 
 
 def plane_views(

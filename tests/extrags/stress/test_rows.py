@@ -61,9 +61,9 @@ class TestRow:
 class TestChoice:
     def test_by_name_or_part(self) -> None:
         rows = [
-            row(0, case="one"),
-            row(0, case="two"),
-            Row("other", "one", "", 1, lambda effort: [("", 0.0)]),
+            row(0.0, case="one"),
+            row(0.0, case="two"),
+            Row("other", "one", "", 1.0, lambda effort: [("", 0.0)]),
         ]
         names = lambda *patterns: [f"{r['part']}/{r['case']}" for r in run_rows(rows, patterns)]  # noqa: E731
         assert names("part") == ["part/one", "part/two"]
@@ -71,8 +71,8 @@ class TestChoice:
         assert names("other", "part/t*") == ["part/two", "other/one"]
 
     def test_a_pattern_without_a_row(self) -> None:
-        with pytest.raises(ConfigError, match="no row matches wind; .* with the parts part"):
-            run_rows([row(0)], ["wind"])
+        with pytest.raises(ConfigError, match=r"no row matches wind; .* with the parts part"):
+            run_rows([row(0.0)], ["wind"])
 
     def test_an_effort_of_nothing(self) -> None:
         with pytest.raises(ConfigError, match="scenes is 0"):

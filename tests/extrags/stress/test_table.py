@@ -28,16 +28,15 @@ PARTS = {
     "depth",
     "metrics",
 }
-QUICK = Effort(scenes=15, iterations=60, largest=1000)
+QUICK = Effort(scenes=4, iterations=30, largest=1000)
 CHOSEN = (
-    "unlit step/o*",
-    "lit step/[!1]*",
+    "lit step/extreme*",
+    "lit step/random scenes",
     "Adam",
     "densification",
     "training/*unlit",
-    "poses",
+    "poses/inverse",
     "lens/depth*",
-    "warp",
     "filling",
     "metrics/known*",
 )
