@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.store import Store
-from flows.outcome import SequenceOutcome
+from flows.outcome import Part, SequenceOutcome
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,7 +45,12 @@ def preview(outcome: SequenceOutcome, store: Store) -> tuple[str, str] | None:
     view = len(held_out) // 2
     frame = int(held_out[view])
     shown, words = [_tile(as_uint8(np.asarray(frames["rgb"][frame])))], ["recorded"]
-    for part, word in (("renders_coarse", "coarse scene"), ("renders_final", "final scene")):
+    scenes: dict[Part, str] = {
+        "renders_coarse": "coarse scene",
+        "renders_final": "final scene",
+        "renders_restored": "the same, restored",
+    }
+    for part, word in scenes.items():
         if part in outcome.refs:
             renders = _group(store.open(outcome.refs[part]) / RenderedViews.stored_as)
             shown.append(_tile(as_uint8(np.asarray(renders["rgb"][view]))))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,6 +17,7 @@ from extrags.redaction import without_credentials
 from extrags.store import Manifest, Ref, Store
 from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
+from flows.memory_limit import check_memory
 from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner, StoreRunner
 from tasks.assess import assess, measuring_settings, plan, planning_settings
@@ -34,6 +35,8 @@ from tasks.enhance import (
 )
 from tasks.enhance import keyed_settings as keyed_enhance_settings
 from tasks.evaluate import METRICS_FILE, measure, render
+from tasks.evaluate import restore as restore_renders
+from tasks.evaluate import restoring_settings as renders_settings
 from tasks.explore import branch, explore, merge, next_anchors, start
 from tasks.finetune import finetune, finetuning_settings, judge
 from tasks.freespace import freespace
@@ -69,6 +72,7 @@ def run_sequence(
     profile: str = "",
     until: StageName = "report",
     leave_out: Mapping[str, str] | None = None,
+    memory_limit_gb: float | None = None,
 ) -> SequenceOutcome:
     """Run all stages of one sequence.
 
@@ -83,25 +87,21 @@ def run_sequence(
         profile: name of the profile the settings come from, for the report.
         until: last stage to run.
         leave_out: see `extrags.pipeline.Pipeline`.
+        memory_limit_gb: see `flows.memory_limit.check_memory`.
 
     Raises:
         NotInStoreError: from a runner that only looks.
         ConfigError: for a stage that does not exist.
     """
-    return SequenceRun(name, config, store, runner, profile, leave_out=leave_out).run(until)
+    run = SequenceRun(name, config, store, runner, profile, leave_out=leave_out)
+    if not isinstance(runner, StoreRunner):
+        limit = memory_limit_gb
+        run.check_frames = lambda counts: check_memory(name, config, counts, limit, until, run.leave_out)
+    return run.run(until)
 
 
 class SequenceRun(Pipeline):
-    """The stages of one sequence as cached tasks.
-
-    Args:
-        name: `DATASET/SEQUENCE[@SETTING]` or a path.
-        config: settings of all stages.
-        store: root of the store.
-        runner: how artefacts are made.
-        profile: name of the profile the settings come from, for the report.
-        leave_out: see `extrags.pipeline.Pipeline`.
-    """
+    """The stages of one sequence as cached tasks; the arguments are those of `run_sequence`."""
 
     def __init__(
         self,
@@ -114,6 +114,7 @@ class SequenceRun(Pipeline):
         leave_out: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(config, leave_out)
+        self.check_frames: Callable[[Mapping[str, Any]], object] = dict  # Of the counts of `ingest`.
         self.outcome = SequenceOutcome(name)
         self.store = Store(store)
         self.runner = runner
@@ -204,6 +205,7 @@ class SequenceRun(Pipeline):
                 "calibration": self.config.ingest.calibration,
             }
             self.refs["ingest"] = self.refs["sequence"] = self._run_task(row, Call(ingest, inputs))
+            self.check_frames(self._manifest("ingest").counts)
 
     def poses(self) -> None:
         """The artefact `sequence` again, with poses."""
@@ -382,21 +384,43 @@ class SequenceRun(Pipeline):
                 shown = {"sequence": sequence, "train_on": self.config.coarse.train_on}
                 calls = [Call(render, {"scene": ref, **shown}) for ref in scenes]
             renders = self._run_tasks(row, calls)
+            restored = self._restored_renders(row, renders[-1])
             weights = self._weights()
             settings = {
                 "lpips_digests": {item.net: item.digest for item in weights},
                 "weights": weights,
                 "added": added_metrics(),
             }
+            measured = renders + ([] if restored is None else [restored])
             figures = self._run_tasks(
-                row, [Call(measure, {"renders": ref, "sequence": sequence, **settings}) for ref in renders]
+                row, [Call(measure, {"renders": ref, "sequence": sequence, **settings}) for ref in measured]
             )
             self.refs["renders_coarse"], self.refs["metrics_coarse"] = renders[0], figures[0]
             if "finetune" in self.refs:
                 self.refs["renders_final"], self.refs["metrics_final"] = renders[1], figures[1]
             # Where nothing was fine-tuned, the coarse scene is the final one.
-            for which, ref in (("coarse", figures[0]), ("final", figures[-1])):
+            measurements = {"coarse": figures[0], "final": figures[len(renders) - 1]}
+            if restored is not None:
+                self.refs["renders_restored"] = restored
+                self.refs["metrics_restored"] = measurements["restored"] = figures[-1]
+            for which, ref in measurements.items():
                 self.outcome.metrics[which] = self.store.load_json(METRICS_FILE, ref)["metrics"]
+
+    def _restored_renders(self, row: StageRow, renders: Ref) -> Ref | None:
+        """The final scene's held-out views, restored; None without a restorer."""
+        kind = self.config.evaluate.restored
+        if kind == "none" or "restorer" not in self.refs:
+            return None
+        inputs = {
+            **self._scene_inputs(),
+            "renders": renders,
+            "sequence": self.refs["sequence"],
+            "training": self.refs["training"],
+            "restorer": self.refs["restorer"],
+            "config": renders_settings(self.config.enhance),
+            "textured": kind == "textured",
+        }
+        return self._run_task(row, Call(restore_renders, inputs))
 
     def report(self) -> None:
         """The page, from what the other stages made."""

@@ -145,14 +145,16 @@ def _summary(inputs: ReportInputs) -> str:
     text = f"{views} the final scene reaches {number(after, 2)} dB PSNR"
     if before is not None:
         text += f", {_against(before, after)} the coarse reconstruction"
+    restored = metric_of(_metrics(inputs.restored_metrics), "psnr")
+    mended = "" if restored is None else f" Restored in the image, its views reach {number(restored, 2)} dB."
     unseen = metric_of(final, "unobserved", "psnr")
     if unseen is None:
-        return text + "."
+        return text + "." + mended
     text += f". On surface that no training frame saw it reaches {number(unseen, 2)} dB"
     unseen_before = metric_of(coarse, "unobserved", "psnr")
     if unseen_before is not None:
         text += f", {_against(unseen_before, unseen)} the coarse one"
-    return text + "."
+    return text + "." + mended
 
 
 def _against(before: float, after: float) -> str:
