@@ -114,8 +114,8 @@ def _fused_repeat(effort: Effort) -> Iterator[Trial]:
 
 def _room(unit: float, offset_mm: float, turn: np.ndarray, frames: int = 6) -> tuple[Scene, Mesh, Cameras]:
     """Views of the inside of a tube of Gaussians, and its mesh."""
-    angle, along = np.meshgrid(np.linspace(0, 2 * np.pi, 40, endpoint=False), np.linspace(-0.5, 6, 40))
-    angle, along = angle.ravel(), along.ravel()
+    grid = np.meshgrid(np.linspace(0, 2 * np.pi, 40, endpoint=False), np.linspace(-0.5, 6, 40))
+    angle, along = (values.ravel() for values in grid)
     local = np.stack([np.cos(angle), np.sin(angle), along], axis=1)
     move = np.full(3, offset_mm)
     points = unit * local @ turn.T + move

@@ -103,7 +103,7 @@ class Row:
                 for place, value in self.trials(effort):
                     count += 1
                     # NaN is no measure: it must not hide behind a comparison.
-                    value = math.inf if math.isnan(value) else value
+                    value = math.inf if math.isnan(value) else float(value)
                     if value > worst:
                         worst, where = value, place
         except Exception as error:

@@ -45,6 +45,10 @@ class TestRow:
         assert found["where"] == "seed 1"
         json.dumps(found, allow_nan=False)
 
+    def test_numbers_of_numpy_go_into_json_too(self) -> None:
+        found = row(np.float64(0.5), np.float64(0.7)).run(Effort())
+        assert json.loads(json.dumps(found, allow_nan=False))["passed"] is True
+
     def test_no_trial_proves_nothing(self) -> None:
         assert not row().run(Effort())["passed"]
 
