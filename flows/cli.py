@@ -110,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     root = parser(next((word for word in arguments if not word.startswith("-")), None))
-    given = root.parse_args(arguments, argparse.Namespace(debug=False))
+    given = root.parse_args(arguments, argparse.Namespace(debug=False, quiet=False))
     if given.version:
         from extrags import __version__
 

@@ -10,7 +10,7 @@ import json
 import logging
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
 from extrags.redaction import CredentialFilter
@@ -27,6 +27,7 @@ __all__ = [
     "parsed_settings",
     "run_config",
     "set_up_logging",
+    "showing",
     "stage_limits",
     "store_root",
     "write_json",
@@ -162,9 +163,14 @@ def write_json(value: Any, target: str | None) -> None:
         raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
 
 
-def set_up_logging(*, debug: bool, terminal: bool) -> None:
-    """Log lines to standard error: everything with `debug`, progress where there is no terminal."""
-    level = logging.INFO if debug or not terminal else logging.WARNING
+def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:
+    """Log lines to standard error: everything with `debug`, errors alone when quiet.
+
+    Progress goes there where there is no terminal.
+    """
+    level = logging.ERROR if quiet else logging.WARNING if terminal else logging.INFO
+    if debug:
+        level = logging.INFO
     handler = logging.StreamHandler(sys.stderr)
     # The handler's as well as the loggers': a run on a lasting server sends more to its log than is shown.
     handler.setLevel(level)
@@ -172,3 +178,10 @@ def set_up_logging(*, debug: bool, terminal: bool) -> None:
     logging.basicConfig(level=level, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=[handler])
     for noisy in ("httpx", "httpcore", "prefect", "distributed", "distributed.scheduler", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING if debug else logging.CRITICAL)
+
+
+def showing(given: argparse.Namespace) -> Literal["terminal", "log", "nothing"]:
+    """Where the progress of a run goes: see `flows.progress_display`."""
+    if given.quiet:
+        return "nothing"
+    return "terminal" if sys.stderr.isatty() else "log"
