@@ -173,12 +173,12 @@ class RunDisplay:
     def __rich_console__(self, out: Console, options: ConsoleOptions) -> RenderResult:
         """What stands below the lines of the stages that have ended."""
         with self._guard:
-            yield from self._lines(self._clock())
+            yield from self._lines(self._clock(), options.max_width)
 
-    def _lines(self, now: float) -> Iterator[Text | Table]:
+    def _lines(self, now: float, width: int) -> Iterator[Text | Table]:
         in_work = list(self._estimate.in_work)
         for label in in_work[:MOST_SEQUENCES]:
-            yield self._stages(label)
+            yield self._stages(label, width)
             if label in self._loops:
                 yield _loop(*self._loops[label])
         if len(in_work) > MOST_SEQUENCES:
@@ -192,10 +192,10 @@ class RunDisplay:
             # In one piece: it is there to be clicked or copied.
             yield Text(f"picture  {self._picture}", style="dim", overflow="fold")
 
-    def _stages(self, label: str) -> Text:
-        """`phantom/11@sparse  ✓ ingest  - poses  ▸ coarse  · assess`."""
+    def _stages(self, label: str, width: int) -> Text:
+        """`phantom/11@sparse  ✓ ingest  - poses  ▸ coarse  · assess`, with breaks between stages alone."""
         estimate = self._estimate.in_work[label]
-        words = Text.assemble((label, "bold"))
+        words, used = Text.assemble((label, "bold")), len(label)
         for stage in STAGES[: STAGES.index(self._run.until) + 1]:
             ended = estimate.ended.get(stage)
             if ended is not None:
@@ -204,8 +204,12 @@ class RunDisplay:
                 mark, style = "▸", "bold"
             else:
                 mark, style = "·", "dim"
-            # No break between a mark and its stage.
-            words.append("  ").append(f"{mark}\N{NO-BREAK SPACE}{stage}", style=style)
+            word = f"{mark} {stage}"
+            if used + 2 + len(word) > width:
+                words.append("\n")
+                used = 0
+            words.append("  ").append(word, style=style)
+            used += 2 + len(word)
         return words
 
     def _whole(self, now: float) -> Table:
@@ -236,9 +240,10 @@ def _bar(name: str, share: float, words: str, detail: str) -> Table:
     line = Table.grid(padding=(0, 2))
     line.add_column(width=18, no_wrap=True)
     line.add_column(width=BAR_WIDTH)
-    line.add_column(no_wrap=True)
-    line.add_column(no_wrap=True, overflow="ellipsis", style="dim")
-    line.add_row(f"  {name}", ProgressBar(total=1.0, completed=share, width=BAR_WIDTH), words, escape(detail))
+    # In one column, so that a narrow terminal cuts the detail first.
+    line.add_column(no_wrap=True, overflow="ellipsis")
+    said = Text.assemble(words, ("   " if detail else "", ""), (detail, "dim"))
+    line.add_row(f"  {name}", ProgressBar(total=1.0, completed=share, width=BAR_WIDTH), said)
     return line
 
 

@@ -43,7 +43,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=8, ignore=("rows",))
+@stage("report", version=9, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
@@ -145,7 +145,7 @@ def _absent(skipped: dict[str, str]) -> dict[str, str]:
     }
 
 
-@stage("dataset-report", version=2, ignore=("rows",))
+@stage("dataset-report", version=3, ignore=("rows",))
 def dataset_report(
     slot: Slot,
     name: str,
