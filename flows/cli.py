@@ -26,6 +26,8 @@ VERBS = {
     "serve": "run the deployments on this machine, on demand and on schedule",
     "plan": "measure a scene and say which stages it needs, and why",
     "report": "build the page of a finished run again, from the store",
+    "compare": "hold finished runs of one sequence against each other, on a page",
+    "leaderboard": "sequences by methods, from the store's records, on a page that sorts and filters",
     "export": "write a reconstructed scene as PLY, or a sequence as COLMAP model or transforms.json",
     "data": "what sequences there are, and whether a source is right",
     "cache": "what is in the store",
@@ -48,6 +50,7 @@ EXAMPLES = """examples:
   extrags plan phantom/0@sparse
   extrags evaluate phantom/0@sparse --renders my_renders/ --json -
   extrags benchmark phantom/0@sparse phantom/1@sparse --methods 3dgs,coarse --seeds 0,1,2
+  extrags compare phantom/0@sparse --methods 3dgs extrags
   extrags data check my_video.mp4 my_colmap_scene/
   extrags export phantom/0@sparse --to colmap --out scene/
   extrags cache rm 'explore*'

@@ -13,6 +13,7 @@ from extrags.report.inputs import ReportInputs
 from extrags.report.wording import compare, described_metrics, metric_of, number, shown_metrics
 
 __all__ = [
+    "REGIONS",
     "metrics_of",
     "missing_reasons",
     "numbers_csv",
@@ -25,11 +26,12 @@ __all__ = [
     "unobserved_shares",
 ]
 
-_REGIONS = (
+REGIONS = (
     ((), "All valid pixels"),
     (("observed",), "Observed by training"),
     (("unobserved",), "Never observed"),
 )
+"""Kinds of pixels: where their figures stand in a tree of metrics, and what they are called."""
 
 
 def summary(inputs: ReportInputs) -> str:
@@ -93,7 +95,7 @@ def regions(inputs: ReportInputs) -> list[dict[str, Any]]:
     if coarse is None and final is None:
         return []
     rows = []
-    for path, label in _REGIONS:
+    for path, label in REGIONS:
         share = _first(metric_of(final, *path, "pixel_share"), metric_of(coarse, *path, "pixel_share"))
         for alignment, kind in (((), "plain"), (("aligned",), "exposure-aligned")):
             cells = [
@@ -174,7 +176,7 @@ def numbers_csv(inputs: ReportInputs) -> str:
     """All means over the held-out views as a `data:` URI: kind of pixels, exposure, metric, both scenes."""
     coarse, final = metrics_of(inputs.coarse_metrics), metrics_of(inputs.final_metrics)
     rows: list[list[Cell]] = []
-    for path, label in _REGIONS:
+    for path, label in REGIONS:
         for alignment, kind in (((), "plain"), (("aligned",), "exposure-aligned")):
             for metric in shown_metrics(coarse, final):
                 values = [metric_of(tree, *path, *alignment, metric.key) for tree in (coarse, final)]

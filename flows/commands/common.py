@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
-from extrags.redaction import CredentialFilter
+from extrags.redaction import CredentialFilter, without_credentials
 
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
@@ -31,6 +31,7 @@ __all__ = [
     "stage_limits",
     "store_root",
     "write_json",
+    "write_page",
 ]
 
 
@@ -161,6 +162,21 @@ def write_json(value: Any, target: str | None) -> None:
         Path(target).write_text(text, encoding="utf-8")
     except OSError as error:
         raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
+
+
+def write_page(page: str, target: str) -> str:
+    """Write an HTML page; the absolute path of the file.
+
+    Raises:
+        StoreError: when it cannot be written.
+    """
+    place = Path(target).expanduser().absolute()
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text(without_credentials(page), encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
+    return str(place)
 
 
 def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:
