@@ -20,7 +20,8 @@ __all__ = ["RecordedRun", "board_rows", "chosen_runs", "compared_run", "run_name
 
 REPORT = "report-v"
 """Begin of the keys of a sequence's own pages."""
-DEFAULT_SEED = "its own"
+DEFAULT_SEED = "default seeds"
+"""In words: each stage has its own."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ class RecordedRun:
         return {
             "method": str(self.record["method"]),
             "profile": str(self.record["profile"]),
-            "seed": DEFAULT_SEED if seed is None else str(seed),
+            "seed": DEFAULT_SEED if seed is None else f"seed {seed}",
             "settings": setting_text(self.record["variant"]),
         }
 
@@ -132,11 +133,7 @@ def run_names(runs: Sequence[RecordedRun]) -> list[str]:
     telling = [key for key in keys if len({own.get(key, "") for own in traits}) > 1]
     names = []
     for own in traits:
-        words = [
-            f"seed {own[key]}" if key == "seed" else own[key]
-            for key in telling
-            if own.get(key) and key != "page"
-        ]
+        words = [own[key] for key in telling if own.get(key) and key != "page"]
         names.append(", ".join(words) or own.get("page", "") or "run")
     return [
         f"{name} ({names[: place + 1].count(name)})" if names.count(name) > 1 else name

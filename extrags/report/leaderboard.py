@@ -42,7 +42,7 @@ class BoardRow:
     status: Literal["ok", "failed"] = "ok"
     reason: str = ""
     ended: str = ""
-    seconds: float = 0.0
+    seconds: float | int = 0.0
     metrics: Mapping[str, Any] | None = None
     link: str = ""
 
@@ -70,9 +70,11 @@ def build_leaderboard(rows: Sequence[BoardRow], *, name: str = "Leaderboard") ->
         name: title of the page.
     """
     trees = [row.metrics for row in rows if row.metrics is not None]
-    shown = [
-        item for item in figures("tables") if any(figure_of(tree, item.name) is not None for tree in trees)
-    ]
+    shown, compared = (
+        [item for item in asked if any(figure_of(tree, item.name) is not None for tree in trees)]
+        # What training never saw is told of in differences; the list of runs has no room for it.
+        for asked in (figures("tables"), dict.fromkeys([*figures("tables"), *figures("differences")]))
+    )
     profiles = _distinct(row.profile for row in rows)
     return rendered_page(
         "leaderboard.html.j2",
@@ -84,14 +86,15 @@ def build_leaderboard(rows: Sequence[BoardRow], *, name: str = "Leaderboard") ->
             ("Methods", count(len({row.column for row in rows}))),
             ("Failed", count(sum(row.status == "failed" for row in rows))),
         ],
-        figures=shown,
+        figures=compared,
+        columns=shown,
         profiles=profiles,
         datasets=_distinct(row.dataset for row in rows),
         methods=_distinct(row.column for row in rows),
         boards=[
             board
             for profile in profiles
-            for item in shown
+            for item in compared
             if (board := _board(rows, item, profile)) is not None
         ],
         rows=[_run(row, shown) for row in rows],
@@ -165,7 +168,10 @@ def _cells(values: Mapping[str, float | None], figure: Figure) -> list[dict[str,
         {
             "text": number(value, figure.digits),
             "value": "" if value is None else repr(value),
-            "best": best is not None and value == best,
+            # Nobody is better by what is not shown.
+            "best": best is not None
+            and value is not None
+            and round(value, figure.digits) == round(best, figure.digits),
         }
         for value in values.values()
     ]

@@ -143,7 +143,7 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
                     "cells": [
                         {
                             "value": number(value, metric.digits),
-                            "best": value == best and len(known) > 1,
+                            "best": len(known) > 1 and _same(value, best, metric.digits),
                             "change": compare(metric, values[0], value) if place else None,
                         }
                         for place, value in enumerate(values)
@@ -151,6 +151,11 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
                 }
             )
     return rows
+
+
+def _same(value: float | None, best: float, digits: int) -> bool:
+    """Whether both are written alike: nobody is better by what is not shown."""
+    return value is not None and round(value, digits) == round(best, digits)
 
 
 def _figures_csv(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> str:
