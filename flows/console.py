@@ -59,7 +59,7 @@ def print_failures(run: DatasetOutcome) -> None:
 
 
 def _change(name: str, coarse: float | None, final: float | None) -> str:
-    if coarse is None:
+    if coarse is None or coarse == final:
         return figure(name, final)
     return f"{figure(name, coarse)} → {figure(name, final)}"
 

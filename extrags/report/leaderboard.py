@@ -186,7 +186,7 @@ def _run(row: BoardRow, shown: Sequence[Figure]) -> dict[str, Any]:
             for value, item in zip(values, shown, strict=True)
         ],
         "time": duration(row.seconds) if row.seconds else "",
-        "ended": row.ended[:16].replace("T", " "),
+        "ended": row.ended[:10],
     }
 
 

@@ -117,13 +117,13 @@ def _summary(runs: Sequence[ComparedRun]) -> str:
     return f"{text}, {number(best - first, 2)} dB above {runs[0].name}."
 
 
-def _head(run: ComparedRun) -> dict[str, str]:
+def _head(run: ComparedRun) -> dict[str, Any]:
     gaussians = metric_of(run.result["metrics"], "n_gaussians")
     said = [
         "" if gaussians is None else f"{count(gaussians)} Gaussians",
         "" if run.seconds is None else duration(run.seconds),
     ]
-    return {"name": run.name, "link": run.link, "note": " · ".join(part for part in said if part)}
+    return {"name": run.name, "link": run.link, "notes": [part for part in said if part]}
 
 
 def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dict[str, Any]]:

@@ -69,10 +69,14 @@ def test_one_figure_is_shown_at_a_time(board: Browser) -> None:
     assert board.run(foot) is True
 
 
+@pytest.fixture(scope="module")
+def html(inputs: ReportInputs) -> str:
+    return build_report(inputs, ReportConfig(held_out_views=1, virtual_views=2, viewer_mb=0))
+
+
 @pytest.fixture
-def report(tab: Browser, inputs: ReportInputs, tmp_path: Path) -> Browser:
-    config = ReportConfig(held_out_views=1, virtual_views=2, viewer_mb=0)
-    (tmp_path / "report.html").write_text(build_report(inputs, config), encoding="utf-8")
+def report(tab: Browser, html: str, tmp_path: Path) -> Browser:
+    (tmp_path / "report.html").write_text(html, encoding="utf-8")
     tab.open(tmp_path / "report.html")
     return tab
 
