@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from extrags.report.downloads import Chart, file_name
+from extrags.report.downloads import Cell, Chart, file_name
 from extrags.report.encode import data_uri
 
 __all__ = [
@@ -267,7 +267,7 @@ def sequences_chart(
         right.set_xlim(left=0)
         chart = svg_image(figure)
     header = ["sequence", "coarse_psnr_db", "final_psnr_db", "seconds"]
-    rows = [
+    rows: list[list[Cell]] = [
         [name, float(coarse[place]), float(final[place]), float(seconds[place])]
         for place, name in enumerate(names)
     ]
@@ -326,7 +326,7 @@ def methods_chart(
         right.set_xlabel("seconds")
         right.set_xlim(left=0)
         chart = svg_image(figure)
-    rows = [
+    rows: list[list[Cell]] = [
         [group, method, float(value), float(took)]
         for method in colors
         for group in groups
@@ -372,7 +372,7 @@ def pairs_chart(
             panel.grid(visible=False, axis="y")
         axes[0].set_yticks(place, [name for name, _ in rows])
         chart = svg_image(figure)
-    numbers = [
+    numbers: list[list[Cell]] = [
         [name, title, *cell]
         for name, cells in rows
         for (title, _), cell in zip(panels, cells, strict=True)

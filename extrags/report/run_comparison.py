@@ -211,7 +211,7 @@ def _views_chart(sequence: EndoscopicSequence, runs: Sequence[ComparedRun]) -> C
     with drawing_style():
         figure = Figure(figsize=(9.6, 2.8), layout="constrained")
         FigureCanvasAgg(figure)
-        axes = figure.add_subplot()
+        axes: Any = figure.add_subplot()
         for place, (name, psnr) in enumerate(values.items()):
             color = METHOD_COLORS[place % len(METHOD_COLORS)]
             axes.plot(order, psnr, color=color, marker="o", markersize=3.5, linewidth=1.2, label=name)
