@@ -200,8 +200,8 @@ class Resampling:
         Args:
             source_width: size of the images on disk.
             source_height: size of the images on disk.
-            config: `width` and `height`, or `downscale`.
-            usual_downscale: where the settings give neither.
+            config: `width` and `height`, or `downscale`, or `size`.
+            usual_downscale: divisor of thumbnails.
             box: left, top, width and height to keep; None keeps all.
 
         Raises:
@@ -211,7 +211,7 @@ class Resampling:
         if config.width is None:
             if config.height is not None:
                 raise ConfigError("ingest.height needs ingest.width")
-            divisor = config.downscale or usual_downscale
+            divisor = config.downscale or (usual_downscale if config.size == "thumbnail" else 1)
             width, height = crop_width // divisor, crop_height // divisor
             crop_width, crop_height = width * divisor, height * divisor
         else:

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.images import Resampling
 from extrags.config import IngestConfig
-from extrags.lens import Lens, Undistortion
+from extrags.lens import Lens, Undistortion, size_for_focal
 
-__all__ = ["CameraModel", "LensSampling", "Sampling"]
+__all__ = ["CameraModel", "LensSampling", "Sampling", "keeps_central_resolution"]
 
 
 @runtime_checkable
@@ -60,6 +60,22 @@ class Sampling(Protocol):
         """z-depth, never mixed across a fold; 0 stays unknown."""
 
 
+def _enlarged_size(lens: Lens, config: IngestConfig, first: Sampling | None) -> tuple[int, int] | None:
+    """Size at which a pinhole of the given field of view keeps the central resolution; None: the lens's."""
+    if config.field_of_view_deg is None or not keeps_central_resolution(config):
+        return None
+    if isinstance(first, LensSampling):
+        # Frames of several lenses share the first one's size.
+        return first.resampling.source_width, first.resampling.source_height
+    focal = float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))
+    return size_for_focal(lens.width, lens.height, float(np.radians(config.field_of_view_deg)), focal)
+
+
+def keeps_central_resolution(config: IngestConfig) -> bool:
+    """Whether a pinhole wider than the source's centre allows grows instead of losing resolution."""
+    return config.size == "central" and config.width is None and config.downscale is None
+
+
 @dataclass(frozen=True)
 class LensSampling:
     """A COLMAP lens undone at full size, then the crop and shrinking that all frames share.
@@ -88,22 +104,29 @@ class LensSampling:
 
         Args:
             lens: of the images.
-            config: `width` and `height`, or `downscale`; `field_of_view_deg` where there is distortion.
+            config: `width` and `height`, or `downscale`, or `size`; `field_of_view_deg` where there is
+                distortion.
             first: of the sequence's first lens, whose crop and size are kept; None for the first itself.
-            usual_downscale: where the settings give no size.
+            usual_downscale: divisor of thumbnails.
             box: left, top, width and height to keep, in pixels; None keeps all.
 
         Raises:
             ConfigError: a size that the source cannot give.
         """
+        undistortion = None
+        width, height = lens.width, lens.height
+        if not lens.is_pinhole:
+            undistortion = Undistortion.planned(
+                lens, config.field_of_view_deg, size=_enlarged_size(lens, config, first)
+            )
+            height, width = undistortion.valid.shape
         resampling = (
             first.resampling
             if isinstance(first, LensSampling)
-            else Resampling.planned(lens.width, lens.height, config, usual_downscale, box)
+            else Resampling.planned(width, height, config, usual_downscale, box)
         )
-        if lens.is_pinhole:
+        if undistortion is None:
             return cls(None, resampling, resampling.intrinsics(lens.K))
-        undistortion = Undistortion.planned(lens, config.field_of_view_deg)
         return cls(undistortion, resampling, resampling.intrinsics(undistortion.K))
 
     @property

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from extrags.errors import SourceError
 
-__all__ = ["LENS_PARAMETERS", "Lens", "Undistortion", "sample_depth"]
+__all__ = ["LENS_PARAMETERS", "Lens", "Undistortion", "sample_depth", "size_for_focal"]
 
 LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -182,7 +182,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Undistortion:
-    """A plan to resample images of one lens to a pinhole of the same size.
+    """A plan to resample images of one lens to a pinhole.
 
     Args:
         K: of the pinhole.
@@ -197,15 +197,22 @@ class Undistortion:
     valid: Bool[np.ndarray, "h w"]
 
     @classmethod
-    def planned(cls, lens: Lens, field_of_view_deg: float | None = None) -> Undistortion:
+    def planned(
+        cls,
+        lens: Lens,
+        field_of_view_deg: float | None = None,
+        *,
+        size: tuple[int, int] | None = None,
+    ) -> Undistortion:
         """The pinhole for a lens: square pixels, centred.
 
         Args:
             lens: what the images were taken with.
             field_of_view_deg: horizontal, of the pinhole; None keeps the lens's own central resolution, which
                 cuts off the outermost part of what a fisheye sees.
+            size: width and height of the pinhole's image, in pixels; None keeps the source's.
         """
-        width, height = lens.width, lens.height
+        width, height = (lens.width, lens.height) if size is None else size
         focal = float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))
         if field_of_view_deg is not None:
             focal = float(width / 2 / np.tan(np.radians(field_of_view_deg) / 2))
@@ -216,7 +223,7 @@ class Undistortion:
         u, v = lens.project(x, y)
         radius = np.hypot(x, y)
         # Half a pixel inside, so that no sample reaches over the border.
-        valid = (u >= 0.5) & (u <= width - 0.5) & (v >= 0.5) & (v <= height - 0.5)
+        valid = (u >= 0.5) & (u <= lens.width - 0.5) & (v >= 0.5) & (v <= lens.height - 0.5)
         valid &= radius < lens.fold_radius(float(radius.max()) * 1.01)
         return cls(K, u, v, valid)
 
@@ -244,6 +251,19 @@ class Undistortion:
     def _maps(self) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
         # OpenCV counts from pixel centres.
         return (self.u - 0.5).astype(np.float32), (self.v - 0.5).astype(np.float32)
+
+
+def size_for_focal(width: int, height: int, angle_rad: float, focal_px: float) -> tuple[int, int]:
+    """Width and height in pixels at which a pinhole of a field of view has a focal length.
+
+    Args:
+        width: of the source; the result is never smaller.
+        height: of the source; the proportion is kept.
+        angle_rad: horizontal field of view, below pi.
+        focal_px: focal length that is to be reached.
+    """
+    wide = max(width, int(np.ceil(2 * focal_px * np.tan(angle_rad / 2) - 1e-6)))
+    return wide, round(height * wide / width)
 
 
 def sample_depth(

@@ -60,8 +60,8 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
     "surface": ("one", "train*pixels", "gaussians"),
     "freespace": ("one", "gaussians"),
     "explore": ("trajectories", "trajectories*gaussians"),
-    "enhance-train": ("one", "pixels", "fold_iterations", "fold_iterations*pixels"),
-    "enhance": ("one", "views", "views*pixels"),
+    "enhance-train": ("one", "restored", "fold_iterations", "fold_iterations*restored"),
+    "enhance": ("one", "views", "views*restored"),
     "finetune-judge": ("judge_iterations", "judge_iterations*pixels", "judge_iterations*gaussians"),
     "finetune": ("tuning", "tuning*pixels", "tuning*gaussians"),
     "evaluate-render": ("test", "test*pixels"),
@@ -89,6 +89,7 @@ class Workload:
         test: of them, those that are held out.
         config: settings of all stages.
         views: virtual views to restore; None takes the setting.
+        width: of an image, in pixels; None: of one that is narrow enough to be restored as it is.
     """
 
     pixels: float | int
@@ -97,6 +98,7 @@ class Workload:
     test: float | int
     config: PipelineConfig
     views: float | int | None = None
+    width: float | int | None = None
 
     def numbers(self) -> dict[str, float]:
         """By name in terms. Gaussians are the limit, which densification reaches in nearly every scene."""
@@ -105,6 +107,8 @@ class Workload:
         return {
             "one": 1.0,
             "pixels": float(self.pixels),
+            # Of a virtual view.
+            "restored": float(self.pixels) * self._restored_share(),
             "frames": float(self.frames),
             "train": float(self.train),
             "test": float(self.test),
@@ -119,6 +123,11 @@ class Workload:
             # LPIPS with this backbone takes longer than all other metrics together.
             "vgg": float("vgg" in config.evaluate.lpips_nets),
         }
+
+    def _restored_share(self) -> float:
+        if self.width is None:
+            return 1.0
+        return (self.config.enhance.working_width(round(self.width)) / self.width) ** 2
 
     def term(self, name: str) -> float:
         """A product of numbers, e.g. `iterations*pixels`."""

@@ -177,5 +177,6 @@ def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:
         return ingest.width, ingest.height
     if about.format in ("phantom", "caverns"):
         return about.width, about.height
-    divisor = ingest.downscale or max(1, round(about.width / USUAL_WIDTH))
+    usual = max(1, round(about.width / USUAL_WIDTH)) if ingest.size == "thumbnail" else 1
+    divisor = ingest.downscale or usual
     return about.width / divisor, about.height / divisor

@@ -41,7 +41,7 @@ one are not among them."""
 
 
 class StageLimits(BaseModel):
-    """What a stage may cost before it counts as failed."""
+    """What a stage, or the run of a sequence, may cost before it counts as failed."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -56,6 +56,12 @@ class StageLimits(BaseModel):
     )
     time_limit_s: float | None = Field(
         None, gt=0, description="a stage fails at its first progress event after so long; no limit by default"
+    )
+    memory_gb: float | None = Field(
+        None,
+        gt=0,
+        description="a sequence whose estimated peak memory, in GB (1e9 bytes), is higher is refused as soon "
+        "as its frames are read; no limit by default",
     )
 
     def delays_s(self) -> list[float]:

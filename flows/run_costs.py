@@ -165,7 +165,7 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
         )
         config = decided.applied_to(config)
         skipped |= {line.stage for line in decided.decisions if not line.run}
-    work = Workload(width * height, frames, train, test, config)
+    work = Workload(width * height, frames, train, test, config, width=width)
     return work, {str(stage) for stage in STAGES if stage not in skipped}
 
 
@@ -190,7 +190,7 @@ def catalogue_work(
     stages = {str(stage) for stage in STAGES if stage not in leave_out}
     stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
     stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
-    return Workload(float(width * height), frames, frames / 2, frames / 2, config), stages
+    return Workload(float(width * height), frames, frames / 2, frames / 2, config, width=width), stages
 
 
 def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record], list[Record]]:
@@ -265,7 +265,7 @@ def _workload(
     width, height, frames, train, test = (float(value or 0) for value in size)
     views = manifest.counts.get("views") if manifest.stage == "enhance" else None
     return Workload(
-        width * height, frames, train, test, _config(line, fallback), float(views) if views else None
+        width * height, frames, train, test, _config(line, fallback), float(views) if views else None, width
     )
 
 

@@ -78,6 +78,7 @@ def reconstruct_sequence(
             profile=profile_label(profile, method),
             until=until,
             leave_out=METHODS[method].leave_out,
+            memory_limit_gb=limits.memory_gb,
         )
         record_outcome_quietly(Store(store), case, outcome, until, config)
         # Of workers that died while others went on.

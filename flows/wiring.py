@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,6 +17,7 @@ from extrags.redaction import without_credentials
 from extrags.store import Manifest, Ref, Store
 from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
+from flows.memory_limit import check_memory
 from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner, StoreRunner
 from tasks.assess import assess, measuring_settings, plan, planning_settings
@@ -69,6 +70,7 @@ def run_sequence(
     profile: str = "",
     until: StageName = "report",
     leave_out: Mapping[str, str] | None = None,
+    memory_limit_gb: float | None = None,
 ) -> SequenceOutcome:
     """Run all stages of one sequence.
 
@@ -83,25 +85,21 @@ def run_sequence(
         profile: name of the profile the settings come from, for the report.
         until: last stage to run.
         leave_out: see `extrags.pipeline.Pipeline`.
+        memory_limit_gb: see `flows.memory_limit.check_memory`.
 
     Raises:
         NotInStoreError: from a runner that only looks.
         ConfigError: for a stage that does not exist.
     """
-    return SequenceRun(name, config, store, runner, profile, leave_out=leave_out).run(until)
+    run = SequenceRun(name, config, store, runner, profile, leave_out=leave_out)
+    if not isinstance(runner, StoreRunner):
+        limit = memory_limit_gb
+        run.check_frames = lambda counts: check_memory(name, config, counts, limit, until, run.leave_out)
+    return run.run(until)
 
 
 class SequenceRun(Pipeline):
-    """The stages of one sequence as cached tasks.
-
-    Args:
-        name: `DATASET/SEQUENCE[@SETTING]` or a path.
-        config: settings of all stages.
-        store: root of the store.
-        runner: how artefacts are made.
-        profile: name of the profile the settings come from, for the report.
-        leave_out: see `extrags.pipeline.Pipeline`.
-    """
+    """The stages of one sequence as cached tasks; the arguments are those of `run_sequence`."""
 
     def __init__(
         self,
@@ -114,6 +112,7 @@ class SequenceRun(Pipeline):
         leave_out: Mapping[str, str] | None = None,
     ) -> None:
         super().__init__(config, leave_out)
+        self.check_frames: Callable[[Mapping[str, Any]], object] = dict  # Of the counts of `ingest`.
         self.outcome = SequenceOutcome(name)
         self.store = Store(store)
         self.runner = runner
@@ -204,6 +203,7 @@ class SequenceRun(Pipeline):
                 "calibration": self.config.ingest.calibration,
             }
             self.refs["ingest"] = self.refs["sequence"] = self._run_task(row, Call(ingest, inputs))
+            self.check_frames(self._manifest("ingest").counts)
 
     def poses(self) -> None:
         """The artefact `sequence` again, with poses."""

@@ -26,11 +26,11 @@ RESTORER = "restorer"
 
 
 _OF_RESTORATION = frozenset(
-    {"clips_per_batch", "iou", "max_views", "pixel_confidence", "reference", "references"}
+    {"clips_per_batch", "iou", "max_views", "max_width", "pixel_confidence", "reference", "references"}
 )
 """Settings that the stage `enhance-restore` reads itself; all others work through the restorer."""
 
-_OF_KEYFRAMES = frozenset({"keyframes", "max_views", "reference", "references"})
+_OF_KEYFRAMES = frozenset({"keyframes", "max_views", "max_width", "reference", "references"})
 """Settings that the stage `enhance-keyframes` reads itself."""
 
 _OF_EMBEDDED = frozenset(
@@ -43,6 +43,7 @@ _OF_EMBEDDED = frozenset(
         "folds",
         "judge",
         "learning_rate",
+        "max_width",
         "precision",
         "reference",
         "references",

@@ -11,6 +11,7 @@ the picture, and grows a little into it, since the corners are cut. It is part o
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,17 +19,20 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
 from data_catalog.images import Resampling
+from data_catalog.sampling import keeps_central_resolution
 from extrags.cameras import unproject_pixels
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
-from extrags.lens import sample_depth
+from extrags.lens import sample_depth, size_for_focal
 
 __all__ = ["USUAL_FIELD_OF_VIEW_DEG", "USUAL_WIDTH", "PinholeResampling"]
+
+logger = logging.getLogger(__name__)
 
 USUAL_FIELD_OF_VIEW_DEG = 100.0
 """Nearly the widest pinhole of 5 : 4 that the published lenses fill to its edges."""
 USUAL_WIDTH = 225
-"""Where the settings give no size: the whole divisor that comes nearest to this."""
+"""Of thumbnails (`ingest.size`): the whole divisor that comes nearest to this."""
 
 _LARGEST_SUPERSAMPLE = 16
 
@@ -64,17 +68,29 @@ class PinholeResampling:
 
         Args:
             camera: of the source images.
-            config: `width`, `height` or `downscale`, and `field_of_view_deg`.
+            config: `width`, `height`, `downscale` or `size`, and `field_of_view_deg`.
 
         Raises:
             ConfigError: a size that the source cannot give.
         """
         usual_divisor = max(1, round(camera.width / USUAL_WIDTH))
         size = Resampling.planned(camera.width, camera.height, config, usual_divisor)
+        width, height = size.width, size.height
         angle = np.radians(config.field_of_view_deg or USUAL_FIELD_OF_VIEW_DEG)
-        focal = size.width / 2 / np.tan(angle / 2)
-        K = np.array([[focal, 0, size.width / 2], [0, focal, size.height / 2], [0, 0, 1.0]])
-        return cls.to_pinhole(camera, K, size.width, size.height)
+        if keeps_central_resolution(config):
+            # On the axis the fisheye resolves a0 pixels per radian, as a pinhole of that focal length does.
+            width, height = size_for_focal(camera.width, camera.height, angle, camera.a0)
+        focal = width / 2 / np.tan(angle / 2)
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+        resolution = focal / camera.a0
+        logger.info(
+            "pinhole of %d x %d pixels, %.0f degrees wide: %.2f of the central resolution of the source",
+            width,
+            height,
+            np.degrees(angle),
+            resolution,
+        )
+        return cls.to_pinhole(camera, K, width, height)
 
     @classmethod
     def to_pinhole(

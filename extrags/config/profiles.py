@@ -41,6 +41,7 @@ PROFILES: dict[str, PipelineConfig] = {
     ),
     # The default: minutes to a quarter of an hour on two cores.
     "balanced": PipelineConfig(
+        ingest=IngestConfig(size="source"),
         coarse=CoarseConfig(
             iterations=5000, max_points=16_000, sh_every=1000, densify=DensifyConfig(max_gaussians=40_000)
         ),
@@ -54,9 +55,9 @@ PROFILES: dict[str, PipelineConfig] = {
         finetune=FinetuneConfig(iterations=4000),
         evaluate=EvaluateConfig(lpips_nets=("alex", "vgg")),
     ),
-    # The paper's counts, at the full size of the source's frames.
+    # The paper's counts, at the full resolution of the source's frames.
     "paper": PipelineConfig(
-        ingest=IngestConfig(downscale=1),
+        ingest=IngestConfig(size="central"),
         coarse=CoarseConfig(
             iterations=30_000,
             max_points=60_000,

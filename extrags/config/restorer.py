@@ -195,6 +195,13 @@ class EnhanceConfig(StageConfig):
         ge=1,
         description="virtual views restored at most; no more trajectories than this are planned or restored",
     )
+    max_width: int | None = Field(
+        320,
+        ge=32,
+        le=4096,
+        description="virtual views are rendered, restored and fine-tuned on at most this wide, in pixels, "
+        "with real views and leave-out pairs of the same size; None: as wide as the frames",
+    )
     keyframes: int = Field(
         0,
         ge=0,
@@ -219,6 +226,10 @@ class EnhanceConfig(StageConfig):
         if samples != "mean" and not 1 <= samples <= MOST_SAMPLES:
             raise ValueError(f"expected mean, or a number from 1 to {MOST_SAMPLES}")
         return samples
+
+    def working_width(self, width: int) -> int:
+        """Width of virtual views of a sequence whose frames have a width, in pixels."""
+        return width if self.max_width is None else min(width, self.max_width)
 
     def batches(self, trajectories: int) -> int:
         """Number of batches that so many trajectories, of which `max_views` at most, are restored in."""

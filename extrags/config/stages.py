@@ -45,8 +45,14 @@ class IngestConfig(StageConfig):
         None,
         ge=1,
         le=16,
-        description="divide the source's size by this; None: the source's usual divisor (sinus 4, "
-        "simcol3d 2, C3VD to a width of 225, others 1); ignored when width is set",
+        description="divide the source's size by this; None: as ingest.size says; ignored when width is set",
+    )
+    size: Literal["thumbnail", "source", "central"] = Field(
+        "thumbnail",
+        description="where neither width nor downscale is set. thumbnail: the source's usual divisor (sinus "
+        "4, simcol3d 2, C3VD to a width of 225, others 1); source: as large as the source; central: as "
+        "source, but where field_of_view_deg (of C3VD: 100) widens the pinhole of a distorted source, the "
+        "image grows with it, so that the source's central resolution is kept",
     )
     holdout_every: int = Field(
         8, ge=2, description="hold out every n-th frame where the source defines no split"

@@ -19,7 +19,7 @@ from extrags.threads import one_torch_thread
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import ReferenceViews
 
-__all__ = ["restore", "restore_batch", "restore_keyframes", "restored_batches"]
+__all__ = ["at_working_size", "restore", "restore_batch", "restore_keyframes", "restored_batches"]
 
 
 def restore(
@@ -57,6 +57,20 @@ def restore(
     return PseudoViews.concatenated(parts).quantised()
 
 
+def at_working_size(
+    sequence: EndoscopicSequence, trajectories: Sequence[Cameras], config: EnhanceConfig
+) -> tuple[EndoscopicSequence, list[Cameras]]:
+    """Frames and virtual views at the size that views are restored at (`enhance.max_width`).
+
+    Args:
+        sequence: frames of any size; those that are small enough are returned as they are.
+        trajectories: virtual views.
+        config: the settings.
+    """
+    width = config.working_width(sequence.width)
+    return sequence.at_most_width(width), [cameras.at_most_width(width) for cameras in trajectories]
+
+
 def restored_batches(
     scene: Scene,
     sequence: EndoscopicSequence,
@@ -81,6 +95,7 @@ def restored_batches(
     Raises:
         ShapeError: when a batch has no view at all.
     """
+    sequence, trajectories = at_working_size(sequence, trajectories, config)
     references = gather_references(scene, sequence, sequence.train)
     keyframes = restore_keyframes(scene, sequence, trajectories, enhancer, config, references=references)
     for batch in range(config.batches(len(trajectories))):
@@ -115,13 +130,14 @@ def restore_keyframes(
         trajectories: all of them, the real start of each first; at least one.
         enhancer: the scene's restorer.
         config: number of keyframes and of views.
-        references: training views of the scene, where they are gathered already.
+        references: training views of the scene at the working size, where they are gathered already.
 
     Returns:
         The keyframes; none with `enhance.keyframes=0`, or for a restorer that follows none.
     """
     if config.keyframes == 0 or not follows_keyframes(enhancer):
-        return Keyframes.none(trajectories[0])
+        return Keyframes.none(trajectories[0].at_most_width(config.working_width(trajectories[0].width)))
+    sequence, trajectories = at_working_size(sequence, trajectories, config)
     if references is None:
         references = gather_references(scene, sequence, sequence.train)
     views = choose_views([len(cameras) for cameras in trajectories], config.max_views)
@@ -153,11 +169,12 @@ def restore_batch(
         batch: which batch.
         measure: behind the pixel-level confidence; whether it is `raw` is the settings' to say.
         keyframes: restored views that all batches follow (`restore_keyframes`); None for none.
-        references: training views of the scene, where they are gathered already.
+        references: training views of the scene at the working size, where they are gathered already.
 
     Raises:
         ShapeError: when the batch has no view at all.
     """
+    sequence, trajectories = at_working_size(sequence, trajectories, config)
     views = choose_views([len(cameras) for cameras in trajectories], config.max_views)
     first = batch * config.clips_per_batch
     chosen = range(first, min(first + config.clips_per_batch, len(trajectories)))

@@ -123,7 +123,7 @@ def finished_run(given: argparse.Namespace, until: StageName, otherwise: str = "
 
 
 def stage_limits(given: argparse.Namespace) -> StageLimits:
-    """Retries and time limits from the command line; loads Prefect.
+    """Retries and limits of time and memory from the command line; loads Prefect.
 
     Raises:
         ConfigError: for a value out of range.
@@ -134,7 +134,10 @@ def stage_limits(given: argparse.Namespace) -> StageLimits:
         raise ConfigError(f"--retries {given.retries}: expected 0 to 10")
     if given.stage_time_limit is not None and not given.stage_time_limit > 0:
         raise ConfigError(f"--stage-time-limit {given.stage_time_limit:g}: expected more than 0 seconds")
-    return StageLimits(retries=given.retries, time_limit_s=given.stage_time_limit)
+    memory_gb = getattr(given, "memory_limit", None)
+    if memory_gb is not None and not memory_gb > 0:
+        raise ConfigError(f"--memory-limit {memory_gb:g}: expected more than 0 GB")
+    return StageLimits(retries=given.retries, time_limit_s=given.stage_time_limit, memory_gb=memory_gb)
 
 
 def store_root(given: argparse.Namespace) -> str:

@@ -68,6 +68,13 @@ def add_arguments(parser: Parser) -> None:
         "--at-once", type=int, default=1, metavar="N", help="sequences in work at the same time (default: 1)"
     )
     parser.add_argument(
+        "--memory-limit",
+        type=float,
+        metavar="GB",
+        help="refuse a sequence whose estimated peak memory is higher, and name settings that fit; of each "
+        "sequence in work (default: no limit)",
+    )
+    parser.add_argument(
         "--only",
         choices=("failed", "changed", "missing"),
         help="only sequences whose last run failed, of which something would be made, or that never ended",

@@ -151,10 +151,27 @@ class TestPinhole:
                 offset = np.linalg.lstsq(slopes, (found - expected)[here].ravel(), rcond=None)[0]
                 assert np.abs(offset).max() < 0.02
 
-    def test_the_profile_paper_keeps_the_size_of_the_frames(self) -> None:
-        camera = CALIBRATIONS["c3vdv2"]
+    def test_the_profile_balanced_keeps_the_size_of_the_frames(self) -> None:
+        camera = CALIBRATIONS["c3vdv2"].scaled(675, 540)
+        plan = PinholeResampling.planned(camera, PROFILES["balanced"].ingest)
+        assert (plan.width, plan.height) == (675, 540)
+        assert plan.K[0, 0] == pytest.approx(337.5 / np.tan(np.radians(50)))
+
+    def test_the_profile_paper_keeps_the_central_resolution(self) -> None:
+        camera = CALIBRATIONS["c3vdv2"].scaled(675, 540)
         plan = PinholeResampling.planned(camera, PROFILES["paper"].ingest)
-        assert (plan.width, plan.height) == (camera.width, camera.height)
+        assert 2 * np.degrees(np.arctan(plan.width / 2 / plan.K[0, 0])) == pytest.approx(100)
+        assert plan.width / plan.height == pytest.approx(675 / 540, abs=0.002)
+        steps = np.hypot(*np.moveaxis(np.diff(plan.centres, axis=1), -1, 0))
+        # No new pixel spans more than one of the source, and at the centre hardly less.
+        assert 0.99 < steps.max() < 1.001
+
+    def test_a_width_or_a_divisor_count_before_the_size(self) -> None:
+        camera = CALIBRATIONS["c3vdv2"].scaled(675, 540)
+        for size in ("thumbnail", "source", "central"):
+            for given, wanted in (({"width": 300}, (300, 240)), ({"downscale": 2}, (337, 270))):
+                plan = PinholeResampling.planned(camera, IngestConfig(size=size, **given))
+                assert (plan.width, plan.height) == wanted
 
     def test_usual_size_and_field_of_view(self) -> None:
         for width, height in ((1350, 1080), (675, 540)):

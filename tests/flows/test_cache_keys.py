@@ -110,6 +110,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "enhance.pretrained_weights": (),  # By content, below.
     "enhance.keyframes": ("enhance-keyframes", "finetune-judge"),
     "enhance.max_views": ("plan", *RESTORE),
+    "enhance.max_width": ("enhance-train", *RESTORE, "finetune-judge"),
     "enhance.clips_per_batch": ("enhance-restore",),
     "enhance.references": ("enhance-train", *RESTORE, "finetune-judge"),
     "enhance.reference": ("enhance-train", *RESTORE, "finetune-judge"),

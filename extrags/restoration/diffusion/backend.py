@@ -57,7 +57,9 @@ class EmbeddedBackend:
         """
         from extrags.restoration.diffusion.scene_restorer import scene_restorer
 
-        return scene_restorer(scene, sequence, config, coarse)
+        # What it restores later has the working size: pairs of another would tell little about that.
+        small = sequence.at_most_width(config.working_width(sequence.width))
+        return scene_restorer(scene, small, config, coarse)
 
     def load(self, path: Path) -> Enhancer:
         """Read what `EmbeddedEnhancer.save` wrote.

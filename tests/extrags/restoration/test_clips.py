@@ -131,6 +131,24 @@ class TestPseudoObservations:
         assert np.array_equal(views.pixel_confidence, expected)
         assert views.provenance["pixel_confidence"] == {"bounded": "", "raw": "raw_"}[form] + "lpips_alex"
 
+    def test_virtual_views_are_no_wider_than_the_settings_say(self, tube: Tube) -> None:
+        cameras = tube_cameras(2, offset_mm=6.0, turn=0.5)
+
+        def restored(max_width: int | None) -> PseudoViews:
+            config = EnhanceConfig(max_width=max_width)
+            measure = PerceptualDifference(None, "test")
+            return restore_batch(
+                tube.scene, tube.sequence, [cameras], ClassicalEnhancer(), config, 0, measure
+            )
+
+        small, whole, wide = restored(cameras.width // 2), restored(None), restored(cameras.width)
+        assert (small.cameras.width, small.cameras.height) == (cameras.width // 2, cameras.height // 2)
+        assert small.target.shape[1:3] == (cameras.height // 2, cameras.width // 2)
+        assert np.array_equal(wide.target, whole.target)
+        # The same views: what they show agrees with the larger ones, averaged.
+        blocks = whole.restored.reshape(len(whole), cameras.height // 2, 2, cameras.width // 2, 2, 3)
+        assert np.abs(small.restored - blocks.mean(axis=(2, 4))).mean() < 0.05
+
     def test_sizes_are_checked(self, pseudo: PseudoViews) -> None:
         with pytest.raises((ShapeError, TypeCheckError), match="alpha"):
             replace(pseudo, alpha=pseudo.alpha[:, :-1])

@@ -1,0 +1,217 @@
+"""How much memory a run will need at most, from the size of its frames and its settings.
+
+A model of what each stage holds at its peak, in bytes per pixel, frame and Gaussian. It states an upper
+bound for the usual case, not an average: stages that share a process keep what the largest of them took.
+
+The constants were read off the peaks that runs recorded (`peak_mib` of their artefacts); see
+docs/running_at_scale.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+from extrags.config import PipelineConfig
+from extrags.pipeline import STAGES, StageName
+
+__all__ = ["FrameSize", "MemoryEstimate", "estimate_memory", "fitting_settings"]
+
+GB = 1e9
+
+PROCESS = 700_000_000
+"""Interpreter, libraries and the flow, before anything is read."""
+SEQUENCE = 16
+"""Bytes per pixel of a frame: colours, masks and depth, and the copy that holds the training frames."""
+DECODED = 60
+"""Bytes per source pixel of the frame that is being read, with its resampling grid."""
+TRAINING_VIEW = 60
+"""Bytes per pixel of a training frame while Gaussians are optimised: targets, weights, comparison."""
+STEP = 140
+"""Bytes per pixel of the image of one optimisation step: rendering, loss and their gradients."""
+GAUSSIAN = 2400
+"""Bytes of a Gaussian with all harmonics while it is optimised: parameters, gradients, moments, tiles."""
+PAIR = 650
+"""Bytes per pixel of a training frame while the restorer is prepared: layers of its leave-out pairs."""
+REFERENCE = 30
+"""Bytes per pixel of a training frame that is carried into virtual views."""
+CLIP = 360
+"""Bytes per pixel of a view of a batch: layers, conditioning and what is made of it."""
+NETWORK = 6000
+"""Bytes per pixel and thread of the network's working set, four views at once."""
+PSEUDO_VIEW = 220
+"""Bytes per pixel of a restored view: when batches are joined, and as a target of the fine-tuning."""
+METRICS = 3500
+"""Bytes per pixel of the images that metrics are computed on at once, the features of LPIPS-VGG included."""
+RENDERED_VIEW = 24
+"""Bytes per pixel of a rendered held-out view."""
+PIXELS_MEASURED_AT_ONCE = 400_000
+SURFACE_WIDTH = 320
+SMALLEST_WIDTH = 32
+
+
+@dataclass(frozen=True)
+class FrameSize:
+    """What is known of a sequence before it is reconstructed.
+
+    Args:
+        frames: of the sequence, held-out ones included.
+        training_frames: of these.
+        width: in pixels, as the frames are used (after `ingest.*`).
+        height: in pixels.
+        source_pixels: of one frame on disk; None: as many as are used.
+    """
+
+    frames: int
+    training_frames: int
+    width: int
+    height: int
+    source_pixels: int | None = None
+
+
+@dataclass(frozen=True)
+class MemoryEstimate:
+    """Peak memory of a run by stage.
+
+    Args:
+        by_stage: bytes, in the order of the stages.
+    """
+
+    by_stage: dict[StageName, int]
+
+    @property
+    def stage(self) -> StageName:
+        """The stage that needs most."""
+        return max(self.by_stage, key=lambda name: self.by_stage[name])
+
+    @property
+    def peak_bytes(self) -> int:
+        """What that stage needs."""
+        return self.by_stage[self.stage]
+
+    @property
+    def peak_gb(self) -> float:
+        """The same in GB (1e9 bytes)."""
+        return self.peak_bytes / GB
+
+    def __str__(self) -> str:
+        return f"at most about {self.peak_gb:.1f} GB, in {self.stage}"
+
+
+def estimate_memory(
+    config: PipelineConfig,
+    size: FrameSize,
+    *,
+    threads: int = 2,
+    until: StageName = "report",
+    leave_out: Collection[str] = (),
+) -> MemoryEstimate:
+    """Peak resident memory of a run, stage by stage.
+
+    Restorers other than `embedded` and `classical` bring the memory of their own models, which is not
+    counted, and neither is what several sequences or workers at once add.
+
+    Args:
+        config: settings of all stages.
+        size: of the sequence.
+        threads: that work at the same time.
+        until: last stage.
+        leave_out: stages that the method leaves out.
+    """
+    pixels = size.width * size.height
+    share = min(1.0, config.enhance.working_width(size.width) / size.width)
+    working = round(pixels * share**2)
+    train, all_frames = size.training_frames, size.frames
+    source = pixels if size.source_pixels is None else size.source_pixels
+    explored = "explore" not in leave_out and "enhance" not in leave_out
+    views = config.enhance.max_views if explored else 0
+    harmonics = ((config.coarse.sh_degree + 1) ** 2 + 15) / 31
+    coarse_gaussians = max(config.coarse.max_points, config.coarse.densify.max_gaussians)
+    gaussian = GAUSSIAN * min(1.0, harmonics)
+    held = PROCESS + SEQUENCE * train * pixels
+    steps = TRAINING_VIEW * train * pixels + STEP * pixels
+    batch_views = min(views, config.enhance.clips_per_batch * (config.explore.length + 1))
+    network = NETWORK * threads * working if config.enhance.backend == "embedded" else 0
+    references = REFERENCE * train * working
+    small = round(pixels * min(1.0, SURFACE_WIDTH / size.width) ** 2)
+    metrics = METRICS * max(pixels, min(PIXELS_MEASURED_AT_ONCE, pixels * max(1, all_frames - train)))
+    whole = PROCESS + SEQUENCE * all_frames * pixels
+    rendered = RENDERED_VIEW * max(0, all_frames - train) * pixels
+    found: dict[StageName, float] = {
+        "ingest": PROCESS + SEQUENCE * all_frames * pixels + DECODED * source,
+        "poses": whole,
+        "depth": held + TRAINING_VIEW * train * pixels,
+        "coarse": held + steps + gaussian * coarse_gaussians,
+        "surface": held + 40 * train * small,
+        "explore": held + 8 * train * small,
+        "enhance": held
+        + max(
+            # The judge of the restorer runs the network beside the pairs.
+            PAIR * train * working + network,
+            references + CLIP * batch_views * working + network,
+            PSEUDO_VIEW * views * working,
+        ),
+        "finetune": held
+        + steps
+        + gaussian * config.finetune.growth * coarse_gaussians
+        + PSEUDO_VIEW * views * working,
+        "evaluate": whole + rendered + metrics,
+        "report": whole + 2 * rendered,
+    }
+    wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in leave_out]
+    return MemoryEstimate({stage: round(found[stage]) for stage in wanted if stage in found})
+
+
+def fitting_settings(
+    config: PipelineConfig,
+    size: FrameSize,
+    limit_gb: float,
+    *,
+    threads: int = 2,
+    until: StageName = "report",
+    leave_out: Collection[str] = (),
+) -> dict[str, int] | None:
+    """Settings that bring a run below a limit, those that cost least quality first.
+
+    Tried are, one after the other and together with those before: virtual views of smaller size
+    (`enhance.max_width`), fewer of them (`enhance.max_views`), smaller frames (`ingest.width`).
+
+    Args:
+        config: settings of all stages.
+        size: of the sequence.
+        limit_gb: in GB (1e9 bytes).
+        threads: as `estimate_memory`.
+        until: as `estimate_memory`.
+        leave_out: as `estimate_memory`.
+
+    Returns:
+        Dotted names and values; empty where nothing has to change, None where nothing that is tried helps.
+    """
+    changed: dict[str, int] = {}
+
+    def fits(changes: dict[str, int]) -> bool:
+        share = changes.get("ingest.width", size.width) / size.width
+        smaller = replace(size, width=round(size.width * share), height=round(size.height * share))
+        settings = config.with_overrides(changes)
+        estimate = estimate_memory(settings, smaller, threads=threads, until=until, leave_out=leave_out)
+        return estimate.peak_gb <= limit_gb
+
+    if fits(changed):
+        return changed
+    ways: dict[str, tuple[int, list[int]]] = {
+        "enhance.max_width": (config.enhance.working_width(size.width), [320, 240, 160]),
+        "enhance.max_views": (config.enhance.max_views, [160, 96, 48]),
+        "ingest.width": (size.width, [size.width * part // 4 for part in (3, 2, 1)]),
+    }
+    for name, (now, values) in ways.items():
+        for value in values:
+            if not SMALLEST_WIDTH <= value < now:
+                continue
+            changed[name] = value
+            if fits(changed):
+                # What was tried before may not be needed any more.
+                for earlier in list(changed):
+                    fewer = {other: kept for other, kept in changed.items() if other != earlier}
+                    changed = fewer if fits(fewer) else changed
+                return changed
+    return None

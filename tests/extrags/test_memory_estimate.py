@@ -1,0 +1,87 @@
+"""The estimate of a run's memory: against recorded peaks, in its growth, and in its advice."""
+
+from __future__ import annotations
+
+import pytest
+
+from extrags.config import PROFILES, profile_config
+from extrags.memory_estimate import FrameSize, estimate_memory, fitting_settings
+
+THUMBNAILS = FrameSize(60, 52, 225, 180)
+MANY = FrameSize(240, 210, 225, 180)
+FULL = FrameSize(40, 20, 675, 540)
+
+
+class TestEstimate:
+    @pytest.mark.parametrize(
+        ("profile", "size", "stage", "recorded_mib"),
+        [
+            ("quick", THUMBNAILS, "coarse", 735.7),
+            ("quick", THUMBNAILS, "enhance", 2196.4),
+            ("quick", THUMBNAILS, "finetune", 1401.0),
+            ("quick", MANY, "coarse", 1118.4),
+            ("quick", MANY, "enhance", 6153.8),
+            ("balanced", FULL, "coarse", 1138.5),
+            ("balanced", FULL, "enhance", 3613.5),
+            ("balanced", FULL, "finetune", 3997.1),
+        ],
+    )
+    def test_covers_recorded_peaks_without_exceeding_them_much(
+        self, profile: str, size: FrameSize, stage: str, recorded_mib: float
+    ) -> None:
+        """Of three runs on a path-traced colon, two threads each."""
+        found = estimate_memory(profile_config(profile), size)
+        assert 0.9 < found.by_stage[stage] / (recorded_mib * 2**20) < 1.4
+
+    @pytest.mark.parametrize("profile", sorted(PROFILES))
+    def test_grows_with_frames_pixels_and_budgets(self, profile: str) -> None:
+        config = profile_config(profile)
+        usual = estimate_memory(config, FULL).peak_bytes
+        for size in (FrameSize(60, 40, 675, 540), FrameSize(40, 20, 1350, 1080)):
+            assert estimate_memory(config, size).peak_bytes > usual
+        for name, value in (("enhance.max_width", None), ("enhance.max_views", 2000)):
+            assert estimate_memory(config.with_overrides({name: value}), FULL).peak_bytes > usual
+
+    def test_ends_with_the_last_stage_and_leaves_stages_out(self) -> None:
+        config = profile_config("balanced")
+        assert list(estimate_memory(config, FULL, until="coarse").by_stage)[-1] == "coarse"
+        whole = estimate_memory(config, FULL)
+        alone = estimate_memory(config, FULL, leave_out=("explore", "enhance"))
+        assert "enhance" not in alone.by_stage
+        assert alone.by_stage["finetune"] < whole.by_stage["finetune"]
+
+    def test_names_the_stage_that_needs_most(self) -> None:
+        found = estimate_memory(profile_config("quick"), FrameSize(240, 210, 225, 180))
+        assert found.stage == "enhance"
+        assert f"{found.peak_gb:.1f} GB, in enhance" in str(found)
+
+
+class TestFittingSettings:
+    def test_nothing_changes_where_it_fits(self) -> None:
+        assert fitting_settings(profile_config("quick"), THUMBNAILS, 1000.0) == {}
+
+    @pytest.mark.parametrize("share", [0.9, 0.75, 0.5])
+    def test_what_it_names_fits_and_none_of_it_is_superfluous(self, share: float) -> None:
+        config = profile_config("balanced")
+        limit = share * estimate_memory(config, FULL).peak_gb
+
+        def peak(changes: dict[str, int]) -> float:
+            width = changes.get("ingest.width", FULL.width)
+            size = FrameSize(
+                FULL.frames, FULL.training_frames, width, round(FULL.height * width / FULL.width)
+            )
+            return estimate_memory(config.with_overrides(changes), size).peak_gb
+
+        found = fitting_settings(config, FULL, limit)
+        assert found
+        assert peak(found) <= limit
+        for name in found:
+            assert peak({other: value for other, value in found.items() if other != name}) > limit
+
+    def test_smaller_virtual_views_come_before_smaller_frames(self) -> None:
+        config = profile_config("balanced").with_overrides({"enhance.max_width": None})
+        found = fitting_settings(config, FULL, 0.9 * estimate_memory(config, FULL).peak_gb)
+        assert found == {"enhance.max_width": 320}
+
+    def test_none_where_the_process_alone_takes_more(self) -> None:
+        assert fitting_settings(profile_config("quick"), THUMBNAILS, 0.1) is None

@@ -1,0 +1,43 @@
+"""Memory limits of runs: said before the reconstruction begins, with settings that fit."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pytest
+
+from extrags.config import profile_config
+from extrags.errors import ConfigError
+from flows.memory_limit import check_memory
+from flows.runners import DirectRunner
+from flows.wiring import run_sequence
+from tests.flows.tiny import SEQUENCE, tiny_config
+
+COUNTS = {"frames": 40, "train": 20, "width": 675, "height": 540}
+
+
+def test_the_estimate_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO, logger="flows.memory_limit"):
+        check_memory("a/b", profile_config("balanced"), COUNTS, None, "report", ())
+    assert "a/b: 40 frames of 675 x 540 px take at most about" in caplog.text
+
+
+def test_a_run_over_the_limit_is_refused_with_settings_that_fit() -> None:
+    config = profile_config("balanced").with_overrides({"enhance.max_width": None})
+    with pytest.raises(
+        ConfigError, match=r"more than the limit of 6 GB; it fits with --enhance\.max_width 320"
+    ):
+        check_memory("a/b", config, COUNTS, 6.0, "report", ())
+    with pytest.raises(ConfigError, match="no smaller frames or fewer virtual views were found"):
+        check_memory("a/b", config, COUNTS, 0.1, "report", ())
+
+
+def test_nothing_but_ingest_is_made_of_a_refused_sequence(tmp_path: Path) -> None:
+    store = str(tmp_path)
+    outcome = run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), memory_limit_gb=0.1)
+    assert outcome.status == "failed"
+    assert isinstance(outcome.error, ConfigError)
+    assert outcome.stages[0].stage == "ingest"
+    assert outcome.stages[0].state == "failed"
+    assert {row.state for row in outcome.stages[1:]} == {"skipped"}
