@@ -108,8 +108,14 @@ def duration_text(seconds: float) -> str:
 def rate_text(steps_per_second: float) -> str:
     """How fast a loop goes: `12.5/s`, or the time of a step where that is longer than a second."""
     if steps_per_second < 1:
-        return f"{duration_text(1 / steps_per_second)} each"
+        seconds = 1 / steps_per_second
+        return f"{seconds:.2g} s each" if seconds < 10 else f"{duration_text(seconds)} each"
     return f"{steps_per_second:.0f}/s" if steps_per_second >= 100 else f"{steps_per_second:.3g}/s"
+
+
+def _value_text(value: float) -> str:
+    """Counts as they are, measured values with four digits."""
+    return f"{value:.0f}" if float(value).is_integer() and abs(value) < 1e9 else f"{value:.4g}"
 
 
 class Pace:
@@ -179,9 +185,9 @@ class ProgressLog:
             return f"{place} starts"
         if progress.stage in IN_PARALLEL:
             return None
-        parts = [progress.detail] if progress.detail else []
+        parts = []
         if progress.total:
-            parts.insert(0, f"{progress.done} of {progress.total}")
+            parts.append(f"{progress.done} of {progress.total}")
             rate = self._pace.rate(progress, now)
             if rate is not None:
                 parts.append(rate_text(rate))
@@ -192,7 +198,8 @@ class ProgressLog:
         if now < self._quiet_until.setdefault(progress.label, now + LOG_EVERY_SECONDS):
             return None
         self._quiet_until[progress.label] = now + LOG_EVERY_SECONDS
-        return f"{place} {', '.join(parts)}"
+        said = [", ".join(words) for words in (parts, progress.detail.split("  ")) if any(words)]
+        return f"{place} {'; '.join(said)}"
 
 
 _log_of_the_process = ProgressLog()
@@ -223,10 +230,10 @@ def reporting(label: str, stage: str, time_limit_s: float | None = None) -> Iter
                 f"{stage} of {label} took {taken_s:.1f} s; a stage may take {time_limit_s:g} s (time_limit_s)"
             )
         if isinstance(event, Progress):
-            detail = "  ".join(f"{name} {value:.4g}" for name, value in event.values.items())
+            detail = "  ".join(f"{name} {_value_text(value)}" for name, value in event.values.items())
             notify(StageProgress(label, stage, "running", event.done, event.total, detail))
         elif isinstance(event, MetricRecorded):
-            notify(StageProgress(label, stage, "running", detail=f"{event.name} {event.value:.4g}"))
+            notify(StageProgress(label, stage, "running", detail=f"{event.name} {_value_text(event.value)}"))
 
     with subscribed(receive):
         yield

@@ -69,7 +69,7 @@ class TestLog:
         clock.now += LOG_EVERY_SECONDS
         write(step("coarse", 600, 1000, "loss 0.1"))
         write(step("coarse", 601, 1000, "loss 0.1"))
-        assert caplog.messages[1:] == ["scene coarse: 600 of 1000, loss 0.1, 20/s, about 20 s left"]
+        assert caplog.messages[1:] == ["scene coarse: 600 of 1000, 20/s, about 20 s left; loss 0.1"]
 
     def test_many_branches_of_a_search_are_no_lines(self, caplog: pytest.LogCaptureFixture) -> None:
         caplog.set_level(logging.INFO, logger="extrags.progress")
@@ -108,8 +108,8 @@ class TestLog:
 def test_events_of_a_stage_reach_the_observer() -> None:
     seen: list[StageProgress] = []
     with observed(seen.append), reporting("scene", "coarse"):
-        emit(Progress("coarse", 3, 9, {"loss": 0.25}))
-    assert seen == [step("coarse", 3, 9, "loss 0.25")]
+        emit(Progress("coarse", 3, 9, {"loss": 0.25, "n_gaussians": 13980}))
+    assert seen == [step("coarse", 3, 9, "loss 0.25  n_gaussians 13980")]
 
 
 class TestPace:
@@ -141,3 +141,4 @@ def test_words_for_times_and_rates() -> None:
     assert rate_text(431.2) == "431/s"
     assert rate_text(12.54) == "12.5/s"
     assert rate_text(0.2) == "5 s each"
+    assert rate_text(0.7) == "1.4 s each"
