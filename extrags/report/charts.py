@@ -261,8 +261,16 @@ def sequences_chart(
         left.grid(axis="x")
         left.set_title("PSNR on held-out views (dB)")
         left.legend(ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.1, handletextpad=0.1)
-        right.scatter(seconds, final, s=22, color=FINAL_COLOR)
-        right.set_title("Final PSNR (dB) by run time")
+        has_final = np.isfinite(final)
+        if has_final.any():
+            right.scatter(seconds[has_final], final[has_final], s=22, color=FINAL_COLOR)
+        if not has_final.all():
+            # Nothing was fine-tuned there.
+            alone = ~has_final
+            right.scatter(
+                seconds[alone], coarse[alone], s=18, facecolor="white", edgecolor=COARSE_COLOR, linewidth=1.4
+            )
+        right.set_title("PSNR (dB) by run time")
         right.set_xlabel("seconds")
         right.set_xlim(left=0)
         chart = svg_image(figure)

@@ -34,7 +34,8 @@ def untouched_environment() -> Iterator[None]:
 def store(finished: tuple[str, SequenceOutcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
     """Two runs on record that differ in a setting, and one that failed."""
     root = tmp_path_factory.mktemp("recorded") / "store"
-    shutil.copytree(finished[0], root)
+    # Without the records that other tests have left there.
+    shutil.copytree(finished[0], root, ignore=shutil.ignore_patterns("records"))
     found = Store(str(root))
     for views in (1, 2):
         config = tiny_config(report__held_out_views=views)
