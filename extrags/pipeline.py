@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from extrags.exploration import Exploration
     from extrags.finetuning_judge import Judgement
     from extrags.freespace import FreeSpace
+    from extrags.metrics.lpips import LpipsByNet
     from extrags.metrics.protocol import EvaluationResult, RenderedViews
     from extrags.metrics.surface import TrueSurface
     from extrags.pseudo_views import PseudoViews
@@ -296,8 +297,9 @@ class Result:
         pseudo_views: restored virtual views.
         judgement: how much of the fine-tuning is kept, and why.
         finetuning: the fine-tuned scene and its training history; None where the coarse scene is kept.
-        renders: held-out views of `coarse` and, if it was fine-tuned, of `final`.
-        evaluations: metrics of `coarse` and `final`; without fine-tuning both are the coarse scene's.
+        renders: held-out views of `coarse` and, if it was fine-tuned, of `final`; `restored` are those of the
+            final scene restored in the image, where there is a restorer (`evaluate.restored`).
+        evaluations: metrics of the same; without fine-tuning `final` are the coarse scene's.
         skipped: why stages were skipped, by name.
         seconds: wall-clock time by stage.
     """
@@ -551,8 +553,27 @@ class InMemoryPipeline(Pipeline):
                     true_surface=self.true_surface,
                     lpips=lpips,
                 )
+            self._evaluate_restored(lpips)
         # Where nothing was fine-tuned, the coarse scene is the final one.
         self.result.evaluations.setdefault("final", self.result.evaluations["coarse"])
+
+    def _evaluate_restored(self, lpips: LpipsByNet) -> None:
+        """The final scene's views once more, restored (`evaluate.restored`)."""
+        from extrags.evaluation import evaluate_renders
+        from extrags.restoration.restored_renders import restored_renders
+
+        if self._enhancer is None or self.config.evaluate.restored == "none":
+            return
+        views = self.result.renders["restored"] = restored_renders(
+            self.result.coarse,
+            self.result.renders.get("final", self.result.renders["coarse"]),
+            self.result.sequence,
+            self._training,
+            self._enhancer,
+            self.config.enhance,
+            textured=self.config.evaluate.restored == "textured",
+        )
+        self.result.evaluations["restored"] = evaluate_renders(views, self.result.sequence, lpips=lpips)
 
     def report(self) -> None:
         """Nothing: the HTML report is built from artefacts, which a run in memory does not have."""

@@ -36,6 +36,13 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
             counts,
             *(_change(name, coarse.get(name), final.get(name)) for name in columns),
         )
+        if restored := outcome.metrics.get("restored"):
+            table.add_row(
+                "[dim]  restored in the image[/]",
+                "",
+                "",
+                *(_change(name, final.get(name), restored.get(name)) for name in columns),
+            )
     out.print(table)
     print_failures(run)
     for outcome in run.sequences:

@@ -239,6 +239,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "enhance.reference": "nearest",
         "enhance.iou": "reference",
         "enhance.keyframes": 0,
+        "enhance.max_width": None,
         "enhance.pixel_confidence": "raw",
         "finetune.loss": "paper",
         # With these two the colour terms are L1 + (1 - SSIM).
@@ -255,6 +256,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "finetune.confidence_floor": 0.0,
         "finetune.image_confidence": True,
         "finetune.judge.enabled": False,
+        "evaluate.restored": "none",
     }
 
 

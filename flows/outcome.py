@@ -37,14 +37,16 @@ Part = Literal[
     "finetune",
     "renders_coarse",
     "renders_final",
+    "renders_restored",
     "metrics_coarse",
     "metrics_final",
+    "metrics_restored",
     "report",
 ]
 """Artefacts of a run. `sequence` has all frames with the latest poses, `depth` the estimated depth of the
 training frames, `training` the training frames alone, with that depth where it was estimated,
 `waves` the state of the exploration, `restorer` the restorer prepared for this scene, `judgement` how much of
-the fine-tuning is kept."""
+the fine-tuning is kept; what is `restored` are the final scene's held-out views, restored in the image."""
 
 StageState = Literal["ran", "cached", "skipped", "failed", "interrupted"]
 """How a stage ended. An interrupted one is announced, never returned: the run ends with it."""
@@ -97,7 +99,8 @@ class SequenceOutcome:
     status: Literal["ok", "failed"] = "ok"
     stages: list[StageRow] = field(default_factory=list)
     metrics: dict[str, Any] = field(default_factory=lambda: {"coarse": None, "final": None})
-    """`{coarse: M, final: M}`; without fine-tuning `final` is the coarse scene's M."""
+    """`{coarse: M, final: M}`; without fine-tuning `final` is the coarse scene's M. With a restorer also
+    `restored`: M of the final scene's views, restored in the image."""
     seconds: float = 0.0
     report: str | None = None
     """Where `report.html` stands."""

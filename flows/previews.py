@@ -158,7 +158,12 @@ def _evaluated(refs: Mapping[Any, Ref], store: Store, tile_px: int) -> tuple[np.
     view = len(held_out) // 2
     frame = int(held_out[view])
     shown, words = [_tile(as_uint8(_array(frames["rgb"][frame])), tile_px)], ["recorded"]
-    for part, word in (("renders_coarse", "coarse scene"), ("renders_final", "final scene")):
+    scenes = {
+        "renders_coarse": "coarse scene",
+        "renders_final": "final scene",
+        "renders_restored": "the same, restored",
+    }
+    for part, word in scenes.items():
         if part in refs:
             renders = _group(store.open(refs[part]) / RenderedViews.stored_as)
             shown.append(_tile(as_uint8(_array(renders["rgb"][view])), tile_px))

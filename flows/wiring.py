@@ -35,6 +35,8 @@ from tasks.enhance import (
 )
 from tasks.enhance import keyed_settings as keyed_enhance_settings
 from tasks.evaluate import METRICS_FILE, measure, render
+from tasks.evaluate import restore as restore_renders
+from tasks.evaluate import restoring_settings as renders_settings
 from tasks.explore import branch, explore, merge, next_anchors, start
 from tasks.finetune import finetune, finetuning_settings, judge
 from tasks.freespace import freespace
@@ -382,21 +384,43 @@ class SequenceRun(Pipeline):
                 shown = {"sequence": sequence, "train_on": self.config.coarse.train_on}
                 calls = [Call(render, {"scene": ref, **shown}) for ref in scenes]
             renders = self._run_tasks(row, calls)
+            restored = self._restored_renders(row, renders[-1])
             weights = self._weights()
             settings = {
                 "lpips_digests": {item.net: item.digest for item in weights},
                 "weights": weights,
                 "added": added_metrics(),
             }
+            measured = renders + ([] if restored is None else [restored])
             figures = self._run_tasks(
-                row, [Call(measure, {"renders": ref, "sequence": sequence, **settings}) for ref in renders]
+                row, [Call(measure, {"renders": ref, "sequence": sequence, **settings}) for ref in measured]
             )
             self.refs["renders_coarse"], self.refs["metrics_coarse"] = renders[0], figures[0]
             if "finetune" in self.refs:
                 self.refs["renders_final"], self.refs["metrics_final"] = renders[1], figures[1]
             # Where nothing was fine-tuned, the coarse scene is the final one.
-            for which, ref in (("coarse", figures[0]), ("final", figures[-1])):
+            measurements = {"coarse": figures[0], "final": figures[len(renders) - 1]}
+            if restored is not None:
+                self.refs["renders_restored"] = restored
+                self.refs["metrics_restored"] = measurements["restored"] = figures[-1]
+            for which, ref in measurements.items():
                 self.outcome.metrics[which] = self.store.load_json(METRICS_FILE, ref)["metrics"]
+
+    def _restored_renders(self, row: StageRow, renders: Ref) -> Ref | None:
+        """The final scene's held-out views, restored; None without a restorer."""
+        kind = self.config.evaluate.restored
+        if kind == "none" or "restorer" not in self.refs:
+            return None
+        inputs = {
+            **self._scene_inputs(),
+            "renders": renders,
+            "sequence": self.refs["sequence"],
+            "training": self.refs["training"],
+            "restorer": self.refs["restorer"],
+            "config": renders_settings(self.config.enhance),
+            "textured": kind == "textured",
+        }
+        return self._run_task(row, Call(restore_renders, inputs))
 
     def report(self) -> None:
         """The page, from what the other stages made."""

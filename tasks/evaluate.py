@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import Literal
 
-from extrags.config import LpipsNet
+from extrags.config import EnhanceConfig, LpipsNet
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Ref, Slot
 from extrags.zarr_io import group_exists
+from tasks.enhance import RESTORER
 from tasks.stage import stage
 from tasks.weights import Weights, lpips_by_net
 
-__all__ = ["METRICS_FILE", "measure", "render"]
+__all__ = ["METRICS_FILE", "measure", "render", "restore", "restoring_settings"]
 
 METRICS_FILE = "metrics.json"
 """`EvaluationResult.to_json()`, per-view figures included."""
@@ -39,6 +40,53 @@ def render(slot: Slot, scene: Ref, sequence: Ref, train_on: Literal["train", "al
     if mesh is not None:
         slot.save(mesh)
     slot.counts["triangles"] = 0 if mesh is None else len(mesh.triangles)
+
+
+def restoring_settings(config: EnhanceConfig) -> EnhanceConfig:
+    """The settings that `restore` reads, all others at their defaults: the restorer stands for these."""
+    return EnhanceConfig(references=config.references, seed=config.seed)
+
+
+@stage("evaluate-restore", version=1)
+def restore(
+    slot: Slot,
+    renders: Ref,
+    scene: Ref,
+    sequence: Ref,
+    training: Ref,
+    restorer: Ref,
+    config: EnhanceConfig,
+    textured: bool,
+) -> None:
+    """Restore rendered held-out views in the image; writes `renders/`.
+
+    Args:
+        slot: the artefact to write.
+        renders: of the final scene.
+        scene: the coarse scene, which the restorer was made for.
+        sequence: all frames.
+        training: the training frames alone, with estimated depth where there is no other.
+        restorer: of the scene.
+        config: from `restoring_settings`.
+        textured: see `extrags.restoration.restored_renders.restored_renders`.
+    """
+    from extrags.metrics.protocol import RenderedViews
+    from extrags.restoration.backends import load_enhancer
+    from extrags.restoration.restored_renders import restored_renders
+    from extrags.scene import Scene
+    from extrags.sequence import EndoscopicSequence
+
+    views = restored_renders(
+        slot.load(Scene, scene),
+        slot.load(RenderedViews, renders),
+        slot.load(EndoscopicSequence, sequence),
+        slot.load(EndoscopicSequence, training),
+        load_enhancer(slot.open(restorer) / RESTORER),
+        config,
+        textured=textured,
+    )
+    slot.save(views)
+    slot.counts["views"] = len(views)
 
 
 # Metrics are a separate stage, so that a new version of the protocol does not repeat the rendering.

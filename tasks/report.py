@@ -34,8 +34,10 @@ ReportPart = Literal[
     "finetune",
     "renders_coarse",
     "renders_final",
+    "renders_restored",
     "metrics_coarse",
     "metrics_final",
+    "metrics_restored",
 ]
 REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 """What a page shows of a run, by the names of `flows.outcome.Part`; all but `sequence` may be missing."""
@@ -43,7 +45,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=9, ignore=("rows",))
+@stage("report", version=10, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
@@ -90,8 +92,10 @@ def report(
         sequence=sequence,
         coarse=part(RenderedViews, "renders_coarse"),
         final=part(RenderedViews, "renders_final"),
+        restored=part(RenderedViews, "renders_restored"),
         coarse_metrics=figures("metrics_coarse", METRICS_FILE),
         final_metrics=figures("metrics_final", METRICS_FILE),
+        restored_metrics=figures("metrics_restored", METRICS_FILE),
         depth=part(DepthEstimate, "depth"),
         pseudo=pseudo,
         virtual_cameras=None if pseudo is None else pseudo.cameras,

@@ -215,6 +215,12 @@ class EvaluateConfig(StageConfig):
         description="npz file with LPIPS weights, or the folder that holds one for each backbone; None looks "
         "in the usual places",
     )
+    restored: Literal["none", "smooth", "textured"] = Field(
+        "textured",
+        description="held-out views of the final scene are also measured after restoration in the image. "
+        "textured: what is invented gets texture of the scene's own frames, which looks right and costs some "
+        "PSNR; smooth: without it; none: not measured",
+    )
 
     @field_validator("lpips_nets")
     @classmethod

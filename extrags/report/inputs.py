@@ -153,9 +153,11 @@ class ReportInputs:
         held_out: frames that were rendered, in that order; None means the test split.
         coarse: held-out views rendered from the coarse scene.
         final: the same from the fine-tuned scene.
+        restored: the final scene's views, restored in the image.
         coarse_metrics: `EvaluationResult.to_json()` of the coarse scene: `metrics`, `per_view`,
             `reasons`, `protocol`.
         final_metrics: the same of the fine-tuned scene.
+        restored_metrics: the same of its views restored in the image.
         depth: depth of the training frames that was estimated from images.
         pseudo: virtual views before and after restoration.
         virtual_cameras: of `pseudo`, in its order.
@@ -185,8 +187,10 @@ class ReportInputs:
     held_out: Int[np.ndarray, "t"] | None = None
     coarse: RendersLike | None = None
     final: RendersLike | None = None
+    restored: RendersLike | None = None
     coarse_metrics: Mapping[str, Any] | None = None
     final_metrics: Mapping[str, Any] | None = None
+    restored_metrics: Mapping[str, Any] | None = None
     depth: DepthLike | None = None
     pseudo: PseudoLike | None = None
     virtual_cameras: Cameras | None = None
@@ -208,7 +212,11 @@ class ReportInputs:
     def __post_init__(self) -> None:
         frames = self.frames
         expected = (len(frames), self.sequence.height, self.sequence.width, 3)
-        for name, renders in (("coarse", self.coarse), ("final", self.final)):
+        for name, renders in (
+            ("coarse", self.coarse),
+            ("final", self.final),
+            ("restored", self.restored),
+        ):
             if renders is not None and renders.rgb.shape != expected:
                 raise ShapeError(
                     f"{self.name}: {name} renders have shape {renders.rgb.shape}, expected {expected} "
@@ -220,7 +228,11 @@ class ReportInputs:
                 f"{self.name}: estimated depth has shape {self.depth.depth.shape}, expected {shape} for "
                 f"{shape[0]} training frames"
             )
-        for name, metrics in (("coarse", self.coarse_metrics), ("final", self.final_metrics)):
+        for name, metrics in (
+            ("coarse", self.coarse_metrics),
+            ("final", self.final_metrics),
+            ("restored", self.restored_metrics),
+        ):
             if metrics is not None and len(metrics["per_view"]) != len(frames):
                 raise ShapeError(
                     f"{self.name}: {name} metrics hold {len(metrics['per_view'])} views, "

@@ -49,14 +49,16 @@ def summary(inputs: ReportInputs) -> str:
     text = f"{views} the final scene reaches {number(after, 2)} dB PSNR"
     if before is not None:
         text += f", {_against(before, after)} the coarse reconstruction"
+    restored = metric_of(metrics_of(inputs.restored_metrics), "psnr")
+    mended = "" if restored is None else f" Restored in the image, its views reach {number(restored, 2)} dB."
     unseen = metric_of(final, "unobserved", "psnr")
     if unseen is None:
-        return text + "."
+        return text + "." + mended
     text += f". On surface that no training frame saw it reaches {number(unseen, 2)} dB"
     unseen_before = metric_of(coarse, "unobserved", "psnr")
     if unseen_before is not None:
         text += f", {_against(unseen_before, unseen)} the coarse one"
-    return text + "."
+    return text + "." + mended
 
 
 def _against(before: float, after: float) -> str:
@@ -175,21 +177,28 @@ def unobserved_shares(inputs: ReportInputs) -> np.ndarray | None:
 def numbers_csv(inputs: ReportInputs) -> str:
     """All means over the held-out views as a `data:` URI: kind of pixels, exposure, metric, both scenes."""
     coarse, final = metrics_of(inputs.coarse_metrics), metrics_of(inputs.final_metrics)
+    trees = {"coarse": coarse, "final": final}
+    if inputs.restored_metrics is not None:
+        trees["restored"] = metrics_of(inputs.restored_metrics)
     rows: list[list[Cell]] = []
     for path, label in REGIONS:
         for alignment, kind in (((), "plain"), (("aligned",), "exposure-aligned")):
             for metric in shown_metrics(coarse, final):
-                values = [metric_of(tree, *path, *alignment, metric.key) for tree in (coarse, final)]
-                if values != [None, None]:
+                values = [metric_of(tree, *path, *alignment, metric.key) for tree in trees.values()]
+                if any(value is not None for value in values):
                     better = "higher" if metric.higher_is_better else "lower"
                     rows.append([label, kind, metric.key, metric.unit, better, *values])
-    return csv_uri(["pixels", "exposure", "metric", "unit", "better", "coarse", "final"], rows)
+    return csv_uri(["pixels", "exposure", "metric", "unit", "better", *trees], rows)
 
 
 def per_view_csv(inputs: ReportInputs) -> str:
     """Every figure of every held-out view as a `data:` URI, one line per view and scene."""
     rows: list[list[Cell]] = []
-    found = {"coarse": inputs.coarse_metrics, "final": inputs.final_metrics}
+    found = {
+        "coarse": inputs.coarse_metrics,
+        "final": inputs.final_metrics,
+        "restored": inputs.restored_metrics,
+    }
     flat = {
         scene: [_leaves(view) for view in result["per_view"]]
         for scene, result in found.items()

@@ -75,7 +75,10 @@ def depth_rows(inputs: ReportInputs, views: int, largest_bytes: int) -> ImageTab
     if not known.any():
         return None
     near, far = (float(depth) for depth in np.quantile(truth[known], [1 - SCALE_QUANTILE, SCALE_QUANTILE]))
-    depths = {kind: _surface_depth(renders, chosen) for kind, renders in _renders(inputs)}
+    # Restoration in the image leaves the depth as it is.
+    depths = {
+        kind: _surface_depth(renders, chosen) for kind, renders in _renders(inputs) if kind != "restored"
+    }
     errors = {
         kind: np.where(known & (depth > 0), np.abs(depth - truth) / np.where(known, truth, 1), np.nan)
         for kind, depth in depths.items()
@@ -169,7 +172,7 @@ def virtual_rows(
 
 def _renders(inputs: ReportInputs) -> list[tuple[str, RendersLike]]:
     """The scenes that were rendered, by name."""
-    pairs = (("coarse", inputs.coarse), ("final", inputs.final))
+    pairs = (("coarse", inputs.coarse), ("final", inputs.final), ("restored", inputs.restored))
     return [(kind, renders) for kind, renders in pairs if renders is not None]
 
 
@@ -183,7 +186,7 @@ def _view_note(inputs: ReportInputs, index: int) -> str:
     """PSNR and SSIM of a view, before and after."""
     views: list[Any] = [
         None if result is None else result["per_view"][index]
-        for result in (inputs.coarse_metrics, inputs.final_metrics)
+        for result in (inputs.coarse_metrics, inputs.final_metrics, inputs.restored_metrics)
     ]
     said = []
     for metric in shown_metrics(*views)[:2]:

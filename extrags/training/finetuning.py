@@ -37,8 +37,9 @@ KNOWN_BELOW = 0.5
 GUESSED_NEARER = 0.25
 """A new Gaussian this much nearer than another virtual view's completed depth stands in that view's way."""
 
-MAX_GUESS_DISTANCE = 0.5
-"""Farther from known surface, in median depths, completed depth is too wrong to place a Gaussian by."""
+MAX_GUESS_DISTANCE = 1.0
+"""In median depths. Farther from known surface completed depth says nothing; nearer, a wall at a third too
+short a distance is less wrong than none at all."""
 
 NEAREST_QUANTILE = 0.01
 """Of the depths of training frames: the nearest surface they show, without outliers."""

@@ -109,7 +109,8 @@ def test_the_paper_s_counts_with_its_own_profile() -> None:
     )
     # Every virtual view is restored.
     assert config.enhance.max_views >= config.explore.trajectories * (config.explore.length - 1)
-    assert config.ingest.downscale == 1
+    assert config.ingest.size == "central"
+    assert config.enhance.max_width is None
     assert (config.ingest.width, config.ingest.height) == (None, None)
     quick = method_config("paper", "quick")
     assert quick.finetune.iterations == method_config("extrags", "quick").finetune.iterations

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from extrags.config import EnhanceConfig
+from extrags.errors import ShapeError
+from extrags.evaluation import render
+from extrags.metrics.protocol import RenderedViews
+from extrags.restoration.benchmark.evaluation import AsRendered
+from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.protocol import Clip, Enhancer, Restoration
+from extrags.restoration.restored_renders import FINAL_SHARE, restored_renders
+from tests.extrags.lit_tube import Tube
+
+CONFIG = EnhanceConfig(references=4)
+
+
+@pytest.fixture(scope="module")
+def renders(tube: Tube) -> RenderedViews:
+    return render(tube.scene, tube.sequence)
+
+
+def restored(tube: Tube, renders: RenderedViews, enhancer: Enhancer) -> RenderedViews:
+    training = tube.sequence.training_part()
+    return restored_renders(tube.scene, renders, tube.sequence, training, enhancer, CONFIG, textured=False)
+
+
+class Unnamed(AsRendered):
+    """Blends and fills, but is not known to do no more than that."""
+
+    def restore(self, clip: Clip) -> Restoration:
+        return ClassicalEnhancer().restore(clip)
+
+
+class TestRestoredRenders:
+    def test_a_restorer_that_changes_nothing_leaves_the_mean_of_both_scenes(
+        self, tube: Tube, renders: RenderedViews
+    ) -> None:
+        """The restored view is the coarse scene's own, at the exposure of the protocol."""
+        bright = replace(renders, rgb=np.full_like(renders.rgb, 0.75), alpha=np.ones_like(renders.alpha))
+        mixed = restored(tube, bright, AsRendered())
+        expected = (1 - FINAL_SHARE) * renders.rgb.clip(0, 1) + FINAL_SHARE * 0.75
+        np.testing.assert_allclose(mixed.rgb, expected, atol=1e-5)
+
+    def test_the_final_scene_counts_only_where_it_has_a_surface(
+        self, tube: Tube, renders: RenderedViews
+    ) -> None:
+        empty = replace(renders, rgb=np.ones_like(renders.rgb), alpha=np.zeros_like(renders.alpha))
+        mixed = restored(tube, empty, AsRendered())
+        np.testing.assert_allclose(mixed.rgb, renders.rgb.clip(0, 1), atol=1e-5)
+
+    def test_blending_and_filling_leaves_what_is_known_as_it_was_rendered(
+        self, tube: Tube, renders: RenderedViews
+    ) -> None:
+        solid = replace(renders, alpha=np.ones_like(renders.alpha))
+        mixed = restored(tube, solid, ClassicalEnhancer())
+        rendered = renders.rgb.clip(0, 1)
+        changed = np.abs(mixed.rgb - rendered).max(axis=-1)
+        assert (changed < 1e-6).any()
+        anyhow = np.abs(restored(tube, solid, Unnamed()).rgb - rendered).max(axis=-1)
+        assert changed.mean() < 0.9 * anyhow.mean()
+        truth = tube.sequence.rgb[tube.sequence.test] / 255
+        assert np.square(mixed.rgb - truth).mean() < np.square(renders.rgb - truth).mean()
+
+    def test_geometry_stays_that_of_the_scene(self, tube: Tube, renders: RenderedViews) -> None:
+        mixed = restored(tube, renders, ClassicalEnhancer())
+        np.testing.assert_array_equal(mixed.depth_mm, renders.depth_mm)
+        np.testing.assert_array_equal(mixed.alpha, renders.alpha)
+        assert mixed.n_gaussians == renders.n_gaussians
+
+    def test_renders_of_other_frames_are_refused(self, tube: Tube, renders: RenderedViews) -> None:
+        one = RenderedViews(renders.rgb[:1], renders.alpha[:1], renders.depth_mm[:1], renders.n_gaussians)
+        with pytest.raises(ShapeError, match="1 renders of 2 held-out frames"):
+            restored(tube, one, ClassicalEnhancer())

@@ -1,0 +1,105 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from extrags.cameras import Cameras, pixel_rays
+from extrags.restoration.surface_texture import DARKNESS, MOST_DETAIL, SurfaceTexture
+from extrags.view_synthesis.references import LightTransfer, ReferenceViews
+
+WIDTH, HEIGHT, FOCAL_PX, DEPTH_MM = 120, 96, 100.0, 50.0
+PIXEL_MM = DEPTH_MM / FOCAL_PX
+
+
+def facing_plane(*shifts_mm: tuple[float, float]) -> Cameras:
+    """Cameras that look straight at a plane at `DEPTH_MM`."""
+    poses = np.tile(np.eye(4), (len(shifts_mm), 1, 1))
+    poses[:, :2, 3] = shifts_mm
+    K = np.array([[FOCAL_PX, 0, WIDTH / 2], [0, FOCAL_PX, HEIGHT / 2], [0, 0, 1]])
+    return Cameras(np.tile(K, (len(poses), 1, 1)), poses, WIDTH, HEIGHT)
+
+
+def plane_references(cameras: Cameras, *, contrast: float = 0.2, known: bool = True) -> ReferenceViews:
+    """A plane with stripes 3 mm wide, of a known relative contrast."""
+    points = cameras.centers[:, None, None] + DEPTH_MM * pixel_rays(cameras)
+    bright = 0.5 * (1 + contrast * np.sin(2 * np.pi * points[..., :1] / 3.0))
+    flat = np.ones_like(bright)
+    packed = np.concatenate([bright, bright, bright, flat, flat / DEPTH_MM, flat * known], axis=-1)
+    return ReferenceViews(
+        np.arange(len(cameras)),
+        cameras,
+        torch.from_numpy(packed.astype(np.float32)).permute(0, 3, 1, 2).contiguous(),
+        torch.ones(len(cameras)),
+        torch.zeros(len(cameras), 0, dtype=torch.bool),
+        LightTransfer(None, 0.0, DEPTH_MM),
+    )
+
+
+@pytest.fixture(scope="module")
+def noise() -> SurfaceTexture:
+    generator = torch.Generator().manual_seed(3)
+    tiles = torch.randn(40, 3, 32, 32, generator=generator) * 0.1
+    return SurfaceTexture(tiles - tiles.mean(dim=(2, 3), keepdim=True), PIXEL_MM)
+
+
+def detail(texture: SurfaceTexture, camera: Cameras) -> torch.Tensor:
+    depth = torch.full((HEIGHT, WIDTH), DEPTH_MM)
+    return texture.detail(camera, depth, torch.ones(HEIGHT, WIDTH, dtype=torch.bool))
+
+
+class TestTiles:
+    def test_they_hold_the_relative_contrast_of_the_frames(self) -> None:
+        texture = SurfaceTexture.of_references(plane_references(facing_plane((0, 0), (7, 3))))
+        assert texture is not None
+        assert texture.texel_mm == pytest.approx(PIXEL_MM, rel=1e-3)
+        torch.testing.assert_close(texture.tiles.mean(dim=(2, 3)), torch.zeros(len(texture.tiles), 3))
+        # A sine of relative amplitude 0.2, less what brightness gains by DARKNESS and a texel averages away.
+        averaged = np.sinc(PIXEL_MM / 3.0)
+        expected = 0.2 * 0.5 / (0.5 + DARKNESS) * averaged / np.sqrt(2)
+        assert float(texture.tiles.std()) == pytest.approx(expected, rel=0.1)
+        assert float(texture.tiles.abs().max()) <= 2 * MOST_DETAIL
+
+    def test_there_is_none_where_no_depth_is_known(self) -> None:
+        assert SurfaceTexture.of_references(plane_references(facing_plane((0, 0)), known=False)) is None
+
+    def test_there_is_none_in_the_dark(self) -> None:
+        references = plane_references(facing_plane((0, 0)))
+        references.packed[:, :3] *= 0.05
+        assert SurfaceTexture.of_references(references) is None
+
+
+class TestDetail:
+    def test_all_views_show_the_same_texture_at_the_same_place(self, noise: SurfaceTexture) -> None:
+        first = detail(noise, facing_plane((0, 0)))
+        second = detail(noise, facing_plane((10 * PIXEL_MM, 4 * PIXEL_MM)))
+        torch.testing.assert_close(second[:, :-4, :-10], first[:, 4:, 10:], rtol=0, atol=2e-4)
+
+    def test_overlapping_tiles_keep_their_variance(self, noise: SurfaceTexture) -> None:
+        shifts = [(float(x), 0.0) for x in range(0, 400, 57)]
+        laid = torch.stack([detail(noise, facing_plane(shift)) for shift in shifts])
+        # Sampling between texels averages up to four of them; on the lattice's own grid it does not.
+        aligned = laid.std() / noise.tiles.std()
+        assert 0.6 < float(aligned) < 1.05
+        assert abs(float(laid.mean())) < 0.02
+
+    def test_another_seed_lays_other_tiles(self, noise: SurfaceTexture) -> None:
+        other = SurfaceTexture(noise.tiles, noise.texel_mm, seed=1)
+        first, second = (detail(texture, facing_plane((0, 0))).flatten() for texture in (noise, other))
+        assert abs(float(torch.corrcoef(torch.stack([first, second]))[0, 1])) < 0.1
+
+    def test_far_walls_show_less_of_what_is_finer_than_a_pixel(self, noise: SurfaceTexture) -> None:
+        camera, wanted = facing_plane((0, 0)), torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+        far = noise.detail(camera, torch.full((HEIGHT, WIDTH), 4 * DEPTH_MM), wanted)
+        assert float(far.std()) < 0.4 * float(detail(noise, camera).std())
+
+    def test_only_what_is_invented_changes(self, noise: SurfaceTexture) -> None:
+        rgb = torch.full((1, 3, HEIGHT, WIDTH), 0.5)
+        unconfirmed = torch.zeros(1, HEIGHT, WIDTH)
+        unconfirmed[:, :, WIDTH // 2 :] = 1
+        depth = torch.full((1, HEIGHT, WIDTH), DEPTH_MM)
+        textured = noise.applied(rgb, facing_plane((0, 0)), depth, unconfirmed)
+        assert torch.equal(textured[..., : WIDTH // 2], rgb[..., : WIDTH // 2])
+        assert float(textured[..., WIDTH // 2 :].std()) > 0.01
+        assert float(textured.min()) >= 0
+        assert float(textured.max()) <= 1
