@@ -136,7 +136,7 @@ def test_the_log_has_it_without_a_terminal() -> None:
         ("ingest", 1, "as recorded"),
         ("coarse", 3, "recorded, coarse scene, final scene"),
         ("enhance", 2, "rendered, restored"),
-        ("evaluate", 3, "recorded, coarse scene, final scene"),
+        ("evaluate", 4, "recorded, coarse scene, final scene, the same, restored"),
     ],
 )
 def test_pictures_of_stages(

@@ -193,9 +193,9 @@ def test_pictures_and_report_are_on_the_page(finished: tuple[str, SequenceOutcom
     assert head in ("data:image/png", "data:image/jpeg")
     assert len(picture.data) <= 30_000
     width, height = Image.open(io.BytesIO(base64.b64decode(content))).size
-    # Three views of 48 x 40 pixels side by side.
-    assert (width, height) == (144, 40)
-    assert "recorded, coarse scene, final scene" in picture.description
+    # Four views of 48 x 40 pixels side by side.
+    assert (width, height) == (192, 40)
+    assert "recorded, coarse scene, final scene, the same, restored" in picture.description
     link: Any = Artifact.get(artifact_key("report", SEQUENCE))
     assert outcome.report is not None
     assert outcome.report in link.data
