@@ -26,6 +26,8 @@ VERBS = {
     "serve": "run the deployments on this machine, on demand and on schedule",
     "plan": "measure a scene and say which stages it needs, and why",
     "report": "build the page of a finished run again, from the store",
+    "compare": "hold finished runs of one sequence against each other, on a page",
+    "leaderboard": "sequences by methods, from the store's records, on a page that sorts and filters",
     "export": "write a reconstructed scene as Gaussians, mesh or video, or a sequence for COLMAP",
     "import": "take a scene that another program has made through the later stages",
     "data": "what sequences there are, and whether a source is right",
@@ -52,6 +54,7 @@ EXAMPLES = """examples:
   extrags plan phantom/0@sparse
   extrags evaluate phantom/0@sparse --renders my_renders/ --json -
   extrags benchmark phantom/0@sparse phantom/1@sparse --methods 3dgs,coarse --seeds 0,1,2
+  extrags compare phantom/0@sparse --methods 3dgs extrags
   extrags data check my_video.mp4 my_colmap_scene/
   extrags export phantom/0@sparse --to spz --out scene.spz
   extrags import theirs.ply --sequence their_colmap_folder/ --profile quick
@@ -116,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     root = parser(next((word for word in arguments if not word.startswith("-")), None))
-    given = root.parse_args(arguments, argparse.Namespace(debug=False))
+    given = root.parse_args(arguments, argparse.Namespace(debug=False, quiet=False))
     if given.version:
         from extrags import __version__
 

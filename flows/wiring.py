@@ -536,4 +536,5 @@ class SequenceRun(Pipeline):
 
     def _report_progress(self, row: StageRow, state: str, done: int = 0, total: int = 0) -> None:
         reason = row.reason if state in ("skipped", "failed") else ""
-        notify(StageProgress(self.outcome.name, row.stage, state, done, total, reason, row.seconds))
+        made = {} if state == "running" else {str(part): ref for part, ref in self.refs.items()}
+        notify(StageProgress(self.outcome.name, row.stage, state, done, total, reason, row.seconds, made))

@@ -141,7 +141,7 @@ def export(given: argparse.Namespace) -> int:
     """`extrags export`."""
     _check(given)
     if given.to in SEQUENCES:
-        set_up_logging(debug=given.debug, terminal=True)
+        set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
         return _sequence(given)
     from flows.commands.export_scene import export_scene
 

@@ -34,7 +34,7 @@ def export_scene(given: argparse.Namespace) -> int:
         StoreError: when the run is not in the store, or the file cannot be written.
     """
     terminal = sys.stderr.isatty()
-    set_up_logging(debug=given.debug, terminal=terminal)
+    set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
     config = run_config(given)
     if config.uc_nerf.enabled and given.to != "camera-path":
         raise ConfigError(f"the method {given.method} makes no Gaussians to write as {given.to}")
