@@ -287,4 +287,4 @@ def sample_depth(
     low, high = corners.min(axis=0), corners.max(axis=0)
     one_surface = (low > 0) & (high <= low * (1 + _FOLD_STEP))
     inverse = (weights / np.where(corners > 0, corners, 1)).sum(axis=0)
-    return np.asarray(np.where(one_surface, 1 / np.maximum(inverse, 1e-12), nearest))
+    return np.asarray(np.where(one_surface, 1 / np.where(one_surface, inverse, 1), nearest))

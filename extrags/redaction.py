@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+from functools import cache
 from typing import Any
 
 __all__ = ["HIDDEN", "CredentialFilter", "has_credentials", "without_credentials", "without_credentials_in"]
@@ -80,9 +81,12 @@ class CredentialFilter(logging.Filter):
 
 def _secret_values() -> list[str]:
     """The longest first: one may hold another."""
-    found = {
-        value
-        for name, value in os.environ.items()
-        if len(value) >= _SHORTEST and _SECRET_VARIABLE.search(name) and not os.path.exists(value)
-    }
+    values = {os.environ.get(name, "") for name in os.environ if _names_a_secret(name)}
+    found = [value for value in values if len(value) >= _SHORTEST and not os.path.exists(value)]
     return sorted(found, key=len, reverse=True)
+
+
+@cache
+def _names_a_secret(variable: str) -> bool:
+    # Asked for every variable at every text: of every setting, and of every line that is logged.
+    return _SECRET_VARIABLE.search(variable) is not None

@@ -19,7 +19,11 @@ from extrags.raster import CameraLight, Rendering, rasterize
 from extrags.store.storable import Storable
 from extrags.zarr_io import group_exists
 
-__all__ = ["Scene"]
+__all__ = ["NEAR", "Scene"]
+
+
+NEAR = 0.01
+"""Depth in world units up to which nothing is rendered; see `Scene.near`."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,15 @@ class Scene(Storable):
 
     gaussians: Gaussians
     light: NearFieldLight | None = None
+
+    @property
+    def near(self) -> float:
+        """z-depth, in world units, up to which nothing is rendered.
+
+        A hundredth of the light's reference distance where that is below one unit: the unit of a model from
+        structure from motion is arbitrary. A scene without light has no length of its own.
+        """
+        return NEAR if self.light is None else NEAR * min(1.0, self.light.reference_distance)
 
     def render(
         self,
@@ -102,7 +115,7 @@ class Scene(Storable):
             torch.from_numpy(cameras.K.astype(np.float32)),
             cameras.width,
             cameras.height,
-            **options,
+            **{"near": self.near, **options},
         )
 
     def _camera_light(self, count: int, exposure: Float[Tensor, "c"] | None) -> CameraLight | None:

@@ -151,6 +151,9 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         )
     voxel_mm = float(np.quantile(valid, 0.95)) * config.voxel_share
     far_mm = float(np.quantile(valid, config.depth_quantile))
+    if not (valid < far_mm).any():
+        # A wall that faces the camera has one depth, which is to be fused and not cut off.
+        far_mm = float(np.nextafter(np.float32(far_mm), np.float32(np.inf)))
 
     import open3d as o3d
     import open3d.core as o3c
@@ -175,7 +178,16 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         image = o3d.t.geometry.Image(o3c.Tensor(depth_mm[index].astype(np.float32, order="C")))
         intrinsic, extrinsic = o3c.Tensor(K[index]), o3c.Tensor(viewmats[index])
         view = (image, intrinsic, extrinsic, 1.0, far_mm, config.truncation_voxels)
-        grid.integrate(grid.compute_unique_block_coordinates(*view), *view)
+        try:
+            blocks = grid.compute_unique_block_coordinates(*view)
+        except RuntimeError as error:
+            # It looks at every fourth pixel; the depth of this view lies between them.
+            if "No block is touched" not in str(error):
+                raise
+            continue
+        grid.integrate(blocks, *view)
+    if grid.hashmap().size() == 0:
+        raise CaptureError(f"the depth of {len(cameras)} views holds no surface that could be fused")
     extracted = grid.extract_triangle_mesh(weight_threshold=0.5)
     if len(extracted.vertex.positions) == 0 or len(extracted.triangle.indices) == 0:
         raise CaptureError(f"the fused depth of {len(cameras)} views holds no surface")

@@ -28,7 +28,8 @@ VERBS = {
     "report": "build the page of a finished run again, from the store",
     "compare": "hold finished runs of one sequence against each other, on a page",
     "leaderboard": "sequences by methods, from the store's records, on a page that sorts and filters",
-    "export": "write a reconstructed scene as PLY, or a sequence as COLMAP model or transforms.json",
+    "export": "write a reconstructed scene as Gaussians, mesh or video, or a sequence for COLMAP",
+    "import": "take a scene that another program has made through the later stages",
     "data": "what sequences there are, and whether a source is right",
     "cache": "what is in the store",
     "reconcile": "set runs that a power loss left Running to Crashed",
@@ -39,6 +40,9 @@ VERBS = {
     "pretrain": "make the restorer's weights anew from procedural scenes",
 }
 """Each verb with what it does, in the order of the help."""
+
+MODULES = {"import": "import_scene"}
+"""Modules of verbs that are words of Python."""
 
 EXAMPLES = """examples:
   extrags run phantom/0@sparse --profile quick
@@ -52,6 +56,8 @@ EXAMPLES = """examples:
   extrags benchmark phantom/0@sparse phantom/1@sparse --methods 3dgs,coarse --seeds 0,1,2
   extrags compare phantom/0@sparse --methods 3dgs extrags
   extrags data check my_video.mp4 my_colmap_scene/
+  extrags export phantom/0@sparse --to spz --out scene.spz
+  extrags import theirs.ply --sequence their_colmap_folder/ --profile quick
   extrags export phantom/0@sparse --to colmap --out scene/
   extrags cache rm 'explore*'
 
@@ -73,7 +79,7 @@ def parser(verb: str | None = None) -> Parser:
     for name, summary in VERBS.items():
         made = verbs.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
         if name == verb:
-            import_module(f"flows.commands.{name}").add_arguments(made)
+            import_module(f"flows.commands.{MODULES.get(name, name)}").add_arguments(made)
     return root
 
 

@@ -116,7 +116,7 @@ def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=7, ignore=("given",))
+@stage("enhance-train", version=8, ignore=("given",))
 def train(
     slot: Slot,
     scene: Ref,
@@ -158,7 +158,7 @@ def train(
     train_enhancer(slot.load(Scene, scene), frames, config, coarse).save(slot.path / RESTORER)
 
 
-@stage("enhance-keyframes", version=1)
+@stage("enhance-keyframes", version=2)
 def keyframes(
     slot: Slot, scene: Ref, sequence: Ref, explore: Ref, restorer: Ref, config: EnhanceConfig
 ) -> None:
@@ -184,7 +184,7 @@ def keyframes(
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=6, ignore=("weights",))
+@stage("enhance-restore", version=7, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,

@@ -259,11 +259,14 @@ def posed_frames(sequence: EndoscopicSequence, device: torch.device | str = "cpu
     Raises:
         ShapeError: while the poses are unknown.
     """
+    poses = sequence.cameras.world_from_camera.copy()
+    # Only where frames stand to each other counts, and far from the origin float32 has no digits for that.
+    poses[:, :3, 3] -= poses[:, :3, 3].mean(axis=0)
     return PosedFrames(
         rgb=torch.from_numpy(sequence.rgb).to(device).permute(0, 3, 1, 2).float() / 255,
         mask=torch.from_numpy(sequence.mask.copy()).to(device),
         K=torch.from_numpy(sequence.K).float().to(device),
-        world_from_camera=torch.from_numpy(sequence.cameras.world_from_camera).float().to(device),
+        world_from_camera=torch.from_numpy(poses).float().to(device),
     )
 
 

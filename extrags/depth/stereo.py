@@ -17,6 +17,7 @@ from extrags.depth.frames import PosedFrames
 from extrags.depth.monocular import MonocularFit, aligned, fit_monocular
 from extrags.depth.prior import DepthPrior
 from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
+from extrags.errors import ShapeError
 
 __all__ = [
     "SECOND_SWEEP",
@@ -153,8 +154,14 @@ def multi_view_stereo(
         monocular: inverse depth of each frame up to scale and shift, from a network; None without one.
         chunk: frames at a time; None takes one on the processor, as many as fit on a GPU.
         told: called with the number of frames done, twice for each.
+
+    Raises:
+        ShapeError: for images of less than two pixels a side.
     """
     settings = StereoSettings() if settings is None else settings
+    if min(frames.size) < 2:
+        height, width = frames.size
+        raise ShapeError(f"images of {width}x{height} pixels are too small for stereo; expected 2x2 or more")
     device, n = frames.rgb.device, len(frames)
     recording = torch.zeros(n, dtype=torch.long, device=device) if recording is None else recording
     grey, brightness = frames.grey, smoothed_brightness(frames)

@@ -14,7 +14,7 @@ from extrags.cameras import Cameras
 from extrags.config import FreespaceConfig
 from extrags.events import Progress, emit
 from extrags.freespace.grid import rotated
-from extrags.scene import Scene
+from extrags.scene import NEAR, Scene
 
 __all__ = ["ViewDepths", "seen_through", "voxel_visibility"]
 
@@ -24,8 +24,6 @@ MEDIAN = 0.5
 """Transmittance behind the median depth is at most this, before it more."""
 REACH_PX = 32
 """Blocks whose image may be farther from its centre's are split without a test."""
-NEAR = 0.01
-"""Points nearer than this z-depth are not observed: the rasteriser's near plane."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +34,12 @@ class ViewDepths:
         cameras: the views at the size rendered.
         depth: median depth, infinite where the transmittance stays above one half, -1 where the ray ends on
             no surface, float32, [C, H, W].
+        near: points nearer than this z-depth are not observed: the near plane of the rendering.
     """
 
     cameras: Cameras
     depth: Float[np.ndarray, "c h w"]
+    near: float = NEAR
 
     @classmethod
     def rendered(cls, scene: Scene, cameras: Cameras, config: FreespaceConfig) -> ViewDepths:
@@ -53,7 +53,7 @@ class ViewDepths:
                 depth = np.where(median > 0, median, np.float32(np.inf))
                 parts.append(np.where(batch.alpha.numpy() >= config.min_alpha, depth, np.float32(-1)))
                 emit(Progress("freespace", min(start + VIEWS_PER_BATCH, len(cameras)), len(cameras)))
-        return cls(cameras, np.concatenate(parts).astype(np.float32))
+        return cls(cameras, np.concatenate(parts).astype(np.float32), scene.near)
 
     @property
     def unit_mm(self) -> float:
@@ -184,14 +184,14 @@ def _look(
         asked = np.flatnonzero((blocks.open & bit != 0) & (blocks.seeing < top_views))
         x, y, z = (rotated(centers[asked], viewmats[view, :3, :3]) + viewmats[view, :3, 3]).T
         nearest, farthest = z - radius, z + radius
-        tested = (nearest > NEAR) if edge > 1 else (z >= NEAR)
+        tested = (nearest > views.near) if edge > 1 else (z >= views.near)
         with np.errstate(divide="ignore", invalid="ignore"):
             K = views.cameras.K[view]
             u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
             slant = np.sqrt(1 + np.maximum((x / z) ** 2, (y / z) ** 2))
             reach = max(K[0, 0], K[1, 1]) * radius * slant / nearest
         tested &= reach <= REACH_PX
-        behind = farthest < NEAR
+        behind = farthest < views.near
         least, largest = np.full(len(asked), -1, np.float32), np.full(len(asked), -1, np.float32)
         for window, (low, high) in _bounds(views.depth[view], reach[tested].max(initial=0)):
             fits = tested & (reach <= window) & ((reach > window // 2) | (window == 0))

@@ -9,6 +9,7 @@ Metrics of a sequence are means over the views that have a value. Metrics withou
 
 from __future__ import annotations
 
+import itertools
 import logging
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -31,6 +32,7 @@ from extrags.metrics.registry import metrics as registered_metrics
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
 from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
+from extrags.threads import in_threads
 from extrags.zarr_io import group_exists, new_group, open_group, read_array, write_frames
 
 __all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
@@ -174,12 +176,16 @@ def evaluate_views(
     for net, network in ({} if lpips is None else lpips).items():
         if isinstance(network, str):
             logger.warning("%s: LPIPS with %s is not measured: %s", sequence.name, net, network)
-    per_view: list[dict[str, Any]] = []
     at_once = max(1, _PIXELS_AT_ONCE // (sequence.height * sequence.width))
-    for start in range(0, len(frames), at_once):
-        part = slice(start, start + at_once)
-        per_view += _evaluate_chunk(renders, sequence, frames, part, lpips)
-        emit(Progress("evaluate", len(per_view), len(frames)))
+    done = itertools.count(1)
+
+    def evaluated(start: int) -> list[dict[str, Any]]:
+        found = _evaluate_chunk(renders, sequence, frames, slice(start, start + at_once), lpips)
+        emit(Progress("evaluate", min(next(done) * at_once, len(frames)), len(frames)))
+        return found
+
+    # Each with one thread of torch: filters divided among several would add up in another order.
+    per_view = [view for part in in_threads(evaluated, range(0, len(frames), at_once)) for view in part]
     metrics = _mean_tree([{k: v for k, v in view.items() if k not in ("frame", "name")} for view in per_view])
     metrics["n_gaussians"] = renders.n_gaussians
     metrics["surface"] = _NO_SURFACE if surface is None else surface.to_json()

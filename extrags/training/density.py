@@ -216,7 +216,9 @@ class DefaultStrategy(DensityStrategy):
         noise = torch.randn(2 * len(scales), 3, generator=self._generator)
         offset = torch.einsum("nij,nj->ni", rotation_matrices(twice["quats"]), noise * scales.repeat(2, 1))
         twice["means"] = twice["means"] + offset
-        twice["scales"] = (scales.repeat(2, 1) / SPLIT_SHRINK).log()
+        # The thin axes of needles and pancakes may have no size left in float32, and zero has no logarithm.
+        smallest = torch.finfo(torch.float32).tiny
+        twice["scales"] = (scales.repeat(2, 1) / SPLIT_SHRINK).clamp_min(smallest).log()
         return twice
 
     def reset_statistics(self, n_gaussians: int) -> None:

@@ -12,7 +12,7 @@ from extrags.cameras import Cameras
 from extrags.config import CoarseConfig, DensifyConfig
 from extrags.errors import CaptureError
 from extrags.illumination import NearFieldLight
-from extrags.scene import Scene
+from extrags.scene import NEAR, Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training.footprint import SmallestFootprint
 from extrags.training.frame_weights import weighted_views
@@ -26,6 +26,9 @@ from extrags.training.views import epochs
 __all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent", "smallest_footprint"]
 
 logger = logging.getLogger(__name__)
+
+SHALLOWEST = 20 * NEAR
+"""Typical depth, in world units, below which the near plane would cut off parts of a scene without light."""
 
 
 def reconstruct(
@@ -45,7 +48,8 @@ def reconstruct(
         stage: named in progress events.
 
     Raises:
-        CaptureError: with fewer than one frame, or nothing to start from.
+        CaptureError: with fewer than one frame, nothing to start from, or a unit of length too large for a
+            scene without light.
         DivergedError: when the optimisation does not stay finite.
 
     Returns:
@@ -66,6 +70,11 @@ def reconstruct(
         raise CaptureError(f"{sequence.name}: no training frames")
     depth = median_depth(sequence, chosen)
     light = None
+    if not config.light.enabled and depth < SHALLOWEST:
+        raise CaptureError(
+            f"{sequence.name}: the typical depth is {depth:.3g} units, too small without light, as "
+            f"nothing nearer than {NEAR:g} is rendered; scale poses and depth up, or enable coarse.light"
+        )
     if config.light.enabled:
         light = NearFieldLight.initial(len(chosen), depth, config.light)
     gaussians = starting_gaussians(

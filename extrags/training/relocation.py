@@ -123,6 +123,8 @@ class MCMCStrategy(DensityStrategy):
         if more <= 0:
             return _unchanged(parameters)
         opacities = parameters["opacities"].detach().sigmoid()
+        if not bool((opacities > 0).any()):
+            return _unchanged(parameters)
         source = self._sampled(opacities, more)
         rows, values = self._shared_out(parameters, source)
         place = torch.searchsorted(rows, source)
@@ -154,9 +156,10 @@ class MCMCStrategy(DensityStrategy):
         opacities, scales = compute_relocation(
             values["opacities"].sigmoid(), values["scales"].exp(), times + 1
         )
-        eps = torch.finfo(torch.float32).eps
-        values["opacities"] = torch.logit(opacities.clamp(self._config.prune_opacity, 1 - eps))
-        values["scales"] = scales.log()
+        limits = torch.finfo(torch.float32)
+        values["opacities"] = torch.logit(opacities.clamp(self._config.prune_opacity, 1 - limits.eps))
+        # The thin axes of needles and pancakes may have no size left in float32, and zero has no logarithm.
+        values["scales"] = scales.clamp_min(limits.tiny).log()
         return rows, values
 
 

@@ -165,6 +165,7 @@ class NativeStep:
     """
 
     def __init__(self, scene: Scene, schedule: Schedule) -> None:
+        self._near = scene.near
         self._schedule = schedule
         self._sh_degree = scene.gaussians.sh_degree
         self.light_fit = None if scene.light is None else LightFit(scene.light, schedule.light)
@@ -199,6 +200,7 @@ class NativeStep:
             depth_weight=schedule.depth_weight_at(iteration),
             depth_scale=schedule.depth_scale,
             depth_huber_delta=schedule.depth_huber_delta,
+            near=self._near,
             pose=viewmat is not None,
         )
         if self.light_fit is not None:

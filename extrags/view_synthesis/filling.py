@@ -39,7 +39,8 @@ def push_pull(values: Float[Tensor, "n c h w"], weight: Float[Tensor, "n 1 h w"]
     padding = (0, width % 2, 0, height % 2)
     mass = functional.avg_pool2d(functional.pad(weight, padding), 2)
     total = functional.avg_pool2d(functional.pad(values * weight, padding), 2)
-    coarse = total / mass.clamp_min(1e-12)
+    # However faint a weight is, what it weighs keeps its value.
+    coarse = total / mass.clamp_min(torch.finfo(mass.dtype).tiny)
     # Four times the mean: one fully known pixel of four already fixes the coarser one.
     filled = push_pull(coarse, (4 * mass).clamp(0, 1))
     enlarged = functional.interpolate(filled, scale_factor=2, mode="bilinear", align_corners=False)

@@ -79,8 +79,19 @@ class _Seen:
 
 @dataclass(frozen=True)
 class _Surface:
-    """World points of a view's pixels with their normals, and how the lens sees them."""
+    """Points of a view's pixels with their normals, along the world's axes, and how the lens sees them.
 
+    Args:
+        center: of the lens, float64: points are relative to it, since far from the origin of the world
+            float32 has no digits for what is near.
+        points: [P, 3].
+        distance: from the lens.
+        direction: from it, unit.
+        axis_cosine: to the optical axis.
+        normal: unit.
+    """
+
+    center: Float[np.ndarray, "3"]
     points: Float[Tensor, "p 3"]
     distance: Float[Tensor, "p"]
     direction: Float[Tensor, "p 3"]
@@ -212,10 +223,9 @@ def _surface(camera: Cameras, depth_mm: Float[Tensor, "1 h w"], stride: int) -> 
     rays = torch.from_numpy(pixel_rays(camera)[0, offset::stride, offset::stride].astype(np.float32))
     offsets = (rays * depth_mm[0, offset::stride, offset::stride, None]).reshape(-1, 3)
     distance = offsets.norm(dim=-1).clamp_min(1e-9)
-    center = torch.from_numpy(camera.centers[0].astype(np.float32))
     cosine = 1 / rays.norm(dim=-1).reshape(-1)
     normal = depth_normals(_camera_rays(camera), depth_mm)[offset::stride, offset::stride].reshape(-1, 3)
-    return _Surface(center + offsets, distance, offsets / distance[:, None], cosine, normal)
+    return _Surface(camera.centers[0], offsets, distance, offsets / distance[:, None], cosine, normal)
 
 
 def depth_normals(rays: Float[Tensor, "h w 3"], depth_mm: Float[Tensor, "1 h w"]) -> Float[Tensor, "h w 3"]:
@@ -253,9 +263,11 @@ def _look_up(
     """Colour and trust of a surface in the chosen references."""
     points = surface.points
     index = chosen.numpy()
-    viewmats = references.viewmats[chosen]
+    rotation = references.viewmats[chosen, :3, :3]
+    centers = torch.from_numpy((references.cameras.centers[index] - surface.center).astype(np.float32))
     K = references.K[chosen]
-    local = torch.einsum("kij,pj->kpi", viewmats[:, :3, :3], points) + viewmats[:, None, :3, 3]
+    shift = torch.einsum("kij,kj->ki", rotation, centers)
+    local = torch.einsum("kij,pj->kpi", rotation, points) - shift[:, None]
     z = local[..., 2]
     in_front = z > 1e-6
     safe = torch.where(in_front, z, torch.ones(()))
@@ -275,7 +287,7 @@ def _look_up(
     agreement = torch.exp(-(difference / depth_tolerance).square())
     agreement = ((agreement - 0.05) / 0.95).clamp_min(0)
     weight = torch.where(in_front & known, agreement * sampled[:, 3], torch.zeros(()))
-    away = points - references.centers[chosen][:, None]
+    away = points - centers[:, None]
     seen_from = away.norm(dim=-1).clamp_min(1e-9)
     cosine = ((away / seen_from[..., None]) * surface.direction).sum(dim=-1).clamp(-1, 1)
     quality = torch.exp(

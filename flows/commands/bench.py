@@ -1,6 +1,6 @@
-"""`bench raster`, `bench train`, `bench stability`, `bench enhance`.
+"""`bench raster`, `bench train`, `bench enhance`.
 
-`bench explore`, `bench pipeline` and `bench compare` have modules of their own.
+`bench stability`, `bench explore`, `bench pipeline` and `bench compare` have modules of their own.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from typing import Any
 
 from extrags.errors import ConfigError
 from extrags.metrics.registry import figures
-from flows.commands import bench_compare, bench_explore, bench_pipeline
+from flows.commands import bench_compare, bench_explore, bench_pipeline, bench_stability
 from flows.commands.common import items, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_profile, add_settings, add_verb
 
-__all__ = ["add_arguments", "enhance", "raster", "stability", "train"]
+__all__ = ["add_arguments", "enhance", "raster", "train"]
 
 KERNEL_EXAMPLES = """examples:
   --size 160x128 --gaussians 10000
@@ -49,23 +49,16 @@ def add_arguments(parser: Parser) -> None:
         )
         _add_kernel_cases(made, with_error=with_error)
         add_json(made)
-    made = add_verb(
-        verbs,
-        "stability",
-        stability,
-        "numbers at the edges of what the rasteriser can be given",
-        description="Render and differentiate scenes at the edges of what float32 holds, and say what is not "
-        "finite or not what the float64 specification gives. Exit code 1 if a case fails.",
+    raw: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
+    summary = "every part at the edges of what it can be given"
+    bench_stability.add_arguments(
+        add_verb(
+            verbs, "stability", bench_stability.stability, summary, epilog=bench_stability.EXAMPLES, **raw
+        )
     )
-    made.add_argument("--axis", nargs="+", metavar="NAME", help="these axes only (default: all)")
-    made.add_argument(
-        "--threads", type=int, default=1, metavar="N", help="threads of the kernels (default: 1)"
-    )
-    add_json(made)
     _add_enhance(add_verb(verbs, "enhance", enhance, "restorers beside each other on held-out views"))
     summary = "ways to choose virtual views, against the true surface"
     bench_explore.add_arguments(add_verb(verbs, "explore", bench_explore.explore, summary))
-    raw: dict[str, Any] = {"formatter_class": argparse.RawDescriptionHelpFormatter}
     summary = "run time against error of whole runs, over methods and budgets"
     bench_pipeline.add_arguments(
         add_verb(verbs, "pipeline", bench_pipeline.pipeline, summary, epilog=bench_pipeline.EXAMPLES, **raw)
@@ -133,20 +126,6 @@ def raster(given: argparse.Namespace) -> int:
 def train(given: argparse.Namespace) -> int:
     """`extrags bench train`."""
     return _kernels(given, training=True)
-
-
-def stability(given: argparse.Namespace) -> int:
-    """`extrags bench stability`."""
-    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
-    _set_passive_openmp_wait()
-    from extrags.raster.stability import bench_stability
-
-    found = bench_stability(given.axis, threads=given.threads)
-    if given.json != "-":
-        names = ("axis", "value", "ok", "error", "note")
-        _print(names, [[case[name] for name in names] for case in found["cases"]])
-    write_json(found, given.json)
-    return 0 if all(case["ok"] for case in found["cases"]) else 1
 
 
 def enhance(given: argparse.Namespace) -> int:

@@ -116,3 +116,9 @@ def test_pinholes_are_told_from_lenses() -> None:
 def test_impossible_lenses(model, parameters, message) -> None:
     with pytest.raises(SourceError, match=message):
         Lens(model, parameters, 4, 4)
+
+
+@pytest.mark.parametrize("value", [1e-30, 2.0, 1e30])
+def test_a_constant_depth_stays_however_large(value) -> None:
+    where = np.array([-1e9, 0.0, 1.3, 1e9])
+    np.testing.assert_allclose(sample_depth(np.full((3, 4), value), where, where), value, rtol=1e-6)

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from extrags.cameras import Cameras
 from extrags.gaussians import Gaussians
+from extrags.illumination import NearFieldLight
 from extrags.raster import rasterize
 from extrags.scene import Scene
 
@@ -47,3 +50,18 @@ def test_an_attribute_of_one_gives_the_opacity() -> None:
     blended, alpha = scene.render_attributes(cameras, torch.ones(40, 1))
     torch.testing.assert_close(blended[..., 0], alpha)
     assert 0 < float(alpha.mean()) < 1
+
+
+def test_the_near_plane_follows_the_unit_of_length() -> None:
+    scene, cameras = _scene_and_cameras()
+    lit = replace(scene, light=NearFieldLight.initial(1, 1.0))
+    assert lit.near == scene.near == 0.01
+    unit = 1e-3
+    gaussians = scene.gaussians.detached()
+    small = replace(gaussians, means=gaussians.means * unit, scales=gaussians.scales + float(np.log(unit)))
+    poses = cameras.world_from_camera.copy()
+    poses[:, :3, 3] *= unit
+    found = Scene(small, NearFieldLight.initial(1, unit)).render(replace(cameras, world_from_camera=poses))
+    expected = lit.render(cameras)
+    assert float(expected.alpha.mean()) > 0.1
+    torch.testing.assert_close(found.rgb, expected.rgb, atol=1e-4, rtol=1e-4)

@@ -163,3 +163,21 @@ class TestMesh:
     def test_a_triangle_without_its_vertex_is_refused(self):
         with pytest.raises(ShapeError, match="but there are 2"):
             Mesh(np.zeros((2, 3), np.float32), np.array([[0, 1, 2]], np.int32))
+
+
+class TestUnusualDepth:
+    def test_a_wall_of_one_depth_is_fused(self):
+        K = np.array([[30.0, 0, 24], [0, 30.0, 20], [0, 0, 1]])[None]
+        wall = np.full((1, 40, 48), 2.0, np.float32)
+        mesh = fuse_depth(Cameras(K, np.eye(4)[None], 48, 40), wall, SurfaceConfig())
+        np.testing.assert_allclose(mesh.vertices[:, 2], 2.0, atol=1e-3)
+
+    def test_views_whose_depth_is_too_sparse_are_left_out(self):
+        cameras, depth = sphere_views(3, 60)
+        sparse = np.zeros_like(depth[:1])
+        sparse[0, 29, 30] = depth[0, 29, 30]
+        found = fuse_depth(cameras, np.concatenate([sparse, depth[1:]]), SurfaceConfig())
+        expected = fuse_depth(cameras[1:], depth[1:], SurfaceConfig())
+        assert len(found.vertices) == pytest.approx(len(expected.vertices), rel=0.05)
+        with pytest.raises(CaptureError, match="holds no surface that could be fused"):
+            fuse_depth(cameras[:1], sparse, SurfaceConfig())

@@ -65,6 +65,7 @@ class Stages:
 
     def __init__(self) -> None:
         self.tube = build_tube(enlarged=ENLARGED)
+        self.withheld = with_points(withheld_phantom(5)).training_part()
         with threads(1):
             self.enhancer = self._restorer(ENHANCE.model_copy(update={"judge": False}))
             self.pseudo_views = self._restored()
@@ -113,8 +114,7 @@ class Stages:
         return {name: getattr(gaussians, name).numpy() for name in names}
 
     def estimated_depth(self) -> Arrays:
-        part = with_points(withheld_phantom(5)).training_part()
-        found = estimate_depth(part, DepthConfig(hypotheses=24, sources=3))
+        found = estimate_depth(self.withheld, DepthConfig(hypotheses=24, sources=3))
         return {"depth": found.depth, "expected_error": found.expected_error}
 
 

@@ -17,6 +17,7 @@ from extrags.config import PROFILES, PipelineConfig
 from extrags.config.settings import settings_of
 from extrags.errors import ConfigError, MissingDependencyError
 from extrags.store import Store
+from extrags.stress import Row
 from flows.cli import VERBS, main, parser
 from flows.commands.common import parsed_settings, run_config
 from flows.outcome import SequenceOutcome
@@ -542,8 +543,21 @@ class TestBench:
 
     def test_stability(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         target = tmp_path / "stability.json"
-        assert main(["bench", "stability", "--axis", "flat", "not finite", "--json", str(target)]) == 0
-        cases = json.loads(target.read_text())["cases"]
-        assert {case["axis"] for case in cases} == {"flat", "not finite"}
-        assert all(set(case) >= {"axis", "value", "ok", "error", "note"} for case in cases)
-        assert "means[19, 2] is nan" in capsys.readouterr().out
+        chosen = ["--rows", "rasteriser/not finite", "Adam", "--scenes", "5", "--iterations", "20"]
+        assert main(["bench", "stability", *chosen, "--json", str(target)]) == 0
+        found = json.loads(target.read_text())
+        assert {row["part"] for row in found["rows"]} == {"rasteriser", "Adam"}
+        assert found["effort"] == {"scenes": 5, "iterations": 20, "largest": 100_000}
+        assert all(row["passed"] and row["worst"] <= row["limit"] for row in found["rows"])
+        assert f"all {len(found['rows'])} rows pass" in capsys.readouterr().out
+
+    def test_an_unstable_row(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        row = Row("lamp", "case", "what", 1.0, lambda effort: [("seed 7", 2.0)])
+        monkeypatch.setattr("extrags.stress.ROWS", (row,))
+        assert main(["bench", "stability"]) == 1
+        said = capsys.readouterr()
+        assert "lamp/case: FAILS at seed 7" in said.err
+        assert "1 rows, 1 of them fail" in said.out
+        assert main(["bench", "stability", "--rows", "wind"]) == 2

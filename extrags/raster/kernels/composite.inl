@@ -94,6 +94,9 @@ static void block_masks(const Record* records, int rows, float tile_x, float til
 struct TileFrame {
   int x0, y0;  // first pixel
   int blocks_x, blocks_y;  // blocks inside the image
+  // What moments are taken about, in pixels from the first. It lies in the middle of what the image holds of
+  // the tile: about a point far from a Gaussian, its second moments would be differences of large sums.
+  float centre_x, centre_y;
   int count;   // Gaussians
   size_t first_pair;
 };
@@ -106,6 +109,8 @@ static TileFrame tile_frame(const View* view, int tile) {
   const int columns = (view->width - t.x0 + 3) / 4, rows = (view->height - t.y0 + 3) / 4;
   t.blocks_x = columns < kSide ? columns : kSide;
   t.blocks_y = rows < kSide ? rows : kSide;
+  t.centre_x = 2.f * t.blocks_x;
+  t.centre_y = 2.f * t.blocks_y;
   t.first_pair = starts[tile];
   t.count = static_cast<int>(starts[tile + 1] - starts[tile]);
   return t;
@@ -389,8 +394,8 @@ static void block_backward(const View* view, const ImageGradients* in, const Til
   const PixelGradients v = pixel_gradients(view, in, x0, y0, transmittance);
   {
     // Column `pixel` of the basis, built for all pixels at once and turned round
-    const float half = kTilePx / 2;
-    const Vec x = lane_x + Vec(x0 + 0.5f - t.x0 - half), y = lane_y + Vec(y0 + 0.5f - t.y0 - half);
+    const Vec x = lane_x + Vec(x0 + 0.5f - t.x0 - t.centre_x);
+    const Vec y = lane_y + Vec(y0 + 0.5f - t.y0 - t.centre_y);
     alignas(64) float rows[256];
     const Vec columns[16] = {Vec(1.f), v.red, x,     v.green,  y,     v.blue,   x * x, v.depth,
                              x * y,    Vec(0.f), y * y, Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
@@ -441,7 +446,7 @@ static void file_pair_rows(View* view, const TileFrame& t, const float (*sums)[1
   const Record* locals = static_cast<const Record*>(view->locals.data) + t.first_pair;
   float* out = static_cast<float*>(view->pair_rows.data);
   alignas(64) float columns[256], rows[256], x[16], y[16];
-  const float centre_x = t.x0 + kTilePx / 2, centre_y = t.y0 + kTilePx / 2;
+  const float centre_x = t.x0 + t.centre_x, centre_y = t.y0 + t.centre_y;
   for (int first = 0; first < t.count; first += 16) {
     const int count = t.count - first < 16 ? t.count - first : 16;
     for (int i = 0; i < 16; ++i) {

@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from extrags.config import DepthConfig
-from extrags.depth.estimate import DepthEstimate, estimate_depth
+from extrags.depth.estimate import DepthEstimate, estimate_depth, posed_frames
 from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, subscribed
 from extrags.sequence import EndoscopicSequence, Split
+from extrags.stress.inputs import plane_views
 from tests.extrags.depth.withheld import true_training_depth, with_points, withheld_phantom
 
 SETTINGS = {"hypotheses": 48, "sources": 4}
@@ -162,3 +164,19 @@ def test_a_frame_that_nothing_matches_is_told_to_be_a_guess(withheld: Endoscopic
     assert expected.mean() > 2 * np.median(found.expected_error[1:][part.mask[1:]])
     assert np.median(found.expected_error[1:][part.mask[1:]]) < 0.1
     assert found.report == estimate_depth(part.with_poses(poses), DepthConfig(**SETTINGS)).report
+
+
+def test_far_from_the_origin_of_the_world() -> None:
+    cameras, depth, _, _ = plane_views(3, 16, 12)
+    sequence = EndoscopicSequence(
+        name="made/plane",
+        rgb=np.zeros((*depth.shape, 3), np.uint8),
+        K=cameras.K,
+        mask=np.ones(depth.shape, dtype=bool),
+        split=Split("made", np.arange(3), np.arange(0)),
+        world_from_camera=cameras.world_from_camera,
+    )
+    poses = cameras.world_from_camera.copy()
+    poses[:, :3, 3] += 1e5
+    here, there = (posed_frames(given) for given in (sequence, replace(sequence, world_from_camera=poses)))
+    torch.testing.assert_close(there.world_from_camera, here.world_from_camera, atol=1e-5, rtol=1e-6)

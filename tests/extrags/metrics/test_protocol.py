@@ -18,6 +18,7 @@ from extrags.metrics.image import psnr
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.protocol import PROTOCOL_VERSION, EvaluationResult, RenderedViews, evaluate_views
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
+from extrags.raster import native
 from extrags.sequence import EndoscopicSequence, Split
 
 FRAMES, HEIGHT, WIDTH = 5, 48, 64
@@ -320,3 +321,23 @@ def test_renders_survive_the_disk(sequence: EndoscopicSequence, tmp_path: Path) 
     assert evaluate_views(again, sequence, TEST, None).to_json() == first.to_json()
     with pytest.raises(SourceNotFoundError, match="no renders here"):
         RenderedViews.load(tmp_path / "nothing")
+
+
+def test_the_same_on_any_number_of_threads(
+    sequence: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(protocol, "_PIXELS_AT_ONCE", 1)
+    renders = renders_of(sequence, TEST)
+    noise = np.random.default_rng(1).normal(0, 0.1, renders.rgb.shape).astype(np.float32)
+    renders = replace(renders, rgb=renders.rgb + noise)
+    before = torch.get_num_threads(), native.num_threads()
+    found = []
+    try:
+        for threads in (1, 2, 4):
+            torch.set_num_threads(threads)
+            native.set_num_threads(threads)
+            found.append(evaluate_views(renders, sequence, TEST, None).to_json())
+    finally:
+        torch.set_num_threads(before[0])
+        native.set_num_threads(before[1])
+    assert found[0] == found[1] == found[2]

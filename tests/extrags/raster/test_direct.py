@@ -202,3 +202,32 @@ def test_the_first_nonfinite_value_is_found_in_a_long_array(isa: str, threads: N
     for place in (1_000_002, 700_000, 262_144, 262_143, 0):
         values[place] = np.nan if place % 2 else -np.inf
         assert first_nonfinite(values) == place
+
+
+def test_gradients_in_images_much_smaller_than_a_tile() -> None:
+    """About the middle of a whole tile, second moments of these would be differences of large sums."""
+    generator = torch.Generator().manual_seed(2)
+    n = 12
+    parameters = {
+        "means": torch.cat(
+            [0.6 * torch.randn(n, 2, generator=generator), 2 + torch.rand(n, 1, generator=generator)], 1
+        ),
+        "quats": torch.randn(n, 4, generator=generator),
+        "scales": torch.randn(n, 3, generator=generator) * 0.3 - 0.8,
+        "opacities": torch.randn(n, generator=generator) + 1,
+        "sh": torch.randn(n, 4, 3, generator=generator) * 0.3,
+    }
+    K = np.array([[2.2, 0, 1.5], [0, 2.2, 2.5], [0, 0, 1]])
+    rgb = torch.rand(5, 3, 3, generator=generator)
+    step = DirectStep()
+    step.bind(parameters)
+    step.run(Target(np.eye(4), K, rgb), sh_degree=1)
+    leaves = {k: v.double().requires_grad_() for k, v in parameters.items()}
+    rendering = rasterize(
+        leaves["means"], leaves["quats"], leaves["scales"].exp(), leaves["opacities"].sigmoid(), leaves["sh"],
+        torch.eye(4, dtype=torch.float64)[None], torch.from_numpy(K)[None], 3, 5, backend="reference",
+    )  # fmt: skip
+    l1_ssim_loss(rendering.rgb[0], rgb.double()).backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad is not None
+        assert relative_l2(step.gradients[name], leaf.grad) < 2e-5, name

@@ -201,3 +201,11 @@ class TestChoice:
         idle.step(adam, strong(4, [0]), 499)
         assert idle.penalty(parameters) is None
         assert adam.parameters["means"] is parameters["means"]
+
+
+def test_children_of_a_pancake_without_thickness_in_float32() -> None:
+    gaussians = small_ones(3)
+    gaussians["scales"] = torch.tensor([[0.0, 0.0, -110.0]]).repeat(3, 1)
+    children = strategy(3).children(gaussians, torch.ones(3, dtype=torch.bool))
+    assert bool(children["scales"].isfinite().all())
+    torch.testing.assert_close(children["scales"][:, :2], torch.full((6, 2), -math.log(1.6)))

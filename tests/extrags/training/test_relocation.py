@@ -143,3 +143,16 @@ class TestMCMCStrategy:
         assert len(first.scene.gaussians) == 500
         for name, value in first.scene.gaussians.parameters().items():
             assert torch.equal(value, second.scene.gaussians.parameters()[name]), name
+
+
+def test_sizes_and_opacities_that_float32_rounds_to_zero() -> None:
+    gaussians = small_ones(4)
+    gaussians["scales"][:, 2] = -110
+    strategy().grow({**gaussians, "opacities": torch.full((4,), -120.0)})
+    grown = strategy(max_gaussians=10**6)
+    adam = SelectiveAdam(
+        {**small_ones(40), "scales": gaussians["scales"][:1].repeat(40, 1)}, dict.fromkeys(gaussians, 1e-3)
+    )
+    grown.grow(adam.parameters).apply(adam)
+    assert len(adam.steps) == 42
+    assert bool(adam.parameters["scales"].isfinite().all())

@@ -46,3 +46,18 @@ def test_depth_stays_where_it_is_known() -> None:
     depth[..., 3, 3] = 0
     complete = completed_depth(depth, torch.ones_like(depth), 20.0)
     torch.testing.assert_close(complete, torch.full_like(depth, 5.0))
+
+
+@pytest.mark.parametrize("weight", [1.0, 1e-6, 1e-13, 1e-20])
+def test_what_is_known_faintly_keeps_its_value(weight: float) -> None:
+    known = torch.zeros(1, 1, 16, 16)
+    known[..., 3, 5] = weight
+    filled = push_pull(torch.full((1, 3, 16, 16), 0.6), known)
+    torch.testing.assert_close(filled, torch.full((1, 3, 16, 16), 0.6))
+
+
+def test_half_precision_has_no_gaps_either() -> None:
+    values, known = torch.full((1, 3, 9, 14), 0.5), torch.zeros(1, 1, 9, 14)
+    known[..., 2, 2] = 1
+    for dtype in (torch.float16, torch.bfloat16):
+        assert torch.equal(push_pull(values.to(dtype), known.to(dtype)), values.to(dtype))

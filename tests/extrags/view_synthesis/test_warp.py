@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.cameras import pixel_rays, pose_distances
+from extrags.cameras import Cameras, pixel_rays, pose_distances
 from extrags.view_synthesis.references import LightTransfer
 from extrags.view_synthesis.warp import covisibility, depth_normals, fit_falloff_exponent, warp_references
 from tests.extrags.lit_tube import cast_tube, exact_references, tube_cameras, tube_light
@@ -145,3 +145,18 @@ def test_the_angle_to_the_wall_is_compensated() -> None:
         sure = (warped.blend_weight > 0.5).expand(-1, 3, -1, -1)
         errors.append(float((warped.blend - truth).abs()[sure].mean()))
     assert errors[0] < 0.6 * errors[1]
+
+
+def test_far_from_the_origin_of_the_world() -> None:
+    light, cameras, _, depth = _target()
+    references = exact_references(tube_cameras(8), light)
+
+    def moved(given: Cameras) -> Cameras:
+        poses = given.world_from_camera.copy()
+        poses[:, :3, 3] += 1e5
+        return replace(given, world_from_camera=poses)
+
+    far = replace(references, cameras=moved(references.cameras))
+    here = warp_references(references, cameras, depth, count=4)
+    there = warp_references(far, moved(cameras), depth, count=4)
+    torch.testing.assert_close(there.blend, here.blend, atol=1e-4, rtol=1e-4)
