@@ -16,6 +16,7 @@ from tasks import (
     explore,
     finetune,
     freespace,
+    imported,
     ingest,
     poses,
     report,
@@ -27,8 +28,8 @@ from tests import stage_inventory
 from tests.stage_inventory import NATIVE, changed_modules, inventory, reached, recorded, stages
 
 TASKS = (
-    assess, benchmark, coarse, depth, enhance, evaluate, explore, finetune, freespace, ingest, poses, report,
-    surface, uc_nerf,
+    assess, benchmark, coarse, depth, enhance, evaluate, explore, finetune, freespace, imported, ingest, poses,
+    report, surface, uc_nerf,
 )  # fmt: skip
 
 
@@ -45,7 +46,7 @@ def test_versions_follow_the_code() -> None:
 
 
 def test_the_inventory_reads_versions_as_the_decorator_does() -> None:
-    assert len(TASKS) == 14
+    assert len(TASKS) == 15
     real = {name: version for name, version in stage_versions().items() if not name.startswith("toy")}
     found = {name: version for name, (_, version) in stages().items()}
     assert {name: real[name] for name in found} == found
