@@ -28,8 +28,8 @@ from tests import stage_inventory
 from tests.stage_inventory import NATIVE, changed_modules, inventory, reached, recorded, stages
 
 TASKS = (
-    assess, benchmark, coarse, depth, enhance, evaluate, explore, finetune, freespace, imported, ingest, poses,
-    report, surface, uc_nerf,
+    assess, benchmark, coarse, depth, enhance, evaluate, explore, finetune, freespace, imported,
+    ingest, poses, report, surface, uc_nerf,
 )  # fmt: skip
 
 
