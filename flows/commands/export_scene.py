@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, StoreError
-from flows.commands.common import finished_run, run_config, set_up_logging
+from flows.commands.common import finished_run, run_config, set_up_logging, showing
 
 if TYPE_CHECKING:
     from extrags.cameras import Cameras
@@ -33,14 +33,13 @@ def export_scene(given: argparse.Namespace) -> int:
         ConfigError: for a method without Gaussians, or a trajectory that is not there.
         StoreError: when the run is not in the store, or the file cannot be written.
     """
-    terminal = sys.stderr.isatty()
-    set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
+    set_up_logging(debug=given.debug, terminal=sys.stderr.isatty(), quiet=given.quiet)
     config = run_config(given)
     if config.uc_nerf.enabled and given.to != "camera-path":
         raise ConfigError(f"the method {given.method} makes no Gaussians to write as {given.to}")
     target = Path(given.output)
     write = {"camera-path": _camera_path, "video": _video, "mesh": _mesh, "points": _points}
-    with _progress(given, terminal=terminal):
+    with _progress(given):
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
             said = write.get(given.to, _gaussians)(given, target)
@@ -53,11 +52,11 @@ def export_scene(given: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _progress(given: argparse.Namespace, *, terminal: bool) -> Iterator[None]:
-    from flows.console import progress_bars
+def _progress(given: argparse.Namespace) -> Iterator[None]:
+    from flows.progress_display import progress_display
     from tasks.progress import reporting
 
-    with progress_bars(terminal=terminal), reporting(given.sequence, "export"):
+    with progress_display(showing(given)), reporting(given.sequence, "export"):
         yield
 
 
