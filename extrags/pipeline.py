@@ -17,6 +17,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 from extrags.config import PipelineConfig
@@ -104,7 +105,8 @@ class Pipeline(ABC):
 
     Raises:
         ConfigError: for a stage that does not exist, or that cannot be left out; for a reconstruction from
-            held-out frames (`coarse.train_on`) that a later stage or refined poses would rest on.
+            held-out frames (`coarse.train_on`) that a later stage or refined poses would rest on; for
+            settings that an imported scene makes meaningless.
     """
 
     def __init__(self, config: PipelineConfig, leave_out: Mapping[str, str] | None = None) -> None:
@@ -116,6 +118,7 @@ class Pipeline(ABC):
             check_stage(stage)
             if stage in INDISPENSABLE:
                 raise ConfigError(f"the stage {stage} cannot be left out: everything rests on it")
+        config.check_imported()
         if config.coarse.train_on == "all":
             resting: list[str] = [stage for stage in AFTER_COARSE if stage not in self.leave_out]
             resting += ["coarse.refine_poses"] if config.coarse.refine_poses else []
@@ -402,6 +405,7 @@ class InMemoryPipeline(Pipeline):
         from extrags.poses import estimate_poses, with_estimated_poses
 
         with self._timed("poses"):
+            self.config.check_imported_has_cameras()
             sequence = self.result.sequence
             estimate = estimate_poses(sequence, self.config.poses)
             self.result.sequence = with_estimated_poses(sequence, estimate)
@@ -415,7 +419,7 @@ class InMemoryPipeline(Pipeline):
             self.result.depth = estimate_depth(frames, self.config.depth, self.config.poses)
 
     def coarse(self) -> None:
-        """`extrags.training.reconstruct` on the training frames alone."""
+        """`extrags.training.reconstruct` on the training frames alone, or an imported scene."""
         from extrags.training import reconstruct
         from extrags.training.pose_refinement import with_refined_poses
 
@@ -423,6 +427,9 @@ class InMemoryPipeline(Pipeline):
             self._training = self._with_depth(self.result.sequence.training_part())
             if self.config.uc_nerf.enabled:
                 self.result.uc_nerf = self._train_uc_nerf()
+                return
+            if self.config.imported.scene is not None:
+                self.result.reconstruction = self._imported(self.config.imported.scene)
                 return
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
@@ -583,6 +590,17 @@ class InMemoryPipeline(Pipeline):
         from extrags.depth.training_depth import with_training_depth
 
         return frames if self.result.depth is None else with_training_depth(frames, self.result.depth)
+
+    def _imported(self, file: str) -> TrainingResult:
+        from extrags.splat_files.importing import import_scene
+        from extrags.training import TrainingResult
+
+        found = import_scene(Path(file).expanduser(), self._training, self.config.imported)
+        gaussians = found.scene.gaussians
+        self.config = self.config.of_imported_scene(
+            count=len(gaussians), sh_degree=gaussians.sh_degree, lit=found.scene.light is not None
+        )
+        return TrainingResult(found.scene, [])
 
     def _train_uc_nerf(self) -> UcNerfResult:
         from extrags.baselines.uc_nerf.training import train

@@ -14,10 +14,10 @@ from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
 from extrags.pipeline import StageName
 from extrags.store import Store, digest_of, write_record
+from flows.estimate import expected_seconds
 from flows.methods import METHODS, check_not_pinned, method_config, pinned_settings
 from flows.outcome import SequenceOutcome, StageRow
 from flows.outcome_records import OUTCOME, OutcomeRecord, outcome_records, setting_text
-from flows.run_page import expected_seconds
 from flows.runners import NotInStoreError, StoreRunner
 from flows.selection import Chosen
 from flows.wiring import run_sequence

@@ -26,7 +26,10 @@ VERBS = {
     "serve": "run the deployments on this machine, on demand and on schedule",
     "plan": "measure a scene and say which stages it needs, and why",
     "report": "build the page of a finished run again, from the store",
-    "export": "write a reconstructed scene as PLY, or a sequence as COLMAP model or transforms.json",
+    "compare": "hold finished runs of one sequence against each other, on a page",
+    "leaderboard": "sequences by methods, from the store's records, on a page that sorts and filters",
+    "export": "write a reconstructed scene as Gaussians, mesh or video, or a sequence for COLMAP",
+    "import": "take a scene that another program has made through the later stages",
     "data": "what sequences there are, and whether a source is right",
     "cache": "what is in the store",
     "reconcile": "set runs that a power loss left Running to Crashed",
@@ -38,6 +41,9 @@ VERBS = {
 }
 """Each verb with what it does, in the order of the help."""
 
+MODULES = {"import": "import_scene"}
+"""Modules of verbs that are words of Python."""
+
 EXAMPLES = """examples:
   extrags run phantom/0@sparse --profile quick
   extrags run phantom/0@sparse phantom/0@distanced --seed 1 --json results.json
@@ -48,7 +54,10 @@ EXAMPLES = """examples:
   extrags plan phantom/0@sparse
   extrags evaluate phantom/0@sparse --renders my_renders/ --json -
   extrags benchmark phantom/0@sparse phantom/1@sparse --methods 3dgs,coarse --seeds 0,1,2
+  extrags compare phantom/0@sparse --methods 3dgs extrags
   extrags data check my_video.mp4 my_colmap_scene/
+  extrags export phantom/0@sparse --to spz --out scene.spz
+  extrags import theirs.ply --sequence their_colmap_folder/ --profile quick
   extrags export phantom/0@sparse --to colmap --out scene/
   extrags cache rm 'explore*'
 
@@ -70,7 +79,7 @@ def parser(verb: str | None = None) -> Parser:
     for name, summary in VERBS.items():
         made = verbs.add_parser(name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
         if name == verb:
-            import_module(f"flows.commands.{name}").add_arguments(made)
+            import_module(f"flows.commands.{MODULES.get(name, name)}").add_arguments(made)
     return root
 
 
@@ -110,7 +119,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(arguments: Sequence[str]) -> int:
     root = parser(next((word for word in arguments if not word.startswith("-")), None))
-    given = root.parse_args(arguments, argparse.Namespace(debug=False))
+    given = root.parse_args(arguments, argparse.Namespace(debug=False, quiet=False))
     if given.version:
         from extrags import __version__
 

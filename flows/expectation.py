@@ -12,15 +12,15 @@ from extrags.errors import ExtragsError
 from extrags.pipeline import STAGES, StageName
 from extrags.store import Store, digest_of
 from flows.cases import SequenceCase
+from flows.estimate import expected_seconds
 from flows.methods import METHODS
 from flows.outcome_records import OutcomeRecord, outcome_records
-from flows.run_page import expected_seconds
-from tasks.run_page import duration_text
+from tasks.progress import duration_text
 
 __all__ = ["Expectation", "expectations", "expected_words", "longest_first", "read_size"]
 
 REFERENCE_FRAMES, REFERENCE_PIXELS = 48, 160 * 128
-"""Of the sequences that `flows.run_page.EXPECTED_SECONDS` was measured on."""
+"""Of the sequences that `flows.estimate.EXPECTED_SECONDS` was measured on."""
 USUAL_WIDTH = 340
 """About the width that sources are read at where no divisor is set, in pixels."""
 PER_FRAME: frozenset[StageName] = frozenset({"ingest", "poses", "depth", "evaluate"})

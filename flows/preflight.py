@@ -22,6 +22,7 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
     Raises:
         WeightsError: when weights are not there; says how to get them.
         MissingDependencyError: when a package is not there; says how to install it.
+        SourceNotFoundError: when there is no such file as `imported.scene`.
         ConfigError: when settings do not fit each other, the model or the machine.
         ExtragsError: when the code a checkpoint needs does not start.
     """
@@ -32,6 +33,11 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         chosen_device(config.depth.device, "depth.device")
         depth_completion_digest(config.depth)
         depth_monocular_digest(config.depth.monocular)
+    if config.imported.scene is not None:
+        from tasks.imported import scene_digest
+
+        config.check_imported()
+        scene_digest(config.imported)
     if STAGES.index(until) < STAGES.index("enhance"):
         return
     # Here, because they load torch, which looking up a deployment must not.

@@ -1,22 +1,28 @@
-"""Small pictures of held-out views for the page of a run."""
+"""Small pictures of what a run has made: for its page, and for who watches it in a terminal."""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from extrags.store import Store
-from flows.outcome import Part, SequenceOutcome
+from extrags.store import Ref, Store
+from flows.outcome import SequenceOutcome
 
 if TYPE_CHECKING:
     import numpy as np
 
-__all__ = ["LARGEST_BYTES", "preview"]
+__all__ = ["LARGEST_BYTES", "preview", "stage_preview"]
 
 LARGEST_BYTES = 30_000
 """Of a picture, as text: Prefect keeps it in its database."""
 TILE_PX = 160
-"""Width of each view."""
+"""Width of each view on the page of a run."""
+FILE_TILE_PX = 480
+"""The same in a file."""
+LARGEST_SEQUENCE_BYTES = 500_000_000
+"""Longer sequences are not read for the sake of a picture."""
 
 
 def preview(outcome: SequenceOutcome, store: Store) -> tuple[str, str] | None:
@@ -29,38 +35,148 @@ def preview(outcome: SequenceOutcome, store: Store) -> tuple[str, str] | None:
     Returns:
         A `data:` URI and what it shows; None where nothing was rendered.
     """
-    if "sequence" not in outcome.refs or "renders_coarse" not in outcome.refs:
+    # Here, because it loads torch, which looking up a deployment must not.
+    from extrags.report.encode import fitted_image
+
+    found = _evaluated(outcome.refs, store, TILE_PX)
+    if found is None:
         return None
-    # Here, because they load torch, which looking up a deployment must not.
+    strip, words = found
+    return fitted_image(strip, LARGEST_BYTES).uri, f"{outcome.name}, {words}"
+
+
+def stage_preview(label: str, stage: str, made: Mapping[str, Ref], store: Store) -> tuple[Path, str] | None:
+    """A picture of what a stage has made, as a file in the store's local directory; the last one is kept.
+
+    Args:
+        label: name of the sequence.
+        stage: the stage that has ended.
+        made: what the sequence has, by the names of `flows.outcome.Part`.
+        store: its artefacts.
+
+    Returns:
+        Where it is and what it shows; None for a stage that makes nothing to be looked at.
+
+    Raises:
+        ExtragsError: for an artefact that cannot be read.
+        OSError: for a directory that cannot be written.
+    """
+    strip: np.ndarray
+    if stage == "ingest":
+        strip, words = _recorded(made, store)
+    elif stage in ("coarse", "finetune"):
+        found = _rendered(made, store)
+        if found is None:
+            return None
+        strip, words = found
+    elif stage == "enhance":
+        strip, words = _restored(made, store)
+    elif stage == "evaluate":
+        found = _evaluated(made, store, FILE_TILE_PX)
+        if found is None:
+            return None
+        strip, words = found
+    else:
+        return None
+    from PIL import Image
+
+    folder = store.state / "previews"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{re.sub(r'[^A-Za-z0-9@.]+', '-', label).strip('-')}.jpg"
+    part = path.with_suffix(".part")
+    Image.fromarray(strip).save(part, format="JPEG", quality=90)
+    part.replace(path)
+    return path, words
+
+
+def _recorded(made: Mapping[str, Ref], store: Store) -> tuple[np.ndarray, str]:
+    """The middle frame of a sequence."""
+    from extrags.report.encode import as_uint8
+    from extrags.sequence import EndoscopicSequence
+
+    frames = _group(store.open(made["sequence"]) / EndoscopicSequence.stored_as)["rgb"]
+    frame = frames.shape[0] // 2
+    return _tile(as_uint8(_array(frames[frame])), FILE_TILE_PX), f"frame {frame} as recorded"
+
+
+def _rendered(made: Mapping[str, Ref], store: Store) -> tuple[np.ndarray, str] | None:
+    """The middle held-out frame, or training frame, and what the scenes show there."""
+    import numpy as np
+
+    from extrags.evaluation import render
+    from extrags.report.encode import as_uint8
+    from extrags.scene import Scene
+    from extrags.sequence import EndoscopicSequence
+
+    if store.manifest(made["sequence"]).bytes > LARGEST_SEQUENCE_BYTES:
+        return None
+    sequence = EndoscopicSequence.load(store.open(made["sequence"]) / EndoscopicSequence.stored_as)
+    known, kind = (
+        (sequence.test, "held-out") if len(sequence.test) else (np.asarray(sequence.train), "training")
+    )
+    frame = int(known[len(known) // 2])
+    shown, words = [_tile(as_uint8(sequence.rgb[frame]), FILE_TILE_PX)], ["recorded"]
+    for part, word in (("coarse", "coarse scene"), ("finetune", "final scene")):
+        stored = store.open(made[part]) / Scene.stored_as if part in made else None
+        # UC-NeRF keeps a field there, not Gaussians.
+        if stored is not None and stored.exists():
+            views = render(Scene.load(stored), sequence, np.array([frame]))
+            shown.append(_tile(as_uint8(views.rgb[0]), FILE_TILE_PX))
+            words.append(word)
+    if len(shown) == 1:
+        return None
+    return np.concatenate(shown, axis=1), f"{kind} frame {frame}: {', '.join(words)}"
+
+
+def _restored(made: Mapping[str, Ref], store: Store) -> tuple[np.ndarray, str]:
+    """The middle virtual view before and after restoration."""
+    import numpy as np
+
+    from extrags.pseudo_views import PseudoViews
+    from extrags.report.encode import as_uint8
+
+    group = _group(store.open(made["enhance"]) / PseudoViews.stored_as)
+    view = group["rendered"].shape[0] // 2
+    shown = [_tile(as_uint8(_array(group[name][view])), FILE_TILE_PX) for name in ("rendered", "restored")]
+    return np.concatenate(shown, axis=1), f"virtual view {view}: rendered, restored"
+
+
+def _evaluated(refs: Mapping[Any, Ref], store: Store, tile_px: int) -> tuple[np.ndarray, str] | None:
+    """The middle held-out view as recorded, from the coarse scene, and from the final one."""
+    if "sequence" not in refs or "renders_coarse" not in refs:
+        return None
     import numpy as np
 
     from extrags.metrics.protocol import RenderedViews
-    from extrags.report.encode import as_uint8, fitted_image
+    from extrags.report.encode import as_uint8
     from extrags.sequence import EndoscopicSequence
 
-    frames = _group(store.open(outcome.refs["sequence"]) / EndoscopicSequence.stored_as)
-    held_out = np.asarray(frames["split/test"][:])
+    frames = _group(store.open(refs["sequence"]) / EndoscopicSequence.stored_as)
+    held_out = _array(frames["split/test"][:])
     if len(held_out) == 0:
         return None
     view = len(held_out) // 2
     frame = int(held_out[view])
-    shown, words = [_tile(as_uint8(np.asarray(frames["rgb"][frame])))], ["recorded"]
-    scenes: dict[Part, str] = {
+    shown, words = [_tile(as_uint8(_array(frames["rgb"][frame])), tile_px)], ["recorded"]
+    scenes = {
         "renders_coarse": "coarse scene",
         "renders_final": "final scene",
         "renders_restored": "the same, restored",
     }
     for part, word in scenes.items():
-        if part in outcome.refs:
-            renders = _group(store.open(outcome.refs[part]) / RenderedViews.stored_as)
-            shown.append(_tile(as_uint8(np.asarray(renders["rgb"][view]))))
+        if part in refs:
+            renders = _group(store.open(refs[part]) / RenderedViews.stored_as)
+            shown.append(_tile(as_uint8(_array(renders["rgb"][view])), tile_px))
             words.append(word)
     height = min(tile.shape[0] for tile in shown)
     strip = np.concatenate([tile[:height] for tile in shown], axis=1)
-    return (
-        fitted_image(strip, LARGEST_BYTES).uri,
-        f"{outcome.name}, held-out frame {frame}: {', '.join(words)}",
-    )
+    return strip, f"held-out frame {frame}: {', '.join(words)}"
+
+
+def _array(values: Any) -> np.ndarray:
+    import numpy as np
+
+    return np.asarray(values)
 
 
 def _group(path: Path) -> Any:
@@ -69,7 +185,7 @@ def _group(path: Path) -> Any:
     return open_group(path)
 
 
-def _tile(image: np.ndarray) -> np.ndarray:
-    """At most `TILE_PX` wide, by leaving out rows and columns."""
-    step = max(1, -(-image.shape[1] // TILE_PX))
+def _tile(image: np.ndarray, width: int) -> np.ndarray:
+    """At most so wide, by leaving out rows and columns."""
+    step = max(1, -(-image.shape[1] // width))
     return image[::step, ::step]

@@ -190,6 +190,7 @@ def catalogue_work(
     stages = {str(stage) for stage in STAGES if stage not in leave_out}
     stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
     stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
+    stages -= set() if config.imported.scene is None else {"coarse"}
     return Workload(float(width * height), frames, frames / 2, frames / 2, config, width=width), stages
 
 

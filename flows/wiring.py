@@ -17,6 +17,7 @@ from extrags.redaction import without_credentials
 from extrags.store import Manifest, Ref, Store
 from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
+from flows.imported import imported_call, of_imported_scene
 from flows.memory_limit import check_memory
 from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner, StoreRunner
@@ -210,6 +211,7 @@ class SequenceRun(Pipeline):
     def poses(self) -> None:
         """The artefact `sequence` again, with poses."""
         with self._stage("poses") as row:
+            self.config.check_imported_has_cameras()
             inputs = {"sequence": self.refs["sequence"], "config": estimating_settings(self.config.poses)}
             self.refs["poses"] = self.refs["sequence"] = self._run_task(row, Call(poses, inputs))
             row.reason = str(self._manifest("poses").counts["summary"])
@@ -240,6 +242,11 @@ class SequenceRun(Pipeline):
             if self.config.uc_nerf.enabled:
                 inputs = {"sequence": self.refs["training"], "config": self.config.uc_nerf}
                 self.refs["coarse"] = self._run_task(row, Call(uc_nerf, inputs))
+                return
+            if self.config.imported.scene is not None:
+                self.refs["coarse"] = self._run_task(row, imported_call(self.config, self.refs["training"]))
+                counts = self._manifest("coarse").counts
+                self.config, row.reason = of_imported_scene(self.config, counts), str(counts["summary"])
                 return
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
@@ -529,4 +536,5 @@ class SequenceRun(Pipeline):
 
     def _report_progress(self, row: StageRow, state: str, done: int = 0, total: int = 0) -> None:
         reason = row.reason if state in ("skipped", "failed") else ""
-        notify(StageProgress(self.outcome.name, row.stage, state, done, total, reason, row.seconds))
+        made = {} if state == "running" else {str(part): ref for part, ref in self.refs.items()}
+        notify(StageProgress(self.outcome.name, row.stage, state, done, total, reason, row.seconds, made))

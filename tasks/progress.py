@@ -5,29 +5,38 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from extrags.errors import ExtragsError
 from extrags.events import Event, MetricRecorded, Progress, subscribed
+from extrags.store import Ref
 
 __all__ = [
+    "IN_PARALLEL",
     "Observer",
+    "Pace",
+    "ProgressLog",
     "StageProgress",
     "TimeLimitError",
     "current_observer",
+    "duration_text",
     "interrupt_stages",
-    "log_progress",
     "notify",
     "observed",
+    "rate_text",
     "reporting",
 ]
 
 log = logging.getLogger("extrags.progress")
 
-LOG_EVERY_SECONDS = 15.0
+LOG_EVERY_SECONDS = 30.0
+"""Between two lines of the log on how far a sequence is."""
+
+IN_PARALLEL = frozenset({"explore-branch", "enhance-restore"})
+"""Tasks of which several run at once: the count of one says nothing about the stage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +53,8 @@ class StageProgress:
     detail: str = ""
     """Loss, count or reason, ready to be shown."""
     seconds: float = 0.0
+    made: Mapping[str, Ref] = field(default_factory=dict)
+    """When the stage has ended: what the sequence has, by the names of `flows.outcome.Part`."""
 
 
 Observer = Callable[[StageProgress], None]
@@ -79,11 +90,7 @@ def notify(progress: StageProgress) -> None:
     """Send progress to the observer; without one it is logged. Nothing is said after an interruption."""
     if _interrupted.is_set():
         return
-    observer = _observer.get()
-    if observer is not None:
-        observer(progress)
-        return
-    log_progress(progress)
+    (_observer.get() or _log_of_the_process)(progress)
 
 
 def current_observer() -> Observer | None:
@@ -91,16 +98,111 @@ def current_observer() -> Observer | None:
     return _observer.get()
 
 
-def log_progress(progress: StageProgress) -> None:
-    """One line in the log."""
-    words = [progress.label, f"{progress.stage}:"]
-    if progress.state != "running":
-        words += [progress.state, f"in {progress.seconds:.1f} s"]
-    elif progress.total:
-        words.append(f"{progress.done}/{progress.total}")
-    elif not progress.detail:
-        words.append("starts")
-    log.info("%s", " ".join([*words, progress.detail]).rstrip())
+def duration_text(seconds: float) -> str:
+    """A duration as people say it: `40 s`, `12 min`, `3.5 h`."""
+    if seconds < 90:
+        return f"{max(1, round(seconds))} s"
+    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+def rate_text(steps_per_second: float) -> str:
+    """How fast a loop goes: `12.5/s`, or the time of a step where that is longer than a second."""
+    if steps_per_second < 1:
+        seconds = 1 / steps_per_second
+        return f"{seconds:.2g} s each" if seconds < 10 else f"{duration_text(seconds)} each"
+    return f"{steps_per_second:.0f}/s" if steps_per_second >= 100 else f"{steps_per_second:.3g}/s"
+
+
+def _value_text(value: float) -> str:
+    """Counts as they are, measured values with four digits."""
+    return f"{value:.0f}" if float(value).is_integer() and abs(value) < 1e9 else f"{value:.4g}"
+
+
+class Pace:
+    """How fast loops go, by sequence and stage; the owner sees to it that one thread asks at a time."""
+
+    def __init__(self) -> None:
+        self._first: dict[tuple[str, str], tuple[float, int]] = {}
+
+    def rate(self, progress: StageProgress, now: float) -> float | None:
+        """Steps per second since the first one that was seen; None before there are any.
+
+        A count that falls is another loop of the same stage, and begins anew.
+        """
+        place = (progress.label, progress.stage)
+        begun, first = self._first.setdefault(place, (now, progress.done))
+        if progress.done < first:
+            self._first[place] = (now, progress.done)
+            return None
+        if progress.done == first or now <= begun:
+            return None
+        return (progress.done - first) / (now - begun)
+
+    def seconds_left(self, progress: StageProgress, now: float) -> float | None:
+        """What the rest of the loop takes at its rate; None before there is one, or at its end."""
+        rate = self.rate(progress, now)
+        left = progress.total - progress.done
+        return None if not rate or left <= 0 else left / rate
+
+    def forget(self, label: str) -> None:
+        """A stage of the sequence has ended: its loops are over."""
+        for place in [place for place in self._first if place[0] == label]:
+            del self._first[place]
+
+
+class ProgressLog:
+    """Observer that logs the start and end of every stage, and between them how far it is, at long intervals.
+
+    An interval is that of a sequence, whichever of its stages and tasks speaks, so that a stage of many
+    short tasks says no more than one of a single long one. May be called from any thread, and often.
+
+    Args:
+        clock: seconds, from any origin.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._guard = threading.Lock()
+        self._quiet_until: dict[str, float] = {}
+        self._pace = Pace()
+
+    def __call__(self, progress: StageProgress) -> None:
+        """Log it, or leave it."""
+        with self._guard:
+            line = self._line(progress, self._clock())
+        if line is not None:
+            log.info("%s", line)
+
+    def _line(self, progress: StageProgress, now: float) -> str | None:
+        place = f"{progress.label} {progress.stage}:"
+        if progress.state != "running":
+            self._pace.forget(progress.label)
+            took = [] if progress.state in ("skipped", "cached") else [f"in {progress.seconds:.1f} s"]
+            words = " ".join([place, progress.state, *took])
+            return f"{words}: {progress.detail}" if progress.detail else words
+        if not progress.total and not progress.detail:
+            self._quiet_until[progress.label] = now + LOG_EVERY_SECONDS
+            return f"{place} starts"
+        if progress.stage in IN_PARALLEL:
+            return None
+        parts = []
+        if progress.total:
+            parts.append(f"{progress.done} of {progress.total}")
+            rate = self._pace.rate(progress, now)
+            if rate is not None:
+                parts.append(rate_text(rate))
+            left = self._pace.seconds_left(progress, now)
+            if left is not None:
+                parts.append(f"about {duration_text(left)} left")
+        # A sequence whose start nobody announced here, as in another process: its interval begins now.
+        if now < self._quiet_until.setdefault(progress.label, now + LOG_EVERY_SECONDS):
+            return None
+        self._quiet_until[progress.label] = now + LOG_EVERY_SECONDS
+        said = [", ".join(words) for words in (parts, progress.detail.split("  ")) if any(words)]
+        return f"{place} {'; '.join(said)}"
+
+
+_log_of_the_process = ProgressLog()
 
 
 @contextmanager
@@ -117,10 +219,8 @@ def reporting(label: str, stage: str, time_limit_s: float | None = None) -> Iter
         TimeLimitError: from inside the block, at the first event after the limit.
     """
     begun = time.monotonic()
-    quiet_until = 0.0
 
     def receive(event: Event) -> None:
-        nonlocal quiet_until
         if _interrupted.is_set():
             # The thread of a stage can only end itself.
             raise KeyboardInterrupt
@@ -129,17 +229,11 @@ def reporting(label: str, stage: str, time_limit_s: float | None = None) -> Iter
             raise TimeLimitError(
                 f"{stage} of {label} took {taken_s:.1f} s; a stage may take {time_limit_s:g} s (time_limit_s)"
             )
-        if _observer.get() is None:
-            # Loops may emit thousands of events; the log gets only some of them.
-            now = time.monotonic()
-            if now < quiet_until:
-                return
-            quiet_until = now + LOG_EVERY_SECONDS
         if isinstance(event, Progress):
-            detail = "  ".join(f"{name} {value:.4g}" for name, value in event.values.items())
+            detail = "  ".join(f"{name} {_value_text(value)}" for name, value in event.values.items())
             notify(StageProgress(label, stage, "running", event.done, event.total, detail))
         elif isinstance(event, MetricRecorded):
-            notify(StageProgress(label, stage, "running", detail=f"{event.name} {event.value:.4g}"))
+            notify(StageProgress(label, stage, "running", detail=f"{event.name} {_value_text(event.value)}"))
 
     with subscribed(receive):
         yield

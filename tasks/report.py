@@ -45,7 +45,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=9, ignore=("rows",))
+@stage("report", version=10, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
@@ -149,7 +149,7 @@ def _absent(skipped: dict[str, str]) -> dict[str, str]:
     }
 
 
-@stage("dataset-report", version=2, ignore=("rows",))
+@stage("dataset-report", version=3, ignore=("rows",))
 def dataset_report(
     slot: Slot,
     name: str,

@@ -24,16 +24,22 @@ from uuid import UUID
 from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.context import FlowRunContext, TaskRunContext
 
-from tasks.progress import LOG_EVERY_SECONDS, StageProgress, current_observer, log_progress, observed
+from tasks.progress import (
+    IN_PARALLEL,
+    Pace,
+    ProgressLog,
+    StageProgress,
+    current_observer,
+    duration_text,
+    observed,
+)
 
 __all__ = [
     "PAGE_VARIABLE",
     "ArtifactSender",
-    "ProgressLog",
     "StageBars",
     "artifact_key",
     "attempt",
-    "duration_text",
     "page_wanted",
     "stage_page",
 ]
@@ -54,9 +60,6 @@ CLOSE_SECONDS = 10.0
 MAX_FAILURES = 3
 """After so many in a row the server is left alone."""
 
-IN_PARALLEL = frozenset({"explore-branch", "enhance-restore"})
-"""Tasks of which several run at once: the count of one says nothing about the stage."""
-
 
 def page_wanted() -> bool:
     """Whether the current run has a page to write on: in a flow or task, and not switched off."""
@@ -68,13 +71,6 @@ def artifact_key(kind: str, *names: str) -> str:
     """A key as Prefect wants it: lower-case letters, digits and dashes."""
     plain = (re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") for name in (kind, *names))
     return "-".join(word for word in plain if word)
-
-
-def duration_text(seconds: float) -> str:
-    """A duration as people say it: `40 s`, `12 min`, `3.5 h`."""
-    if seconds < 90:
-        return f"{max(1, round(seconds))} s"
-    return f"{round(seconds / 60)} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def attempt(make: Callable[[], object]) -> bool:
@@ -173,12 +169,6 @@ class ArtifactSender:
         self._failures = 0 if well else self._failures + 1
 
 
-@dataclass
-class _Running:
-    begun: float
-    first_done: int
-
-
 class StageBars:
     """Observer that gives every long stage a progress bar, with what is left at its rate.
 
@@ -189,7 +179,8 @@ class StageBars:
     def __init__(self, sender: ArtifactSender) -> None:
         self._sender = sender
         self._guard = threading.Lock()
-        self._running: dict[tuple[str, str], _Running] = {}
+        self._begun: dict[tuple[str, str], float] = {}
+        self._pace = Pace()
         self._shown: dict[tuple[str, str], str] = {}
 
     def __call__(self, progress: StageProgress) -> None:
@@ -202,16 +193,14 @@ class StageBars:
                 return
             if not progress.total or progress.stage in IN_PARALLEL:
                 return
-            known = self._running.get(place)
-            if known is None or progress.done < known.first_done:
-                known = self._running[place] = _Running(now, progress.done)
-            if now - known.begun < LONG_SECONDS and place not in self._shown:
+            begun = self._begun.setdefault(place, now)
+            left = self._pace.seconds_left(progress, now)
+            if now - begun < LONG_SECONDS and place not in self._shown:
                 return
             key = self._shown.setdefault(place, artifact_key("progress", *place))
         words = [f"{progress.stage} of {progress.label}: {progress.done} of {progress.total}"]
         if progress.detail:
             words.append(", ".join(progress.detail.split("  ")))
-        left = rate_left(known.first_done, progress.done, progress.total, now - known.begun)
         if left is not None:
             words.append(f"about {duration_text(left)} left")
         self._sender.progress(key, 100 * progress.done / progress.total, "; ".join(words))
@@ -219,36 +208,12 @@ class StageBars:
     def _end(self, progress: StageProgress) -> None:
         """The stage has ended: full bars where it went well, else the reason beside the last share."""
         place = (progress.label, progress.stage)
-        self._running.pop(place, None)
+        self._pace.forget(progress.label)
+        self._begun.pop(place, None)
         key = self._shown.pop(place, None)
         if key is not None and progress.state in ("ran", "cached"):
             took = duration_text(progress.seconds)
             self._sender.progress(key, 100, f"{progress.stage} of {progress.label}: done in {took}")
-
-
-class ProgressLog:
-    """Observer that logs every start and end, and now and then how far a stage is."""
-
-    def __init__(self) -> None:
-        self._guard = threading.Lock()
-        self._quiet_until: dict[tuple[str, str], float] = {}
-
-    def __call__(self, progress: StageProgress) -> None:
-        """Log it, or leave it."""
-        if progress.state == "running" and progress.total:
-            place, now = (progress.label, progress.stage), time.monotonic()
-            with self._guard:
-                if now < self._quiet_until.setdefault(place, now + LOG_EVERY_SECONDS):
-                    return
-                self._quiet_until[place] = now + LOG_EVERY_SECONDS
-        log_progress(progress)
-
-
-def rate_left(first_done: int, done: int, total: int, elapsed_s: float) -> float | None:
-    """Seconds that the rest takes at the rate so far; None before there is one, or after the end."""
-    if done <= first_done or done >= total or elapsed_s <= 0:
-        return None
-    return (total - done) * elapsed_s / (done - first_done)
 
 
 @contextmanager

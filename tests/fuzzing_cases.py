@@ -19,10 +19,14 @@ from data_catalog.readers.transforms_json import write_transforms
 from extrags.config import IngestConfig
 from extrags.depth.weights import load_completion
 from extrags.errors import WeightsError
+from extrags.export import CameraPath, read_camera_path, write_camera_path
 from extrags.gaussians import Gaussians
+from extrags.illumination import NearFieldLight
 from extrags.metrics.lpips_weights import array_names, read_weights
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
+from extrags.splat_files import read_splat_file, write_ply_scene, write_spz
 from extrags.store import Store
 from tests.data_catalog.footage_fixture import write_dicom, write_video
 from tests.data_catalog.layouts import write_endonerf
@@ -219,20 +223,43 @@ def restorer(folder: Path) -> Path:
     return folder
 
 
-def gaussians(folder: Path) -> Path:
-    """A scene of three."""
+def _three_gaussians() -> Gaussians:
     generator = torch.Generator().manual_seed(0)
     quats = torch.zeros(3, 4)
     quats[:, 0] = 1
-    Gaussians(
+    return Gaussians(
         means=torch.randn(3, 3, generator=generator),
         quats=quats,
         scales=torch.zeros(3, 3),
         opacities=torch.zeros(3),
         sh0=torch.zeros(3, 1, 3),
         shN=torch.zeros(3, 3, 3),
-    ).write_ply(folder / "a.ply")
+    )
+
+
+def gaussians(folder: Path) -> Path:
+    """A scene of three."""
+    _three_gaussians().write_ply(folder / "a.ply")
     return folder / "a.ply"
+
+
+def lit_gaussians(folder: Path) -> Path:
+    """The same, with a light in the header."""
+    light = NearFieldLight(torch.tensor(-2.0), torch.tensor(0.1), torch.zeros(2), 20.0)
+    write_ply_scene(Scene(_three_gaussians(), light), folder / "a.ply")
+    return folder / "a.ply"
+
+
+def spz(folder: Path) -> Path:
+    """The same, packed."""
+    write_spz(_three_gaussians(), folder / "a.spz")
+    return folder / "a.spz"
+
+
+def camera_path(folder: Path) -> Path:
+    """Three cameras."""
+    write_camera_path(CameraPath(sequence().cameras), folder / "a.json")
+    return folder / "a.json"
 
 
 def source(place: Path) -> object:
@@ -293,4 +320,7 @@ CASES: dict[str, Case] = {
     "restorer.safetensors": Case(restorer, "restorer.safetensors", EmbeddedEnhancer.load),
     "restorer.json": Case(restorer, "restorer.json", EmbeddedEnhancer.load),
     "gaussians.ply": Case(gaussians, "a.ply", Gaussians.read_ply),
+    "lit-gaussians.ply": Case(lit_gaussians, "a.ply", read_splat_file),
+    "gaussians.spz": Case(spz, "a.spz", read_splat_file),
+    "camera_path.json": Case(camera_path, "a.json", read_camera_path),
 }

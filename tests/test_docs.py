@@ -86,6 +86,17 @@ def test_links_and_anchors_resolve(page: Path) -> None:
     assert not broken
 
 
+def test_every_stage_has_a_page() -> None:
+    from extrags.pipeline import STAGES
+
+    rows = re.findall(
+        r"^\| ([a-z, ]+) \| .*\]\((\S+?)(?:#\S*)?\)", (REPOSITORY / "docs/index.md").read_text(), re.MULTILINE
+    )
+    pages = {stage: page for stages, page in rows for stage in stages.split(", ")}
+    assert set(STAGES) <= set(pages)
+    assert all((REPOSITORY / "docs" / page).is_file() for page in pages.values())
+
+
 def test_every_page_can_be_reached_from_the_index() -> None:
     reached, waiting = set(), [REPOSITORY / "docs" / "index.md"]
     while waiting:

@@ -58,11 +58,12 @@ SAFE_YAML = ("Loader", "yaml.SafeLoader", "yaml.CSafeLoader", "getattr(yaml, 'CS
 
 OPTED_IN = {
     ("extrags/restoration/pretrained/checkpoint_driver.py", "_content"),
+    ("extrags/splat_files/sog.py", "write_sog"),
     ("extrags/store/integrity.py", "_metadata_at"),
     ("extrags/zarr_io.py", "new_group"),
 }
 """`enhance.checkpoint.trust_pickle=true` alone comes to the first (docs/algorithms/restoration.md). The
-others list what is in a file and write one: nothing is unpacked."""
+others list what is in a file or write one: nothing is unpacked."""
 
 
 def calls(module: ast.Module) -> Iterator[tuple[str, str, ast.Call]]:

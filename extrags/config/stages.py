@@ -17,9 +17,11 @@ from extrags.config.baselines import UcNerfConfig
 from extrags.config.coarse import CoarseConfig
 from extrags.config.depth import DepthConfig
 from extrags.config.exploration import ExploreConfig, FreespaceConfig, SurfaceConfig
+from extrags.config.imported import ImportedConfig
 from extrags.config.poses import PosesConfig
 from extrags.config.restorer import EnhanceConfig
 from extrags.config.settings import settings_of, unknown_setting
+from extrags.errors import ConfigError, PoseError
 from extrags.thresholds import HOLE_ALPHA
 
 __all__ = [
@@ -247,6 +249,7 @@ class PipelineConfig(StageConfig):
     poses: PosesConfig = PosesConfig()
     depth: DepthConfig = DepthConfig()
     coarse: CoarseConfig = CoarseConfig()
+    imported: ImportedConfig = ImportedConfig()
     uc_nerf: UcNerfConfig = UcNerfConfig()
     assess: AssessConfig = AssessConfig()
     surface: SurfaceConfig = SurfaceConfig()
@@ -265,6 +268,58 @@ class PipelineConfig(StageConfig):
             if "seed" in type(value).model_fields
         }
         return self.model_copy(update=seeded)
+
+    def check_imported(self) -> None:
+        """Refuse settings that an imported scene makes meaningless.
+
+        Raises:
+            ConfigError: names them.
+        """
+        against = {
+            "uc_nerf.enabled": self.uc_nerf.enabled,
+            "coarse.train_on=all": self.coarse.train_on == "all",
+            "coarse.refine_poses": self.coarse.refine_poses is True,
+            "poses.replace_given": self.poses.replace_given,
+        }
+        wrong = [name for name, is_set in against.items() if is_set]
+        if self.imported.scene is not None and wrong:
+            raise ConfigError(
+                "imported.scene takes the place of the coarse scene, with the source's poses; "
+                f"{', '.join(wrong)} cannot be set beside it"
+            )
+
+    def check_imported_has_cameras(self) -> None:
+        """Refuse to estimate poses for an imported scene: they would have a world of their own.
+
+        Raises:
+            PoseError: where a scene is imported.
+        """
+        if self.imported.scene is not None:
+            raise PoseError(
+                "the sequence has no poses, and an imported scene needs the cameras it was made with: poses "
+                "that are estimated here have a world of their own",
+                file=self.imported.scene,
+                field="world_from_camera",
+            )
+
+    def of_imported_scene(self, *, count: int, sh_degree: int, lit: bool) -> PipelineConfig:
+        """The same settings, for later stages that work on an imported scene.
+
+        Folds of the restorer and trials of the judge are reconstructed as the scene is: with or without
+        light, with its degree of harmonics; and fine-tuning may grow from its number of Gaussians on.
+
+        Args:
+            count: of its Gaussians.
+            sh_degree: of its harmonics.
+            lit: whether it has a light.
+        """
+        return self.with_overrides(
+            {
+                "coarse.light.enabled": lit and self.coarse.light.enabled,
+                "coarse.sh_degree": sh_degree,
+                "coarse.densify.max_gaussians": max(count, self.coarse.densify.max_gaussians),
+            }
+        )
 
     def with_overrides(self, overrides: Mapping[str, Any]) -> PipelineConfig:
         """Apply `{"coarse.iterations": 500}`-like settings.

@@ -10,7 +10,7 @@ from extrags.metrics.comparison import CEILING, compare_runs, figure_of
 from extrags.metrics.registry import Figure, figures
 from extrags.report.charts import method_colors, methods_chart, pairs_chart
 from extrags.report.comparison import RenderedMethod, compared_rows
-from extrags.report.encode import DataImage
+from extrags.report.downloads import Chart
 from extrags.report.page import rendered_page
 from extrags.report.trend import trend_chart
 from extrags.report.wording import count, described_metrics, duration, number, percent
@@ -210,7 +210,7 @@ def _sizes(row: Mapping[str, Any]) -> str:
 
 def _difference_chart(
     rows: Sequence[Mapping[str, Any]], columns: Sequence[Figure], baseline: str
-) -> tuple[DataImage, str] | None:
+) -> tuple[Chart, str] | None:
     panels = [column for column in columns if column in figures("charts")]
     if not rows or not panels:
         return None
@@ -230,7 +230,7 @@ def _difference_chart(
 
 def _figure_charts(
     runs: Sequence[Mapping[str, Any]], columns: Sequence[Figure], inputs: BenchmarkInputs
-) -> list[tuple[DataImage, str]]:
+) -> list[tuple[Chart, str]]:
     known = {column.name: column for column in columns}
     # Whole-mask figures only where the source cannot tell what was observed.
     drawn = [figure.name for figure in figures("charts")[:2]]
@@ -252,7 +252,7 @@ def _figure_charts(
     return charts
 
 
-def _trend_chart(inputs: BenchmarkInputs) -> tuple[DataImage, str] | None:
+def _trend_chart(inputs: BenchmarkInputs) -> tuple[Chart, str] | None:
     chart = trend_chart(inputs.history, method_colors(list(inputs.methods), inputs.baseline))
     if chart is None:
         return None

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from extrags.report.encode import DataImage, data_uri
+from extrags.report.downloads import Cell, Chart, file_name
+from extrags.report.encode import data_uri
 
 __all__ = [
     "COARSE_COLOR",
@@ -93,16 +94,16 @@ def drawing_style() -> Iterator[None]:
         yield
 
 
-def svg_image(figure: Any) -> DataImage:
+def svg_image(figure: Any) -> Chart:
     """A figure as an SVG data URI without date or random names; call inside `drawing_style`."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     text = _LONG_PATHS.sub(lambda path: _LONG_FRACTION.sub(r"\1", path.group()), buffer.getvalue())
     width, height = (round(float(inches) * 72) for inches in figure.get_size_inches())
-    return DataImage(data_uri(text.encode("utf-8"), "image/svg+xml"), width, height)
+    return Chart(data_uri(text.encode("utf-8"), "image/svg+xml"), width, height)
 
 
-def history_chart(history: Mapping[str, Sequence[Mapping[str, Any]]]) -> DataImage:
+def history_chart(history: Mapping[str, Sequence[Mapping[str, Any]]]) -> Chart:
     """Training curves of the stages, one after the other on one axis of iterations.
 
     Args:
@@ -141,20 +142,29 @@ def history_chart(history: Mapping[str, Sequence[Mapping[str, Any]]]) -> DataIma
                 axes.set_ylim(bottom=0)
             if place == 0 and len(stages) > 1:
                 axes.legend(handlelength=1.4)
-        return svg_image(figure)
+        chart = svg_image(figure)
+    keys = [key for key, _, _ in panels]
+    rows = [
+        [stage, entry["iteration"], *(entry.get(key) for key in keys)]
+        for stage, entries in stages
+        for entry in entries
+    ]
+    return chart.with_numbers("training", ["stage", "iteration", *keys], rows)
 
 
 def views_chart(
     coarse: Float[np.ndarray, "t"],
     final: Float[np.ndarray, "t"] | None,
     unobserved_share: Float[np.ndarray, "t"] | None,
-) -> DataImage:
+    names: Sequence[str] = (),
+) -> Chart:
     """PSNR of every held-out view, coarse to final, and the gain against how much was never seen.
 
     Args:
         coarse: PSNR per view in dB; NaN where there is none.
         final: the same after fine-tuning, or None.
         unobserved_share: share of each view's pixels that training did not see, or None.
+        names: of the views, for the numbers; their places by default.
     """
     with drawing_style():
         scatter = final is not None and unobserved_share is not None
@@ -188,10 +198,17 @@ def views_chart(
             )
             axes.set_title("Gain (dB) by unseen surface")
             axes.set_xlabel("pixels training never saw (%)")
-        return svg_image(figure)
+        chart = svg_image(figure)
+    columns = {"coarse_psnr_db": coarse, "final_psnr_db": final, "unobserved_share": unobserved_share}
+    known = {name: values for name, values in columns.items() if values is not None}
+    rows = [
+        [names[place] if len(names) else place + 1, *(float(values[place]) for values in known.values())]
+        for place in range(len(coarse))
+    ]
+    return chart.with_numbers("held_out_views", ["view", *known], rows)
 
 
-def gain_chart(percent: Sequence[float], colors: Sequence[str], *, title: str) -> DataImage:
+def gain_chart(percent: Sequence[float], colors: Sequence[str], *, title: str) -> Chart:
     """What each trajectory added, in the order of acceptance.
 
     Args:
@@ -208,7 +225,9 @@ def gain_chart(percent: Sequence[float], colors: Sequence[str], *, title: str) -
         axes.set_xlabel("trajectory, in the order of acceptance")
         axes.set_xlim(0.4, max(len(percent), 8) + 0.6)
         axes.xaxis.get_major_locator().set_params(integer=True)
-        return svg_image(figure)
+        chart = svg_image(figure)
+    rows = [[place + 1, float(value)] for place, value in enumerate(percent)]
+    return chart.with_numbers("trajectories", ["trajectory", "adds_percent"], rows)
 
 
 def sequences_chart(
@@ -216,7 +235,7 @@ def sequences_chart(
     coarse: Float[np.ndarray, "s"],
     final: Float[np.ndarray, "s"],
     seconds: Float[np.ndarray, "s"],
-) -> DataImage:
+) -> Chart:
     """PSNR of each sequence, coarse to final, and PSNR against run time.
 
     Args:
@@ -242,11 +261,25 @@ def sequences_chart(
         left.grid(axis="x")
         left.set_title("PSNR on held-out views (dB)")
         left.legend(ncols=2, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.1, handletextpad=0.1)
-        right.scatter(seconds, final, s=22, color=FINAL_COLOR)
-        right.set_title("Final PSNR (dB) by run time")
+        has_final = np.isfinite(final)
+        if has_final.any():
+            right.scatter(seconds[has_final], final[has_final], s=22, color=FINAL_COLOR)
+        if not has_final.all():
+            # Nothing was fine-tuned there.
+            alone = ~has_final
+            right.scatter(
+                seconds[alone], coarse[alone], s=18, facecolor="white", edgecolor=COARSE_COLOR, linewidth=1.4
+            )
+        right.set_title("PSNR (dB) by run time")
         right.set_xlabel("seconds")
         right.set_xlim(left=0)
-        return svg_image(figure)
+        chart = svg_image(figure)
+    header = ["sequence", "coarse_psnr_db", "final_psnr_db", "seconds"]
+    rows: list[list[Cell]] = [
+        [name, float(coarse[place]), float(final[place]), float(seconds[place])]
+        for place, name in enumerate(names)
+    ]
+    return chart.with_numbers("sequences", header, rows)
 
 
 def method_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
@@ -262,7 +295,7 @@ def methods_chart(
     seconds: Mapping[str, Mapping[str, Sequence[float]]],
     colors: Mapping[str, str],
     title: str,
-) -> DataImage:
+) -> Chart:
     """A figure of every run by group, one line per group and one mark per run, and the same by run time.
 
     Args:
@@ -300,13 +333,22 @@ def methods_chart(
         right.set_title("The same by run time")
         right.set_xlabel("seconds")
         right.set_xlim(left=0)
-        return svg_image(figure)
+        chart = svg_image(figure)
+    rows: list[list[Cell]] = [
+        [group, method, float(value), float(took)]
+        for method in colors
+        for group in groups
+        for value, took in zip(
+            values.get(method, {}).get(group, ()), seconds.get(method, {}).get(group, ()), strict=True
+        )
+    ]
+    return chart.with_numbers(file_name(title), ["sequence", "method", title, "seconds"], rows)
 
 
 def pairs_chart(
     panels: Sequence[tuple[str, bool]],
     rows: Sequence[tuple[str, Sequence[tuple[float, float | None, float | None] | None]]],
-) -> DataImage:
+) -> Chart:
     """Paired differences with their 95 % intervals, one panel per figure, zero marked.
 
     Args:
@@ -337,7 +379,15 @@ def pairs_chart(
             panel.grid(axis="x")
             panel.grid(visible=False, axis="y")
         axes[0].set_yticks(place, [name for name, _ in rows])
-        return svg_image(figure)
+        chart = svg_image(figure)
+    numbers: list[list[Cell]] = [
+        [name, title, *cell]
+        for name, cells in rows
+        for (title, _), cell in zip(panels, cells, strict=True)
+        if cell is not None
+    ]
+    header = ["run", "figure", "mean_difference", "low", "high"]
+    return chart.with_numbers("differences", header, numbers)
 
 
 def _figure(width_in: float, height_in: float) -> Any:

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from extrags.report.charts import drawing_style, svg_image
-from extrags.report.encode import DataImage
+from extrags.report.downloads import Chart
 
 __all__ = ["trend_chart"]
 
 PANELS = (("psnr", "PSNR (dB)"), ("seconds", "Run time (s)"))
 
 
-def trend_chart(entries: Sequence[Mapping[str, Any]], colors: Mapping[str, str]) -> DataImage | None:
+def trend_chart(entries: Sequence[Mapping[str, Any]], colors: Mapping[str, str]) -> Chart | None:
     """PSNR and run time by date, one line per method; None for fewer than two runs.
 
     Args:
@@ -55,4 +55,12 @@ def trend_chart(entries: Sequence[Mapping[str, Any]], colors: Mapping[str, str])
             panel.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
         axes[1].set_ylim(bottom=0)
         axes[0].legend(loc="best")
-        return svg_image(figure)
+        chart = svg_image(figure)
+    keys = [key for key, _ in PANELS]
+    rows = [
+        [entry["when"], method, *(entry["methods"][method][key] for key in keys)]
+        for entry in entries
+        for method in colors
+        if method in entry["methods"]
+    ]
+    return chart.with_numbers("trend", ["when", "method", *keys], rows)

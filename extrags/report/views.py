@@ -136,7 +136,7 @@ def virtual_rows(
             image_cell(
                 sequence.rgb[reference],
                 None,
-                f"Reference, frame {name}",
+                "Reference",
                 f"Reference frame {name}",
                 largest_bytes,
             ),
@@ -159,7 +159,8 @@ def virtual_rows(
             alt = f"Expected error of {where}, mean {expected.mean():.3f}"
             cells.append(image_cell(shown, None, "Expected error", alt, largest_bytes))
         note = (
-            f"trajectory {clip + 1} · image weight {number(float(pseudo.image_confidence[index]), 2)} · "
+            f"trajectory {clip + 1} · reference frame {name} · "
+            f"image weight {number(float(pseudo.image_confidence[index]), 2)} · "
             f"mean uncertainty {number(float(u.mean()), 2)} · {100 * changed:.0f} % of the pixels changed"
         )
         rows.append(ImageRow(f"Virtual view {index + 1}", note, tuple(cells)))

@@ -130,7 +130,7 @@ def train(given: argparse.Namespace) -> int:
 
 def enhance(given: argparse.Namespace) -> int:
     """`extrags bench enhance`."""
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     _set_passive_openmp_wait()
     from flows.settings import pipeline_config
 
@@ -168,7 +168,7 @@ def enhance(given: argparse.Namespace) -> int:
 
 
 def _kernels(given: argparse.Namespace, *, training: bool) -> int:
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     _set_passive_openmp_wait()
     sizes = _sizes(given)
     threads = [_number("--threads", text) for text in items(given.threads or ["1", "2"])]

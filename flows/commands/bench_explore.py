@@ -62,7 +62,7 @@ def add_arguments(parser: Parser) -> None:
 
 def explore(given: argparse.Namespace) -> int:
     """`extrags bench explore`."""
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     # Read when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     from extrags.store import Store

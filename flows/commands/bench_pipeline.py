@@ -65,7 +65,7 @@ def add_arguments(parser: Parser) -> None:
 
 def pipeline(given: argparse.Namespace) -> int:
     """`extrags bench pipeline`."""
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     # Read when torch is loaded; the processes of the runs inherit it.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     if given.repeats < 1:

@@ -56,7 +56,7 @@ def add_arguments(parser: Parser) -> None:
 
 def stability(given: argparse.Namespace) -> int:
     """`extrags bench stability`."""
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     # Read when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     from extrags.raster.bench import machine

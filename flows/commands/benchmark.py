@@ -7,7 +7,15 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
-from flows.commands.common import items, parsed_settings, set_up_logging, stage_limits, store_root, write_json
+from flows.commands.common import (
+    items,
+    parsed_settings,
+    set_up_logging,
+    showing,
+    stage_limits,
+    store_root,
+    write_json,
+)
 from flows.commands.options import Parser, add_json, add_runner, add_settings, add_store
 
 if TYPE_CHECKING:
@@ -82,7 +90,7 @@ def benchmark(given: argparse.Namespace) -> int:
     from flows.environment import prepare, without_heartbeat
 
     terminal = sys.stderr.isatty()
-    set_up_logging(debug=given.debug, terminal=terminal)
+    set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
     root = store_root(given)
     # Any: the flow wants the literal names, which are looked at below.
     methods: Any = items(given.methods)
@@ -92,8 +100,9 @@ def benchmark(given: argparse.Namespace) -> int:
     prepare(Store(root).state, debug=given.debug)
     from flows.benchmark import benchmark as flow
     from flows.benchmark import check_methods
-    from flows.console import progress_bars
-    from flows.selection import absolute_manifests
+    from flows.estimate import expected_seconds
+    from flows.progress_display import RunInView, progress_display
+    from flows.selection import absolute_manifests, chosen_sequences
     from flows.settings import task_runner
     from flows.temporary_server import temporary_server
 
@@ -103,7 +112,10 @@ def benchmark(given: argparse.Namespace) -> int:
     check_methods(methods, variants, given.baseline)
     for profile in profiles:
         profile_config(profile)
-    with temporary_server(), without_heartbeat(), progress_bars(terminal=terminal):
+    ways = len(profiles) * len(seeds) * (len(methods) + len(variants))
+    runs = len(chosen_sequences(given.sequences)) * ways
+    view = RunInView(runs, expected_seconds(profile_config(profiles[0])), "evaluate", root)
+    with temporary_server(), without_heartbeat(), progress_display(showing(given), view):
         found = flow.with_options(task_runner=task_runner(given.runner))(
             sequences=absolute_manifests(given.sequences),
             profiles=profiles,

@@ -10,10 +10,10 @@ import json
 import logging
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
-from extrags.redaction import CredentialFilter
+from extrags.redaction import CredentialFilter, without_credentials
 
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
@@ -27,9 +27,11 @@ __all__ = [
     "parsed_settings",
     "run_config",
     "set_up_logging",
+    "showing",
     "stage_limits",
     "store_root",
     "write_json",
+    "write_page",
 ]
 
 
@@ -165,9 +167,29 @@ def write_json(value: Any, target: str | None) -> None:
         raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
 
 
-def set_up_logging(*, debug: bool, terminal: bool) -> None:
-    """Log lines to standard error: everything with `debug`, progress where there is no terminal."""
-    level = logging.INFO if debug or not terminal else logging.WARNING
+def write_page(page: str, target: str) -> str:
+    """Write an HTML page; the absolute path of the file.
+
+    Raises:
+        StoreError: when it cannot be written.
+    """
+    place = Path(target).expanduser().absolute()
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.write_text(without_credentials(page), encoding="utf-8")
+    except OSError as error:
+        raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
+    return str(place)
+
+
+def set_up_logging(*, debug: bool, terminal: bool, quiet: bool = False) -> None:
+    """Log lines to standard error: everything with `debug`, errors alone when quiet.
+
+    Progress goes there where there is no terminal.
+    """
+    level = logging.ERROR if quiet else logging.WARNING if terminal else logging.INFO
+    if debug:
+        level = logging.INFO
     handler = logging.StreamHandler(sys.stderr)
     # The handler's as well as the loggers': a run on a lasting server sends more to its log than is shown.
     handler.setLevel(level)
@@ -175,3 +197,10 @@ def set_up_logging(*, debug: bool, terminal: bool) -> None:
     logging.basicConfig(level=level, format="%(asctime)s %(message)s", datefmt="%H:%M:%S", handlers=[handler])
     for noisy in ("httpx", "httpcore", "prefect", "distributed", "distributed.scheduler", "asyncio"):
         logging.getLogger(noisy).setLevel(logging.WARNING if debug else logging.CRITICAL)
+
+
+def showing(given: argparse.Namespace) -> Literal["terminal", "log", "nothing"]:
+    """Where the progress of a run goes: see `flows.progress_display`."""
+    if given.quiet:
+        return "nothing"
+    return "terminal" if sys.stderr.isatty() else "log"

@@ -94,7 +94,7 @@ def show(given: argparse.Namespace) -> int:
     from data_catalog import resolve
     from flows.terminal import console
 
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     found = _known(given.sequence)
     measured: dict[str, Any] | None = None
     try:

@@ -40,7 +40,7 @@ def add_arguments(parser: Parser) -> None:
 
 def evaluate(given: argparse.Namespace) -> int:
     """`extrags evaluate`."""
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     if given.renders is None and (given.depth is not None or given.depth_step is not None):
         raise ConfigError("--depth goes with --renders: it holds the depth of the same frames")
     found = _finished(given) if given.renders is None else _renders(given)

@@ -1,77 +1,200 @@
-"""`export`: a reconstructed scene as PLY, a sequence as COLMAP model or `transforms.json`."""
+"""`export`: a reconstructed scene as Gaussians, mesh, points or video; a sequence with its cameras."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, StoreError
-from flows.commands.common import finished_run, run_config, set_up_logging
+from flows.commands.common import set_up_logging
 from flows.commands.options import Parser, add_method
 
-if TYPE_CHECKING:
-    from extrags.sequence import EndoscopicSequence
-
 __all__ = ["add_arguments", "export"]
+
+GAUSSIANS = ("ply", "compressed-ply", "spz", "sog")
+COLORED = (*GAUSSIANS, "mesh", "points")
+FLOWN = ("camera-path", "video")
+SEQUENCES = ("colmap", "colmap-text", "transforms")
+
+SUFFIXES = {
+    "compressed-ply": (".ply",),
+    "spz": (".spz",),
+    "sog": (".sog",),
+    "mesh": (".glb", ".obj", ".ply"),
+    "points": (".ply",),
+    "camera-path": (".json",),
+    "video": (".mp4",),
+}
+"""How the file's name must end: programs choose their reader by it."""
+
+APPLIES = {
+    "scene": COLORED,
+    "light": COLORED,
+    "distance": COLORED,
+    "exposure": (*COLORED, "video"),
+    "texture": ("mesh",),
+    "min_opacity": ("points",),
+    "along": FLOWN,
+    "between": FLOWN,
+    "fps": FLOWN,
+    "width": FLOWN,
+    "panels": ("video",),
+}
+"""Options, and what they say something about."""
+
+PANELS = ("coarse", "final", "uncertainty")
 
 
 def add_arguments(parser: Parser) -> None:
     """The options of `extrags export`."""
     parser.description = (
-        "Write a finished run's scene as PLY, or a sequence with its poses, images, masks, depth and points "
-        "for COLMAP or nerfstudio. Poses that the run estimates or refines are taken from its store."
+        "Write a finished run's scene as Gaussians, mesh, points or video, or a sequence with its poses, "
+        "images, masks, depth and points for COLMAP or nerfstudio. Poses that the run estimates or refines "
+        "are taken from its store."
     )
     parser.set_defaults(command=export)
     parser.add_argument("sequence", metavar="SEQUENCE")
     add_method(parser)
     parser.add_argument(
         "--to",
-        choices=("ply", "colmap", "colmap-text", "transforms"),
+        choices=(*COLORED, *FLOWN, *SEQUENCES),
         default="ply",
-        help="ply: the scene; the others: the sequence (default: ply)",
+        help="ply, compressed-ply, spz, sog: Gaussians, from the largest to the smallest file; mesh: surface "
+        "with texture, of the kind that FILE ends with (.glb, .obj, .ply); points: centres of the Gaussians; "
+        "camera-path: JSON of nerfstudio's viewer; video: H.264; colmap, colmap-text, transforms: the "
+        "sequence (default: ply)",
     )
     parser.add_argument(
-        "--scene", choices=("final", "coarse"), default="final", help="which scene, for ply (default: final)"
+        "-o",
+        "--output",
+        "--out",
+        required=True,
+        metavar="FILE|DIR",
+        help="file, or folder of a sequence, to write",
     )
     parser.add_argument(
-        "-o", "--output", "--out", required=True, metavar="FILE.ply|DIR", help="file, or folder to write into"
+        "--scene",
+        choices=("final", "coarse"),
+        help="which scene, for Gaussians, mesh and points (default: final)",
+    )
+    light = parser.add_argument_group("light: other programs know no lamp on the camera")
+    light.add_argument(
+        "--light",
+        choices=("recorded", "frontal", "kept"),
+        help="recorded: colours as bright as the training views saw them on average (default); frontal: as "
+        "if all surfaces faced the lamp at --distance; kept: albedo, with the light in the header of a PLY, "
+        "which `extrags import` reads",
+    )
+    light.add_argument(
+        "--distance",
+        type=float,
+        metavar="D",
+        help="of --light frontal, in world units (mostly mm; default: the light's reference distance)",
+    )
+    light.add_argument(
+        "--exposure",
+        type=float,
+        metavar="GAIN",
+        help="gain of the camera; 1 is the mean of the training frames (default: 1)",
+    )
+    surface = parser.add_argument_group("mesh and points")
+    surface.add_argument(
+        "--no-texture",
+        dest="texture",
+        action="store_false",
+        default=None,
+        help="a mesh with colours of vertices alone",
+    )
+    surface.add_argument(
+        "--min-opacity",
+        type=float,
+        metavar="SHARE",
+        help="fainter Gaussians are no points (default: 0.5)",
+    )
+    flight = parser.add_argument_group("camera-path and video")
+    flight.add_argument(
+        "--along",
+        metavar="training|held-out|virtual|FILE.json",
+        help="the cameras to fly through: of training or held-out frames, of the exploration's trajectories, "
+        "or of a camera path (default: training)",
+    )
+    flight.add_argument(
+        "--between",
+        type=int,
+        metavar="N",
+        help="steps from each camera to the next; a camera path from a file is taken as it is (default: 1, "
+        "the cameras themselves)",
+    )
+    flight.add_argument("--fps", type=float, metavar="RATE", help="frames per second (default: 24)")
+    flight.add_argument(
+        "--width", type=int, metavar="PX", help="width of one picture (default: that of the frames)"
+    )
+    flight.add_argument(
+        "--panels",
+        metavar="PANEL,...",
+        help="pictures of a video side by side: coarse, final, uncertainty (default: all, without coarse "
+        "where nothing was fine-tuned); uncertainty stands last",
     )
 
 
 def export(given: argparse.Namespace) -> int:
     """`extrags export`."""
-    set_up_logging(debug=given.debug, terminal=True)
-    return _scene(given) if given.to == "ply" else _sequence(given)
+    _check(given)
+    if given.to in SEQUENCES:
+        set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
+        return _sequence(given)
+    from flows.commands.export_scene import export_scene
+
+    return export_scene(given)
 
 
-def _scene(given: argparse.Namespace) -> int:
-    if run_config(given).uc_nerf.enabled:
-        raise ConfigError(f"the method {given.method} makes no Gaussians; --to ply has nothing to write")
-    run = finished_run(given, "coarse" if given.scene == "coarse" else "finetune")
-    from extrags.scene import Scene
+def _check(given: argparse.Namespace) -> None:
+    """Refuse what makes no sense before anything is looked up.
 
-    # Where the plan left fine-tuning out, the coarse scene is the final one.
-    ref = run.refs.get("finetune", run.refs["coarse"])
-    scene = run.store.load(Scene, ref)
-    target = Path(given.output)
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        scene.gaussians.write_ply(target)
-    except OSError as error:
-        raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
-    print(f"{target}: {len(scene.gaussians)} Gaussians")
-    return 0
+    Raises:
+        ConfigError: for an option of another target, a value out of range, or a wrong name of the file.
+    """
+    for name, targets in APPLIES.items():
+        if getattr(given, name) is not None and given.to not in targets:
+            flag = "--no-texture" if name == "texture" else f"--{name.replace('_', '-')}"
+            raise ConfigError(f"{flag} says nothing about --to {given.to}; it is for {', '.join(targets)}")
+    if given.light == "kept" and given.to != "ply":
+        raise ConfigError(f"--light kept is for --to ply; {given.to} has no place for a light")
+    if given.light == "kept" and given.exposure is not None:
+        raise ConfigError("--exposure is baked into colours, and --light kept bakes nothing")
+    if given.distance is not None and given.light != "frontal":
+        raise ConfigError("--distance is that of --light frontal")
+    for name in ("distance", "exposure"):
+        value = getattr(given, name)
+        if value is not None and not 0 < value < float("inf"):
+            raise ConfigError(f"--{name} is {value:g}; expected a number above 0")
+    if given.min_opacity is not None and not 0 <= given.min_opacity < 1:
+        raise ConfigError(f"--min-opacity is {given.min_opacity:g}; expected a number from 0 to below 1")
+    if given.between is not None and not 1 <= given.between <= 1000:
+        raise ConfigError(f"--between is {given.between}; expected 1 to 1000")
+    if given.fps is not None and not 0.1 <= given.fps <= 1000:
+        raise ConfigError(f"--fps is {given.fps:g}; expected 0.1 to 1000")
+    if given.width is not None and not 16 <= given.width <= 8192:
+        raise ConfigError(f"--width is {given.width}; expected 16 to 8192")
+    for panel in [] if given.panels is None else given.panels.split(","):
+        if panel not in PANELS:
+            raise ConfigError(f"--panels: no panel {panel!r}; known: {', '.join(PANELS)}")
+    suffixes = SUFFIXES.get(given.to)
+    if suffixes and Path(given.output).suffix.lower() not in suffixes:
+        raise ConfigError(f"--output {given.output}: the name must end in {' or '.join(suffixes)}")
+    if given.to not in SEQUENCES and Path(given.output).is_dir():
+        raise ConfigError(f"--output {given.output} is a folder; --to {given.to} writes a file")
 
 
 def _sequence(given: argparse.Namespace) -> int:
     from data_catalog.readers.colmap_model import points_of, write_colmap
     from data_catalog.readers.transforms_json import write_transforms
+    from flows.commands.export_scene import posed_sequence
 
     target = Path(given.output)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise ConfigError(f"{target} exists and is not an empty folder; nothing is written over it")
-    sequence = _posed_sequence(given)
+    sequence = posed_sequence(given)
     found = points_of(sequence)
     points, points_rgb = found if found is not None else (None, None)
     try:
@@ -85,24 +208,3 @@ def _sequence(given: argparse.Namespace) -> int:
     count = 0 if points is None else len(points)
     print(f"{target}: {len(sequence)} frames with poses, {count} points")
     return 0
-
-
-def _posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:
-    """The frames with the poses and intrinsics that the scene of a run with these settings is made with.
-
-    Where no stage changes those of the source, no run is needed.
-
-    Raises:
-        StoreError: when a stage changes them and has not run.
-    """
-    from data_catalog.catalog import read
-    from extrags.sequence import EndoscopicSequence
-    from extrags.training.reconstruction import refines_poses
-
-    config = run_config(given)
-    source = read(given.sequence, config.ingest)
-    estimated = source.world_from_camera is None or config.poses.replace_given
-    if not estimated and not refines_poses(source, config.coarse):
-        return source
-    run = finished_run(given, "poses" if config.coarse.refine_poses is False else "coarse")
-    return run.store.load(EndoscopicSequence, run.refs["sequence"])

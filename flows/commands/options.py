@@ -46,6 +46,13 @@ class Parser(argparse.ArgumentParser):
         self.add_argument(
             "--debug", action="store_true", default=argparse.SUPPRESS, help="show tracebacks and the log"
         )
+        self.add_argument(
+            "-q",
+            "--quiet",
+            action="store_true",
+            default=argparse.SUPPRESS,
+            help="say nothing but errors, and what was asked for on standard output",
+        )
 
     def format_help(self) -> str:
         """The help of argparse, and the listing behind it."""

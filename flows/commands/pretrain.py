@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
-from flows.commands.common import set_up_logging
+from flows.commands.common import set_up_logging, showing
 from flows.commands.options import Parser
 
 if TYPE_CHECKING:
@@ -196,7 +196,7 @@ def add_arguments(parser: Parser) -> None:
 def pretrain(given: argparse.Namespace) -> int:
     """`extrags pretrain`."""
     terminal = sys.stderr.isatty()
-    set_up_logging(debug=given.debug, terminal=terminal)
+    set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
     # Before torch is imported: threads that spin while they wait slow each other down.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     import torch
@@ -205,8 +205,9 @@ def pretrain(given: argparse.Namespace) -> int:
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
     from extrags.restoration.diffusion.pretraining import pretrain as trained
-    from flows.console import progress_bars
+    from flows.progress_display import progress_display
     from flows.terminal import console
+    from tasks.progress import reporting
 
     values = {
         "scenes": given.scenes,
@@ -231,7 +232,7 @@ def pretrain(given: argparse.Namespace) -> int:
     # As things are now: in some hours the working tree may be another.
     about: dict[str, Any] = {"command": _command(given), "machine": machine()}
     sources = scene_sources(given, config.scenes)
-    with progress_bars(terminal=terminal):
+    with progress_display(showing(given)), reporting("restorer", "pretrain"):
         files = make_scenes(Path(given.scenes_folder), sources, given.workers)
         if given.scenes_only:
             console().print(f"{len(files)} scenes in {given.scenes_folder}")

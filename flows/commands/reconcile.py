@@ -31,7 +31,7 @@ def add_arguments(parser: Parser) -> None:
 
 def reconcile(given: argparse.Namespace) -> int:
     """`extrags reconcile`."""
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     from prefect.settings import PREFECT_API_URL
 
     from flows.automation import NAME, provide_automation

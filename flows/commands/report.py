@@ -22,7 +22,7 @@ def add_arguments(parser: Parser) -> None:
 
 def report(given: argparse.Namespace) -> int:
     """`extrags report`: from what is in the store, without running anything else."""
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     run = finished_run(given, "evaluate")
     from flows.runners import DirectRunner
     from tasks.report import PAGE

@@ -13,7 +13,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from extrags.errors import ConfigError, DamagedArtefactError, ExtragsError, UnknownSequenceError
-from flows.commands.common import items, run_config, set_up_logging, stage_limits, store_root, write_json
+from flows.commands.common import (
+    items,
+    run_config,
+    set_up_logging,
+    showing,
+    stage_limits,
+    store_root,
+    write_json,
+)
 from flows.commands.options import Parser, add_json, add_method, add_runner
 from flows.failures import describe_error
 from flows.outcome import DatasetFailedError, DatasetOutcome
@@ -122,9 +130,11 @@ def run(given: argparse.Namespace) -> int:
         ),
     )
     seconds = time.monotonic() - begun
-    from flows.console import print_outcomes
+    from flows.console import print_failures, print_outcomes
 
-    if not outcome.sequences:
+    if given.quiet:
+        print_failures(outcome)
+    elif not outcome.sequences:
         print(f"extrags: no sequence is {given.only}; nothing to do", file=sys.stderr)
     else:
         print_outcomes(outcome, seconds)
@@ -211,7 +221,7 @@ def execute(
     from flows.temporary_server import start_early, stop_early, temporary_server
 
     terminal = sys.stderr.isatty()
-    set_up_logging(debug=given.debug, terminal=terminal)
+    set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
     root = store_root(given)
     several = several or Several(methods=(given.method,), seeds=(given.seed,))
     if several.methods == (given.method,):
@@ -256,12 +266,13 @@ def execute(
         first = next((case for case in cases if case.method == method), None)
         if first is not None:
             preflight(first.config(), until, METHODS[method].leave_out)
-    if terminal and len(cases) > 1:
+    if terminal and not given.quiet and len(cases) > 1:
         # Elsewhere it is a line of the log.
         expected = expectations(cases, root, until, refresh=refresh)
         print(f"extrags: {expected_words(expected, at_once)}", file=sys.stderr)
-    from flows.console import progress_bars
     from flows.dataset import reconstruct_dataset
+    from flows.estimate import expected_seconds
+    from flows.progress_display import RunInView, progress_display
 
     # Names were checked by the parser; flows have literals for them.
     arguments: dict[str, Any] = {
@@ -281,7 +292,8 @@ def execute(
         "only": several.only,
         "limits": stage_limits(given),
     }
-    with temporary_server(), without_heartbeat(), progress_bars(terminal=terminal):
+    view = RunInView(len(cases), expected_seconds(cases[0].config()), until, root)
+    with temporary_server(), without_heartbeat(), progress_display(showing(given), view):
         try:
             outcome: DatasetOutcome = reconstruct_dataset(**arguments)
         except DatasetFailedError as error:

@@ -45,7 +45,7 @@ def add_arguments(parser: Parser) -> None:
 
 def lpips(given: argparse.Namespace) -> int:
     """`extrags weights lpips`; exit code 1 when weights are missing."""
-    set_up_logging(debug=given.debug, terminal=True)
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     from extrags.errors import WeightsError
     from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE, download_backbone, find_heads, find_weights
 

@@ -45,6 +45,9 @@ class RecordedRun:
             "test": 4,
             "trajectories": 8,
             "virtual_views": 100,
+            "n_gaussians": 1000,
+            "sh_degree": 1,
+            "has_light": 0,
         }
 
     def run(self, calls: Sequence[Call], label: str) -> list[Result]:

@@ -53,6 +53,7 @@ FOLLOWS = {
         "enhance-restore",
         "finetune-judge",
         "finetune",
+        "evaluate-restore",
     ],
     "assess": ["plan"],
     # What was measured is in the plan, and so on the page.
@@ -63,14 +64,15 @@ FOLLOWS = {
     "explore-branch": ["explore-merge"],
     "explore-merge": ["explore"],
     "explore": ["enhance-keyframes", "enhance-restore", "finetune-judge", "report"],
-    "enhance-train": ["enhance-keyframes", "enhance-restore", "finetune-judge"],
+    "enhance-train": ["enhance-keyframes", "enhance-restore", "finetune-judge", "evaluate-restore"],
     "enhance-keyframes": ["enhance-restore"],
     "enhance-restore": ["enhance"],
     "enhance": ["finetune", "report"],
     # Of the judgement only the amount that is kept counts later.
     "finetune-judge": [],
     "finetune": ["evaluate-render", "report"],
-    "evaluate-render": ["evaluate", "report"],
+    "evaluate-render": ["evaluate-restore", "evaluate", "report"],
+    "evaluate-restore": ["evaluate", "report"],
     "uc-nerf-render": ["evaluate", "report"],
     "evaluate": ["report"],
     "report": [],
@@ -91,6 +93,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "depth.*": ("depth",),
     "coarse.train_on": (),  # Allowed for the oracle alone; below.
     "coarse.*": ("coarse",),
+    "imported.*": (),  # Without a scene nothing is imported; below.
     "uc_nerf.enabled": ALL_AFTER_COARSE,
     "uc_nerf.*": (),  # Reads nothing here; below.
     "assess.min_hole_share": ("plan",),
@@ -116,6 +119,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "enhance.reference": ("enhance-train", *RESTORE, "finetune-judge"),
     "enhance.iou": ("enhance-restore", "finetune-judge"),
     "enhance.pixel_confidence": ("enhance-restore", "finetune-judge"),
+    "enhance.seed": ("enhance-train", "evaluate-restore"),
     "enhance.caption.*": (),  # The embedded backend reads none of these; below.
     "enhance.pretrained.*": (),
     "enhance.checkpoint.*": (),
@@ -123,6 +127,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "finetune.judge.*": ("finetune-judge",),
     "finetune.iterations": ("plan", "finetune-judge", "finetune"),
     "finetune.*": ("finetune-judge", "finetune"),
+    "evaluate.restored": ("evaluate-restore",),
     "evaluate.lpips_nets": ("evaluate",),
     "evaluate.lpips_weights": (),  # By content, below.
     "report.*": (),
@@ -134,6 +139,7 @@ OTHERS: dict[str, Any] = {
     "depth.completion": None,
     "depth.monocular": None,
     "coarse.train_on": None,
+    "imported.scene": None,
     "enhance.pretrained_weights": None,
     "evaluate.lpips_weights": None,
     "depth.device": "cuda",
@@ -363,6 +369,26 @@ class TestContent:
         assert changed(keys("one"), keys("copy")) == {"report"}
         present = recorded_keys(SEQUENCE, BASE)
         assert changed(keys("one"), keys("other")) == expected(stages, present)
+
+    def test_an_imported_scene(self, tmp_path: Path) -> None:
+        """It takes the place of the coarse stage: all that follows this one changes with its content."""
+
+        def keys(place: str, scale: float = 1.0) -> dict[str, list[str]]:
+            base = BASE.with_overrides(
+                {"imported.scene": str(tmp_path / place / "theirs.ply"), "imported.scale": scale}
+            )
+            return recorded_keys(SEQUENCE, base, has_poses=True)
+
+        for place, content in (("one", b"content"), ("copy", b"content"), ("other", b"cOntent")):
+            (tmp_path / place).mkdir()
+            (tmp_path / place / "theirs.ply").write_bytes(content)
+        present = keys("one")
+        usual = recorded_keys(SEQUENCE, BASE, has_poses=True)
+        assert set(present) == {*usual, "import-scene"} - {"coarse", "refined-frames"}
+        assert changed(present, keys("copy")) == {"report"}
+        follow = with_all_that_follow(["coarse"]) & set(present) | {"import-scene", "report"}
+        assert changed(present, keys("other")) == follow
+        assert changed(present, keys("one", 2.0)) == follow
 
     def test_a_source_of_the_same_name_and_size(self, tmp_path: Path) -> None:
         source = tmp_path / "source"

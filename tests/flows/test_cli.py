@@ -324,6 +324,12 @@ class TestFinished:
         assert sequence["metrics"] == first.metrics
         assert "9 cached, 2 skipped" in capsys.readouterr().err
 
+    def test_quiet_says_nothing_where_all_is_well(
+        self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["run", SEQUENCE, *settled(finished[0]), "--until", "evaluate", "--quiet"]) == 0
+        assert capsys.readouterr() == ("", "")
+
     def test_plan_says_why(
         self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -479,6 +485,12 @@ class TestThroughPrefect:
         # The table wraps where columns are narrow.
         assert "the folder is empty" in first["stages"][0]["reason"]
         assert "folder" in capsys.readouterr().err
+        # Quiet or not, a failure is one sentence.
+        assert main(["-q", "run", folder, SEQUENCE, *settled(store)]) == 1
+        said = capsys.readouterr().err.strip().splitlines()
+        assert len(said) == 1
+        assert "failed in ingest: " in said[0]
+        assert "the folder is empty" in said[0]
 
 
 class TestBench:

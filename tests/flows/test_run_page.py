@@ -25,17 +25,14 @@ from prefect.runtime import flow_run
 from prefect.settings import PREFECT_API_URL, PREFECT_LOGGING_TO_API_ENABLED, temporary_settings
 
 from extrags.events import Progress, emit
-from extrags.pipeline import STAGES
 from extrags.store import Ref, Slot
-from flows import run_page as pages
 from flows.outcome import SequenceOutcome
-from flows.run_page import EXPECTED_SECONDS, SequenceEstimate, run_page
+from flows.run_page import run_page
 from flows.sequence import reconstruct_sequence
 from tasks import run_page as senders
-from tasks.progress import StageProgress
 from tasks.run_log import RunLogHandler, run_log
 from tasks.run_page import PAGE_VARIABLE, artifact_key
-from tasks.stage import at, stage, stage_versions
+from tasks.stage import at, stage
 from tests.flows.tiny import SEQUENCE, TINY, tiny_config
 
 
@@ -196,9 +193,9 @@ def test_pictures_and_report_are_on_the_page(finished: tuple[str, SequenceOutcom
     assert head in ("data:image/png", "data:image/jpeg")
     assert len(picture.data) <= 30_000
     width, height = Image.open(io.BytesIO(base64.b64decode(content))).size
-    # Three views of 48 x 40 pixels side by side.
-    assert (width, height) == (144, 40)
-    assert "recorded, coarse scene, final scene" in picture.description
+    # Four views of 48 x 40 pixels side by side.
+    assert (width, height) == (192, 40)
+    assert "recorded, coarse scene, final scene, the same, restored" in picture.description
     link: Any = Artifact.get(artifact_key("report", SEQUENCE))
     assert outcome.report is not None
     assert outcome.report in link.data
@@ -218,72 +215,3 @@ def test_a_sequence_without_artifacts_is_still_a_result(
     store, _ = finished
     outcome = reconstruct_sequence(sequence=SEQUENCE, profile="quick", settings=TINY, store=store)
     assert outcome.status == "ok"
-
-
-def step(stage: str, state: str = "running", done: int = 0, total: int = 0, seconds: float = 0.0) -> Any:
-    return StageProgress("scene", stage, state, done, total, "", seconds)
-
-
-class TestEstimate:
-    def test_every_stage_is_expected_and_its_tasks_exist(self) -> None:
-        assert tuple(EXPECTED_SECONDS) == STAGES
-        named = {task for tasks in EXPECTED_SECONDS.values() for task in tasks}
-        assert named <= set(stage_versions())
-
-    def test_nothing_is_said_before_something_ran(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS)
-        estimate.receive(step("ingest"), 0.0)
-        assert estimate.seconds_left(1.0) is None
-
-    def test_what_is_left_goes_at_the_pace_of_what_ran(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS, until="coarse")
-        estimate.receive(step("ingest"), 0.0)
-        estimate.receive(step("ingest", "ran", seconds=24.0), 24.0)
-        for skipped in ("poses", "depth"):
-            estimate.receive(step(skipped, "skipped"), 24.0)
-        # Ingestion took twice what was expected; 18 s are expected of the coarse scene.
-        assert estimate.seconds_left(24.0) == pytest.approx(36.0)
-        assert estimate.share(24.0) == pytest.approx(12 / 30)
-        estimate.receive(step("coarse"), 24.0)
-        estimate.receive(step("coarse", done=750, total=1500), 42.0)
-        assert estimate.share(42.0) == pytest.approx(21 / 30)
-        assert estimate.seconds_left(42.0) == pytest.approx(18.0)
-        estimate.receive(step("coarse", "ran", seconds=36.0), 60.0)
-        assert estimate.share(60.0) == 1.0
-        assert estimate.seconds_left(60.0) == 0.0
-
-    def test_a_failure_keeps_its_share(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS, until="coarse")
-        estimate.receive(step("ingest"), 0.0)
-        estimate.receive(step("ingest", "failed", seconds=1.0), 1.0)
-        for skipped in ("poses", "depth", "coarse"):
-            estimate.receive(step(skipped, "skipped"), 1.0)
-        assert estimate.share(1.0) == 0.0
-
-    def test_shares_never_fall(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS)
-        shares, now = [], 0.0
-        for name, tasks in EXPECTED_SECONDS.items():
-            estimate.receive(step(name), now)
-            for task in tasks:
-                for done in (1, 2):
-                    estimate.receive(step(task, done=done, total=2), now)
-                    now += 1.0
-                    shares.append(estimate.share(now))
-            estimate.receive(step(name, "ran", seconds=2.0), now)
-            shares.append(estimate.share(now))
-        assert shares == sorted(shares)
-        assert shares[-1] == pytest.approx(1.0)
-
-    def test_cached_stages_teach_nothing_of_the_pace(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS)
-        for name in ("ingest", "poses", "depth", "coarse"):
-            estimate.receive(step(name), 0.0)
-            estimate.receive(step(name, "cached"), 0.0)
-        assert estimate.seconds_left(1.0) is None
-
-
-def test_no_more_words_than_a_page_has_room_for() -> None:
-    assert pages.duration_text(12.3) == "12 s"
-    assert pages.duration_text(600) == "10 min"
-    assert pages.duration_text(3 * 3600) == "3.0 h"

@@ -10,9 +10,9 @@ function comparison(root) {
   const cells = () => [...rows[Number(view.value)].querySelectorAll("figure")];
   const labels = cells().map((cell) => cell.querySelector("figcaption").textContent);
   labels.forEach((label, k) => { left.append(new Option(label, k)); right.append(new Option(label, k)); });
-  const truth = labels.findIndex((label) => label.startsWith("Truth"));
+  // The first two are renders, or a render and the truth.
   left.value = 0;
-  right.value = labels.findIndex((label) => label.startsWith("Final")) > 0 ? 1 : Math.max(truth, 1);
+  right.value = 1;
   const show = () => {
     const shown = cells();
     for (const [picture, chosen] of [[over, left], [under, right]]) {

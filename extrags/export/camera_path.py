@@ -1,0 +1,124 @@
+"""Camera paths as JSON in the layout of nerfstudio's viewer, which its `ns-render camera-path` takes."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from extrags.cameras import Cameras, as_rotation
+from extrags.errors import ExtragsError, SourceError, SourceNotFoundError
+
+__all__ = ["CameraPath", "flight_through", "read_camera_path", "write_camera_path"]
+
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_LARGEST_SIDE_PX = 8192
+_LARGEST_COUNT = 100_000
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Cameras to be flown along.
+
+    Args:
+        cameras: every frame of the flight.
+        fps: frames per second.
+    """
+
+    cameras: Cameras
+    fps: float = 24.0
+
+
+def flight_through(parts: Sequence[Cameras], steps: int) -> Cameras:
+    """One flight through all cameras of each part; from one part to the next it cuts.
+
+    Args:
+        parts: of one image size, e.g. the recordings of a scene, or virtual trajectories.
+        steps: from each camera to the next of its part; 1 takes the cameras themselves.
+
+    Raises:
+        ShapeError: when the image sizes differ.
+    """
+    return Cameras.concatenated([part.interpolated(steps) for part in parts])
+
+
+def write_camera_path(path: CameraPath, file: Path) -> None:
+    """Write every camera with its matrix (OpenGL axes: x right, y up, z backward) and field of view.
+
+    The layout knows a vertical field of view alone, no principal point and no second focal length; exact
+    intrinsics stand beside it as `K`, which other programs skip and `read_camera_path` reads.
+    """
+    cameras = path.cameras
+    entries = [
+        {
+            "camera_to_world": (pose @ _OPENGL).flatten().tolist(),
+            "fov": math.degrees(2 * math.atan(cameras.height / 2 / K[1, 1])),
+            "aspect": cameras.width / cameras.height,
+            "K": K.tolist(),
+        }
+        for pose, K in zip(cameras.world_from_camera, cameras.K, strict=True)
+    ]
+    content = {
+        "camera_type": "perspective",
+        "render_width": cameras.width,
+        "render_height": cameras.height,
+        "fps": path.fps,
+        "seconds": len(cameras) / path.fps,
+        "camera_path": entries,
+    }
+    file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def read_camera_path(file: Path) -> CameraPath:
+    """Read a camera path, of nerfstudio's viewer or of `write_camera_path`.
+
+    Raises:
+        SourceNotFoundError: when there is no such file.
+        SourceError: when it is no camera path, or a number in it is wrong.
+    """
+    if not file.is_file():
+        raise SourceNotFoundError("no such file", file=file)
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        width, height = int(content["render_width"]), int(content["render_height"])
+        fps = float(content.get("fps", 24.0))
+        entries = content["camera_path"]
+        if not isinstance(entries, list):
+            raise TypeError("camera_path is no list")
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        raise SourceError(f"no camera path: {type(error).__name__}: {error}", file=file) from error
+    if not (0 < width <= _LARGEST_SIDE_PX and 0 < height <= _LARGEST_SIDE_PX):
+        raise SourceError(f"images of {width} x {height} pixels", file=file, field="render_width")
+    if not 0 < len(entries) <= _LARGEST_COUNT:
+        raise SourceError(f"{len(entries)} cameras", file=file, field="camera_path")
+    if not 0.1 <= fps <= 1000:
+        raise SourceError(f"{fps:g} frames per second; expected 0.1 to 1000", file=file, field="fps")
+    read = [_camera(entry, index, width, height, file) for index, entry in enumerate(entries)]
+    K, poses = zip(*read, strict=True)
+    return CameraPath(Cameras(np.stack(K), np.stack(poses), width, height), fps)
+
+
+def _camera(entry: Any, index: int, width: int, height: int, file: Path) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        matrix = np.array(entry["camera_to_world"], dtype=np.float64).reshape(4, 4)
+        if "K" in entry:
+            K = np.array(entry["K"], dtype=np.float64).reshape(3, 3)
+        else:
+            focal = height / 2 / math.tan(math.radians(float(entry["fov"])) / 2)
+            K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+        pose = matrix @ _OPENGL
+        pose[:3, :3] = as_rotation(pose[:3, :3], frame=index, file=file)
+    except ExtragsError:
+        raise
+    except (ValueError, KeyError, TypeError, OverflowError, ZeroDivisionError) as error:
+        raise SourceError(
+            f"{type(error).__name__}: {error}", file=file, frame=index, field="camera_path"
+        ) from error
+    if not (np.isfinite(pose).all() and np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        raise SourceError("numbers that are no camera", file=file, frame=index, field="camera_path")
+    return K, pose

@@ -1,0 +1,211 @@
+"""Meshes as GLB, OBJ and PLY, with texture where the format has one and with what was invented."""
+
+from __future__ import annotations
+
+import io
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from extrags.errors import ConfigError
+from extrags.export.textured import ColoredMesh
+
+__all__ = ["MESH_FORMATS", "write_mesh"]
+
+MESH_FORMATS = (".glb", ".obj", ".ply")
+_FLOAT, _UINT = 5126, 5125
+_ARRAY, _ELEMENTS = 34962, 34963
+_METRES = 0.001
+
+
+def write_mesh(colored: ColoredMesh, path: Path, *, metric: bool = True) -> None:
+    """Write a mesh in the format that the name ends with.
+
+    * `.glb`: texture, or colours of vertices without one; vertex attribute `_INVENTED`; metres (a scaled
+      node) where the world's unit is millimetres, world units otherwise.
+    * `.obj`: with `.mtl` and `.png` beside it where there is a texture; colours behind the positions;
+      groups `observed` and `invented`, since the format has no attributes; world units.
+    * `.ply`: colours and `invented` of vertices; the format has no texture that viewers agree on; world
+      units.
+
+    Args:
+        colored: the mesh.
+        path: its suffix chooses the format.
+        metric: the world's unit is millimetres.
+
+    Raises:
+        ConfigError: for another suffix.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".glb":
+        path.write_bytes(_glb(colored, metric))
+    elif suffix == ".obj":
+        _write_obj(colored, path)
+    elif suffix == ".ply":
+        _write_ply(colored, path)
+    else:
+        raise ConfigError(
+            f"a mesh is written as {', '.join(MESH_FORMATS)}; {path.name} ends in none of these"
+        )
+
+
+def _write_ply(colored: ColoredMesh, path: Path) -> None:
+    from plyfile import PlyData, PlyElement
+
+    mesh = colored.mesh
+    vertex = np.empty(
+        len(mesh.vertices),
+        dtype=[(axis, "f4") for axis in "xyz"]
+        + [(name, "u1") for name in ("red", "green", "blue")]
+        + [("invented", "f4")],
+    )
+    for index, axis in enumerate("xyz"):
+        vertex[axis] = mesh.vertices[:, index]
+    for index, name in enumerate(("red", "green", "blue")):
+        vertex[name] = colored.colors[:, index]
+    vertex["invented"] = colored.invented
+    face = np.empty(len(mesh.triangles), dtype=[("vertex_indices", "i4", (3,))])
+    face["vertex_indices"] = mesh.triangles
+    elements = [PlyElement.describe(vertex, "vertex"), PlyElement.describe(face, "face")]
+    PlyData(elements, byte_order="<").write(str(path))
+
+
+def _write_obj(colored: ColoredMesh, path: Path) -> None:
+    mesh, uv = colored.mesh, colored.uv
+    lines = ["# extrags; v: x y z red green blue"]
+    if colored.texture is not None:
+        picture, material = path.with_suffix(".png"), path.with_suffix(".mtl")
+        picture.write_bytes(_png(colored.texture))
+        material.write_text(
+            f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture.name}\n",
+            encoding="utf-8",
+        )
+        lines.append(f"mtllib {material.name}")
+    for position, color in zip(mesh.vertices.tolist(), (colored.colors / 255).tolist(), strict=True):
+        lines.append("v " + " ".join(f"{value:.7g}" for value in position + color))
+    if uv is not None:
+        lines += [f"vt {u:.7g} {v:.7g}" for u, v in uv.reshape(-1, 2).tolist()]
+        lines.append("usemtl surface")
+    # A triangle is invented as soon as one of its corners is.
+    invented = (colored.invented[mesh.triangles] > 0).any(axis=1)
+    for name, chosen in (("observed", ~invented), ("invented", invented)):
+        if not chosen.any():
+            continue
+        lines.append(f"g {name}")
+        for index in np.flatnonzero(chosen).tolist():
+            corners = (mesh.triangles[index] + 1).tolist()
+            if uv is None:
+                lines.append("f " + " ".join(str(corner) for corner in corners))
+            else:
+                lines.append(
+                    "f " + " ".join(f"{corner}/{3 * index + k + 1}" for k, corner in enumerate(corners))
+                )
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _glb(colored: ColoredMesh, metric: bool) -> bytes:
+    mesh = colored.mesh
+    attributes: dict[str, np.ndarray]
+    if colored.uv is None:
+        indices = mesh.triangles.reshape(-1)
+        attributes = {
+            "POSITION": mesh.vertices,
+            "COLOR_0": _linear(colored.colors),
+            "_INVENTED": colored.invented,
+        }
+    else:
+        # A vertex has one place in the texture in each of its triangles, so every corner is a vertex.
+        corners = mesh.triangles.reshape(-1)
+        indices = np.arange(len(corners))
+        flipped = colored.uv.reshape(-1, 2) * [1, -1] + [0, 1]
+        attributes = {
+            "POSITION": mesh.vertices[corners],
+            "TEXCOORD_0": flipped,
+            "_INVENTED": colored.invented[corners],
+        }
+    chunks: list[bytes] = []
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+
+    def view(content: bytes, target: int | None = None) -> int:
+        start = sum(len(chunk) for chunk in chunks)
+        chunks.append(content + b"\0" * (-len(content) % 4))
+        views.append(
+            {"buffer": 0, "byteOffset": start, "byteLength": len(content)}
+            | ({} if target is None else {"target": target})
+        )
+        return len(views) - 1
+
+    def accessor(values: np.ndarray, kind: int, target: int) -> int:
+        values = np.ascontiguousarray(values, dtype="<f4" if kind == _FLOAT else "<u4")
+        shape = "SCALAR" if values.ndim == 1 else f"VEC{values.shape[1]}"
+        accessors.append(
+            {
+                "bufferView": view(values.tobytes(), target),
+                "componentType": kind,
+                "count": len(values),
+                "type": shape,
+                "min": np.atleast_1d(values.min(axis=0)).tolist(),
+                "max": np.atleast_1d(values.max(axis=0)).tolist(),
+            }
+        )
+        return len(accessors) - 1
+
+    placed = {name: accessor(values, _FLOAT, _ARRAY) for name, values in attributes.items()}
+    primitive = {"attributes": placed, "indices": accessor(indices, _UINT, _ELEMENTS), "material": 0}
+    surface: dict[str, Any] = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
+    # Unlit: the light is in the colours already.
+    material = {
+        "pbrMetallicRoughness": surface,
+        "doubleSided": True,
+        "extensions": {"KHR_materials_unlit": {}},
+    }
+    content: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "extrags"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "name": "surface"} | ({"scale": [_METRES] * 3} if metric else {})],
+        "meshes": [{"primitives": [primitive]}],
+        "materials": [material],
+        "accessors": accessors,
+    }
+    if colored.texture is not None:
+        picture = view(_png(colored.texture))
+        surface["baseColorTexture"] = {"index": 0}
+        content |= {
+            "images": [{"bufferView": picture, "mimeType": "image/png"}],
+            "samplers": [{"magFilter": 9729, "minFilter": 9729, "wrapS": 33071, "wrapT": 33071}],
+            "textures": [{"source": 0, "sampler": 0}],
+        }
+    content["bufferViews"] = views
+    body = b"".join(chunks)
+    content["buffers"] = [{"byteLength": len(body)}]
+    text = json.dumps(content, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    length = 12 + 8 + len(text) + 8 + len(body)
+    return (
+        struct.pack("<4sII", b"glTF", 2, length)
+        + struct.pack("<I4s", len(text), b"JSON")
+        + text
+        + struct.pack("<I4s", len(body), b"BIN\0")
+        + body
+    )
+
+
+def _linear(colors: UInt8[np.ndarray, "v 3"]) -> np.ndarray:
+    """Colours of vertices in glTF are linear, textures are sRGB."""
+    share = colors.astype(np.float64) / 255
+    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+
+
+def _png(image: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    return buffer.getvalue()

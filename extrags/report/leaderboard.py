@@ -1,0 +1,203 @@
+"""The leaderboard: sequences by methods from the runs that are on record, to be sorted and filtered."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean, stdev
+from typing import Any, Literal
+
+from extrags.metrics.comparison import figure_of
+from extrags.metrics.registry import Figure, figures
+from extrags.report.downloads import Cell, csv_uri
+from extrags.report.page import rendered_page
+from extrags.report.wording import count, described_metrics, duration, number
+
+__all__ = ["BoardRow", "build_leaderboard"]
+
+
+@dataclass(frozen=True)
+class BoardRow:
+    """One run.
+
+    Args:
+        sequence: `DATASET/SEQUENCE[@SETTING]` or a path.
+        method: name of the method.
+        profile: named settings.
+        seed: of all stages; empty for each stage's own.
+        settings: what a matrix changed, in words; empty for nothing.
+        status: how its last run ended.
+        reason: why it failed.
+        ended: UTC, ISO 8601.
+        seconds: its stages took.
+        metrics: of the final scene, as the `metrics` of an `EvaluationResult`; None without.
+        link: address of its page; empty for none.
+    """
+
+    sequence: str
+    method: str
+    profile: str
+    seed: str = ""
+    settings: str = ""
+    status: Literal["ok", "failed"] = "ok"
+    reason: str = ""
+    ended: str = ""
+    seconds: float | int = 0.0
+    metrics: Mapping[str, Any] | None = None
+    link: str = ""
+
+    @property
+    def dataset(self) -> str:
+        """What stands before the slash; `files` for a path."""
+        name, slash, rest = self.sequence.partition("/")
+        return name if slash and name not in ("", ".", "..") and "/" not in rest else "files"
+
+    @property
+    def column(self) -> str:
+        """The method, and the settings that set it apart."""
+        return f"{self.method}, {self.settings}" if self.settings else self.method
+
+
+def build_leaderboard(rows: Sequence[BoardRow], *, name: str = "Leaderboard") -> str:
+    """One self-contained HTML page: a table of sequences by methods for each figure, and all runs.
+
+    Cells of the first are means over seeds; its last row is the mean over those sequences that every method
+    has, so that no method gains by what it was not run on. Scripts sort and filter; without them all tables
+    are there.
+
+    Args:
+        rows: the runs, failed ones among them.
+        name: title of the page.
+    """
+    trees = [row.metrics for row in rows if row.metrics is not None]
+    shown, compared = (
+        [item for item in asked if any(figure_of(tree, item.name) is not None for tree in trees)]
+        # What training never saw is told of in differences; the list of runs has no room for it.
+        for asked in (figures("tables"), dict.fromkeys([*figures("tables"), *figures("differences")]))
+    )
+    profiles = _distinct(row.profile for row in rows)
+    return rendered_page(
+        "leaderboard.html.j2",
+        name=name,
+        summary=_summary(rows),
+        facts=[
+            ("Runs", count(len(rows))),
+            ("Sequences", count(len({row.sequence for row in rows}))),
+            ("Methods", count(len({row.column for row in rows}))),
+            ("Failed", count(sum(row.status == "failed" for row in rows))),
+        ],
+        figures=compared,
+        columns=shown,
+        profiles=profiles,
+        datasets=_distinct(row.dataset for row in rows),
+        methods=_distinct(row.column for row in rows),
+        boards=[
+            board
+            for profile in profiles
+            for item in compared
+            if (board := _board(rows, item, profile)) is not None
+        ],
+        rows=[_run(row, shown) for row in rows],
+        csv=_csv(rows, shown),
+        protocol={"version": None, "metrics": described_metrics(*trees)},
+    )
+
+
+def _distinct(values: Any) -> list[str]:
+    return sorted(set(values))
+
+
+def _summary(rows: Sequence[BoardRow]) -> str:
+    if not rows:
+        return "No run is on record."
+    newest = max(row.ended for row in rows)[:16].replace("T", " ")
+    return (
+        f"The last run of each sequence, method, profile and seed on record; the newest ended {newest} UTC."
+    )
+
+
+def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, Any] | None:
+    """A figure of one profile, sequences by methods; None where no run has it."""
+    values: dict[tuple[str, str], list[float]] = {}
+    for row in rows:
+        value = None if row.metrics is None or row.profile != profile else figure_of(row.metrics, figure.name)
+        if value is not None and row.status == "ok":
+            values.setdefault((row.sequence, row.column), []).append(value)
+    if not values:
+        return None
+    methods = _distinct(method for _, method in values)
+    sequences = _distinct(sequence for sequence, _ in values)
+    datasets = {row.sequence: row.dataset for row in rows}
+    means = {place: fmean(found) for place, found in values.items()}
+    complete = [item for item in sequences if all((item, method) in means for method in methods)]
+    lines = []
+    for sequence in sequences:
+        cells = {method: means.get((sequence, method)) for method in methods}
+        deviations = [
+            f"± {number(stdev(found), figure.digits)}" if len(found) > 1 else ""
+            for found in (values.get((sequence, method), []) for method in methods)
+        ]
+        lines.append(
+            {
+                "sequence": sequence,
+                "dataset": datasets[sequence],
+                "cells": [
+                    {**cell, "note": note}
+                    for cell, note in zip(_cells(cells, figure), deviations, strict=True)
+                ],
+            }
+        )
+    overall = (
+        {method: fmean(means[item, method] for item in complete) for method in methods} if complete else {}
+    )
+    return {
+        "figure": figure,
+        "profile": profile,
+        "methods": methods,
+        "lines": lines,
+        "complete": len(complete),
+        "means": _cells({method: overall.get(method) for method in methods}, figure) if overall else [],
+    }
+
+
+def _cells(values: Mapping[str, float | None], figure: Figure) -> list[dict[str, Any]]:
+    """Figures of a row, the best of them marked where there are several."""
+    known = [value for value in values.values() if value is not None]
+    best = (max(known) if figure.higher_is_better else min(known)) if len(known) > 1 else None
+    return [
+        {
+            "text": number(value, figure.digits),
+            "value": "" if value is None else repr(value),
+            # Nobody is better by what is not shown.
+            "best": best is not None
+            and value is not None
+            and round(value, figure.digits) == round(best, figure.digits),
+        }
+        for value in values.values()
+    ]
+
+
+def _run(row: BoardRow, shown: Sequence[Figure]) -> dict[str, Any]:
+    values = [None if row.metrics is None else figure_of(row.metrics, item.name) for item in shown]
+    return {
+        "row": row,
+        "cells": [
+            {"text": number(value, item.digits), "value": "" if value is None else repr(value)}
+            for value, item in zip(values, shown, strict=True)
+        ],
+        "time": duration(row.seconds) if row.seconds else "",
+        "ended": row.ended[:10],
+    }
+
+
+def _csv(rows: Sequence[BoardRow], shown: Sequence[Figure]) -> str:
+    header = ["sequence", "method", "profile", "seed", "settings", "status", "reason", "ended", "seconds"]
+    lines: list[list[Cell]] = [
+        [
+            *(row.sequence, row.method, row.profile, row.seed, row.settings),
+            *(row.status, row.reason, row.ended, row.seconds),
+            *(None if row.metrics is None else figure_of(row.metrics, item.name) for item in shown),
+        ]
+        for row in rows
+    ]
+    return csv_uri([*header, *(item.name for item in shown)], lines)

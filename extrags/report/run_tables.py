@@ -1,0 +1,163 @@
+"""What a run was: its facts, plan, times of stages and settings, ready to be shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from extrags.config import PipelineConfig
+from extrags.report.inputs import ReportInputs
+from extrags.report.numbers import metrics_of
+from extrags.report.wording import count, duration, intrinsics_in_words, metric_of
+
+__all__ = [
+    "facts",
+    "flat_settings",
+    "plain_value",
+    "plan_rows",
+    "setting_groups",
+    "stage_rows",
+    "stage_summary",
+]
+
+
+def facts(inputs: ReportInputs) -> list[tuple[str, str]]:
+    """Frames, split, size, scale and run time, each with its label."""
+    sequence = inputs.sequence
+    final = metrics_of(inputs.final_metrics) or metrics_of(inputs.coarse_metrics)
+    facts = [
+        ("Training frames", count(len(sequence.train))),
+        ("Held-out frames", count(len(inputs.frames))),
+        ("Split", sequence.split.name),
+        ("Image size", f"{sequence.width} \N{MULTIPLICATION SIGN} {sequence.height} px"),
+    ]
+    recordings = 1 if sequence.recording is None else len(np.unique(sequence.recording))
+    if recordings > 1:
+        facts.append(("Recordings", count(recordings)))
+    facts.append(("Scale", sequence.scale_words.removesuffix(" scale")))
+    if sequence.intrinsics != "given":
+        facts.append(("Focal length", intrinsics_in_words(sequence)))
+    if (gaussians := metric_of(final, "n_gaussians")) is not None:
+        facts.append(("Gaussians", count(gaussians)))
+    if inputs.stages:
+        facts.append(("Run time", duration(_spent(inputs))))
+    return facts
+
+
+def plan_rows(inputs: ReportInputs) -> dict[str, Any] | None:
+    """Measurements and decisions of the scene plan; None without one."""
+    if inputs.plan is None:
+        return None
+    return {
+        "measurements": [
+            (name.replace("_", " "), _figure(value)) for name, value in inputs.plan["measurements"].items()
+        ],
+        "decisions": [
+            {
+                "stage": line["stage"],
+                "run": line["run"],
+                "value": _figure(line["value"]),
+                "threshold": _figure(line["threshold"]),
+                "budget": [f"{key} = {value}" for key, value in line["budget"].items()],
+                "reason": line["reason"],
+            }
+            for line in inputs.plan["decisions"]
+        ],
+    }
+
+
+def stage_rows(inputs: ReportInputs) -> list[dict[str, Any]]:
+    """Times of the stages, with bars in proportion."""
+    longest = max((_cost(row) for row in inputs.stages), default=0.0)
+    return [
+        {
+            "stage": row["stage"],
+            "state": row["state"],
+            "seconds": duration(None if row["state"] == "skipped" else row.get("seconds")),
+            "made": duration(row["made_seconds"]) if _made(row) else "",
+            "width": f"{100 * _cost(row) / longest:.2f}" if longest > 0 else "0",
+            "reason": row.get("reason") or "",
+        }
+        for row in inputs.stages
+    ]
+
+
+def stage_summary(inputs: ReportInputs) -> str:
+    """How long it took, how many stages ran, and what the cache spared."""
+    parts = []
+    for state, words in (
+        ("ran", "ran"),
+        ("cached", "came from the cache"),
+        ("skipped", "skipped"),
+        ("failed", "failed"),
+    ):
+        found = sum(row["state"] == state for row in inputs.stages)
+        if found:
+            parts.append(f"{found} {words}")
+    saved = sum(float(row["made_seconds"]) for row in inputs.stages if _made(row))
+    text = f"{duration(_spent(inputs))} in all: {', '.join(parts)}."
+    if saved > 0:
+        text += f" The cache spared {duration(saved)}; those stages show what they took when they ran."
+    return text
+
+
+def _made(row: Mapping[str, Any]) -> bool:
+    return row["state"] == "cached" and row.get("made_seconds") is not None
+
+
+def _cost(row: Mapping[str, Any]) -> float:
+    return float(row["made_seconds"] if _made(row) else row.get("seconds") or 0)
+
+
+def _spent(inputs: ReportInputs) -> float:
+    return sum((float(row.get("seconds") or 0) for row in inputs.stages), 0.0)
+
+
+def setting_groups(config: PipelineConfig | None) -> list[dict[str, Any]]:
+    """All settings by stage, those that differ from the defaults marked."""
+    if config is None:
+        return []
+    defaults = PipelineConfig()
+    groups = []
+    for stage in type(config).model_fields:
+        values, usual = flat_settings(getattr(config, stage)), flat_settings(getattr(defaults, stage))
+        groups.append(
+            {
+                "stage": stage,
+                "rows": [
+                    {
+                        "name": name,
+                        "value": plain_value(value),
+                        "usual": plain_value(usual[name]) if value != usual[name] else "",
+                    }
+                    for name, value in values.items()
+                ],
+            }
+        )
+    return groups
+
+
+def flat_settings(model: BaseModel, prefix: str = "") -> dict[str, Any]:
+    """Values of all settings by dotted name."""
+    found: dict[str, Any] = {}
+    for name, value in model:
+        if isinstance(value, BaseModel):
+            found |= flat_settings(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = value
+    return found
+
+
+def _figure(value: float | int) -> str:
+    """A measured number: whole ones as counts, others with four digits."""
+    return count(value) if float(value).is_integer() else f"{float(value):.4g}"
+
+
+def plain_value(value: Any) -> str:
+    """A setting as a page shows it."""
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "none" if value is None else str(value)

@@ -1,0 +1,187 @@
+"""A scene that another program has made, held against the cameras it shall be used with."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from extrags.config import ImportedConfig
+from extrags.errors import PoseError, SourceError
+from extrags.gaussians import Gaussians
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
+from extrags.splat_files.reading import read_splat_file
+
+__all__ = ["ImportedScene", "import_scene"]
+
+_FARTHEST = 1e7
+_LARGEST_LOG_SCALE = 16.0
+_MIN_SEEN_SHARE = 0.05
+_LARGEST_RATIO = 2.0
+_WIDTH_PX = 160
+_VIEWS_PER_BATCH = 8
+
+
+@dataclass(frozen=True)
+class ImportedScene:
+    """A scene from a file, and what the training views say of it.
+
+    Args:
+        scene: in the world of the sequence.
+        seen_share: pixels of the training views that show it.
+        psnr: of its renderings against the training frames, in dB.
+        depth_ratio: median of its depth over the frames' depth; None where none is known.
+        statements: what has to be known of it, in words.
+    """
+
+    scene: Scene
+    seen_share: float
+    psnr: float
+    depth_ratio: float | None
+    statements: tuple[str, ...]
+
+
+def import_scene(
+    path: Path, sequence: EndoscopicSequence, config: ImportedConfig | None = None
+) -> ImportedScene:
+    """Read a scene and check that the sequence's cameras see it where it should be.
+
+    Args:
+        path: 3DGS PLY or SPZ; a PLY of `write_ply_scene` brings its light. Its exposures are kept where there
+            is one for each training frame, else they are the mean.
+        sequence: whose training frames are looked at, with the poses of its source.
+        config: scale of the file's unit.
+
+    Raises:
+        SourceError: when the file is damaged, numbers are out of range, or scene and cameras do not fit each
+            other: the message says how, and names the scale.
+        PoseError: when the sequence's poses are not those of its source: estimated ones have their own world.
+    """
+    config = ImportedConfig() if config is None else config
+    if sequence.world_from_camera is None or sequence.pose_source not in ("given", "refined"):
+        raise PoseError(
+            f"{sequence.name}: an imported scene needs the cameras it was made with; poses that are "
+            "estimated here have a world of their own",
+            file=path,
+            field="world_from_camera",
+        )
+    scene = _in_range(_scaled(read_splat_file(path), config.scale), path)
+    statements = []
+    if scene.light is not None and len(scene.light.log_exposure) != len(sequence.train):
+        statements.append(
+            f"its light has exposures of {len(scene.light.log_exposure)} frames, the sequence has "
+            f"{len(sequence.train)} training frames: they start from the mean"
+        )
+        scene = Scene(scene.gaussians, replace(scene.light, log_exposure=torch.zeros(len(sequence.train))))
+    seen, error, ratio = _compared(scene, sequence)
+    if seen < _MIN_SEEN_SHARE:
+        raise SourceError(_elsewhere(scene, sequence, seen), file=path, field="means")
+    if ratio is not None and not 1 / _LARGEST_RATIO < ratio < _LARGEST_RATIO:
+        raise SourceError(
+            f"its depth is {ratio:.3g} times that of the frames (median): its unit is another, or it was "
+            f"made with other cameras. imported.scale is {config.scale:g}; {config.scale / ratio:.4g} "
+            "would make the depths equal",
+            file=path,
+            field="imported.scale",
+        )
+    if scene.light is None:
+        statements.append("without light: its colours hold the brightness of its recording")
+    statements.append("it may have been made from held-out frames too: nothing in the file says so")
+    psnr = -10 * math.log10(max(error, 1e-20))
+    return ImportedScene(scene, seen, psnr, ratio, tuple(statements))
+
+
+def _scaled(scene: Scene, scale: float) -> Scene:
+    if scale == 1:
+        return scene
+    values = scene.gaussians.parameters()
+    light = scene.light
+    if light is not None:
+        light = replace(light, reference_distance=light.reference_distance * scale)
+    return Scene(
+        Gaussians(
+            **{**values, "means": values["means"] * scale, "scales": values["scales"] + math.log(scale)}
+        ),
+        light,
+    )
+
+
+def _in_range(scene: Scene, path: Path) -> Scene:
+    gaussians = scene.gaussians
+    far = gaussians.means.abs().amax(dim=1)
+    if bool((far > _FARTHEST).any()):
+        raise SourceError(
+            f"{int((far > _FARTHEST).sum())} of {len(gaussians)} Gaussians lie farther than {_FARTHEST:g} "
+            f"units from the origin, the farthest {float(far.max()):.3g}",
+            file=path,
+            field="means",
+        )
+    large = gaussians.scales.amax(dim=1)
+    if bool((large > _LARGEST_LOG_SCALE).any()):
+        raise SourceError(
+            f"{int((large > _LARGEST_LOG_SCALE).sum())} of {len(gaussians)} Gaussians have scales above "
+            f"{_LARGEST_LOG_SCALE:g}, the largest {float(large.max()):.3g}; scales are natural logarithms",
+            file=path,
+            field="scales",
+        )
+    return scene
+
+
+def _compared(scene: Scene, sequence: EndoscopicSequence) -> tuple[float, float, float | None]:
+    """Share of the training pixels that show the scene, mean squared error there, and ratio of depths."""
+    from torch.nn import functional
+
+    train = sequence.train
+    cameras = sequence.training_cameras.at_most_width(_WIDTH_PX)
+    size = cameras.height, cameras.width
+    exposures = None if scene.light is None else scene.light.exposures()
+    shown, total, error, count = 0, 0, 0.0, 0
+    ratios: list[Float[np.ndarray, "k"]] = []
+    for begun in range(0, len(train), _VIEWS_PER_BATCH):
+        frames = train[begun : begun + _VIEWS_PER_BATCH]
+        part = slice(begun, begun + len(frames))
+        with torch.no_grad():
+            rendering = scene.render(
+                cameras[part], exposure=None if exposures is None else exposures[part], median_depth=True
+            )
+        images = torch.from_numpy(sequence.rgb[frames]).permute(0, 3, 1, 2).float() / 255
+        images = functional.interpolate(images, size, mode="area").permute(0, 2, 3, 1)
+        # Nearest pixels: depth and masks are not averaged over edges.
+        rows = ((np.arange(size[0]) + 0.5) * sequence.height / size[0]).astype(np.int64)
+        columns = ((np.arange(size[1]) + 0.5) * sequence.width / size[1]).astype(np.int64)
+        mask = sequence.mask[frames][:, rows][:, :, columns]
+        hit = (rendering.alpha.numpy() > 0.5) & mask
+        shown, total = shown + int(hit.sum()), total + int(mask.sum())
+        error += float(((rendering.rgb.clamp(0, 1) - images) ** 2).mean(dim=-1).numpy()[hit].sum())
+        count += int(hit.sum())
+        if sequence.depth_mm is not None:
+            known = sequence.depth_mm[frames][:, rows][:, :, columns]
+            both = hit & (known > 0)
+            ratios.append((np.asarray(rendering.median_depth)[both] / known[both]).astype(np.float64))
+    ratio = np.concatenate(ratios) if ratios else np.zeros(0)
+    return (
+        shown / max(1, total),
+        error / max(1, count),
+        float(np.median(ratio)) if len(ratio) else None,
+    )
+
+
+def _elsewhere(scene: Scene, sequence: EndoscopicSequence, seen: float) -> str:
+    means = scene.gaussians.means.numpy().astype(np.float64)
+    centers = sequence.training_cameras.centers
+
+    def place(points: Float[np.ndarray, "p 3"]) -> str:
+        center = np.median(points, axis=0)
+        spread = float(np.median(np.linalg.norm(points - center, axis=1)))
+        return f"({', '.join(f'{value:.3g}' for value in center)}), half of them within {spread:.3g}"
+
+    return (
+        f"the training views of {sequence.name} hardly see it: {100 * seen:.1f} % of their pixels; its "
+        f"Gaussians are around {place(means)}, the cameras around {place(centers)} units. Were other cameras "
+        "used, other axes, or another unit (imported.scale)?"
+    )

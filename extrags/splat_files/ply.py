@@ -1,0 +1,103 @@
+"""Scenes as 3DGS PLY whose header can keep the light, so that nothing is lost on the way back.
+
+The light stands in one comment line, `comment extrags_light {...}`, with the parameters of
+`extrags.illumination.NearFieldLight` as JSON. Viewers skip comments and show albedo.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from extrags.errors import SourceError
+from extrags.gaussians import Gaussians
+from extrags.illumination import NearFieldLight
+from extrags.scene import Scene
+
+__all__ = ["read_ply_scene", "write_ply_scene"]
+
+_MARK = b"comment extrags_light "
+_HEADER_BYTES = 1 << 20
+
+
+def write_ply_scene(scene: Scene, path: Path) -> None:
+    """Write the Gaussians as stored and, where there is one, the light into the header.
+
+    Args:
+        scene: its colours are albedo where it has a light.
+        path: file to write.
+    """
+    scene.gaussians.write_ply(path)
+    if scene.light is None:
+        return
+    values: dict[str, Any] = {
+        name: value.tolist() for name, value in scene.light.detached().parameters().items()
+    }
+    # A linear response has a shoulder of zero, whose logarithm JSON cannot say.
+    values["shoulder"] = math.exp(values.pop("log_shoulder"))
+    values["reference_distance"] = scene.light.reference_distance
+    line = _MARK + json.dumps(values, allow_nan=False).encode("ascii") + b"\n"
+    head, end, body = path.read_bytes().partition(b"element vertex")
+    path.write_bytes(head + line + end + body)
+
+
+def read_ply_scene(path: Path) -> Scene:
+    """Read a 3DGS PLY, with the light if its header has one.
+
+    Raises:
+        SourceNotFoundError: when there is no such file.
+        SourceError: when it is damaged, or a field is missing.
+    """
+    gaussians = Gaussians.read_ply(path)
+    with path.open("rb") as stream:
+        header = stream.read(_HEADER_BYTES).partition(b"end_header")[0]
+    line = next((line for line in header.splitlines() if line.startswith(_MARK)), None)
+    return Scene(gaussians, None if line is None else _light(line.removeprefix(_MARK), path))
+
+
+_SHAPES: dict[str, tuple[int, ...] | None] = {
+    "log_softening": (),
+    "log_exponent": (),
+    "log_exposure": None,
+    "spread": (),
+    "cosine": (),
+    "offset": (3,),
+    "log_shoulder": (),
+}
+"""Parameters of the light, and how many numbers each is; None: any, one after the other."""
+
+
+def _light(text: bytes, path: Path) -> NearFieldLight:
+    try:
+        values = json.loads(text)
+        shoulder, reference = float(values.pop("shoulder")), float(values.pop("reference_distance"))
+        tensors = {name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()}
+    except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, OverflowError) as error:
+        raise SourceError(
+            f"the light in the header cannot be read: {error}", file=path, field="extrags_light"
+        ) from error
+    tensors["log_shoulder"] = torch.tensor(math.log(shoulder) if shoulder > 0 else -math.inf)
+    for name in sorted(_SHAPES.keys() ^ tensors.keys()):
+        what = "is missing" if name in _SHAPES else "is unknown"
+        raise SourceError(f"the light's {name} {what}", file=path, field="extrags_light")
+    for name, value in tensors.items():
+        shape = _SHAPES[name]
+        fits = value.ndim == 1 if shape is None else tuple(value.shape) == shape
+        if not fits or not (bool(torch.isfinite(value).all()) or name == "log_shoulder"):
+            raise SourceError(
+                f"the light's {name} has shape {tuple(value.shape)} or is not finite",
+                file=path,
+                field=f"extrags_light.{name}",
+            )
+    if not (math.isfinite(reference) and reference > 0 and math.isfinite(shoulder)):
+        raise SourceError(
+            f"the light's reference distance is {reference:g}, its shoulder {shoulder:g}; "
+            "expected a positive and a finite number",
+            file=path,
+            field="extrags_light.reference_distance",
+        )
+    return NearFieldLight(**tensors, reference_distance=reference)

@@ -1,0 +1,152 @@
+"""SOG of PlayCanvas (version 2): attributes as lossless WebP images and a `meta.json`, in one zip.
+
+Positions are 16 bits of sign(x) ln(1 + |x|) in two images, rotations 3 x 8 bits with the largest component
+left out, scales and colours 8-bit indices into codebooks of 256 numbers, higher harmonics 16-bit indices
+into a palette whose entries are indices into a codebook again.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, Shaped, UInt8
+
+from extrags.gaussians import Gaussians
+from extrags.splat_files.packing import largest_component, morton_order, unit_quaternions
+
+__all__ = ["write_sog"]
+
+_CODEBOOK = 256
+_LLOYD_ROUNDS = 12
+_PALETTE_LARGEST = 65_536
+_PALETTE_ROW = 64
+_SCALE_LIMIT = 20.0
+_TIME = (1980, 1, 1, 0, 0, 0)
+"""The earliest a zip knows: the same scene gives the same file."""
+
+
+def write_sog(gaussians: Gaussians, path: Path) -> None:
+    """Write a bundled SOG; Gaussians are reordered along a space-filling curve.
+
+    Args:
+        gaussians: with colours, not albedo (`bake_light`).
+        path: file to write; viewers expect it to end in `.sog`.
+    """
+    gaussians = gaussians.detached()
+    order = morton_order(gaussians.means.numpy())
+    images: dict[str, UInt8[np.ndarray, "h w 4"]] = {}
+    width = -(-int(np.ceil(np.sqrt(len(order)))) // 4) * 4
+    height = -(-len(order) // (width * 4)) * 4
+
+    def image(*channels: Shaped[np.ndarray, "n"]) -> UInt8[np.ndarray, "h w 4"]:
+        """Three or four channels, one Gaussian per pixel; without a fourth it is opaque."""
+        pixels = np.full((height * width, 4), 255, dtype=np.uint8)
+        for index, channel in enumerate(channels):
+            pixels[: len(order), index] = channel
+        pixels[len(order) :, :3] = 0
+        return pixels.reshape(height, width, 4)
+
+    means = gaussians.means.numpy()[order].astype(np.float64)
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    fixed = np.rint((logs - low) / np.where(high > low, high - low, 1.0) * 65535).astype(np.uint16)
+    images["means_l.webp"] = image(*(fixed & 255).T)
+    images["means_u.webp"] = image(*(fixed >> 8).T)
+    largest, rest = largest_component(unit_quaternions(gaussians.quats.numpy()[order]))
+    images["quats.webp"] = image(
+        *np.rint((rest * np.sqrt(2) * 0.5 + 0.5) * 255).clip(0, 255).T, 252 + largest
+    )
+    scales = gaussians.scales.numpy()[order].clip(-_SCALE_LIMIT, _SCALE_LIMIT)
+    scale_labels, scale_codebook = _codebook(scales)
+    images["scales.webp"] = image(*scale_labels.T)
+    color_labels, color_codebook = _codebook(gaussians.sh0.numpy()[order, 0])
+    opacity = np.rint(gaussians.opacities.sigmoid().numpy()[order] * 255)
+    images["sh0.webp"] = image(*color_labels.T, opacity)
+    meta: dict[str, Any] = {
+        "version": 2,
+        "asset": {"generator": "extrags"},
+        "count": len(order),
+        "means": {
+            "mins": low.tolist(),
+            "maxs": high.tolist(),
+            "files": ["means_l.webp", "means_u.webp"],
+        },
+        "scales": {"codebook": scale_codebook.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"codebook": color_codebook.tolist(), "files": ["sh0.webp"]},
+    }
+    if gaussians.sh_degree:
+        shN = gaussians.shN.numpy()[order]
+        palette, labels = _palette(shN.reshape(len(order), -1))
+        entries, codebook = _codebook(palette)
+        rows = -(-len(palette) // _PALETTE_ROW)
+        centroids = np.full((rows * _PALETTE_ROW, shN.shape[1], 4), 255, dtype=np.uint8)
+        centroids[: len(palette), :, :3] = entries.reshape(len(palette), -1, 3)
+        images["shN_centroids.webp"] = centroids.reshape(rows, _PALETTE_ROW * shN.shape[1], 4)
+        images["shN_labels.webp"] = image(labels & 255, labels >> 8, np.zeros_like(labels))
+        meta["shN"] = {
+            "count": len(palette),
+            "bands": gaussians.sh_degree,
+            "codebook": codebook.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED) as bundle:
+        bundle.writestr(zipfile.ZipInfo("meta.json", _TIME), json.dumps(meta))
+        for name, pixels in images.items():
+            bundle.writestr(zipfile.ZipInfo(name, _TIME), _webp(pixels))
+
+
+def _codebook(values: Float[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, "n k"], Float[np.ndarray, "c"]]:
+    """At most 256 numbers for all values, by Lloyd's algorithm in one dimension from their quantiles.
+
+    Returns:
+        Index of each value's number, and the 256 numbers, ascending; unused ones repeat the largest.
+    """
+    flat = np.sort(values.astype(np.float64), axis=None)
+    total = np.concatenate([[0.0], np.cumsum(flat)])
+    # Between quantiles, which spend all on the bulk, and an even grid, which spends half on the tails.
+    share = (np.arange(_CODEBOOK) + 0.5) / _CODEBOOK
+    centers = 0.5 * (np.quantile(flat, share) + flat[0] + share * (flat[-1] - flat[0]))
+    for _ in range(_LLOYD_ROUNDS):
+        edges = np.concatenate([[0], np.searchsorted(flat, 0.5 * (centers[1:] + centers[:-1])), [len(flat)]])
+        count = np.diff(edges)
+        mean = np.diff(total[edges]) / np.maximum(count, 1)
+        centers = np.sort(np.where(count > 0, mean, centers))
+    numbers = centers.astype(np.float32)
+    labels = np.searchsorted(0.5 * (numbers[1:] + numbers[:-1]), values)
+    return labels, numbers
+
+
+def _palette(
+    vectors: Float[np.ndarray, "n k"],
+) -> tuple[Float[np.ndarray, "p k"], Int[np.ndarray, "n"]]:
+    """Representative vectors by k-means, and which of them each vector takes."""
+    from scipy.spatial import cKDTree
+
+    n = len(vectors)
+    count = min(_PALETTE_LARGEST, max(1, n // 2 if n > 2048 else n))
+    start = np.random.default_rng(0).choice(n, count, replace=False)
+    centers = vectors[np.sort(start)].astype(np.float64)
+    labels = np.zeros(n, dtype=np.int64)
+    for _ in range(_LLOYD_ROUNDS // 3):
+        labels = cKDTree(centers).query(vectors)[1]
+        used = np.bincount(labels, minlength=count)
+        for column in range(centers.shape[1]):
+            sums = np.bincount(labels, weights=vectors[:, column], minlength=count)
+            centers[:, column] = np.where(used > 0, sums / np.maximum(used, 1), centers[:, column])
+    labels = cKDTree(centers).query(vectors)[1]
+    return centers.astype(np.float32), np.asarray(labels, dtype=np.int64)
+
+
+def _webp(pixels: UInt8[np.ndarray, "h w 4"]) -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    # exact: colours of transparent pixels count here.
+    Image.fromarray(pixels).save(buffer, "WEBP", lossless=True, exact=True, quality=100, method=4)
+    return buffer.getvalue()

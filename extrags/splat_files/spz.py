@@ -1,0 +1,158 @@
+"""SPZ, the compressed format of Niantic: fixed-point numbers, packed attribute by attribute, in gzip.
+
+Version 2 and 3 are read, version 3 is written. Layout after gzip, little-endian: magic `NGSP`, version,
+count, SH degree, fractional bits of positions, flags, a zero; then positions (3 x 24 bits), opacities (8
+bits), colours (3 x 8), logarithms of scales (3 x 8, steps of 1/16 from -10), rotations (version 2: x, y, z
+of 8 bits; version 3: 32 bits, the largest component left out), SH coefficients (8 bits, coefficient by
+coefficient).
+
+The format's axes are right, up, back; ours are OpenCV's right, down, forward. Positions, rotations and
+harmonics are turned by half a turn about x on the way, as the format's own tools do for PLY files.
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from extrags.errors import SourceError, SourceNotFoundError
+from extrags.gaussians import Gaussians
+from extrags.splat_files.packing import largest_component, unit_quaternions
+
+__all__ = ["read_spz", "write_spz"]
+
+_MAGIC = 0x5053474E
+_HEADER = struct.Struct("<IIIBBBB")
+_COLOR_SCALE = 0.15
+"""Of the colours' SH coefficients, set by the format: 8 bits reach a little beyond [0, 1]."""
+_REST = {0: 0, 1: 3, 2: 8, 3: 15}
+"""SH coefficients above degree 0, by degree."""
+_LARGEST_COUNT = 10_000_000
+_QUAT_MAX = 511
+_FLIPPED = np.array([-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], dtype=np.float32)
+"""Signs of SH coefficients 1 to 15 under half a turn about x: those odd in (y, z) together change."""
+
+
+def write_spz(gaussians: Gaussians, path: Path) -> None:
+    """Write SPZ of version 3.
+
+    Positions get as many fractional bits as the scene's size leaves of 24, at most 20; scales reach from
+    e^-10 to e^5.9 world units; SH coefficients lie in [-1, 1), in steps of 1/8 (degree 1: 1/32) as the
+    format's own tools round them.
+
+    Args:
+        gaussians: with colours, not albedo (`bake_light`).
+        path: file to write.
+
+    Raises:
+        SourceError: for positions that 24 bits cannot hold.
+    """
+    n = len(gaussians)
+    means = gaussians.means.detach().double().numpy() * [1, -1, -1]
+    reach = float(np.abs(means).max(initial=0.0))
+    bits = 20 if reach == 0 else min(20, int(np.floor(np.log2((2**23 - 1) / reach))))
+    if bits < 0 or not np.isfinite(reach):
+        raise SourceError(f"positions reach to {reach:g}; SPZ holds at most 2^23 units", field="means")
+    fixed = np.rint(means * (1 << bits)).astype("<i4")
+    positions = fixed.view(np.uint8).reshape(n, 3, 4)[:, :, :3]
+    opacities = _bytes(gaussians.opacities.detach().sigmoid().numpy() * 255)
+    sh0 = gaussians.sh0.detach().numpy()[:, 0]
+    colors = _bytes((sh0 * _COLOR_SCALE + 0.5) * 255)
+    scales = _bytes((gaussians.scales.detach().numpy() + 10) * 16)
+    # Components in the format's order x, y, z, w.
+    quats = unit_quaternions(gaussians.quats.detach().numpy())[:, [1, 2, 3, 0]] * [1, -1, -1, 1]
+    largest, rest = largest_component(quats)
+    magnitude = np.rint(np.abs(rest) * np.sqrt(2) * _QUAT_MAX).astype(np.uint32).clip(0, _QUAT_MAX)
+    parts = magnitude | ((rest < 0).astype(np.uint32) << 9)
+    packed = largest.astype(np.uint32) << 30 | parts[:, 0] << 20 | parts[:, 1] << 10 | parts[:, 2]
+    shN = gaussians.shN.detach().numpy() * _FLIPPED[: gaussians.shN.shape[1], None]
+    harmonics = np.rint(shN * 128 + 128)
+    # Steps of 8 for degree 1, of 16 above: gzip does the rest.
+    step = np.where(np.arange(shN.shape[1]) < 3, 8, 16)[:, None]
+    harmonics = _bytes(np.floor((harmonics + step / 2) / step) * step)
+    header = _HEADER.pack(_MAGIC, 3, n, gaussians.sh_degree, bits, 0, 0)
+    content = [positions, opacities, colors, scales, packed.astype("<u4"), harmonics]
+    body = b"".join(np.ascontiguousarray(part).tobytes() for part in content)
+    # No time stamp: the same scene gives the same file.
+    path.write_bytes(gzip.compress(header + body, mtime=0))
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Read SPZ of version 2 or 3.
+
+    Raises:
+        SourceNotFoundError: when there is no such file.
+        SourceError: when it is damaged, of another version, or announces more than it holds.
+    """
+    if not path.is_file():
+        raise SourceNotFoundError("no such file", file=path)
+    try:
+        with gzip.open(path) as stream:
+            start = stream.read(_HEADER.size)
+            if len(start) < _HEADER.size:
+                raise SourceError("it ends within its header", file=path)
+            magic, version, n, degree, bits, _, _ = _HEADER.unpack(start)
+            if magic != _MAGIC:
+                raise SourceError("not an SPZ file: wrong magic number", file=path)
+            if version not in (2, 3):
+                raise SourceError(f"SPZ of version {version}; 2 and 3 are read", file=path, field="version")
+            if degree not in _REST:
+                raise SourceError(f"SH degree {degree}; expected 0 to 3", file=path, field="sh_degree")
+            if n > _LARGEST_COUNT or bits > 24:
+                raise SourceError(f"{n} Gaussians with {bits} fractional bits", file=path, field="count")
+            sizes = [9, 1, 3, 3, 3 if version == 2 else 4, 3 * _REST[degree]]
+            # Not more than announced: a small file can unpack to anything.
+            body = stream.read(n * sum(sizes))
+    except (OSError, EOFError, zlib.error) as error:
+        raise SourceError(f"not an SPZ file, or damaged: {error}", file=path) from error
+    if len(body) < n * sum(sizes):
+        raise SourceError(f"{n} Gaussians announced, but the file is truncated", file=path, field="count")
+    ends = np.cumsum([n * size for size in sizes])[:-1]
+    positions, opacities, colors, scales, rotations, harmonics = np.split(
+        np.frombuffer(body, dtype=np.uint8), ends
+    )
+    fixed = np.zeros((n, 3, 4), dtype=np.uint8)
+    fixed[:, :, 1:] = positions.reshape(n, 3, 3)
+    means = (fixed.view("<i4")[..., 0] >> 8) / float(1 << bits) * [1, -1, -1]
+    share = (opacities.astype(np.float64) / 255).clip(1e-6, 1 - 1e-6)
+    quats = (_smallest_three if version == 3 else _three_bytes)(rotations)
+    shN = (harmonics.reshape(n, _REST[degree], 3).astype(np.float32) - 128) / 128
+    return Gaussians(
+        means=torch.from_numpy(means.astype(np.float32)),
+        quats=torch.from_numpy((quats[:, [3, 0, 1, 2]] * [1, 1, -1, -1]).astype(np.float32)),
+        scales=torch.from_numpy(scales.reshape(n, 3).astype(np.float32) / 16 - 10),
+        opacities=torch.from_numpy(np.log(share / (1 - share)).astype(np.float32)),
+        sh0=torch.from_numpy((colors.reshape(n, 1, 3).astype(np.float32) / 255 - 0.5) / _COLOR_SCALE),
+        shN=torch.from_numpy(shN * _FLIPPED[: shN.shape[1], None]),
+    )
+
+
+def _smallest_three(packed: UInt8[np.ndarray, "b"]) -> Float[np.ndarray, "n 4"]:
+    """Components x, y, z, w from 2 bits that name the largest and 3 x 10 bits with sign."""
+    words = packed.view("<u4") if packed.flags.aligned else np.frombuffer(packed.tobytes(), "<u4")
+    parts = np.stack([words >> 20, words >> 10, words], axis=1) & 0x3FF
+    values = (parts & _QUAT_MAX) / _QUAT_MAX * np.sqrt(0.5) * np.where(parts >> 9, -1.0, 1.0)
+    largest = (words >> 30).astype(np.int64)
+    quats = np.zeros((len(words), 4))
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    np.put_along_axis(quats, others, values, axis=1)
+    quats[np.arange(len(words)), largest] = np.sqrt(np.maximum(0, 1 - (values**2).sum(axis=1)))
+    return quats
+
+
+def _three_bytes(packed: UInt8[np.ndarray, "b"]) -> Float[np.ndarray, "n 4"]:
+    """Components x, y, z, w from x, y, z with w not negative."""
+    vector = packed.reshape(-1, 3) / 127.5 - 1
+    w = np.sqrt(np.maximum(0, 1 - (vector**2).sum(axis=1)))
+    quats = np.concatenate([vector, w[:, None]], axis=1)
+    return np.asarray(quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12))
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.asarray(np.rint(values).clip(0, 255).astype(np.uint8))

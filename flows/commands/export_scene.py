@@ -1,0 +1,265 @@
+"""What `extrags export` writes of a finished run: Gaussians, mesh, points, camera paths, video; its poses."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from extrags.errors import ConfigError, StoreError
+from flows.commands.common import finished_run, run_config, set_up_logging
+
+if TYPE_CHECKING:
+    from extrags.cameras import Cameras
+    from extrags.config import PipelineConfig
+    from extrags.export import CameraPath
+    from extrags.gaussians import Gaussians
+    from extrags.pipeline import StageName
+    from extrags.scene import Scene
+    from extrags.sequence import EndoscopicSequence
+    from flows.wiring import SequenceRun
+
+__all__ = ["export_scene", "posed_sequence"]
+
+
+def export_scene(given: argparse.Namespace) -> int:
+    """All of `extrags export` but sequences; the options were checked before.
+
+    Raises:
+        ConfigError: for a method without Gaussians, or a trajectory that is not there.
+        StoreError: when the run is not in the store, or the file cannot be written.
+    """
+    terminal = sys.stderr.isatty()
+    set_up_logging(debug=given.debug, terminal=terminal, quiet=given.quiet)
+    config = run_config(given)
+    if config.uc_nerf.enabled and given.to != "camera-path":
+        raise ConfigError(f"the method {given.method} makes no Gaussians to write as {given.to}")
+    target = Path(given.output)
+    write = {"camera-path": _camera_path, "video": _video, "mesh": _mesh, "points": _points}
+    with _progress(given, terminal=terminal):
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            said = write.get(given.to, _gaussians)(given, target)
+        except StoreError:
+            raise
+        except OSError as error:
+            raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
+    print(f"{target}: {said}")
+    return 0
+
+
+@contextmanager
+def _progress(given: argparse.Namespace, *, terminal: bool) -> Iterator[None]:
+    from flows.console import progress_bars
+    from tasks.progress import reporting
+
+    with progress_bars(terminal=terminal), reporting(given.sequence, "export"):
+        yield
+
+
+@dataclass(frozen=True)
+class _Finished:
+    """The scenes of a finished run and the cameras they were made with."""
+
+    run: SequenceRun
+    config: PipelineConfig
+
+    @property
+    def fine_tuned(self) -> bool:
+        return "finetune" in self.run.refs
+
+    def scene(self, which: str) -> Scene:
+        """`coarse` or `final`; where fine-tuning was left out, the coarse scene is the final one."""
+        from extrags.scene import Scene
+
+        part = self.run.refs["coarse"]
+        return self.run.store.load(Scene, self.run.refs.get("finetune", part) if which == "final" else part)
+
+    def frames(self) -> EndoscopicSequence:
+        """All frames, with the poses that the scene was made with."""
+        from extrags.sequence import EndoscopicSequence
+
+        return self.run.store.load(EndoscopicSequence, self.run.refs["sequence"])
+
+    def virtual(self) -> list[Cameras]:
+        """The views of each virtual trajectory; none where nothing was explored."""
+        from extrags.exploration import Exploration
+
+        if "explore" not in self.run.refs:
+            return []
+        return self.run.store.load(Exploration, self.run.refs["explore"]).trajectories
+
+
+def _finished(given: argparse.Namespace, until: StageName) -> _Finished:
+    from tasks.progress import observed
+
+    # Looking up stages is no progress.
+    with observed(lambda _: None):
+        run = finished_run(given, until)
+    return _Finished(run, run_config(given))
+
+
+def _chosen(given: argparse.Namespace) -> tuple[_Finished, Scene]:
+    which = given.scene or "final"
+    finished = _finished(given, "coarse" if which == "coarse" else "finetune")
+    return finished, finished.scene(which)
+
+
+def _baked(given: argparse.Namespace, finished: _Finished, scene: Scene) -> Gaussians:
+    from extrags.splat_files import bake_light, bake_recorded_light
+
+    exposure = 1.0 if given.exposure is None else given.exposure
+    if given.light == "frontal" or scene.light is None:
+        return bake_light(scene, distance=given.distance, exposure=exposure)
+    return bake_recorded_light(scene, finished.frames().training_cameras, exposure=exposure)
+
+
+def _gaussians(given: argparse.Namespace, target: Path) -> str:
+    from extrags.scene import Scene
+    from extrags.splat_files import write_compressed_ply, write_ply_scene, write_sog, write_spz
+
+    finished, scene = _chosen(given)
+    if given.light == "kept":
+        write_ply_scene(scene, target)
+        light = "without light" if scene.light is None else "albedo, the light is in the header"
+    else:
+        gaussians = _baked(given, finished, scene)
+        if given.to == "ply":
+            write_ply_scene(Scene(gaussians), target)
+        else:
+            write = {"compressed-ply": write_compressed_ply, "spz": write_spz, "sog": write_sog}
+            write[given.to](gaussians, target)
+        light = "without light" if scene.light is None else f"light baked, {given.light or 'recorded'}"
+    return f"{len(scene.gaussians)} Gaussians, {light}, {_megabytes(target)}"
+
+
+def _mesh(given: argparse.Namespace, target: Path) -> str:
+    from extrags.cameras import Cameras
+    from extrags.export import colored_mesh, write_mesh
+    from extrags.scene import Scene
+    from extrags.surface import fuse_surface
+
+    finished, scene = _chosen(given)
+    frames = finished.frames()
+    train = frames.training_cameras
+    # Virtual views show what they have added to the final scene; there is nothing of it in the coarse one.
+    flights = finished.virtual() if (given.scene or "final") == "final" and finished.fine_tuned else []
+    virtual = Cameras.concatenated(flights) if flights else None
+    views = train if virtual is None else Cameras.concatenated([train, virtual])
+    mesh = fuse_surface(scene, views, finished.config.surface)
+    baked = Scene(_baked(given, finished, scene))
+    # PLY has no texture that viewers agree on.
+    texture = given.texture is not False and target.suffix.lower() != ".ply"
+    colored = colored_mesh(mesh, baked, train, virtual, texture=texture)
+    write_mesh(colored, target, metric=frames.metric)
+    return (
+        f"{len(mesh.vertices)} vertices, {len(mesh.triangles)} triangles, "
+        f"{100 * float((colored.invented > 0).mean()):.1f} % of the vertices invented, {_megabytes(target)}"
+    )
+
+
+def _points(given: argparse.Namespace, target: Path) -> str:
+    from extrags.export import write_points
+
+    finished, scene = _chosen(given)
+    opacity = 0.5 if given.min_opacity is None else given.min_opacity
+    count = write_points(_baked(given, finished, scene), target, min_opacity=opacity)
+    return f"{count} of {len(scene.gaussians)} Gaussians as points, {_megabytes(target)}"
+
+
+def _camera_path(given: argparse.Namespace, target: Path) -> str:
+    from extrags.export import write_camera_path
+
+    path = _flight(given)
+    write_camera_path(path, target)
+    return f"{len(path.cameras)} cameras, {len(path.cameras) / path.fps:.1f} s"
+
+
+def _video(given: argparse.Namespace, target: Path) -> str:
+    from extrags.export import fly_through, write_video
+
+    finished = _finished(given, "finetune")
+    path = _flight(given)
+    if given.panels is None:
+        panels = ["coarse", "final", "uncertainty"] if finished.fine_tuned else ["final", "uncertainty"]
+    else:
+        panels = given.panels.split(",")
+    shown = [which for which in panels if which != "uncertainty"]
+    # What is not known is that of the last scene shown, of the final one where none is.
+    scenes = [finished.scene(which) for which in shown or ["final"]]
+    train = finished.frames().training_cameras if "uncertainty" in panels else None
+    exposure = 1.0 if given.exposure is None else given.exposure
+    pictures = fly_through(scenes, path.cameras, exposure=exposure, train=train, colors=bool(shown))
+    count = write_video(pictures, target, fps=path.fps)
+    names = [*shown, *(["uncertainty"] if train is not None else [])]
+    return f"{count} frames of {', '.join(names)}, {count / path.fps:.1f} s, {_megabytes(target)}"
+
+
+def _flight(given: argparse.Namespace) -> CameraPath:
+    """The cameras of `--along`, with the steps in between, at the size asked for."""
+    from extrags.export import CameraPath, read_camera_path
+
+    along, steps = given.along or "training", given.between or 1
+    if along in ("training", "held-out", "virtual"):
+        path = CameraPath(_cameras(given, along, steps), given.fps or 24.0)
+    elif Path(along).suffix.lower() == ".json" or Path(along).exists():
+        if given.between is not None:
+            raise ConfigError("--between adds nothing to a camera path from a file: it is taken as it is")
+        read = read_camera_path(Path(along))
+        path = CameraPath(read.cameras, given.fps or read.fps)
+    else:
+        raise ConfigError(f"--along {along}: expected training, held-out, virtual or a FILE.json")
+    if given.width is None:
+        return path
+    height = max(1, round(path.cameras.height * given.width / path.cameras.width))
+    return CameraPath(path.cameras.resized(given.width, height), path.fps)
+
+
+def _cameras(given: argparse.Namespace, along: str, steps: int) -> Cameras:
+    import numpy as np
+
+    from extrags.export import flight_through
+
+    if along == "virtual":
+        flights = _finished(given, "explore").virtual()
+        if not flights:
+            raise ConfigError(f"--along virtual: the run of {given.sequence} has no virtual trajectories")
+        return flight_through(flights, steps)
+    frames = posed_sequence(given)
+    chosen = np.sort(frames.train if along == "training" else frames.test)
+    if not len(chosen):
+        raise ConfigError(f"--along {along}: {given.sequence} has no such frames")
+    # Between recordings of one scene there is no way.
+    recording = np.zeros(len(chosen)) if frames.recording is None else frames.recording[chosen]
+    return flight_through(
+        [frames.cameras[chosen[recording == index]] for index in np.unique(recording)], steps
+    )
+
+
+def _megabytes(target: Path) -> str:
+    return f"{target.stat().st_size / 1e6:.2f} MB"
+
+
+def posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:
+    """The frames with the poses and intrinsics that the scene of a run with these settings is made with.
+
+    Where no stage changes those of the source, no run is needed.
+
+    Raises:
+        StoreError: when a stage changes them and has not run.
+    """
+    from data_catalog.catalog import read
+    from extrags.sequence import EndoscopicSequence
+    from extrags.training.reconstruction import refines_poses
+
+    config = run_config(given)
+    source = read(given.sequence, config.ingest)
+    estimated = source.world_from_camera is None or config.poses.replace_given
+    if not estimated and not refines_poses(source, config.coarse):
+        return source
+    run = finished_run(given, "poses" if config.coarse.refine_poses is False else "coarse")
+    return run.store.load(EndoscopicSequence, run.refs["sequence"])

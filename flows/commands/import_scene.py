@@ -1,0 +1,62 @@
+"""`import`: a scene that another program has made goes through the later stages."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from extrags.errors import ConfigError, SourceNotFoundError
+from flows.commands.options import Parser, add_json, add_method, add_runner
+
+__all__ = ["add_arguments", "import_scene"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags import`."""
+    from extrags.pipeline import STAGES
+
+    parser.description = (
+        "Take a scene that another program has made, as 3DGS PLY or SPZ, through exploration, restoration, "
+        "fine-tuning and evaluation, with the cameras and frames of the sequence it belongs to: it takes the "
+        "place of the coarse scene. Scene and cameras must share one world: a COLMAP folder, or "
+        "transforms.json, that the scene was trained from is such a sequence. The same as `extrags run "
+        "SEQUENCE --imported.scene FILE --imported.scale MM`; other verbs find the run by these settings."
+    )
+    parser.set_defaults(command=import_scene)
+    parser.add_argument("file", metavar="FILE", help="3DGS PLY or SPZ")
+    parser.add_argument(
+        "--sequence", required=True, metavar="SEQUENCE", help="its frames and cameras: a name or a path"
+    )
+    parser.add_argument(
+        "--units",
+        type=float,
+        metavar="MM",
+        help="units of the sequence's poses, mostly millimetres, in one unit of the file (default: 1)",
+    )
+    add_method(parser)
+    add_runner(parser)
+    add_json(parser)
+    parser.add_argument(
+        "--until", choices=STAGES, default="report", metavar="STAGE", help="stop after this stage"
+    )
+    parser.add_argument(
+        "--refresh", action="store_true", help="run every stage although its artefact is in the store"
+    )
+
+
+def import_scene(given: argparse.Namespace) -> int:
+    """`extrags import`."""
+    from flows.commands.run import run
+
+    file = Path(given.file).expanduser().absolute()
+    if not file.is_file():
+        raise SourceNotFoundError("no such file", file=file)
+    for name in ("imported.scene", "imported.scale"):
+        if name in given.settings and (name == "imported.scene" or given.units is not None):
+            raise ConfigError(f"{name} is set twice: by FILE or --units, and by --{name}")
+    # No default of the parser: it is shared by all that it parses.
+    given.settings = {**given.settings, "imported.scene": str(file)}
+    if given.units is not None:
+        given.settings["imported.scale"] = given.units
+    several = {"manifest": [], "at_once": 1, "only": None, "methods": [], "seeds": [], "matrix": []}
+    return run(argparse.Namespace(**vars(given), **several, sequences=[given.sequence], always_flow=False))

@@ -1,0 +1,52 @@
+"""`leaderboard`: sequences by methods, from the records of a store."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from extrags.errors import StoreError
+from flows.commands.common import set_up_logging, store_root, write_page
+from flows.commands.options import Parser, add_store
+
+__all__ = ["add_arguments", "leaderboard"]
+
+
+def add_arguments(parser: Parser) -> None:
+    """The options of `extrags leaderboard`."""
+    parser.description = (
+        "Make a page of sequences by methods, to be sorted and filtered, from the last run of each sequence, "
+        "method, profile and seed that the store has on record. No artefact is read."
+    )
+    parser.set_defaults(command=leaderboard)
+    parser.add_argument(
+        "patterns", nargs="*", metavar="PATTERN", help="sequences, with * and ? (default: all on record)"
+    )
+    add_store(parser)
+    parser.add_argument("--name", default="Leaderboard", help="title of the page (default: %(default)s)")
+    parser.add_argument(
+        "-o", "--output", metavar="FILE", default="leaderboard.html", help="the page (default: %(default)s)"
+    )
+
+
+def leaderboard(given: argparse.Namespace) -> int:
+    """`extrags leaderboard`.
+
+    Raises:
+        StoreError: when there is no such store, no such run, or the page cannot be written.
+    """
+    from extrags.store import Store
+
+    set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
+    root = store_root(given)
+    if "://" not in root and not Path(root).is_dir():
+        raise StoreError(f"there is no store {root}")
+    from extrags.report.leaderboard import build_leaderboard
+    from flows.recorded_runs import board_rows
+
+    rows = board_rows(Store(root), given.patterns)
+    if not rows:
+        wanted = f" of {', '.join(given.patterns)}" if given.patterns else ""
+        raise StoreError(f"no run{wanted} is on record in {root}")
+    print(write_page(build_leaderboard(rows, name=given.name), given.output))
+    return 0

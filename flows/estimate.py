@@ -1,0 +1,243 @@
+"""How far a run is, and how long it still takes, from the stages that its sequences have been through."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from extrags.config import PipelineConfig
+from extrags.pipeline import STAGES, StageName
+from tasks.progress import StageProgress, duration_text
+
+__all__ = ["EXPECTED_SECONDS", "RunEstimate", "SequenceEstimate", "expected_seconds"]
+
+EXPECTED_SECONDS: dict[StageName, dict[str, float]] = {
+    "ingest": {"ingest": 12.0},
+    "poses": {"poses": 20.0},
+    "depth": {"depth": 30.0},
+    "coarse": {"coarse": 18.0},
+    "assess": {"assess": 0.4},
+    "surface": {"surface": 1.2},
+    "freespace": {"freespace": 1.2},
+    "explore": {"explore": 25.0},
+    "enhance": {"enhance-train": 15.0, "enhance-keyframes": 5.0, "enhance-restore": 35.0, "enhance": 4.0},
+    "finetune": {"finetune-judge": 18.0, "finetune": 25.0},
+    "evaluate": {"evaluate-render": 8.0, "evaluate": 15.0},
+    "report": {"report": 8.0},
+}
+"""How long the tasks of each stage take, in the order in which they run.
+
+Rounded, from some runs of the profile `quick` on two cores. They count in proportion to each other
+only: how fast this machine is with this sequence is learned from the stages that have run.
+"""
+QUICK_ITERATIONS = {"coarse": 1500, "finetune": 1000}
+
+LEARNED_SECONDS = 10.0
+"""So much of what is expected must have run before anything is said of what is left."""
+ALMOST = 0.95
+"""Share of a task that has outlasted what was expected of it."""
+
+
+def expected_seconds(config: PipelineConfig) -> dict[StageName, dict[str, float]]:
+    """`EXPECTED_SECONDS` with the iterations of these settings."""
+    times = {stage: dict(tasks) for stage, tasks in EXPECTED_SECONDS.items()}
+    times["coarse"]["coarse"] *= config.coarse.iterations / QUICK_ITERATIONS["coarse"]
+    times["finetune"]["finetune"] *= config.finetune.iterations / QUICK_ITERATIONS["finetune"]
+    return times
+
+
+@dataclass
+class SequenceEstimate:
+    """How far a sequence is, and how long it still takes.
+
+    Args:
+        expected: seconds by stage and task (`expected_seconds`).
+        until: last stage.
+    """
+
+    expected: dict[StageName, dict[str, float]]
+    until: StageName = "report"
+    ended: dict[str, StageProgress] = field(default_factory=dict)
+    stage: str = ""
+    """In work."""
+    newest: StageProgress | None = None
+    _begun: float = 0.0
+    _task: str = ""
+    _task_begun: float = 0.0
+    _task_share: float | None = None
+
+    def receive(self, progress: StageProgress, now: float) -> None:
+        """Take note of a step or the end of a stage."""
+        if self.failed:
+            # What is skipped now is not done.
+            return
+        if progress.state != "running":
+            self.ended[progress.stage] = progress
+            self.stage, self.newest = "", None
+            return
+        if progress.stage in self.expected and progress.stage != self.stage and not progress.total:
+            # Announced by the flow: the next stage.
+            self._begin(progress, now)
+            return
+        tasks = self._tasks(self.stage)
+        self.newest = progress
+        if progress.stage in tasks:
+            if progress.stage != self._task:
+                self._task, self._task_begun, self._task_share = progress.stage, now, None
+            # Several tasks of a kind may run at once; only the sum of `enhance-restore` would be a share.
+            if progress.total and progress.stage != "enhance-restore":
+                self._task_share = max(self._task_share or 0.0, min(1.0, progress.done / progress.total))
+
+    @property
+    def failed(self) -> bool:
+        """Whether a stage failed; nothing comes after it."""
+        return any(row.state == "failed" for row in self.ended.values())
+
+    def _begin(self, progress: StageProgress, now: float) -> None:
+        self.stage, self.newest = progress.stage, progress
+        self._begun = self._task_begun = now
+        self._task = next(iter(self._tasks(progress.stage)), "")
+        self._task_share = None
+
+    def share(self, now: float) -> float:
+        """Of the expected time that stages to be run take, in [0, 1]."""
+        whole = sum(self._seconds(stage) for stage in self._stages())
+        well = [stage for stage, row in self.ended.items() if row.state in ("ran", "cached")]
+        done = sum(self._seconds(stage) for stage in self._stages() if stage in well)
+        return min(1.0, (done + self._stage_done(now)) / whole) if whole else 1.0
+
+    def seconds_left(self, now: float) -> float | None:
+        """At the pace of the stages that ran here; None before enough of them have."""
+        pace = self._pace(now)
+        if pace is None:
+            return None
+        waiting = [stage for stage in self._stages() if stage not in self.ended and stage != self.stage]
+        rest = sum(self._seconds(stage) for stage in waiting)
+        if self.stage:
+            rest += self._seconds(self.stage) - self._stage_done(now)
+        return pace * rest
+
+    def _pace(self, now: float) -> float | None:
+        """Seconds per expected second."""
+        ran = [row for row in self.ended.values() if row.state == "ran" and row.stage in self._stages()]
+        expected = sum(self._seconds(row.stage) for row in ran)
+        took = sum(row.seconds for row in ran)
+        if self.stage and self._task_share:
+            expected += self._stage_done(now)
+            took += now - self._begun
+        return took / expected if expected >= LEARNED_SECONDS else None
+
+    def _stages(self) -> list[StageName]:
+        wanted = STAGES[: STAGES.index(self.until) + 1]
+        return [stage for stage in wanted if stage not in self.ended or self.ended[stage].state != "skipped"]
+
+    def _tasks(self, stage: str) -> dict[str, float]:
+        return next((tasks for name, tasks in self.expected.items() if name == stage), {})
+
+    def _seconds(self, stage: str) -> float:
+        return sum(self._tasks(stage).values())
+
+    def _stage_done(self, now: float) -> float:
+        """Expected seconds of the stage in work that are behind it."""
+        done = 0.0
+        for task, seconds in self._tasks(self.stage).items():
+            if task == self._task:
+                share = self._task_share
+                if share is None:
+                    share = min(ALMOST, (now - self._task_begun) / seconds) if seconds else ALMOST
+                return done + float(share * seconds)
+            done += seconds
+        return 0.0
+
+
+class RunEstimate:
+    """How far the sequences of a run are, and how long it still takes. One thread at a time.
+
+    Args:
+        sequences: how many it takes through the stages, one after the other or at once.
+        expected: of one sequence (`expected_seconds`).
+        until: last stage.
+    """
+
+    def __init__(self, sequences: int, expected: dict[StageName, dict[str, float]], until: StageName) -> None:
+        self.sequences = sequences
+        self.ended = self.failed = 0
+        self.in_work: dict[str, SequenceEstimate] = {}
+        """By name."""
+        self._expected, self._until = expected, until
+        self._failed_share = 0.0
+        self._ran_seconds: list[float] = []
+        self._started_at: dict[str, float] = {}
+
+    def restart(self) -> None:
+        """All sequences are looked up again from the first (`flows.damage`)."""
+        self.ended = self.failed = 0
+
+    def receive(self, progress: StageProgress, now: float) -> SequenceEstimate:
+        """Take note of a step or the end of a stage; how far its sequence is."""
+        estimate = self.in_work.get(progress.label)
+        if estimate is None:
+            estimate = self.in_work[progress.label] = SequenceEstimate(self._expected, self._until)
+            self._started_at[progress.label] = now
+        estimate.receive(progress, now)
+        return estimate
+
+    def sequence_ended(self, label: str, now: float, *, failed: bool, ran: bool) -> None:
+        """A sequence is through.
+
+        Args:
+            label: its name.
+            now: seconds, from the origin of `receive`.
+            failed: whether a stage failed.
+            ran: whether anything was made; what came from the store teaches nothing.
+        """
+        self.ended += 1
+        estimate = self.in_work.pop(label, None)
+        if failed:
+            self.failed += 1
+            self._failed_share = 0.0 if estimate is None else estimate.share(now)
+        begun = self._started_at.pop(label, now)
+        if ran:
+            self._ran_seconds.append(now - begun)
+
+    def share(self, now: float) -> float:
+        """Of the whole run, in [0, 1]; of a single sequence that failed, what it came to."""
+        if self.failed == self.sequences == 1:
+            return self._failed_share
+        done = self.ended + sum(item.share(now) for item in self.in_work.values())
+        return min(1.0, done / self.sequences)
+
+    def seconds_left(self, now: float) -> float | None:
+        """Those in work to their end, and the others as long as those before, as many at once as now."""
+        in_work = {label: item.seconds_left(now) for label, item in self.in_work.items()}
+        waiting = self.sequences - self.ended - len(in_work)
+        known = [left for left in in_work.values() if left is not None]
+        if len(known) < len(in_work):
+            return None
+        whole = self._ran_seconds or [
+            left + now - self._started_at[label] for label, left in in_work.items() if left is not None
+        ]
+        if waiting > 0 and not whole:
+            return None
+        rest = waiting * sum(whole) / len(whole) / max(1, len(in_work)) if waiting > 0 else 0.0
+        return max(known, default=0.0) + rest
+
+    def text(self, now: float) -> str:
+        """What is in work, and what is left: `3 of 12 sequences done; some/scene: coarse, 7 of 9; ...`."""
+        words = []
+        if self.sequences > 1:
+            words.append(f"{self.ended} of {self.sequences} sequences done")
+        for label, estimate in self.in_work.items():
+            if estimate.stage:
+                words.append(f"{label}: {_at_work(estimate)}")
+        left = self.seconds_left(now)
+        if left is not None:
+            words.append(f"about {duration_text(left)} left")
+        return "; ".join(words)
+
+
+def _at_work(estimate: SequenceEstimate) -> str:
+    newest = estimate.newest
+    if newest is None or not newest.total:
+        return estimate.stage
+    task = "" if newest.stage == estimate.stage else f" ({newest.stage})"
+    return f"{estimate.stage}{task}, {newest.done} of {newest.total}"

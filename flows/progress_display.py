@@ -1,0 +1,283 @@
+"""What a terminal shows of a run under way: stages, the loop in work, the whole run, the last picture."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Literal
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.live import Live
+from rich.markup import escape
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+from rich.text import Text
+
+from extrags.pipeline import STAGES, StageName
+from extrags.store import Store
+from flows.estimate import EXPECTED_SECONDS, RunEstimate
+from flows.previews import stage_preview
+from flows.terminal import console
+from tasks.progress import IN_PARALLEL, Pace, StageProgress, duration_text, observed, rate_text
+
+__all__ = ["RunDisplay", "RunInView", "progress_display"]
+
+log = logging.getLogger(__name__)
+
+Showing = Literal["terminal", "log", "nothing"]
+"""Where progress goes: a live display, lines of a log, nowhere."""
+
+MARKS = {"ran": "✓", "cached": "=", "skipped": "-", "failed": "✗", "interrupted": "✗"}
+STYLES = {"ran": "green", "cached": "cyan", "skipped": "dim", "failed": "red", "interrupted": "red"}
+
+MOST_SEQUENCES = 4
+"""In work at the same time that have lines of their own."""
+BAR_WIDTH = 24
+PREVIEW_WAIT_SECONDS = 2.0
+"""How long the end of a run waits for a picture that is being made."""
+
+
+@dataclass(frozen=True)
+class RunInView:
+    """What is known of a run before it begins.
+
+    Args:
+        sequences: how many it takes through the stages; 0 for a loop that is none of theirs.
+        expected: seconds that their stages take in proportion to each other.
+        until: last stage.
+        store: root of the store whose artefacts are shown as small pictures; None for none.
+    """
+
+    sequences: int = 0
+    expected: Mapping[StageName, dict[str, float]] = field(default_factory=lambda: EXPECTED_SECONDS)
+    until: StageName = "report"
+    store: str | None = None
+
+
+@contextmanager
+def progress_display(showing: Showing, run: RunInView | None = None) -> Iterator[None]:
+    """Show how far the stages are that run inside the block.
+
+    Args:
+        showing: `terminal` for a live display on standard error; for `log` the stages log it themselves
+            (`tasks.progress.ProgressLog`).
+        run: what is known of it.
+    """
+    if showing == "log":
+        yield
+        return
+    if showing == "nothing":
+        with observed(_ignore):
+            yield
+        return
+    run = run or RunInView()
+    out = console(error=True)
+    previews = nullcontext(None) if run.store is None else _previews(Store(run.store))
+    with previews as wanted:
+        display = RunDisplay(run, announce=lambda line: out.print(line, highlight=False), preview=wanted)
+        with Live(display, console=out, refresh_per_second=4, transient=True), observed(display):
+            yield
+
+
+def _ignore(_: StageProgress) -> None:
+    """Nobody wants to know."""
+
+
+class RunDisplay:
+    """Observer that draws the state of a run; may be called and drawn from any thread.
+
+    Args:
+        run: what is known of it.
+        announce: prints a line, with rich's markup, when a stage has ended.
+        preview: is told of every stage that has made something, and gives what it has to show to a function.
+        clock: seconds, from any origin.
+    """
+
+    def __init__(
+        self,
+        run: RunInView,
+        *,
+        announce: Callable[[str], object],
+        preview: Callable[[StageProgress, Callable[[str], None]], object] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._run = run
+        self._announce = announce
+        self._preview = preview
+        self._clock = clock
+        self._begun = clock()
+        self._guard = threading.Lock()
+        self._pace = Pace()
+        self._loops: dict[str, tuple[StageProgress, float | None, float | None]] = {}
+        """The loop in work of each sequence, its rate and the seconds left."""
+        self._over: set[str] = set()
+        self._ran: set[str] = set()
+        self._estimate = RunEstimate(max(1, run.sequences), dict(run.expected), run.until)
+        self._picture = ""
+
+    def __call__(self, progress: StageProgress) -> None:
+        """Take note of a step or the end of a stage."""
+        with self._guard:
+            if progress.state == "running":
+                self._step(progress)
+                return
+            if progress.label in self._over:
+                # After a failure every further stage is announced as skipped.
+                return
+            self._end(progress, self._clock())
+        took = "" if progress.state in ("skipped", "cached") else f"  {progress.seconds:6.1f} s"
+        why = f"  [dim]{escape(progress.detail)}[/]" if progress.state in ("skipped", "failed") else ""
+        style = STYLES[progress.state]
+        self._announce(
+            f"[{style}]{MARKS[progress.state]}[/] {escape(progress.label)}  {progress.stage:<10} "
+            f"{progress.state:<8}{took}{why}"
+        )
+        if self._preview is not None and progress.state in ("ran", "cached"):
+            self._preview(progress, self._show_picture)
+
+    def _step(self, progress: StageProgress) -> None:
+        now = self._clock()
+        if not progress.total and not progress.detail:
+            self._over.discard(progress.label)
+        if self._run.sequences and progress.label not in self._over:
+            self._estimate.receive(progress, now)
+        if progress.total and progress.stage not in IN_PARALLEL:
+            rate, left = self._pace.rate(progress, now), self._pace.seconds_left(progress, now)
+            self._loops[progress.label] = progress, rate, left
+
+    def _end(self, progress: StageProgress, now: float) -> None:
+        self._pace.forget(progress.label)
+        self._loops.pop(progress.label, None)
+        if not self._run.sequences:
+            return
+        self._estimate.receive(progress, now)
+        failed = progress.state == "failed"
+        if progress.state == "ran":
+            self._ran.add(progress.label)
+        if failed or progress.stage == self._run.until:
+            self._over.add(progress.label)
+            ran = progress.label in self._ran
+            self._ran.discard(progress.label)
+            self._estimate.sequence_ended(progress.label, now, failed=failed, ran=ran)
+
+    def _show_picture(self, words: str) -> None:
+        with self._guard:
+            self._picture = words
+
+    def __rich_console__(self, out: Console, options: ConsoleOptions) -> RenderResult:
+        """What stands below the lines of the stages that have ended."""
+        with self._guard:
+            yield from self._lines(self._clock(), options.max_width)
+
+    def _lines(self, now: float, width: int) -> Iterator[Text | Table]:
+        in_work = list(self._estimate.in_work)
+        for label in in_work[:MOST_SEQUENCES]:
+            yield self._stages(label, width)
+            if label in self._loops:
+                yield _loop(*self._loops[label])
+        if len(in_work) > MOST_SEQUENCES:
+            yield Text(f"and {len(in_work) - MOST_SEQUENCES} more sequences", style="dim")
+        for label, loop in self._loops.items():
+            if label not in self._estimate.in_work:
+                yield _loop(*loop)
+        if self._run.sequences:
+            yield self._whole(now)
+        if self._picture:
+            # In one piece: it is there to be clicked or copied.
+            yield Text(f"picture  {self._picture}", style="dim", overflow="fold")
+
+    def _stages(self, label: str, width: int) -> Text:
+        """`phantom/11@sparse  ✓ ingest  - poses  ▸ coarse  · assess`, with breaks between stages alone."""
+        estimate = self._estimate.in_work[label]
+        words, used = Text.assemble((label, "bold")), len(label)
+        for stage in STAGES[: STAGES.index(self._run.until) + 1]:
+            ended = estimate.ended.get(stage)
+            if ended is not None:
+                mark, style = MARKS[ended.state], STYLES[ended.state]
+            elif stage == estimate.stage:
+                mark, style = "▸", "bold"
+            else:
+                mark, style = "·", "dim"
+            word = f"{mark} {stage}"
+            if used + 2 + len(word) > width:
+                words.append("\n")
+                used = 0
+            words.append("  ").append(word, style=style)
+            used += 2 + len(word)
+        return words
+
+    def _whole(self, now: float) -> Table:
+        run = self._estimate
+        share = run.share(now)
+        words = [f"{100 * share:.0f} %"]
+        if run.sequences > 1:
+            words.append(f"{run.ended} of {run.sequences} sequences done")
+        if run.failed:
+            words.append(f"{run.failed} failed")
+        words.append(f"{duration_text(now - self._begun)} so far")
+        left = run.seconds_left(now)
+        if left is not None and left >= 1:
+            words.append(f"about {duration_text(left)} left")
+        return _bar("whole run", share, ", ".join(words), "")
+
+
+def _loop(progress: StageProgress, rate: float | None, left: float | None) -> Table:
+    words = [f"{progress.done} of {progress.total}"]
+    if rate is not None:
+        words.append(rate_text(rate))
+    if left is not None:
+        words.append(f"about {duration_text(left)} left")
+    return _bar(progress.stage, progress.done / progress.total, ", ".join(words), progress.detail)
+
+
+def _bar(name: str, share: float, words: str, detail: str) -> Table:
+    line = Table.grid(padding=(0, 2))
+    line.add_column(width=18, no_wrap=True)
+    line.add_column(width=BAR_WIDTH)
+    # In one column, so that a narrow terminal cuts the detail first.
+    line.add_column(no_wrap=True, overflow="ellipsis")
+    said = Text.assemble(words, ("   " if detail else "", ""), (detail, "dim"))
+    line.add_row(f"  {name}", ProgressBar(total=1.0, completed=share, width=BAR_WIDTH), said)
+    return line
+
+
+@contextmanager
+def _previews(store: Store) -> Iterator[Callable[[StageProgress, Callable[[str], None]], object]]:
+    """Makes pictures in a thread of its own, of the newest stage where several wait; no run fails by it."""
+    asked: SimpleQueue[tuple[StageProgress, Callable[[str], None]] | None] = SimpleQueue()
+
+    def work() -> None:
+        while (wanted := asked.get()) is not None:
+            while not asked.empty():
+                newer = asked.get()
+                if newer is None:
+                    return
+                wanted = newer
+            progress, show = wanted
+            try:
+                found = stage_preview(progress.label, progress.stage, progress.made, store)
+            except Exception as error:
+                log.info("no picture of %s %s: %s", progress.label, progress.stage, error)
+                continue
+            if found is not None:
+                path, words = found
+                show(f"{_short(path)} ({words})")
+
+    thread = threading.Thread(target=work, name="previews", daemon=True)
+    thread.start()
+    try:
+        yield lambda progress, show: asked.put((progress, show))
+    finally:
+        asked.put(None)
+        thread.join(PREVIEW_WAIT_SECONDS)
+
+
+def _short(path: Path) -> str:
+    """Relative to the working directory where it is inside."""
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else str(path)

@@ -1,0 +1,239 @@
+"""Runs that a store has on record, as the pages that compare them show them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from extrags.errors import ConfigError, StoreError
+from extrags.report.leaderboard import BoardRow
+from extrags.store import Manifest, Ref, Store
+from flows.outcome_records import OutcomeRecord, outcome_records, setting_text
+
+if TYPE_CHECKING:
+    from extrags.report.run_comparison import ComparedRun
+
+__all__ = ["RecordedRun", "board_rows", "chosen_runs", "compared_run", "run_names"]
+
+REPORT = "report-v"
+"""Begin of the keys of a sequence's own pages."""
+DEFAULT_SEED = "default seeds"
+"""In words: each stage has its own."""
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """A run that went through to its page.
+
+    Args:
+        report: manifest of the page, which knows what was shown on it.
+        record: how the run ended; None for a page that was named itself and is on no record.
+    """
+
+    report: Manifest
+    record: OutcomeRecord | None = None
+
+    @property
+    def sequence(self) -> str:
+        """Its sequence."""
+        return self.report.label if self.record is None else str(self.record["sequence"])
+
+    def traits(self) -> dict[str, str]:
+        """What tells it from other runs of its sequence: method, profile, seed and settings of a matrix."""
+        if self.record is None:
+            return {"profile": str(self.report.config.get("profile", "")), "page": self.report.key}
+        seed = self.record["seed"]
+        return {
+            "method": str(self.record["method"]),
+            "profile": str(self.record["profile"]),
+            "seed": DEFAULT_SEED if seed is None else f"seed {seed}",
+            "settings": setting_text(self.record["variant"]),
+        }
+
+    def ref(self, store: Store, part: str) -> Ref | None:
+        """An artefact that the page shows, by the names of `flows.outcome.Part`; None where it shows none.
+
+        Raises:
+            StoreError: when it is gone from the store.
+        """
+        key = self.report.input_keys.get(f"parts.{part}")
+        if key is None:
+            return None
+        found = store.find(key)
+        if found is None:
+            raise StoreError(f"{self.sequence}: {key} is gone from the store; run it again")
+        return found
+
+
+def chosen_runs(
+    store: Store,
+    names: Sequence[str],
+    *,
+    methods: Sequence[str] = (),
+    profiles: Sequence[str] = (),
+    seeds: Sequence[int] = (),
+) -> list[RecordedRun]:
+    """The runs of one sequence that are to be compared, the oldest first.
+
+    Args:
+        store: where they are.
+        names: a sequence, which stands for all of its runs on record, or pages: their files, folders or keys.
+        methods: only runs of these; all without any.
+        profiles: the same.
+        seeds: the same.
+
+    Raises:
+        ConfigError: when fewer than two are found, or they are of different sequences.
+        StoreError: for a page that is not in the store.
+    """
+    records = sorted(outcome_records(store).values(), key=lambda record: str(record["ended"]))
+    found: dict[str, RecordedRun] = {}
+    unfinished = 0
+    for name in names:
+        key = _report_key(name)
+        if key is not None:
+            manifest = _manifest(store, key)
+            if manifest is None:
+                raise StoreError(f"the page {key} is not in the store {store.root}")
+            record = next((item for item in records if _key_of(item) == key), None)
+            found[key] = RecordedRun(manifest, record)
+            continue
+        for record in records:
+            if record["sequence"] != name or not _wanted(record, methods, profiles, seeds):
+                continue
+            key = _key_of(record)
+            manifest = None if key is None else _manifest(store, key)
+            if record["status"] == "ok" and key is not None and manifest is not None:
+                found[key] = RecordedRun(manifest, record)
+            else:
+                unfinished += 1
+    runs = list(found.values())
+    sequences = sorted({run.sequence for run in runs})
+    if len(sequences) > 1:
+        raise ConfigError(
+            f"runs of one sequence are compared; these are of {', '.join(sequences)} "
+            "(extrags leaderboard compares sequences)"
+        )
+    if len(runs) < 2:
+        more = f", and {unfinished} that did not come to a page" if unfinished else ""
+        raise ConfigError(
+            f"{', '.join(names)}: {len(runs)} finished run{'s' * (len(runs) != 1)} on record in "
+            f"{store.root}{more}; a comparison takes two"
+        )
+    return runs
+
+
+def run_names(runs: Sequence[RecordedRun]) -> list[str]:
+    """What sets the runs apart: the traits in which they differ, numbered where those are the same."""
+    traits = [run.traits() for run in runs]
+    keys = list(dict.fromkeys(key for own in traits for key in own))
+    telling = [key for key in keys if len({own.get(key, "") for own in traits}) > 1]
+    names = []
+    for own in traits:
+        words = [own[key] for key in telling if own.get(key) and key != "page"]
+        names.append(", ".join(words) or own.get("page", "") or "run")
+    return [
+        f"{name} ({names[: place + 1].count(name)})" if names.count(name) > 1 else name
+        for place, name in enumerate(names)
+    ]
+
+
+def compared_run(store: Store, run: RecordedRun, name: str) -> ComparedRun:
+    """A run with what is shown of it; where nothing was fine-tuned, its coarse scene.
+
+    Raises:
+        StoreError: when an artefact is gone, or the run was not evaluated.
+    """
+    # Here, because they load torch, which a leaderboard needs not.
+    from extrags.metrics.protocol import RenderedViews
+    from extrags.report.run_comparison import ComparedRun
+    from extrags.report.run_tables import plain_value
+    from tasks.evaluate import METRICS_FILE
+    from tasks.report import PAGE
+
+    renders = run.ref(store, "renders_final") or run.ref(store, "renders_coarse")
+    metrics = run.ref(store, "metrics_final") or run.ref(store, "metrics_coarse")
+    if renders is None or metrics is None:
+        raise StoreError(f"{run.sequence}: the page {run.report.key} was made without an evaluation")
+    settings = _flat(run.report.config["config"])
+    stages = [] if run.record is None else run.record["stages"]
+    page = store.find(run.report.key)
+    return ComparedRun(
+        name=name,
+        rgb=store.load(RenderedViews, renders).rgb,
+        result=store.load_json(METRICS_FILE, metrics),
+        settings={key: plain_value(value) for key, value in settings.items()},
+        seconds=sum(float(stage["made_seconds"]) for stage in stages) if stages else None,
+        link="" if page is None else _address(f"{page.uri}/{PAGE}"),
+    )
+
+
+def board_rows(store: Store, patterns: Sequence[str] = ()) -> list[BoardRow]:
+    """Every run on record whose sequence matches one of the patterns; all without patterns.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    rows = []
+    for record in outcome_records(store).values():
+        sequence = str(record["sequence"])
+        if patterns and not any(fnmatchcase(sequence, pattern) for pattern in patterns):
+            continue
+        seed, tree = record["seed"], record["metrics"]
+        rows.append(
+            BoardRow(
+                sequence=sequence,
+                method=str(record["method"]),
+                profile=str(record["profile"]),
+                seed="" if seed is None else str(seed),
+                settings=setting_text(record["variant"]),
+                status=record["status"],
+                reason=f"{record['stage']}: {record['reason']}" if record["status"] == "failed" else "",
+                ended=str(record["ended"]),
+                seconds=sum(float(stage["made_seconds"]) for stage in record["stages"]),
+                metrics=tree.get("final") or tree.get("coarse"),
+                link=_address(record["report"]) if record["report"] else "",
+            )
+        )
+    return sorted(rows, key=lambda row: (row.sequence, row.method, row.profile, row.seed, row.settings))
+
+
+def _wanted(
+    record: Mapping[str, Any], methods: Sequence[str], profiles: Sequence[str], seeds: Sequence[int]
+) -> bool:
+    return (
+        (not methods or record["method"] in methods)
+        and (not profiles or record["profile"] in profiles)
+        and (not seeds or record["seed"] in seeds)
+    )
+
+
+def _report_key(name: str) -> str | None:
+    """The key of a page that is named by its file, its folder or itself; None for a sequence."""
+    parts = [part for part in name.replace("\\", "/").split("/") if part]
+    return next((part for part in reversed(parts[-2:]) if part.startswith(REPORT)), None)
+
+
+def _key_of(record: Mapping[str, Any]) -> str | None:
+    return _report_key(record["report"]) if record["report"] else None
+
+
+def _manifest(store: Store, key: str) -> Manifest | None:
+    ref = store.find(key)
+    return None if ref is None else store.manifest(ref)
+
+
+def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Values of a tree of settings by dotted name."""
+    found: dict[str, Any] = {}
+    for name, value in tree.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+    return found
+
+
+def _address(place: str) -> str:
+    """Of a page, for a link from anywhere on this machine."""
+    return place if "://" in place else Path(place).absolute().as_uri()

@@ -1,0 +1,93 @@
+"""A PLY that keeps the light in its header."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from plyfile import PlyData
+
+from extrags.cameras import Cameras
+from extrags.errors import SourceError, SourceNotFoundError
+from extrags.scene import Scene
+from extrags.splat_files import read_ply_scene, write_ply_scene
+from tests.extrags.splat_files.conftest import psnr
+
+
+@pytest.fixture(scope="module")
+def lit(lit: Scene) -> Scene:
+    """A few Gaussians are enough."""
+    return Scene(lit.gaussians.subset(torch.arange(0, 5000, 25).clamp_max(len(lit.gaussians) - 1)), lit.light)
+
+
+def changed(path: Path, **values: object) -> None:
+    """Other numbers in the light of a file."""
+    head, mark, rest = path.read_bytes().partition(b"comment extrags_light ")
+    text, end, body = rest.partition(b"\n")
+    light = {**json.loads(text), **values}
+    path.write_bytes(head + mark + json.dumps(light).encode() + end + body)
+
+
+class TestLight:
+    def test_it_comes_back(self, lit: Scene, views: Cameras, tmp_path: Path) -> None:
+        write_ply_scene(lit, tmp_path / "a.ply")
+        back = read_ply_scene(tmp_path / "a.ply")
+        assert lit.light is not None
+        assert back.light is not None
+        for name, value in lit.light.parameters().items():
+            assert torch.allclose(back.light.parameters()[name], value, rtol=1e-6), name
+        assert back.light.reference_distance == lit.light.reference_distance
+        assert psnr(back, lit, views) > 100
+
+    def test_other_programs_pass_over_it(self, lit: Scene, tmp_path: Path) -> None:
+        write_ply_scene(lit, tmp_path / "a.ply")
+        vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+        assert torch.equal(torch.from_numpy(vertex["f_dc_1"].copy()), lit.gaussians.sh0[:, 0, 1])
+
+    def test_a_linear_response(self, lit: Scene, tmp_path: Path) -> None:
+        """The logarithm of its shoulder is minus infinity, which JSON cannot say."""
+        from dataclasses import replace
+
+        assert lit.light is not None
+        linear = replace(lit.light, log_shoulder=torch.tensor(-torch.inf))
+        write_ply_scene(Scene(lit.gaussians, linear), tmp_path / "a.ply")
+        back = read_ply_scene(tmp_path / "a.ply")
+        assert back.light is not None
+        assert float(back.light.log_shoulder) == -torch.inf
+
+    def test_without_light_the_header_says_nothing(self, lit: Scene, tmp_path: Path) -> None:
+        write_ply_scene(Scene(lit.gaussians), tmp_path / "a.ply")
+        assert b"extrags_light" not in (tmp_path / "a.ply").read_bytes()
+        assert read_ply_scene(tmp_path / "a.ply").light is None
+
+    @pytest.mark.parametrize(
+        ("name", "value", "message"),
+        [
+            ("offset", [1.0, 2.0], "extrags_light.offset"),
+            ("log_softening", [1.0], "extrags_light.log_softening"),
+            ("log_exponent", 1e400, "extrags_light"),
+            ("reference_distance", 0.0, "reference_distance"),
+            ("reference_distance", "far", "extrags_light"),
+            ("colour", 1.0, "extrags_light"),
+        ],
+    )
+    def test_a_wrong_light_is_refused(
+        self, name: str, value: object, message: str, lit: Scene, tmp_path: Path
+    ) -> None:
+        write_ply_scene(lit, tmp_path / "a.ply")
+        changed(tmp_path / "a.ply", **{name: value})
+        with pytest.raises(SourceError, match=message):
+            read_ply_scene(tmp_path / "a.ply")
+
+    def test_a_header_that_is_no_json(self, lit: Scene, tmp_path: Path) -> None:
+        write_ply_scene(lit, tmp_path / "a.ply")
+        whole = (tmp_path / "a.ply").read_bytes()
+        (tmp_path / "a.ply").write_bytes(whole.replace(b"extrags_light {", b"extrags_light [", 1))
+        with pytest.raises(SourceError, match="cannot be read"):
+            read_ply_scene(tmp_path / "a.ply")
+
+    def test_no_file(self, tmp_path: Path) -> None:
+        with pytest.raises(SourceNotFoundError):
+            read_ply_scene(tmp_path / "none.ply")

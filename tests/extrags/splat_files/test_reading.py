@@ -1,0 +1,107 @@
+"""Files of Gaussians from elsewhere, right and wrong ones."""
+
+from __future__ import annotations
+
+import gzip
+import struct
+from pathlib import Path
+
+import pytest
+import torch
+
+from extrags.errors import SourceError, SourceNotFoundError
+from extrags.gaussians import Gaussians
+from extrags.scene import Scene
+from extrags.splat_files import read_splat_file, read_spz, write_spz
+
+
+@pytest.fixture
+def few(lit: Scene) -> Gaussians:
+    return lit.gaussians.subset(torch.arange(20)).detached()
+
+
+def with_values(gaussians: Gaussians, **values: torch.Tensor) -> Gaussians:
+    return Gaussians(**{**gaussians.parameters(), **values})
+
+
+class TestRefused:
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [
+            (b"", "neither PLY nor SPZ"),
+            (b"PK\x03\x04", "neither PLY nor SPZ"),
+            (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "property is missing"),
+            (b"\x1f\x8b\x08\x00", "SPZ"),
+            (gzip.compress(b"short"), "ends within its header"),
+            (gzip.compress(bytes(16)), "wrong magic number"),
+            (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 4, 1, 0, 12, 0, 0)), "SPZ of version 4"),
+            (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 4, 12, 0, 0)), "SH degree 4"),
+            (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 2**31, 0, 12, 0, 0)), "2147483648 Gaussians"),
+            (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 5, 0, 12, 0, 0) + bytes(9)), "truncated"),
+            (gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 3, 0, 0, 12, 0, 0)), "holds no Gaussians"),
+        ],
+    )
+    def test_damaged_files(self, content: bytes, message: str, tmp_path: Path) -> None:
+        file = tmp_path / "scene.spz"
+        file.write_bytes(content)
+        with pytest.raises(SourceError, match=message) as found:
+            read_splat_file(file)
+        assert found.value.file == str(file)
+
+    def test_no_file(self, tmp_path: Path) -> None:
+        for read in (read_splat_file, read_spz):
+            with pytest.raises(SourceNotFoundError):
+                read(tmp_path / "none.ply")
+
+    def test_every_truncation(self, few: Gaussians, tmp_path: Path) -> None:
+        write_spz(few, tmp_path / "whole.spz")
+        whole = (tmp_path / "whole.spz").read_bytes()
+        for length in range(0, len(whole), 37):
+            (tmp_path / "part.spz").write_bytes(whole[:length])
+            with pytest.raises(SourceError):
+                read_splat_file(tmp_path / "part.spz")
+
+    def test_numbers_that_are_not_finite(self, few: Gaussians, tmp_path: Path) -> None:
+        few.scales[3, 1] = torch.nan
+        few.scales[7, 0] = torch.inf
+        few.write_ply(tmp_path / "a.ply")
+        with pytest.raises(SourceError, match="field scales: 2 Gaussians"):
+            read_splat_file(tmp_path / "a.ply")
+
+    def test_rotations_without_length(self, few: Gaussians, tmp_path: Path) -> None:
+        few.quats[2] = 0
+        few.write_ply(tmp_path / "a.ply")
+        with pytest.raises(SourceError, match="length zero"):
+            read_splat_file(tmp_path / "a.ply")
+
+
+class TestSpz:
+    def test_our_own_reader(self, lit: Scene, tmp_path: Path) -> None:
+        """Within half a step of each number's grid."""
+        given = lit.gaussians.detached()
+        write_spz(given, tmp_path / "a.spz")
+        back = read_spz(tmp_path / "a.spz")
+        assert torch.allclose(back.means, given.means, atol=1e-5)
+        assert torch.allclose(back.scales, given.scales, atol=0.5 / 16 + 1e-6)
+        assert torch.allclose(back.opacities.sigmoid(), given.opacities.sigmoid(), atol=0.5 / 255 + 1e-6)
+        same = torch.nn.functional.cosine_similarity(back.quats, given.quats).abs()
+        assert float(same.min()) > 1 - 1e-5
+        assert torch.allclose(back.shN[:, 3:], given.shN[:, 3:], atol=1 / 16 + 1 / 256 + 1e-6)
+
+    def test_version_2(self, tmp_path: Path) -> None:
+        """Rotations of three bytes: x, y, z of 127.5 (1 + q), w not negative."""
+        header = struct.pack("<4sIIBBBB", b"NGSP", 2, 1, 0, 12, 0, 0)
+        position = b"".join((value << 12).to_bytes(3, "little", signed=True) for value in (1, -2, 3))
+        rotation = bytes([128, 255, 128])
+        body = position + bytes([128]) + bytes([128] * 3) + bytes([160] * 3) + rotation
+        (tmp_path / "a.spz").write_bytes(gzip.compress(header + body))
+        back = read_spz(tmp_path / "a.spz")
+        assert back.means.tolist() == [[1.0, 2.0, -3.0]]
+        assert back.scales.tolist() == [[0.0, 0.0, 0.0]]
+        # About the format's y axis, which is our -y.
+        assert torch.allclose(back.quats, torch.tensor([[0.0, 0.0, -1.0, 0.0]]), atol=0.01)
+
+    def test_a_scene_too_large(self, few: Gaussians, tmp_path: Path) -> None:
+        far = with_values(few, means=few.means * 1e6)
+        with pytest.raises(SourceError, match="SPZ holds at most"):
+            write_spz(far, tmp_path / "a.spz")

@@ -1,0 +1,93 @@
+"""How far a run is said to be, and how long it still takes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from extrags.pipeline import STAGES
+from flows.estimate import EXPECTED_SECONDS, RunEstimate, SequenceEstimate
+from tasks.progress import StageProgress
+from tasks.stage import stage_versions
+
+
+def step(stage: str, state: str = "running", done: int = 0, total: int = 0, seconds: float = 0.0) -> Any:
+    return StageProgress("scene", stage, state, done, total, "", seconds)
+
+
+class TestEstimate:
+    def test_every_stage_is_expected_and_its_tasks_exist(self) -> None:
+        assert tuple(EXPECTED_SECONDS) == STAGES
+        named = {task for tasks in EXPECTED_SECONDS.values() for task in tasks}
+        assert named <= set(stage_versions())
+
+    def test_nothing_is_said_before_something_ran(self) -> None:
+        estimate = SequenceEstimate(EXPECTED_SECONDS)
+        estimate.receive(step("ingest"), 0.0)
+        assert estimate.seconds_left(1.0) is None
+
+    def test_what_is_left_goes_at_the_pace_of_what_ran(self) -> None:
+        estimate = SequenceEstimate(EXPECTED_SECONDS, until="coarse")
+        estimate.receive(step("ingest"), 0.0)
+        estimate.receive(step("ingest", "ran", seconds=24.0), 24.0)
+        for skipped in ("poses", "depth"):
+            estimate.receive(step(skipped, "skipped"), 24.0)
+        # Ingestion took twice what was expected; 18 s are expected of the coarse scene.
+        assert estimate.seconds_left(24.0) == pytest.approx(36.0)
+        assert estimate.share(24.0) == pytest.approx(12 / 30)
+        estimate.receive(step("coarse"), 24.0)
+        estimate.receive(step("coarse", done=750, total=1500), 42.0)
+        assert estimate.share(42.0) == pytest.approx(21 / 30)
+        assert estimate.seconds_left(42.0) == pytest.approx(18.0)
+        estimate.receive(step("coarse", "ran", seconds=36.0), 60.0)
+        assert estimate.share(60.0) == 1.0
+        assert estimate.seconds_left(60.0) == 0.0
+
+    def test_a_failure_keeps_its_share(self) -> None:
+        estimate = SequenceEstimate(EXPECTED_SECONDS, until="coarse")
+        estimate.receive(step("ingest"), 0.0)
+        estimate.receive(step("ingest", "failed", seconds=1.0), 1.0)
+        for skipped in ("poses", "depth", "coarse"):
+            estimate.receive(step(skipped, "skipped"), 1.0)
+        assert estimate.share(1.0) == 0.0
+
+    def test_shares_never_fall(self) -> None:
+        estimate = SequenceEstimate(EXPECTED_SECONDS)
+        shares, now = [], 0.0
+        for name, tasks in EXPECTED_SECONDS.items():
+            estimate.receive(step(name), now)
+            for task in tasks:
+                for done in (1, 2):
+                    estimate.receive(step(task, done=done, total=2), now)
+                    now += 1.0
+                    shares.append(estimate.share(now))
+            estimate.receive(step(name, "ran", seconds=2.0), now)
+            shares.append(estimate.share(now))
+        assert shares == sorted(shares)
+        assert shares[-1] == pytest.approx(1.0)
+
+    def test_cached_stages_teach_nothing_of_the_pace(self) -> None:
+        estimate = SequenceEstimate(EXPECTED_SECONDS)
+        for name in ("ingest", "poses", "depth", "coarse"):
+            estimate.receive(step(name), 0.0)
+            estimate.receive(step(name, "cached"), 0.0)
+        assert estimate.seconds_left(1.0) is None
+
+
+class TestRun:
+    def test_waiting_sequences_take_as_long_as_those_before(self) -> None:
+        run = RunEstimate(3, EXPECTED_SECONDS, "ingest")
+        run.receive(step("ingest"), 0.0)
+        run.receive(step("ingest", "ran", seconds=12.0), 12.0)
+        run.sequence_ended("scene", 12.0, failed=False, ran=True)
+        assert run.share(12.0) == pytest.approx(1 / 3)
+        assert run.seconds_left(12.0) == pytest.approx(24.0)
+        assert run.text(12.0) == "1 of 3 sequences done; about 24 s left"
+
+    def test_more_sequences_than_were_announced_do_no_harm(self) -> None:
+        run = RunEstimate(1, EXPECTED_SECONDS, "ingest")
+        for _ in range(2):
+            run.sequence_ended("scene", 0.0, failed=False, ran=True)
+        assert run.share(0.0) == 1.0
+        assert run.seconds_left(0.0) == 0.0

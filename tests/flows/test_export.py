@@ -1,0 +1,230 @@
+"""`extrags export` of a finished run, read back by other programs' readers."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import av
+import numpy as np
+import pycolmap
+import pytest
+import torch
+import trimesh
+from plyfile import PlyData
+
+from extrags.export import read_camera_path
+from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
+from extrags.splat_files import read_ply_scene
+from extrags.store import Store
+from flows.cli import main
+from flows.outcome import SequenceOutcome
+from tests.extrags.splat_files import decoders
+from tests.flows.tiny import SEQUENCE, TINY
+
+Finished = tuple[str, SequenceOutcome]
+SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
+
+
+@pytest.fixture(autouse=True)
+def untouched_environment() -> Iterator[None]:
+    """The command sets up Prefect through the environment; put it back."""
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+def export(finished: Finished, *arguments: str) -> int:
+    return main(["export", SEQUENCE, "--profile", "quick", "--store", finished[0], *SETTINGS, *arguments])
+
+
+def frames(finished: Finished) -> EndoscopicSequence:
+    store, outcome = finished
+    return Store(store).load(EndoscopicSequence, outcome.refs["sequence"])
+
+
+def final_scene(finished: Finished) -> Scene:
+    store, outcome = finished
+    return Store(store).load(Scene, outcome.refs["finetune"])
+
+
+def psnr(first: Scene, second: Scene, sequence: EndoscopicSequence) -> float:
+    with torch.no_grad():
+        shown, other = (scene.render(sequence.training_cameras).rgb.clamp(0, 1) for scene in (first, second))
+    return float(-10 * torch.log10(((shown - other) ** 2).mean().clamp_min(1e-20)))
+
+
+class TestGaussians:
+    def test_all_formats_show_the_same_baked_scene(
+        self, finished: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        sequence = frames(finished)
+        assert export(finished, "-o", str(tmp_path / "a.ply")) == 0
+        assert "light baked, recorded" in capsys.readouterr().out
+        plain = Scene(decoders.ply(tmp_path / "a.ply"))
+        assert export(finished, "--to", "spz", "-o", str(tmp_path / "a.spz")) == 0
+        assert psnr(Scene(decoders.spz(tmp_path / "a.spz")), plain, sequence) > 35
+        # As bright as the recording on average, which the albedo is not.
+        lit = final_scene(finished)
+        assert psnr(plain, lit, sequence) > psnr(Scene(lit.gaussians), lit, sequence) + 2
+
+    def test_light_that_is_kept(self, finished: Finished, tmp_path: Path) -> None:
+        assert export(finished, "--light", "kept", "-o", str(tmp_path / "a.ply")) == 0
+        assert psnr(read_ply_scene(tmp_path / "a.ply"), final_scene(finished), frames(finished)) > 80
+
+    def test_frontal_light_falls_off_with_the_distance(self, finished: Finished, tmp_path: Path) -> None:
+        brightness = []
+        for distance in ("10", "30"):
+            target = tmp_path / f"{distance}.ply"
+            assert export(finished, "--light", "frontal", "--distance", distance, "-o", str(target)) == 0
+            brightness.append(float(decoders.ply(target).sh0.mean()))
+        assert brightness[0] > brightness[1]
+
+
+class TestSurface:
+    def test_mesh(self, finished: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        target = tmp_path / "a.ply"
+        assert export(finished, "--to", "mesh", "-o", str(target)) == 0
+        mesh = trimesh.load(target, process=False)
+        said = capsys.readouterr().out
+        assert f"{len(mesh.faces)} triangles" in said
+        invented = PlyData.read(str(target))["vertex"]["invented"]
+        assert f"{100 * (invented > 0).mean():.1f} % of the vertices invented" in said
+        # Virtual views have shown more than training views have, but not all.
+        assert 0 < invented.mean() < 0.9
+
+    def test_points(self, finished: Finished, tmp_path: Path) -> None:
+        assert export(finished, "--to", "points", "--min-opacity", "0", "-o", str(tmp_path / "a.ply")) == 0
+        assert len(trimesh.load(tmp_path / "a.ply").vertices) == len(final_scene(finished).gaussians)
+
+
+class TestFlights:
+    def test_a_path_and_the_video_along_it(
+        self, finished: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        path, video = tmp_path / "path.json", tmp_path / "a.mp4"
+        flight = ["--along", "held-out", "--between", "2", "--fps", "10"]
+        assert export(finished, "--to", "camera-path", *flight, "-o", str(path)) == 0
+        written = read_camera_path(path)
+        held_out = frames(finished)
+        poses = held_out.cameras[np.sort(held_out.test)].world_from_camera
+        np.testing.assert_allclose(written.cameras.world_from_camera[0], poses[0], atol=1e-9)
+        assert export(finished, "--to", "video", "--along", str(path), "--width", "64", "-o", str(video)) == 0
+        assert "frames of coarse, final, uncertainty" in capsys.readouterr().out
+        with av.open(str(video)) as container:
+            pictures = [picture.to_ndarray(format="rgb24") for picture in container.decode(video=0)]
+            assert float(container.streams.video[0].average_rate or 0) == 10
+        assert len(pictures) == len(written.cameras)
+        assert pictures[0].shape == (54, 3 * 64, 3)
+        with torch.no_grad():
+            expected = final_scene(finished).render(written.cameras[0].resized(64, 53)).rgb[0].clamp(0, 1)
+        error = (pictures[0][:53, 64:128] / 255 - expected.numpy()) ** 2
+        assert -10 * np.log10(error.mean()) > 28
+
+    def test_virtual_trajectories(self, finished: Finished, tmp_path: Path) -> None:
+        from extrags.exploration import Exploration
+
+        target = tmp_path / "path.json"
+        assert export(finished, "--to", "camera-path", "--along", "virtual", "-o", str(target)) == 0
+        store, outcome = finished
+        explored = Store(store).load(Exploration, outcome.refs["explore"])
+        assert len(read_camera_path(target).cameras) == len(explored.cameras)
+
+    def test_uncertainty_alone(self, finished: Finished, tmp_path: Path) -> None:
+        target = tmp_path / "a.mp4"
+        assert export(finished, "--to", "video", "--panels", "uncertainty", "-o", str(target)) == 0
+        with av.open(str(target)) as container:
+            assert container.streams.video[0].width == 48
+
+
+class TestCameras:
+    def test_pycolmap_projects_as_we_do(self, finished: Finished, tmp_path: Path) -> None:
+        assert export(finished, "--to", "colmap", "-o", str(tmp_path / "scene")) == 0
+        given = frames(finished)
+        model = pycolmap.Reconstruction(str(tmp_path / "scene" / "sparse" / "0"))
+        assert len(model.images) == len(given)
+        assert len(model.points3D) > 100
+        point = given.cameras.centers.mean(axis=0) + 10 * given.cameras.forward.mean(axis=0)
+        ours = given.cameras.project(point[None])[0][:, 0]
+        found = 0
+        for image in model.images.values():
+            theirs = image.project_point(point)
+            if theirs is not None:
+                nearest = np.nanmin(np.abs(ours - theirs).max(axis=1))
+                assert nearest < 1e-6
+                found += 1
+        assert found > 3
+
+    def test_transforms(self, finished: Finished, tmp_path: Path) -> None:
+        assert export(finished, "--to", "transforms", "-o", str(tmp_path / "scene")) == 0
+        given = frames(finished)
+        content = json.loads((tmp_path / "scene" / "transforms.json").read_text())
+        centers = np.array([np.array(frame["transform_matrix"])[:3, 3] for frame in content["frames"]])
+        apart = np.linalg.norm(centers[:, None] - given.cameras.centers[None], axis=-1)
+        assert len(centers) == len(given)
+        assert float(apart.min(axis=1).max()) < 1e-6
+
+
+class TestUsage:
+    @pytest.mark.parametrize(
+        ("arguments", "message"),
+        [
+            (["--to", "spz", "-o", "a.ply"], "must end in .spz"),
+            (["--to", "mesh", "-o", "a.stl"], "must end in .glb or .obj or .ply"),
+            (["--to", "video", "-o", "a.avi"], "must end in .mp4"),
+            (["--to", "spz", "--between", "3", "-o", "a.spz"], "--between says nothing about --to spz"),
+            (["--to", "points", "--no-texture", "-o", "a.ply"], "--no-texture says nothing"),
+            (["--to", "colmap", "--light", "kept", "-o", "a"], "--light says nothing about --to colmap"),
+            (["--to", "sog", "--light", "kept", "-o", "a.sog"], "no place for a light"),
+            (["--light", "kept", "--exposure", "2", "-o", "a.ply"], "bakes nothing"),
+            (["--distance", "3", "-o", "a.ply"], "--light frontal"),
+            (["--light", "frontal", "--distance", "0", "-o", "a.ply"], "--distance is 0"),
+            (["--exposure", "nan", "-o", "a.ply"], "--exposure is nan"),
+            (["--to", "points", "--min-opacity", "1", "-o", "a.ply"], "--min-opacity is 1"),
+            (["--to", "video", "--panels", "fine", "-o", "a.mp4"], "no panel 'fine'"),
+            (["--to", "video", "--fps", "0", "-o", "a.mp4"], "--fps is 0"),
+            (["--to", "video", "--width", "3", "-o", "a.mp4"], "--width is 3"),
+            (["--to", "video", "--between", "0", "-o", "a.mp4"], "--between is 0"),
+            (["--method", "uc-nerf", "-o", "a.ply"], "makes no Gaussians"),
+            (["-o", "."], "is a folder"),
+        ],
+    )
+    def test_wrong_usage_is_said_at_once(
+        self, arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["export", SEQUENCE, "--store", str(tmp_path / "store"), *arguments]) == 2
+        said = capsys.readouterr().err
+        assert message in said
+        assert said.count("\n") == 1
+
+    @pytest.mark.parametrize(
+        ("along", "code", "message"),
+        [
+            ("sideways", 2, "expected training, held-out, virtual or a FILE.json"),
+            ("no.json", 1, "no such file"),
+        ],
+    )
+    def test_a_trajectory_that_is_not_there(
+        self,
+        along: str,
+        code: int,
+        message: str,
+        finished: Finished,
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        target = tmp_path / "a.json"
+        assert export(finished, "--to", "camera-path", "--along", along, "-o", str(target)) == code
+        assert message in capsys.readouterr().err
+        assert not target.exists()
+
+    def test_a_folder_that_cannot_be_written(
+        self, finished: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (tmp_path / "file").write_text("x")
+        assert export(finished, "--to", "points", "-o", str(tmp_path / "file" / "a.ply")) == 1
+        assert "cannot be written" in capsys.readouterr().err

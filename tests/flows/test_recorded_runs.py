@@ -1,0 +1,144 @@
+"""Runs on record: which are compared, by what names; the verbs that make pages of them."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from extrags.errors import ConfigError, StoreError
+from extrags.store import Store
+from flows.cases import SequenceCase, record_outcome
+from flows.cli import main
+from flows.outcome import SequenceOutcome
+from flows.recorded_runs import RecordedRun, board_rows, chosen_runs, run_names
+from flows.runners import DirectRunner
+from flows.wiring import run_sequence
+from tests.flows.tiny import SEQUENCE, tiny_config
+
+
+@pytest.fixture(autouse=True)
+def untouched_environment() -> Iterator[None]:
+    """The commands set up Prefect through the environment; put it back."""
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)
+
+
+@pytest.fixture(scope="module")
+def store(finished: tuple[str, SequenceOutcome], tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Two runs on record that differ in a setting, and one that failed."""
+    root = tmp_path_factory.mktemp("recorded") / "store"
+    # Without the records that other tests have left there.
+    shutil.copytree(finished[0], root, ignore=shutil.ignore_patterns("records"))
+    found = Store(str(root))
+    for views in (1, 2):
+        config = tiny_config(report__held_out_views=views)
+        outcome = run_sequence(SEQUENCE, config, str(root), DirectRunner(str(root)), profile="quick")
+        changed = {} if views == 1 else {"report.held_out_views": views}
+        case = SequenceCase(SEQUENCE, profile="quick", seed=0, changed=changed)
+        record_outcome(found, case, outcome, "report", config)
+    failed = SequenceOutcome(SEQUENCE, "failed")
+    case = SequenceCase(SEQUENCE, method="3dgs", profile="quick")
+    record_outcome(found, case, failed, "report", config)
+    return found
+
+
+def test_a_sequence_stands_for_its_finished_runs(store: Store) -> None:
+    runs = chosen_runs(store, [SEQUENCE])
+    assert len(runs) == 2
+    assert sorted(run_names(runs)) == ["report.held_out_views = 2", "run"]
+
+
+def test_pages_are_named_by_file_folder_or_key(store: Store) -> None:
+    keys = [run.report.key for run in chosen_runs(store, [SEQUENCE])]
+    named = chosen_runs(store, [f"somewhere/{keys[0]}/report.html", keys[1]])
+    assert [run.report.key for run in named] == keys
+    assert all(run.record is not None for run in named)
+
+
+def test_too_few_runs(store: Store) -> None:
+    with pytest.raises(ConfigError, match=r"0 finished runs on record .* and 1 that did not come to a page"):
+        chosen_runs(store, [SEQUENCE], methods=["3dgs"])
+    with pytest.raises(ConfigError, match="a comparison takes two"):
+        chosen_runs(store, ["phantom/7@sparse"])
+
+
+def test_a_page_that_is_gone(store: Store) -> None:
+    with pytest.raises(StoreError, match="is not in the store"):
+        chosen_runs(store, ["report-v1-0123456789abcdef0123456789abcdef"])
+
+
+class Traits(RecordedRun):
+    """A run of which nothing is known but its traits."""
+
+    def __init__(self, **own: str) -> None:
+        object.__setattr__(self, "own", own)
+
+    def traits(self) -> dict[str, str]:
+        return dict(self.own)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("traits", "names"),
+    [
+        (
+            [{"method": "3dgs", "seed": "seed 0"}, {"method": "extrags", "seed": "seed 0"}],
+            ["3dgs", "extrags"],
+        ),
+        (
+            [{"method": "3dgs", "seed": "seed 0"}, {"method": "extrags", "seed": "seed 1"}],
+            ["3dgs, seed 0", "extrags, seed 1"],
+        ),
+        ([{"method": "3dgs"}, {"method": "3dgs"}], ["run (1)", "run (2)"]),
+    ],
+)
+def test_names_say_what_differs(traits: list[dict[str, str]], names: list[str]) -> None:
+    assert run_names([Traits(**own) for own in traits]) == names
+
+
+def test_rows_of_the_leaderboard(store: Store) -> None:
+    rows = board_rows(store)
+    assert [(row.method, row.status) for row in rows] == [
+        ("3dgs", "failed"),
+        ("extrags", "ok"),
+        ("extrags", "ok"),
+    ]
+    assert rows[1].metrics is not None
+    assert rows[1].link.startswith("file://")
+    assert board_rows(store, ["c3vd/*"]) == []
+    assert len(board_rows(store, ["phantom/*"])) == 3
+
+
+def test_both_pages_from_the_command_line(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    page = tmp_path / "pages" / "compared.html"
+    assert main(["compare", SEQUENCE, "--store", store.root, "--views", "1", "-o", str(page)]) == 0
+    assert capsys.readouterr().out.strip() == str(page)
+    assert "report.held_out_views" in page.read_text(encoding="utf-8")
+    board = tmp_path / "board.html"
+    assert main(["leaderboard", "phantom/*", "--store", store.root, "-o", str(board), "--quiet"]) == 0
+    assert SEQUENCE in board.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["compare", "phantom/7@sparse"], "0 finished runs on record"),
+        (["compare", SEQUENCE, "--views", "0"], "--views 0: expected 1 or more"),
+        (["leaderboard", "c3vd/*"], "no run of c3vd/* is on record"),
+    ],
+)
+def test_mistakes_are_one_sentence(
+    store: Store, arguments: list[str], message: str, capsys: pytest.CaptureFixture[Any]
+) -> None:
+    assert main([*arguments, "--store", store.root]) in (1, 2)
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
