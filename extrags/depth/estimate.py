@@ -70,6 +70,10 @@ STEREO_ERRORS = (0.03, 0.5)
 """Expected relative error of stereo without completion: where all sources agree, and where none does."""
 
 
+FAR_AWAY = 100.0
+"""Distance from the origin, in reaches of the frames, from which poses are taken about their middle."""
+
+
 @dataclass(frozen=True)
 class DepthEstimate(Storable):
     """Dense depth of frames, with its expected error and where it comes from.
@@ -261,7 +265,10 @@ def posed_frames(sequence: EndoscopicSequence, device: torch.device | str = "cpu
     """
     poses = sequence.cameras.world_from_camera.copy()
     # Only where frames stand to each other counts, and far from the origin float32 has no digits for that.
-    poses[:, :3, 3] -= poses[:, :3, 3].mean(axis=0)
+    middle = poses[:, :3, 3].mean(axis=0)
+    reach = np.abs(poses[:, :3, 3] - middle).max()
+    if np.abs(middle).max() > FAR_AWAY * reach:
+        poses[:, :3, 3] -= middle
     return PosedFrames(
         rgb=torch.from_numpy(sequence.rgb).to(device).permute(0, 3, 1, 2).float() / 255,
         mask=torch.from_numpy(sequence.mask.copy()).to(device),

@@ -10,11 +10,13 @@ import torch
 
 from extrags.depth import matching, native
 from extrags.depth.consistency import agreement
-from extrags.depth.frames import select_sources
+from extrags.depth.frames import PosedFrames, select_sources
 from extrags.depth.stereo import StereoSettings, multi_view_stereo, sweep_around
+from extrags.errors import ShapeError
 from extrags.raster import native as raster_native
 from extrags.raster.native import compiled_kernels
 from extrags.raster.native import set_num_threads as set_threads
+from extrags.stress.inputs import plane_views
 from tests.extrags.depth.planes import inside_sphere, on, tilted_plane
 
 ISAS = raster_native.usable_isas()
@@ -211,3 +213,15 @@ def test_a_frame_without_sources_matches_nothing_with_both() -> None:
         cost = kernels.matching_cost(frames, **case)
         assert (cost[1] == 1).all()
         assert cost[0].std() > 0.1
+
+
+def test_images_too_small_for_stereo_are_refused() -> None:
+    cameras, _, _, _ = plane_views(2, 1, 9)
+    frames = PosedFrames(
+        torch.zeros(2, 3, 9, 1),
+        torch.ones(2, 9, 1, dtype=torch.bool),
+        torch.from_numpy(cameras.K).float(),
+        torch.from_numpy(cameras.world_from_camera).float(),
+    )
+    with pytest.raises(ShapeError, match="images of 1x9 pixels are too small for stereo"):
+        multi_view_stereo(frames, torch.tensor([[1], [0]]), torch.ones(2), 2 * torch.ones(2))

@@ -106,3 +106,17 @@ class TestReconstruct:
         kept = caught.value.last_good
         assert isinstance(kept, Scene)
         assert all(bool(torch.isfinite(value).all()) for value in kept.gaussians.parameters().values())
+
+
+def test_a_unit_too_large_for_the_near_plane_is_refused_without_light(
+    tube_sequence: EndoscopicSequence,
+) -> None:
+    assert tube_sequence.depth_mm is not None
+    assert tube_sequence.world_from_camera is not None
+    poses = tube_sequence.world_from_camera.copy()
+    poses[:, :3, 3] *= 1e-3
+    small = replace(
+        tube_sequence, world_from_camera=poses, depth_mm=tube_sequence.depth_mm * np.float32(1e-3)
+    )
+    with pytest.raises(CaptureError, match=r"the typical depth is 0\.0.* or enable coarse\.light"):
+        reconstruct(small, CoarseConfig(iterations=5, light=LightConfig(enabled=False)))
