@@ -560,12 +560,12 @@ class InMemoryPipeline(Pipeline):
                     true_surface=self.true_surface,
                     lpips=lpips,
                 )
-            self._evaluate_restored(lpips)
+            self._evaluate_restored(meshes.get("final", meshes.get("coarse")), lpips)
         # Where nothing was fine-tuned, the coarse scene is the final one.
         self.result.evaluations.setdefault("final", self.result.evaluations["coarse"])
 
-    def _evaluate_restored(self, lpips: LpipsByNet) -> None:
-        """The final scene's views once more, restored (`evaluate.restored`)."""
+    def _evaluate_restored(self, mesh: Mesh | None, lpips: LpipsByNet) -> None:
+        """The final scene's views once more, restored (`evaluate.restored`); the surface is the scene's."""
         from extrags.evaluation import evaluate_renders
         from extrags.restoration.restored_renders import restored_renders
 
@@ -580,7 +580,9 @@ class InMemoryPipeline(Pipeline):
             self.config.enhance,
             textured=self.config.evaluate.restored == "textured",
         )
-        self.result.evaluations["restored"] = evaluate_renders(views, self.result.sequence, lpips=lpips)
+        self.result.evaluations["restored"] = evaluate_renders(
+            views, self.result.sequence, mesh=mesh, true_surface=self.true_surface, lpips=lpips
+        )
 
     def report(self) -> None:
         """Nothing: the HTML report is built from artefacts, which a run in memory does not have."""

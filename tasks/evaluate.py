@@ -58,7 +58,7 @@ def restore(
     config: EnhanceConfig,
     textured: bool,
 ) -> None:
-    """Restore rendered held-out views in the image; writes `renders/`.
+    """Restore rendered held-out views in the image; writes `renders/`, and the scene's `mesh/` again.
 
     Args:
         slot: the artefact to write.
@@ -75,6 +75,7 @@ def restore(
     from extrags.restoration.restored_renders import restored_renders
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
+    from extrags.surface import Mesh
 
     views = restored_renders(
         slot.load(Scene, scene),
@@ -87,6 +88,8 @@ def restore(
     )
     slot.save(views)
     slot.counts["views"] = len(views)
+    if group_exists(slot.open(renders) / Mesh.stored_as):
+        slot.save(slot.load(Mesh, renders))
 
 
 # Metrics are a separate stage, so that a new version of the protocol does not repeat the rendering.

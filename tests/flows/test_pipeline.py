@@ -205,6 +205,31 @@ class TestRules:
             assert STAGES.index(needed) < STAGES.index(stage)
 
 
+class TestRestored:
+    """Held-out views of the final scene, restored in the image."""
+
+    def test_in_memory_and_cached(self, tmp_path: Path) -> None:
+        config = tiny_config(enhance__backend="classical", coarse__iterations=20, finetune__iterations=10)
+        outcome = run_sequence(SEQUENCE, config, str(tmp_path), DirectRunner(str(tmp_path)), until="evaluate")
+        assert outcome.status == "ok", outcome.error
+        sequence = extrags.read(SEQUENCE, config.ingest)
+        result = extrags.run_pipeline(sequence, config, true_surface=true_surface(sequence))
+        for which in ("final", "restored"):
+            assert json.loads(json.dumps(result.evaluations[which].metrics)) == outcome.metrics[which]
+        assert outcome.metrics["restored"]["psnr"] != outcome.metrics["final"]["psnr"]
+
+    def test_not_measured_unless_wanted(self, tmp_path: Path) -> None:
+        config = tiny_config(
+            enhance__backend="classical",
+            coarse__iterations=20,
+            finetune__iterations=10,
+            evaluate__restored="none",
+        )
+        outcome = run_sequence(SEQUENCE, config, str(tmp_path), DirectRunner(str(tmp_path)), until="evaluate")
+        assert set(outcome.metrics) == {"coarse", "final"}
+        assert "renders_restored" not in outcome.refs
+
+
 class TestOracle:
     """Held-out frames are trained on, and whoever reads the figures is told."""
 
