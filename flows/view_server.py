@@ -75,6 +75,8 @@ class ViewServer:
         self._renderer, self._width = renderer, width
         self._start = overview(renderer.scene, width) if renderer.train is None else renderer.train[0]
         self._viewers: dict[int, _Viewer] = {}
+        self._left: set[int] = set()
+        self._guard = threading.Lock()
         self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
         found = int(self._server.get_port())
         if port not in (0, found):
@@ -86,10 +88,19 @@ class ViewServer:
         self._server.on_client_disconnect(self._gone)
 
     def _connected(self, client: Any) -> None:
-        self._viewers[client.client_id] = _Viewer(client, self._renderer, self._start, self._width)
+        viewer = _Viewer(client, self._renderer, self._start, self._width)
+        with self._guard:
+            # viser tells of both from a pool of threads: a page that is closed at once has left before.
+            left = client.client_id in self._left
+            if not left:
+                self._viewers[client.client_id] = viewer
+        if left:
+            viewer.end()
 
     def _gone(self, client: Any) -> None:
-        viewer = self._viewers.pop(client.client_id, None)
+        with self._guard:
+            self._left.add(client.client_id)
+            viewer = self._viewers.pop(client.client_id, None)
         if viewer is not None:
             viewer.end()
 
@@ -137,7 +148,7 @@ class _Viewer:
         pose[:3, :3] = Rotation.from_quat(np.asarray(page.wxyz)[[1, 2, 3, 0]]).as_matrix()
         pose[:3, 3] = np.asarray(page.position) * self._unit
         try:
-            self.session.look(pinhole(pose, float(page.fov), float(page.aspect), self._width))
+            self.session.look(pinhole(pose, float(page.fov), float(page.aspect), self.session.camera.width))
         except ExtragsError as error:
             # E.g. a window without height, or an hour of recording.
             self._say(str(error))
