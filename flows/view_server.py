@@ -5,6 +5,8 @@ viser's page steers the camera and has the controls; what it shows is rendered h
 
 from __future__ import annotations
 
+import contextlib
+import io
 import logging
 import tempfile
 import threading
@@ -77,11 +79,15 @@ class ViewServer:
         self._viewers: dict[int, _Viewer] = {}
         self._left: set[int] = set()
         self._guard = threading.Lock()
-        self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        with _silent():
+            self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        # A page can ask viser for a tunnel that shows the scene to the world by way of viser's own servers.
+        self._server.request_share_url = _not_shared
+        self._server.gui.configure_theme(show_share_button=False)
         found = int(self._server.get_port())
         if port not in (0, found):
             # viser goes on to the next port that is free, where nobody looks for it.
-            self._server.stop()
+            self._stop()
             raise StoreError(f"port {port} of {host} is taken; choose another one with --port")
         self.url = f"http://{host}:{found}"
         self._server.on_client_connect(self._connected)
@@ -108,7 +114,20 @@ class ViewServer:
         """Close all sessions, and the server."""
         for viewer in list(self._viewers.values()):
             viewer.end()
-        self._server.stop()
+        self._stop()
+
+    def _stop(self) -> None:
+        with _silent():
+            self._server.stop()
+
+
+def _silent() -> contextlib.redirect_stdout[io.StringIO]:
+    """Without what viser prints it is to be verbose or not: where it listens, and that it ends."""
+    return contextlib.redirect_stdout(io.StringIO())
+
+
+def _not_shared(**_: Any) -> None:
+    logger.warning("a page asked for a public address of the scene; extrags gives none")
 
 
 class _Viewer:

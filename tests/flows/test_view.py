@@ -52,12 +52,12 @@ def renderer() -> SceneRenderer:
 
 
 @pytest.fixture
-def stand_in(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[viser_stand_in.ViserServer]]:
+def stand_in(monkeypatch: pytest.MonkeyPatch) -> type[viser_stand_in.ViserServer]:
     module = types.ModuleType("viser")
     module.ViserServer = viser_stand_in.ViserServer  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "viser", module)
     monkeypatch.setattr(viser_stand_in.ViserServer, "made", [])
-    yield viser_stand_in.ViserServer
+    return viser_stand_in.ViserServer
 
 
 @pytest.fixture
@@ -299,7 +299,9 @@ class TestBrowser:
 
 
 @pytest.mark.skipif(not REAL, reason="viser is not installed: pip install extrags[view]")
-def test_a_real_server_answers_a_real_browser(renderer: SceneRenderer) -> None:
+def test_a_real_server_answers_a_real_browser(
+    renderer: SceneRenderer, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
     import cv2
     import msgspec.msgpack
     import viser
@@ -336,11 +338,15 @@ def test_a_real_server_answers_a_real_browser(renderer: SceneRenderer) -> None:
                         if message["type"] == "BackgroundImageMessage" and message["rgb_data"]:
                             yield cv2.imdecode(np.frombuffer(message["rgb_data"], np.uint8), 1)[..., ::-1]
 
+            # Nobody can have the scene shown to the world.
+            browser.send(msgspec.msgpack.encode({"type": "ShareUrlRequest"}))
             look(0.0)
             shown = pictures()
             assert next(picture for picture in shown if picture.shape == (80, 160, 3)).mean() > 10
             look(0.4)
             assert next(shown).shape == (40, 80, 3), "half while it moves"
             assert next(picture for picture in shown if picture.shape == (80, 160, 3)).mean() > 10
+        assert "a page asked for a public address" in eventually(lambda: caplog.text)
     finally:
         server.stop()
+    assert capsys.readouterr().out == ""

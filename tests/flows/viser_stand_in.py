@@ -46,7 +46,7 @@ class Gui:
         self.controls[label] = Control(options.get("initial_value"))
         return self.controls[label]
 
-    def add_slider(self, label: str, *, min: float, max: float, step: float, initial_value: float) -> Control:  # noqa: A002
+    def add_slider(self, label: str, *, min: float, max: float, step: float, initial_value: float) -> Control:
         assert min <= initial_value <= max
         return self._add(label, min=min, max=max, step=step, initial_value=initial_value)
 
@@ -97,7 +97,7 @@ class Client:
         self.files: dict[str, bytes] = {}
         self.scene = SimpleNamespace(set_background_image=self._shown)
 
-    def _shown(self, image: np.ndarray, *, format: str, jpeg_quality: int) -> None:  # noqa: A002
+    def _shown(self, image: np.ndarray, *, format: str, jpeg_quality: int) -> None:
         assert format == "jpeg"
         assert 0 < jpeg_quality <= 100
         self.pictures.append(image)
@@ -117,6 +117,7 @@ class ViserServer:
 
     def __init__(self, *, host: str, port: int, label: str, verbose: bool) -> None:
         self.host, self.port, self.label = host, port + 1 if port == self.taken else port or 49152, label
+        self.gui = SimpleNamespace(configure_theme=lambda *, show_share_button: None)
         self.stopped = False
         self.made.append(self)
 
