@@ -38,7 +38,7 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
         )
         if restored := outcome.metrics.get("restored"):
             table.add_row(
-                "[dim]  restored in the image[/]",
+                "[dim]  restored[/]",
                 "",
                 "",
                 *(_change(name, final.get(name), restored.get(name)) for name in columns),

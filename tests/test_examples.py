@@ -56,7 +56,7 @@ class TestWholeJob:
         assert result.skipped == GIVEN
         assert result.pseudo_views is not None
         assert result.finetuning is not None
-        assert set(result.evaluations) == {"coarse", "final"}
+        assert set(result.evaluations) == {"coarse", "final", "restored"}
         assert len(extrags.Gaussians.read_ply(ply)) == len(result.scene.gaussians)
 
     def test_progress_can_be_followed(self) -> None:

@@ -121,10 +121,11 @@ def begun(finished: tuple[str, SequenceOutcome], tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("send", "code"),
     [
-        (lambda process: os.killpg(process.pid, signal.SIGINT), 130),
-        (lambda process: process.send_signal(signal.SIGTERM), 143),
+        pytest.param(lambda process: os.killpg(process.pid, signal.SIGINT), 130, id="Ctrl-C"),
+        pytest.param(
+            lambda process: process.send_signal(signal.SIGTERM), 143, marks=pytest.mark.slow, id="SIGTERM"
+        ),
     ],
-    ids=["Ctrl-C", "SIGTERM"],
 )
 def test_an_interrupted_run_says_so_ends_at_once_and_resumes(
     send: Callable[[subprocess.Popen[bytes]], None],

@@ -66,8 +66,19 @@ class TestAgreement:
         _, outcome = finished
         assert in_memory.plan is not None
         assert outcome.plan == in_memory.plan.model_dump(mode="json")
-        for which in ("coarse", "final"):
+        for which in ("coarse", "final", "restored"):
             assert json.loads(json.dumps(in_memory.evaluations[which].metrics)) == outcome.metrics[which]
+        assert outcome.metrics["restored"]["psnr"] != outcome.metrics["final"]["psnr"]
+
+    def test_views_are_not_restored_where_nobody_wants_it(
+        self, finished: tuple[str, SequenceOutcome]
+    ) -> None:
+        store, _ = finished
+        config = tiny_config(evaluate__restored="none")
+        again = run_sequence(SEQUENCE, config, store, StoreRunner(store), until="evaluate")
+        assert {row.state for row in again.stages} == {"cached", "skipped"}
+        assert set(again.metrics) == {"coarse", "final"}
+        assert "renders_restored" not in again.refs
 
 
 # Its renders take most of the time, and go by frames.
@@ -203,31 +214,6 @@ class TestRules:
     def test_needs_point_backwards(self) -> None:
         for stage, needed in NEEDS.items():
             assert STAGES.index(needed) < STAGES.index(stage)
-
-
-class TestRestored:
-    """Held-out views of the final scene, restored in the image."""
-
-    def test_in_memory_and_cached(self, tmp_path: Path) -> None:
-        config = tiny_config(enhance__backend="classical", coarse__iterations=20, finetune__iterations=10)
-        outcome = run_sequence(SEQUENCE, config, str(tmp_path), DirectRunner(str(tmp_path)), until="evaluate")
-        assert outcome.status == "ok", outcome.error
-        sequence = extrags.read(SEQUENCE, config.ingest)
-        result = extrags.run_pipeline(sequence, config, true_surface=true_surface(sequence))
-        for which in ("final", "restored"):
-            assert json.loads(json.dumps(result.evaluations[which].metrics)) == outcome.metrics[which]
-        assert outcome.metrics["restored"]["psnr"] != outcome.metrics["final"]["psnr"]
-
-    def test_not_measured_unless_wanted(self, tmp_path: Path) -> None:
-        config = tiny_config(
-            enhance__backend="classical",
-            coarse__iterations=20,
-            finetune__iterations=10,
-            evaluate__restored="none",
-        )
-        outcome = run_sequence(SEQUENCE, config, str(tmp_path), DirectRunner(str(tmp_path)), until="evaluate")
-        assert set(outcome.metrics) == {"coarse", "final"}
-        assert "renders_restored" not in outcome.refs
 
 
 class TestOracle:

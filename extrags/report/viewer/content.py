@@ -29,8 +29,6 @@ __all__ = ["ViewerContent", "encoded_within", "script_text", "viewer_content", "
 SCRIPTS = ("camera.js", "decode.js", "renderer.js", "viewer.js", "controls.js", "compare.js", "start.js")
 SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "shape.vert", "shape.frag")
 SORTER = "sort.worker.js"
-NEAR = 0.01
-"""Near plane, as `extrags.raster.rasterize` has it unless told otherwise."""
 TRAIN_COLOR = "#e9eef2"
 BASE64_SHARE = 4 / 3
 
@@ -112,7 +110,7 @@ def viewer_content(inputs: ReportInputs, largest_bytes: int) -> ViewerContent | 
         "mesh": None if inputs.mesh is None else _surface(inputs.mesh),
         "width": sequence.width,
         "height": sequence.height,
-        "near": NEAR,
+        "near": min(scene.near for scene in scenes.values()),
         "dilation": DILATION_PX2,
         "distance": float(distance),
     }

@@ -133,6 +133,7 @@ class TestPretraining:
         with pytest.raises(ConfigError, match="2 pretraining scenes found, settings say 3"):
             pretrain(files[:2], TINY)
 
+    @pytest.mark.slow  # Each of them imports torch.
     def test_processes_draw_batches_in_turn(self, files: list[Path]) -> None:
         config = TINY.model_copy(update={"drawing_processes": 2})
         make = partial(_mixed_sampler, files[:2], config, 0)
