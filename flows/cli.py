@@ -28,6 +28,7 @@ VERBS = {
     "report": "build the page of a finished run again, from the store",
     "compare": "hold finished runs of one sequence against each other, on a page",
     "leaderboard": "sequences by methods, from the store's records, on a page that sorts and filters",
+    "view": "look at a scene in the browser, live: light, layers, camera paths to record",
     "export": "write a reconstructed scene as Gaussians, mesh or video, or a sequence for COLMAP",
     "import": "take a scene that another program has made through the later stages",
     "data": "what sequences there are, and whether a source is right",
@@ -56,6 +57,7 @@ EXAMPLES = """examples:
   extrags benchmark phantom/0@sparse phantom/1@sparse --methods 3dgs,coarse --seeds 0,1,2
   extrags compare phantom/0@sparse --methods 3dgs extrags
   extrags data check my_video.mp4 my_colmap_scene/
+  extrags view phantom/0@sparse --scene coarse
   extrags export phantom/0@sparse --to spz --out scene.spz
   extrags import theirs.ply --sequence their_colmap_folder/ --profile quick
   extrags export phantom/0@sparse --to colmap --out scene/

@@ -26,7 +26,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-__all__ = ["INTERRUPTED", "interruptible"]
+__all__ = ["INTERRUPTED", "interruptible", "until_told_to_stop"]
 
 INTERRUPTED = "the run was interrupted; finished stages are kept, and the same command resumes"
 
@@ -109,6 +109,22 @@ def interruptible() -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
         writer.close()
+
+
+def until_told_to_stop() -> None:
+    """Wait for SIGINT or SIGTERM: for a command that serves, which ends well by being told to.
+
+    For the main thread alone. In this time the signals do not end the process.
+    """
+    told = threading.Event()
+    wakeup = signal.set_wakeup_fd(-1)
+    before = {number: signal.signal(number, lambda *_: told.set()) for number in SIGNALS}
+    try:
+        told.wait()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(wakeup, warn_on_full_buffer=False)
 
 
 def _end_children() -> None:

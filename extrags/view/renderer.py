@@ -1,0 +1,213 @@
+"""One scene, rendered over and over: from any camera, under the viewer's light, as one of several layers."""
+
+from __future__ import annotations
+
+import math
+import threading
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from extrags.cameras import Cameras
+from extrags.errors import ConfigError
+from extrags.export.video import unobserved
+from extrags.raster import CameraLight, Rendering, rasterize
+from extrags.scene import Scene
+from extrags.view.viewpoints import overview, typical_depth
+
+__all__ = ["LAYERS", "SceneRenderer", "ViewSettings"]
+
+LAYERS = ("color", "alpha", "depth", "uncertainty")
+"""What can be shown."""
+
+_HIT = 0.5
+"""Where alpha is lower, no depth is shown."""
+
+
+@dataclass(frozen=True)
+class ViewSettings:
+    """What a viewer can change while looking.
+
+    Args:
+        exposure: gain of the camera, above 0; 1 is the mean of the training frames.
+        lamp: brightness of the lamp, 0 is off; 1 is that of the recording. It multiplies as the exposure
+            does; a scene without a lamp has none to change.
+        falloff: False lights everything as on the axis at the light's reference distance, facing the lamp:
+            albedo under the camera's response.
+        layer: color; alpha, how opaque; depth, from near (red) to far (blue); uncertainty, how little the
+            training views say (black: well known, yellow: unknown).
+        mix: share of a layer other than colour, the rest of which is colour, 0 to 1.
+
+    Raises:
+        ConfigError: for a value out of range.
+    """
+
+    exposure: float = 1.0
+    lamp: float = 1.0
+    falloff: bool = True
+    layer: str = "color"
+    mix: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.exposure < math.inf:
+            raise ConfigError(f"exposure is {self.exposure:g}; expected a number above 0")
+        if not 0 <= self.lamp < math.inf:
+            raise ConfigError(f"lamp is {self.lamp:g}; expected a number from 0")
+        if self.layer not in LAYERS:
+            raise ConfigError(f"layer is {self.layer!r}; expected {', '.join(LAYERS)}")
+        if not 0 <= self.mix <= 1:
+            raise ConfigError(f"mix is {self.mix:g}; expected 0 to 1")
+
+
+class SceneRenderer:
+    """Renders one scene for any number of viewers, from any thread, one picture at a time.
+
+    With the settings that hold at first a picture is exactly that of `Scene.render`. What `Scene.render`
+    makes of the parameters for every picture is made once here, and lies on the device that renders.
+
+    Args:
+        scene: the scene.
+        train: the views it was made from, which the layer `uncertainty` needs.
+        device: a CUDA device renders with gsplat, the processor with the native kernels.
+    """
+
+    def __init__(
+        self, scene: Scene, *, train: Cameras | None = None, device: torch.device | str = "cpu"
+    ) -> None:
+        self.scene = scene
+        self.train = train
+        self.device = torch.device(device)
+        self._lock = threading.Lock()
+        gaussians = scene.gaussians
+        with torch.no_grad():
+            self._means = gaussians.means.to(self.device)
+            self._quats = gaussians.quats.to(self.device)
+            self._scales = gaussians.scales.exp().to(self.device)
+            self._opacities = gaussians.opacities.sigmoid().to(self.device)
+            self._sh = gaussians.sh.to(self.device)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """The layers that this scene has."""
+        return LAYERS if self.train is not None else tuple(name for name in LAYERS if name != "uncertainty")
+
+    def render(self, camera: Cameras, settings: ViewSettings) -> UInt8[np.ndarray, "h w 3"]:
+        """One picture.
+
+        Args:
+            camera: one camera, with the size of the picture.
+            settings: light and layer. The first picture of the layer `uncertainty` waits for what the
+                training views saw to be counted; the later ones do not.
+
+        Raises:
+            ConfigError: for more cameras than one, or the layer `uncertainty` without training views.
+        """
+        if len(camera) != 1:
+            raise ConfigError(f"a picture is that of one camera, not of {len(camera)}")
+        if settings.layer not in self.layers:
+            raise ConfigError("the layer uncertainty needs the views that the scene was made from")
+        with self._lock, torch.inference_mode():
+            if settings.layer == "color" or settings.mix == 0:
+                return _eight_bit(self._lit(camera, settings).rgb[0])
+            if settings.layer == "uncertainty":
+                share = self._unknown(camera)
+                color = None if settings.mix == 1 else self._lit(camera, settings).rgb[0]
+            else:
+                rendering = self._lit(camera, settings)
+                color = rendering.rgb[0]
+                share = rendering.alpha[0] if settings.layer == "alpha" else self._nearness(camera, rendering)
+            shown = _palettes()[settings.layer][_eight_bit(share)]
+            if color is None or settings.mix == 1:
+                return shown
+            mixed = (1 - settings.mix) * _eight_bit(color) + settings.mix * shown
+            return np.asarray(np.rint(mixed).astype(np.uint8))
+
+    def _lit(self, camera: Cameras, settings: ViewSettings) -> Rendering:
+        return self._rasterized(camera, self._sh, light=self._light(settings))
+
+    def _rasterized(
+        self,
+        camera: Cameras,
+        sh: Float[Tensor, "n k 3"] | None,
+        *,
+        colors: Float[Tensor, "n 3"] | None = None,
+        light: CameraLight | None = None,
+    ) -> Rendering:
+        return rasterize(
+            self._means,
+            self._quats,
+            self._scales,
+            self._opacities,
+            sh,
+            torch.from_numpy(camera.viewmats.astype(np.float32)).to(self.device),
+            torch.from_numpy(camera.K.astype(np.float32)).to(self.device),
+            camera.width,
+            camera.height,
+            colors=colors,
+            light=light,
+            near=self.scene.near,
+        )
+
+    def _light(self, settings: ViewSettings) -> CameraLight | None:
+        light = self.scene.light
+        zero, one = torch.zeros(()), torch.ones(())
+        if light is None:
+            if settings.exposure == 1:
+                return None
+            gain = torch.full((1, 3), settings.exposure)
+            made = CameraLight(gain, one, zero, zero, zero, torch.zeros(3), zero, 1.0)
+        else:
+            if not settings.falloff:
+                light = replace(light, log_exponent=torch.tensor(-math.inf), spread=zero, cosine=zero)
+            made = light.camera_light(torch.tensor([settings.exposure * settings.lamp]))
+        moved = {item.name: getattr(made, item.name) for item in fields(made)}
+        return CameraLight(
+            **{name: v.to(self.device) if isinstance(v, Tensor) else v for name, v in moved.items()}
+        )
+
+    def _unknown(self, camera: Cameras) -> Float[Tensor, "h w"]:
+        rendering = self._rasterized(camera, None, colors=self._lacking)
+        # Where the scene holds nothing, nothing is known.
+        return rendering.rgb[0, ..., 0] + 1 - rendering.alpha[0]
+
+    @cached_property
+    def _lacking(self) -> Float[Tensor, "n 3"]:
+        assert self.train is not None
+        return unobserved(self.scene, self.train)[:, None].expand(-1, 3).contiguous().to(self.device)
+
+    def _nearness(self, camera: Cameras, rendering: Rendering) -> Float[Tensor, "h w"]:
+        # One scale for all pictures: colours that follow each picture's own range flicker while it moves.
+        depth, alpha = rendering.depth[0], rendering.alpha[0]
+        return torch.where(alpha < _HIT, 0.0, self._depth_unit / (self._depth_unit + depth))
+
+    @cached_property
+    def _depth_unit(self) -> float:
+        start = overview(self.scene, 64) if self.train is None else self.train[0]
+        return typical_depth(self.scene, start)
+
+
+def _eight_bit(values: Float[Tensor, "*shape"]) -> UInt8[np.ndarray, "*shape"]:
+    return np.asarray(np.rint(values.clamp(0, 1).cpu().numpy() * 255).astype(np.uint8))
+
+
+_made: dict[str, np.ndarray] = {}
+
+
+def _palettes() -> dict[str, UInt8[np.ndarray, "256 3"]]:
+    """Colours of the values 0 to 255 of each layer; nothing at all is black."""
+    if not _made:
+        from matplotlib import colormaps
+
+        share = np.linspace(0, 1, 256)
+        for name, colors in (
+            ("alpha", np.repeat(share[:, None], 3, axis=1)),
+            ("depth", colormaps["turbo"](share)[:, :3]),
+            ("uncertainty", colormaps["hot"](share * 0.85)[:, :3]),
+        ):
+            _made[name] = np.rint(colors * 255).astype(np.uint8)
+        _made["depth"][0] = 0
+    return _made
