@@ -68,8 +68,8 @@ class RateMeter:
 class ViewSession:
     """One viewer: `look` and `change` say what it wants, from any thread; `next_picture` renders it.
 
-    While anything changes, pictures have half the resolution, a quarter of the pixels; once nothing has changed
-    for `still_after_s`, one more follows at full resolution. What changes during a picture is made up for by
+    While anything changes, pictures have half the resolution, a quarter of the pixels; once nothing has
+    changed for `still_after_s`, one more follows at full resolution. What changes during a picture is made up for by
     the next one: nothing queues up.
 
     Args:
