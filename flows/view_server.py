@@ -169,8 +169,9 @@ class _Viewer:
         try:
             self.session.look(pinhole(pose, float(page.fov), float(page.aspect), self.session.camera.width))
         except ExtragsError as error:
-            # E.g. a window without height, or an hour of recording.
+            # E.g. a window without height, or an hour of recording, which ends it.
             self._say(str(error))
+            self._record.value = self.session.recording
 
     def _render(self) -> None:
         while not self.session.closed:
@@ -201,9 +202,12 @@ class _Viewer:
         # Words that change with every picture cannot be read, and cost as much as the picture.
         if picture.full or time.monotonic() - self._said_at > _SAY_EVERY_S:
             self._said_at = time.monotonic()
-            count, seconds = self.session.recorded
-            path = f"path: {count} views, {seconds:.1f} s"
-            self._status.content = "  \n".join(line for line in (self._moving, self._still, path) if line)
+            self._tell()
+
+    def _tell(self) -> None:
+        count, seconds = self.session.recorded
+        path = f"path: {count} views, {seconds:.1f} s"
+        self._status.content = "  \n".join(line for line in (self._moving, self._still, path) if line)
 
     def _say(self, message: str) -> None:
         self._client.add_notification("extrags", message, color="red")
@@ -235,15 +239,15 @@ class _Viewer:
                 self._on_value(frame, lambda index: self._place(train[int(index)]))
             self._on_click(gui.add_button("back to the start"), lambda: self._place(self._start))
         with gui.add_folder("Path"):
-            record = gui.add_checkbox("record", initial_value=False)
-            self._on_value(record, session.record)
+            self._record = gui.add_checkbox("record", initial_value=False)
+            self._on_value(self._record, session.record)
             self._on_click(gui.add_button("add view"), session.add_view)
             fps = gui.add_slider("frames per second", min=1, max=60, step=1, initial_value=24)
             self._on_click(gui.add_button("save"), lambda: self._save(float(fps.value)))
 
             def clear() -> None:
                 session.clear_path()
-                record.value = False
+                self._record.value = False
 
             self._on_click(gui.add_button("clear"), clear)
 
@@ -264,6 +268,7 @@ class _Viewer:
             do(*values)
         except ConfigError as error:
             self._say(str(error))
+        self._tell()
 
     def _save(self, fps: float) -> None:
         path = self.session.path(fps=fps)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import threading
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -122,7 +122,7 @@ class SceneRenderer:
                 share = rendering.alpha[0] if settings.layer == "alpha" else self._nearness(camera, rendering)
             shown = _palettes()[settings.layer][_eight_bit(share)]
             if color is None or settings.mix == 1:
-                return shown
+                return np.asarray(shown)
             mixed = (1 - settings.mix) * _eight_bit(color) + settings.mix * shown
             return np.asarray(np.rint(mixed).astype(np.uint8))
 
@@ -164,10 +164,10 @@ class SceneRenderer:
             if not settings.falloff:
                 light = replace(light, log_exponent=torch.tensor(-math.inf), spread=zero, cosine=zero)
             made = light.camera_light(torch.tensor([settings.exposure * settings.lamp]))
-        moved = {item.name: getattr(made, item.name) for item in fields(made)}
-        return CameraLight(
-            **{name: v.to(self.device) if isinstance(v, Tensor) else v for name, v in moved.items()}
-        )
+        moved = {
+            name: value.to(self.device) for name, value in vars(made).items() if name != "reference_distance"
+        }
+        return replace(made, **moved)
 
     def _unknown(self, camera: Cameras) -> Float[Tensor, "h w"]:
         rendering = self._rasterized(camera, None, colors=self._lacking)

@@ -69,8 +69,8 @@ class ViewSession:
     """One viewer: `look` and `change` say what it wants, from any thread; `next_picture` renders it.
 
     While anything changes, pictures have half the resolution, a quarter of the pixels; once nothing has
-    changed for `still_after_s`, one more follows at full resolution. What changes during a picture is made up for by
-    the next one: nothing queues up.
+    changed for `still_after_s`, one more follows at full resolution. What changes during a picture is made up
+    for by the next one: nothing queues up.
 
     Args:
         renderer: of the scene; viewers share it.
@@ -118,15 +118,23 @@ class ViewSession:
         return self._settings
 
     def look(self, camera: Cameras) -> None:
-        """Look from one camera; only its aspect counts of its size. The same camera again changes nothing."""
+        """Look from one camera; only its aspect counts of its size. The same camera again changes nothing.
+
+        Raises:
+            ConfigError: when more than an hour would be recorded; recording ends, and the camera moves.
+        """
         with self._state:
             sized = _sized(camera, self._width)
             if _same(sized, self._camera):
                 return
             self._camera = sized
-            if self._recording:
-                self._record_view()
             self._touched()
+            if self._recording:
+                try:
+                    self._record_view()
+                except ConfigError:
+                    self._recording = False
+                    raise
 
     def change(self, settings: ViewSettings) -> None:
         """Show another layer, or under another light."""

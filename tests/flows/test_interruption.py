@@ -40,6 +40,23 @@ with interruptible():
             pass
 """
 
+SERVES = """
+import signal, threading
+from flows.interruption import interruptible, until_told_to_stop
+
+class Told(threading.Event):
+    def wait(self, timeout=None):
+        print("up", flush=True)
+        return super().wait(timeout)
+
+with interruptible():
+    before = signal.getsignal(signal.SIGINT)
+    threading.Event = Told
+    until_told_to_stop()
+    assert signal.getsignal(signal.SIGINT) == before
+    print("closed", flush=True)
+"""
+
 STAYS = """
 import os, signal, time
 signal.signal(signal.SIGTERM, signal.SIG_IGN)
@@ -181,3 +198,14 @@ def test_the_server_of_a_killed_command_ends(home: Path, tmp_path: Path) -> None
         process.kill()
         process.wait()
         wait_for(lambda: not is_running(server), END_S)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_command_that_serves_ends_well_when_it_is_told_to(number: signal.Signals) -> None:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", SERVES], **pipes) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        process.send_signal(number)
+        out, err = process.communicate(timeout=PATIENCE_S)
+    assert (process.returncode, out, err) == (0, "closed\n", "")

@@ -253,6 +253,7 @@ class TestBrowser:
         for position in positions:
             client.camera.move(position=position)
             controls["add view"].set()
+        assert "path: 3 views, 4.0 s" in controls["status"].content
         controls["frames per second"].set(10)
         controls["save"].set()
         (tmp_path / "path.json").write_bytes(client.files["camera_path.json"])

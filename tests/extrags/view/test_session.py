@@ -209,3 +209,13 @@ class TestRecording:
         assert len(centers) == 31
         np.testing.assert_allclose(centers[:30], np.tile(cameras.centers[0], (30, 1)), atol=1e-9)
         np.testing.assert_allclose(centers[30], cameras.centers[1], atol=1e-9)
+
+    def test_an_hour_is_the_most(self, session: ViewSession, clock: Clock) -> None:
+        session.next_picture(0.0)
+        session.record(True)
+        clock.now += 4000.0
+        with pytest.raises(ConfigError, match="longer than 60 minutes"):
+            session.look(tube_cameras(4)[1])
+        assert not session.recording
+        assert session.next_picture(0.0) is not None, "the view goes on"
+        assert session.recorded == (1, 0.0)
