@@ -43,6 +43,10 @@ PSEUDO_VIEW = 220
 """Bytes per pixel of a restored view: when batches are joined, and as a target of the fine-tuning."""
 METRICS = 3500
 """Bytes per pixel of the images that metrics are computed on at once, the features of LPIPS-VGG included."""
+ENLARGED = 100
+"""Bytes per pixel of a held-out view that is mixed with its restored one at the full size."""
+CLIP_VIEWS = 8
+"""Held-out views that are restored at once."""
 RENDERED_VIEW = 24
 """Bytes per pixel of a rendered held-out view."""
 PIXELS_MEASURED_AT_ONCE = 400_000
@@ -137,6 +141,10 @@ def estimate_memory(
     metrics = METRICS * max(pixels, min(PIXELS_MEASURED_AT_ONCE, pixels * max(1, all_frames - train)))
     whole = PROCESS + SEQUENCE * all_frames * pixels
     rendered = RENDERED_VIEW * max(0, all_frames - train) * pixels
+    # Held-out views are restored as well, in clips.
+    restored = references + CLIP * CLIP_VIEWS * working + network + ENLARGED * CLIP_VIEWS * pixels
+    if not explored or config.evaluate.restored == "none":
+        restored = 0
     found: dict[StageName, float] = {
         "ingest": PROCESS + SEQUENCE * all_frames * pixels + DECODED * source,
         "poses": whole,
@@ -155,7 +163,7 @@ def estimate_memory(
         + steps
         + gaussian * config.finetune.growth * coarse_gaussians
         + PSEUDO_VIEW * views * working,
-        "evaluate": whole + rendered + metrics,
+        "evaluate": whole + rendered + max(metrics, restored),
         "report": whole + 2 * rendered,
     }
     wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in leave_out]

@@ -45,11 +45,12 @@ STAGE_TASKS: dict[str, tuple[str, ...]] = {
     "explore": ("explore",),
     "enhance": ("enhance-train", "enhance"),
     "finetune": ("finetune-judge", "finetune"),
-    "evaluate": ("evaluate-render", "evaluate"),
+    "evaluate": ("evaluate-render", "evaluate-restore", "evaluate"),
     "report": ("report",),
 }
 """The tasks of each stage that are modelled. `explore` stands for all of its waves, `enhance` for the
-restoration of all batches and their assembly; evaluation counts once for each scene that is measured."""
+restoration of all batches and their assembly; evaluation counts once for each set of views that is measured,
+`evaluate-restore` once where there is a restorer."""
 
 TIME_TERMS: dict[str, tuple[str, ...]] = {
     "ingest": ("one", "frames", "frames*pixels"),
@@ -65,6 +66,7 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
     "finetune-judge": ("judge_iterations", "judge_iterations*pixels", "judge_iterations*gaussians"),
     "finetune": ("tuning", "tuning*pixels", "tuning*gaussians"),
     "evaluate-render": ("test", "test*pixels"),
+    "evaluate-restore": ("test*pixels", "test*restored"),
     "evaluate": ("one", "test", "test*pixels", "test*pixels*vgg"),
     "report": ("one", "frames*pixels"),
 }

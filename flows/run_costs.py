@@ -129,18 +129,33 @@ def predict_run(
         if not any(task in model.time for task in STAGE_TASKS[stage]):
             unknown.append(stage)
             continue
-        costs = [model.predict(task, work) for task in STAGE_TASKS[stage] if task in model.time]
-        times = measured_scenes if stage == "evaluate" else 1
+        repeats = _repeats(stage, stages, work, measured_scenes)
+        costs = [model.predict(task, work) for task in repeats if task in model.time]
         peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
         found.append(
             StageCost(
                 stage,
-                times * sum(cost.seconds * pace[cost.task] for cost in costs),
-                times * sum(cost.seconds * wall_pace[cost.task] for cost in costs) if wall_pace else None,
+                sum(repeats[cost.task] * cost.seconds * pace[cost.task] for cost in costs),
+                sum(repeats[cost.task] * cost.seconds * wall_pace[cost.task] for cost in costs)
+                if wall_pace
+                else None,
                 max(peaks, default=None),
             )
         )
     return RunPrediction(found, source, len(processor), unknown)
+
+
+def _repeats(stage: str, stages: Collection[str], work: Workload, measured_scenes: int) -> dict[str, int]:
+    """How often each task of a stage runs; those that do not run are left out."""
+    if stage != "evaluate":
+        return dict.fromkeys(STAGE_TASKS[stage], 1)
+    restored = int("enhance" in stages and work.config.evaluate.restored != "none")
+    found = {
+        "evaluate-render": measured_scenes,
+        "evaluate-restore": restored,
+        "evaluate": measured_scenes + restored,
+    }
+    return {task: found[task] for task in STAGE_TASKS[stage] if found[task]}
 
 
 def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig) -> tuple[Workload, set[str]]:

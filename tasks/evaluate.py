@@ -44,10 +44,10 @@ def render(slot: Slot, scene: Ref, sequence: Ref, train_on: Literal["train", "al
 
 def restoring_settings(config: EnhanceConfig) -> EnhanceConfig:
     """The settings that `restore` reads, all others at their defaults: the restorer stands for these."""
-    return EnhanceConfig(references=config.references, seed=config.seed)
+    return EnhanceConfig(references=config.references, max_width=config.max_width, seed=config.seed)
 
 
-@stage("evaluate-restore", version=1)
+@stage("evaluate-restore", version=2)
 def restore(
     slot: Slot,
     renders: Ref,

@@ -12,13 +12,16 @@ docs/references.md; what is restored and mixed here differs.
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
+from extrags.cameras import Cameras
 from extrags.config import EnhanceConfig
 from extrags.errors import ShapeError
 from extrags.events import Progress, emit
@@ -26,12 +29,9 @@ from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.metrics.protocol import RenderedViews
 from extrags.restoration.benchmark.evaluation import held_out_clips
 from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.clips import FEATHER_RADIUS_PX, FEATHER_SIGMA_PX
 from extrags.restoration.protocol import Clip, Enhancer
-from extrags.restoration.surface_texture import (
-    UNCONFIRMED_FROM,
-    UNCONFIRMED_TO,
-    SurfaceTexture,
-)
+from extrags.restoration.surface_texture import SurfaceTexture, invented_share
 from extrags.restoration.training_data.augmentation import unconfirmed
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -41,10 +41,11 @@ from extrags.view_synthesis.gather import gather_references
 
 __all__ = ["restored_renders"]
 
+logger = logging.getLogger(__name__)
+
 FINAL_SHARE = 0.4
 """Of the final scene's view; the rest is the restored one. Their errors have little in common, so that the
 mean of both is nearer to the truth than either."""
-FEATHER_SIGMA_PX, FEATHER_RADIUS_PX = 2.0, 6
 
 
 @one_torch_thread()
@@ -61,7 +62,8 @@ def restored_renders(
     """Restore rendered held-out views.
 
     Where the restorer only blends and fills (`classical`, which also stands in for one that the leave-out
-    frames speak against), what the scene knows stays as it is rendered.
+    frames speak against), what the scene knows stays as it is rendered. Views are restored at
+    `enhance.max_width` at most, as virtual views are.
 
     Args:
         coarse: the scene that the restorer was made for.
@@ -69,7 +71,7 @@ def restored_renders(
         sequence: posed frames in the scene's world, held-out ones included.
         training: its training frames, with the depth that the scene was made with.
         enhancer: the scene's restorer.
-        config: the number of references, and the seed.
+        config: the number of references, the working width, and the seed.
         textured: whether what is invented gets texture of the scene's own frames.
 
     Returns:
@@ -81,47 +83,66 @@ def restored_renders(
     """
     if len(renders) != len(sequence.test):
         raise ShapeError(f"{len(renders)} renders of {len(sequence.test)} held-out frames")
+    width = config.working_width(sequence.width)
+    small, training = sequence.at_most_width(width), training.at_most_width(width)
     references = gather_references(coarse, training, training.train)
     texture = SurfaceTexture.of_references(references, seed=config.seed) if textured else None
-    clips = held_out_clips(coarse, references, sequence, sequence.test, count=config.references)
+    if textured and texture is None:
+        logger.warning("no frame shows the surface closely enough: restored views stay without texture")
+    clips = held_out_clips(coarse, references, small, sequence.test, count=config.references)
     keeps_known = isinstance(enhancer, ClassicalEnhancer)
     restored, done = [], 0
     for clip in clips:
-        final = replace(
-            renders,
-            rgb=renders.rgb[done : done + len(clip)],
-            alpha=renders.alpha[done : done + len(clip)],
-            depth_mm=renders.depth_mm[done : done + len(clip)],
-        )
-        restored.append(_restored(clip, final, enhancer, texture, keeps_known=keeps_known))
+        part = slice(done, done + len(clip))
+        cameras = sequence.cameras[sequence.test[part]]
+        rendered = torch.from_numpy(renders.rgb[part]).permute(0, 3, 1, 2).clamp(0, 1)
+        solid = torch.from_numpy(renders.alpha[part])[:, None].clamp(0, 1)
+        mixed = _mixed(clip, cameras, rendered, solid, enhancer, texture, keeps_known=keeps_known)
+        restored.append(mixed.permute(0, 2, 3, 1).numpy())
         done += len(clip)
         emit(Progress("restore renders", done, len(renders)))
     return replace(renders, rgb=np.concatenate(restored))
 
 
-def _restored(
-    clip: Clip, final: RenderedViews, enhancer: Enhancer, texture: SurfaceTexture | None, *, keeps_known: bool
-) -> Float[np.ndarray, "t h w 3"]:
+def _mixed(
+    clip: Clip,
+    cameras: Cameras,
+    rendered: Float[Tensor, "t 3 h w"],
+    solid: Float[Tensor, "t 1 h w"],
+    enhancer: Enhancer,
+    texture: SurfaceTexture | None,
+    *,
+    keeps_known: bool,
+) -> Float[Tensor, "t 3 h w"]:
     restoration = enhancer.restore(clip)
-    rgb = torch.from_numpy(restoration.rgb).permute(0, 3, 1, 2)
-    rendered = torch.from_numpy(final.rgb).permute(0, 3, 1, 2).clamp(0, 1)
-    window = gaussian_weights(FEATHER_SIGMA_PX, FEATHER_RADIUS_PX)
+    colors = torch.from_numpy(restoration.rgb).permute(0, 3, 1, 2)
     to_invent = unconfirmed(clip.layers)
-    span = UNCONFIRMED_TO - UNCONFIRMED_FROM
-    invented = filter_separable(((to_invent - UNCONFIRMED_FROM) / span).clamp(0, 1), window, window)
+    depth = (
+        condition(clip.layers, clip.transfer).depth_mm
+        if restoration.depth_mm is None
+        else torch.from_numpy(restoration.depth_mm)[:, None]
+    )
+    size = rendered.shape[-2:]
+    window = gaussian_weights(FEATHER_SIGMA_PX, FEATHER_RADIUS_PX)
+    invented = _enlarged(filter_separable(invented_share(to_invent), window, window), size)
+    restored = _enlarged(colors, size)
+    if colors.shape[-2:] != size:
+        # Where the scene knows the surface, its own detail stays, and restoration changes what is coarser.
+        change = _enlarged(colors - functional.interpolate(rendered, colors.shape[-2:], mode="area"), size)
+        restored = invented * restored + (1 - invented) * (rendered + change)
     # A hole of the final scene has no colour that could be met.
-    solid = torch.from_numpy(final.alpha)[:, None].clamp(0, 1)
     share = FINAL_SHARE * solid
     if keeps_known:
         share = torch.maximum(share, (1 - invented) * solid)
-    mixed = (1 - share) * rgb + share * rendered
+    mixed = (1 - share) * restored + share * rendered
     if texture is not None:
-        mixed = texture.applied(mixed, clip.cameras, _depth(clip, restoration.depth_mm), to_invent[:, 0])
-    return np.ascontiguousarray(mixed.permute(0, 2, 3, 1).numpy())
+        mixed = texture.applied(
+            mixed, cameras, _enlarged(depth, size)[:, 0], _enlarged(to_invent, size)[:, 0]
+        )
+    return mixed.clamp(0, 1)
 
 
-def _depth(clip: Clip, completed: Float[np.ndarray, "t h w"] | None) -> Float[Tensor, "t h w"]:
-    """z-depth without gaps: the restorer's, or that of smooth filling."""
-    if completed is not None:
-        return torch.from_numpy(completed)
-    return condition(clip.layers, clip.transfer).depth_mm[:, 0]
+def _enlarged(image: Float[Tensor, "t c h0 w0"], size: torch.Size) -> Float[Tensor, "t c h w"]:
+    if image.shape[-2:] == size:
+        return image
+    return functional.interpolate(image, size, mode="bilinear", align_corners=False)

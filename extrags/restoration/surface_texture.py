@@ -27,7 +27,7 @@ from extrags.view_synthesis.filling import completed_depth
 from extrags.view_synthesis.references import ReferenceViews
 from extrags.view_synthesis.warp import depth_normals
 
-__all__ = ["SurfaceTexture"]
+__all__ = ["SurfaceTexture", "invented_share"]
 
 TILE_TEXELS = 32
 MARGIN_TEXELS = 8
@@ -123,8 +123,7 @@ class SurfaceTexture:
         """
         window = gaussian_weights(DETAIL_SIGMA, DETAIL_RADIUS)
         brightness = filter_separable(rgb, window, window) + DARKNESS
-        span = UNCONFIRMED_TO - UNCONFIRMED_FROM
-        share = ((unconfirmed - UNCONFIRMED_FROM) / span).clamp(0, 1)
+        share = invented_share(unconfirmed)
         textured = [
             rgb[view]
             + STRENGTH
@@ -240,6 +239,15 @@ class SurfaceTexture:
             lower = (1 - across) * flat[texel + side] + across * flat[texel + side + 1]
             sampled[here] = (1 - down) * upper + down * lower
         return sampled
+
+
+def invented_share(unconfirmed: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """How much of a pixel counts as invented, 0 to 1.
+
+    Args:
+        unconfirmed: share of each pixel that neither the rendering nor a real view confirms, in [0, 1].
+    """
+    return ((unconfirmed - UNCONFIRMED_FROM) / (UNCONFIRMED_TO - UNCONFIRMED_FROM)).clamp(0, 1)
 
 
 @dataclass(frozen=True)
