@@ -221,7 +221,8 @@ class EvaluateConfig(StageConfig):
         "textured",
         description="held-out views of the final scene are also measured after restoration in the image. "
         "textured: what is invented gets texture of the scene's own frames, which looks right and costs some "
-        "PSNR; smooth: without it; none: not measured",
+        "PSNR; smooth: without it; none: not measured. Each held-out view takes the restorer once, which a "
+        "large pretrained model makes long",
     )
 
     @field_validator("lpips_nets")
