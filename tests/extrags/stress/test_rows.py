@@ -69,7 +69,10 @@ class TestChoice:
             row(0.0, case="two"),
             Row("other", "one", "", 1.0, lambda effort: [("", 0.0)]),
         ]
-        names = lambda *patterns: [f"{r['part']}/{r['case']}" for r in run_rows(rows, patterns)]  # noqa: E731
+
+        def names(*patterns: str) -> list[str]:
+            return [f"{found['part']}/{found['case']}" for found in run_rows(rows, patterns)]
+
         assert names("part") == ["part/one", "part/two"]
         assert names("*/one") == ["part/one", "other/one"]
         assert names("other", "part/t*") == ["part/two", "other/one"]
