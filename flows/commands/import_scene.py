@@ -6,15 +6,13 @@ import argparse
 from pathlib import Path
 
 from extrags.errors import ConfigError, SourceNotFoundError
-from flows.commands.options import Parser, add_json, add_method, add_runner
+from flows.commands.options import Parser, add_json, add_method, add_runner, add_stages
 
 __all__ = ["add_arguments", "import_scene"]
 
 
 def add_arguments(parser: Parser) -> None:
     """The options of `extrags import`."""
-    from extrags.pipeline import STAGES
-
     parser.description = (
         "Take a scene that another program has made, as 3DGS PLY or SPZ, through exploration, restoration, "
         "fine-tuning and evaluation, with the cameras and frames of the sequence it belongs to: it takes the "
@@ -36,12 +34,7 @@ def add_arguments(parser: Parser) -> None:
     add_method(parser)
     add_runner(parser)
     add_json(parser)
-    parser.add_argument(
-        "--until", choices=STAGES, default="report", metavar="STAGE", help="stop after this stage"
-    )
-    parser.add_argument(
-        "--refresh", action="store_true", help="run every stage although its artefact is in the store"
-    )
+    add_stages(parser)
 
 
 def import_scene(given: argparse.Namespace) -> int:

@@ -25,6 +25,7 @@ __all__ = [
     "add_profile",
     "add_runner",
     "add_settings",
+    "add_stages",
     "add_store",
     "add_verb",
 ]
@@ -129,6 +130,18 @@ def add_runner(parser: Parser) -> None:
         type=float,
         metavar="SECONDS",
         help="a stage that takes longer fails at its next progress event (default: no limit)",
+    )
+
+
+def add_stages(parser: Parser) -> None:
+    """`--until` and `--refresh`."""
+    from extrags.pipeline import STAGES
+
+    parser.add_argument(
+        "--until", choices=STAGES, default="report", metavar="STAGE", help="stop after this stage"
+    )
+    parser.add_argument(
+        "--refresh", action="store_true", help="run every stage although its artefact is in the store"
     )
 
 

@@ -22,7 +22,7 @@ from flows.commands.common import (
     store_root,
     write_json,
 )
-from flows.commands.options import Parser, add_json, add_method, add_runner
+from flows.commands.options import Parser, add_json, add_method, add_runner, add_stages
 from flows.failures import describe_error
 from flows.outcome import DatasetFailedError, DatasetOutcome
 
@@ -35,8 +35,6 @@ __all__ = ["Several", "add_arguments", "execute", "parsed_matrix", "parsed_metho
 
 def add_arguments(parser: Parser) -> None:
     """The options of `extrags run`."""
-    from extrags.pipeline import STAGES
-
     parser.description = (
         "Take each sequence through all stages. What is in the store already is not made again; a failure of "
         "one sequence does not stop the others."
@@ -58,12 +56,7 @@ def add_arguments(parser: Parser) -> None:
     add_method(parser)
     add_runner(parser)
     add_json(parser)
-    parser.add_argument(
-        "--until", choices=STAGES, default="report", metavar="STAGE", help="stop after this stage"
-    )
-    parser.add_argument(
-        "--refresh", action="store_true", help="run every stage although its artefact is in the store"
-    )
+    add_stages(parser)
     parser.add_argument(
         "--at-once", type=int, default=1, metavar="N", help="sequences in work at the same time (default: 1)"
     )
