@@ -89,7 +89,15 @@ class LitScene:
 
 
 def lit_tube(n: int = 200, width: int = 40, height: int = 32, *, seed: int = 3, lit: bool = True) -> LitScene:
-    """The standard scene of the kernels' benchmark, with light and measured depth."""
+    """The standard scene of the kernels' benchmark, with light and measured depth.
+
+    Args:
+        n: Gaussians.
+        width: of the image, in pixels.
+        height: in pixels.
+        seed: of everything that is drawn.
+        lit: whether there is a light.
+    """
     base = bench_scene(BenchSize(width, height, n), seed=seed)
     generator = torch.Generator().manual_seed(seed)
     depth = 1.0 + 5 * torch.rand(height, width, generator=generator)
@@ -170,8 +178,19 @@ def random_lit_scene(seed: int, *, wild: bool = False) -> LitScene:
 
 def plane_views(
     frames: int, width: int, height: int, *, unit: float = 1.0, offset_mm: float = 0.0
-) -> tuple[Cameras, np.ndarray, np.ndarray, np.ndarray]:
-    """Views of a slanted plane: cameras, exact z-depth [F, H, W], the plane's normal and a point of it."""
+) -> tuple[Cameras, Float[np.ndarray, "f h w"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Views of a slanted plane.
+
+    Args:
+        frames: views, on a closed way.
+        width: of an image, in pixels.
+        height: in pixels.
+        unit: half the distance of the plane, in world units; the way grows with it.
+        offset_mm: of everything from the origin, along each axis.
+
+    Returns:
+        The cameras; exact z-depth, [F, H, W]; the plane's unit normal, and a point of it.
+    """
     turn = rotation_about(np.array([0.3, 1.0, 0.2]) / np.linalg.norm([0.3, 1.0, 0.2]), 0.7)
     middle = np.full(3, offset_mm)
     poses = []
