@@ -107,7 +107,7 @@ def _add_enhance(parser: Parser) -> None:
         help="none, classical, embedded (as the settings say), embedded-1, embedded-4 (steps), zero-shot "
         "(pretrained weights alone), scene-trained (trained further on the scene), scratch (trained on the "
         "scene alone), deterministic (the same as a plain regression), each also with /no-references, "
-        "/keyframes or /no-keyframes behind it (default: none classical embedded)",
+        "/textured, /keyframes or /no-keyframes behind it (default: none classical embedded)",
     )
     add_profile(parser, "quick")
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of all stages (default: 0)")
@@ -286,6 +286,33 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
                 for case in chosen
             ],
         )
+        _print(
+            [
+                "method",
+                "Fréchet: well",
+                "rim",
+                "hole",
+                "fine detail: well",
+                "rim",
+                "hole",
+                "within 50 %",
+                "90 %",
+            ],
+            [_realism_row(case) for case in chosen],
+        )
+
+
+def _realism_row(case: dict[str, Any]) -> list[Any]:
+    """Whether regions look like tissue, and how many errors lie in the intervals meant for 50 and 90 %."""
+    parts = ("well", "rim", "hole")
+    detail = [case["detail"][part] for part in parts]
+    coverage = {} if case["calibration"] is None else case["calibration"]["coverage"]
+    return [
+        case["method"],
+        *(case["frechet"][part] for part in parts),
+        *(None if bands is None else bands[0] for bands in detail),
+        *(coverage.get(share) for share in ("50", "90")),
+    ]
 
 
 def _print(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:

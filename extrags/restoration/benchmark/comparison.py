@@ -19,13 +19,12 @@ from extrags.metrics.lpips import LpipsByNet
 from extrags.raster.bench import machine
 from extrags.restoration.backends import train_enhancer
 from extrags.restoration.benchmark.evaluation import (
-    AsRendered,
     RestorerBenchmark,
     TrueViews,
-    WithoutReferences,
     held_out_clips,
     restore_views,
 )
+from extrags.restoration.benchmark.variants import AsRendered, Textured, WithoutReferences
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.keyframes import Keyframes, following, make_keyframes
@@ -43,6 +42,7 @@ __all__ = [
     "NO_KEYFRAMES",
     "NO_REFERENCES",
     "RECIPES",
+    "TEXTURED",
     "WITH_KEYFRAMES",
     "Method",
     "bench_enhance",
@@ -55,6 +55,8 @@ __all__ = [
 
 NO_REFERENCES = "/no-references"
 """Suffix of a method's name: the same restorer, not told what real views see."""
+TEXTURED = "/textured"
+"""Suffix of a method's name: the same restorer, with texture laid onto what it invents."""
 WITH_KEYFRAMES, NO_KEYFRAMES = "/keyframes", "/no-keyframes"
 """Suffixes of a method's name: the same restorer with keyframes, or every view restored alone; without
 either it is as the settings say."""
@@ -162,13 +164,13 @@ def check_methods(names: Iterable[str]) -> list[str]:
     if unknown or not chosen:
         raise ConfigError(
             f"unknown methods {', '.join(unknown) or '(none named)'}; expected {', '.join(known)}, "
-            f"each also with {NO_REFERENCES}, {WITH_KEYFRAMES} or {NO_KEYFRAMES} behind it"
+            f"each also with {NO_REFERENCES}, {TEXTURED}, {WITH_KEYFRAMES} or {NO_KEYFRAMES} behind it"
         )
     return chosen
 
 
 def _plain(name: str) -> str:
-    for suffix in (NO_REFERENCES, NO_KEYFRAMES, WITH_KEYFRAMES):
+    for suffix in (NO_REFERENCES, TEXTURED, NO_KEYFRAMES, WITH_KEYFRAMES):
         if name.endswith(suffix):
             return name.removesuffix(suffix)
     return name
@@ -256,6 +258,8 @@ def compare_methods(
     restorers = prepared(methods, scene, training, config.enhance, config.coarse)
     for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
         keyed = _keyed(name, config.enhance)
+        if name.endswith(TEXTURED):
+            enhancer = Textured(enhancer, references, seed=config.enhance.seed)
         begun = time.perf_counter()
         keyframes = clip_keyframes(scene, references, clips, enhancer, keyed)
         keyframe_seconds = time.perf_counter() - begun
@@ -324,8 +328,8 @@ def bench_enhance(
     Args:
         sequences: with poses and held-out frames.
         config: settings of `coarse` and `enhance`, seeds included.
-        methods: names of `METHODS` or of backends, possibly with a suffix: `/no-references`, `/keyframes` or
-            `/no-keyframes`.
+        methods: names of `METHODS` or of backends, possibly with a suffix: `/no-references`, `/textured`,
+            `/keyframes` or `/no-keyframes`.
         lpips: LPIPS by backbone; None leaves it out.
 
     Returns:

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from extrags.cameras import Cameras
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.metrics.exposure import align_exposure
 from extrags.metrics.image import mean_of_known, psnr
-from extrags.metrics.lpips import LpipsByNet
+from extrags.metrics.lpips import Lpips, LpipsByNet
 from extrags.metrics.photometric import photometric_values
 from extrags.metrics.protocol import COLOR_LEVELS, MIN_REGION_SHARE
 from extrags.metrics.registry import figures, metric_named
@@ -35,22 +34,19 @@ from extrags.restoration.benchmark.inconsistency import (
     motion,
     view_pairs,
 )
+from extrags.restoration.benchmark.realism import Realism, rims
 from extrags.restoration.clips import as_images, as_planes, keep_known, render_clips
-from extrags.restoration.protocol import Clip, Enhancer, Restoration
-from extrags.restoration.training_data.augmentation import drop_references
+from extrags.restoration.protocol import Clip, Enhancer
 from extrags.restoration.uncertainty.reliability_diagram import calibration, cell_correlation
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.thresholds import HOLE_ALPHA
-from extrags.view_synthesis.conditioning import Layers
 from extrags.view_synthesis.references import ReferenceViews
 
 __all__ = [
-    "AsRendered",
     "RestoredViews",
     "RestorerBenchmark",
     "TrueViews",
-    "WithoutReferences",
     "held_out_clips",
     "restore_views",
 ]
@@ -152,46 +148,6 @@ def held_out_clips(
     return clips
 
 
-class AsRendered:
-    """The restorer that changes nothing: the baseline of all others."""
-
-    name = "none"
-
-    def restore(self, clip: Clip) -> Restoration:
-        """The rendering itself."""
-        return Restoration(as_images(clip.layers.get("rendered").clamp(0, 1)), None, {"backend": self.name})
-
-    def save(self, path: Path) -> None:
-        """Not possible: there is nothing to save.
-
-        Raises:
-            ConfigError: always.
-        """
-        raise ConfigError(f"{path}: the baseline without restoration cannot be saved")
-
-
-class WithoutReferences:
-    """A restorer without its reference views, to measure their contribution.
-
-    Args:
-        enhancer: the restorer.
-    """
-
-    def __init__(self, enhancer: Enhancer) -> None:
-        self.enhancer = enhancer
-        self.name = f"{enhancer.name}/no-references"
-
-    def restore(self, clip: Clip) -> Restoration:
-        """Restore a clip with its references removed; the clip itself is not changed."""
-        alone = drop_references(Layers(clip.layers.data.clone()))
-        restoration = self.enhancer.restore(replace(clip, layers=alone))
-        return replace(restoration, provenance={**restoration.provenance, "references": False})
-
-    def save(self, path: Path) -> None:
-        """Save the wrapped restorer."""
-        self.enhancer.save(path)
-
-
 @dataclass(frozen=True)
 class RestoredViews:
     """Clips after restoration, all views in a row.
@@ -273,13 +229,13 @@ class RestorerBenchmark:
             restored: of this benchmark's clips.
 
         Returns:
-            `{psnr, ssim, lpips_alex, well: {...}, hole: {...}, observed: {...}, unobserved: {...}}` of the
-            raw restoration, its `aligned_psnr` (the best gain of each image divided out: the exposure of
-            another recording cannot be known), the same tree of the target of the fine-tuning in `kept`, and
-            `changed_share` (of the target's pixels inside the mask), `flicker`, `error_flicker`,
+            `{psnr, ssim, lpips_alex, well: {...}, hole: {...}, rim: {...}, ...}` of the raw restoration, its
+            `aligned_psnr` (the best gain of each image divided out: the exposure of another recording cannot
+            be known), the same tree of the target of the fine-tuning in `kept`, and `changed_share` (of the
+            target's pixels inside the mask), `flicker`, `error_flicker`,
             `inconsistency: {within, across, of_photographs}` of what was invented (in both views a hole, or
-            never observed; see `invented_inconsistency`), `seconds_per_frame`, `calibration` (see
-            `calibration`; None without prediction) with
+            never observed; see `invented_inconsistency`), `frechet` and `detail` by region (see `Realism`),
+            `seconds_per_frame`, `calibration` (see `calibration`; None without prediction) with
             `rank_correlation_of`: the rank correlation of the error with what else could predict it.
 
         Raises:
@@ -303,6 +259,7 @@ class RestorerBenchmark:
             "changed_share": float(changed[mask].float().mean()) if bool(mask.any()) else None,
             **self._flicker(rgb),
             "inconsistency": self._inconsistency(rgb),
+            **self._realism.figures(rgb),
             "seconds_per_frame": restored.seconds_per_frame,
             "calibration": found,
             "rank_correlation_of": {
@@ -313,13 +270,15 @@ class RestorerBenchmark:
 
     @cached_property
     def regions(self) -> dict[str, Bool[Tensor, "v h w"]]:
-        """Pixels that count, by name: all, well seen, holes, and where it is known (un)observed."""
+        """Pixels that count: all, well seen, holes, their rims, and where it is known (un)observed."""
         mask = torch.from_numpy(np.ascontiguousarray(self.truth.mask))
         alpha, uncertainty = self._layer("alpha"), self._layer("uncertainty")
+        hole = mask & (alpha < HOLE_ALPHA)
         regions = {
             "valid": mask,
             "well": mask & (alpha > WELL_SEEN_ALPHA) & (uncertainty < WELL_SEEN_UNCERTAINTY),
-            "hole": mask & (alpha < HOLE_ALPHA),
+            "hole": hole,
+            "rim": rims(mask, hole),
         }
         if self.truth.observed is not None:
             seen = torch.from_numpy(np.ascontiguousarray(self.truth.observed))
@@ -331,6 +290,11 @@ class RestorerBenchmark:
         """Share of the mask that each region has."""
         total = max(1, int(self.regions["valid"].sum()))
         return {name: float(region.sum()) / total for name, region in self.regions.items() if name != "valid"}
+
+    @cached_property
+    def _realism(self) -> Realism:
+        network = None if self.lpips is None else self.lpips.get("alex")
+        return Realism(self._truth, self.regions, network if isinstance(network, Lpips) else None)
 
     @cached_property
     def _truth(self) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,9 +12,11 @@ from jaxtyping import Bool, Float, Shaped
 from extrags.errors import ConfigError, ShapeError
 from extrags.restoration.uncertainty.calibration import cell_means
 
-__all__ = ["calibration", "cell_correlation", "rank_correlation"]
+__all__ = ["calibration", "cell_correlation", "interval_coverage", "rank_correlation"]
 
 CALIBRATION_BINS = 10
+INTERVALS = (0.5, 0.9)
+"""Shares of the errors that the intervals should hold whose coverage is measured."""
 
 
 def calibration(
@@ -32,9 +35,9 @@ def calibration(
         bins: of equal numbers of cells, by prediction.
 
     Returns:
-        `{rank_correlation, calibration_error, cells, bins: [{predicted, error, low, high, cells}]}`:
-        Spearman's; the mean distance of the bins from the diagonal; in each bin the means, and the
-        quartiles of the true error.
+        `{rank_correlation, calibration_error, coverage: {50, 90}, cells, bins: [{predicted, error, low, high,
+        cells}]}`: Spearman's; the mean distance of the bins from the diagonal; see `interval_coverage`; in
+        each bin the means, and the quartiles of the true error.
 
     Raises:
         ShapeError: when the shapes differ.
@@ -64,8 +67,35 @@ def calibration(
     return {
         "rank_correlation": rank_correlation(expected, found),
         "calibration_error": sum(off) / len(order) if len(order) else None,
+        "coverage": interval_coverage(predicted, error, mask),
         "cells": len(order),
         "bins": table,
+    }
+
+
+def interval_coverage(
+    predicted: Shaped[np.ndarray, "v h w"],
+    error: Shaped[np.ndarray, "v h w"],
+    mask: Bool[np.ndarray, "v h w"],
+) -> dict[str, float | None]:
+    r"""Share of pixels whose error lies in an interval that should hold 50 % or 90 % of them.
+
+    An absolute error whose colours are Laplace distributed, as the restorer's likelihood takes them to be,
+    is exponentially distributed: with the predicted mean :math:`b` a share :math:`q` of the errors lies
+    between 0 and :math:`-b \log(1 - q)`.
+
+    Args:
+        predicted: the error the restorer expects.
+        error: the true absolute error, mean of the channels.
+        mask: which pixels count.
+
+    Returns:
+        Share by percentage; None without any pixel.
+    """
+    ratio = error[mask] / np.maximum(predicted[mask], np.finfo(np.float32).tiny)
+    return {
+        f"{100 * share:.0f}": float((ratio <= -math.log(1 - share)).mean()) if len(ratio) else None
+        for share in INTERVALS
     }
 
 

@@ -9,7 +9,7 @@ from extrags.config import EnhanceConfig
 from extrags.errors import ShapeError
 from extrags.evaluation import render
 from extrags.metrics.protocol import RenderedViews
-from extrags.restoration.benchmark.evaluation import AsRendered
+from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.restored_renders import FINAL_SHARE, restored_renders

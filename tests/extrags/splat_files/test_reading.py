@@ -16,7 +16,7 @@ from extrags.splat_files import read_splat_file, read_spz, write_spz
 
 
 def packed(content: bytes) -> bytes:
-    """Without the time of day, which would be in the names of the tests, and differ from process to process."""
+    """Without the time of day: it would be in the names of tests, which processes must agree on."""
     return gzip.compress(content, mtime=0)
 
 

@@ -1,0 +1,100 @@
+"""Restorers that are another one with something added or taken away, to measure what that contributes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from extrags.errors import CaptureError, ConfigError
+from extrags.restoration.clips import as_images
+from extrags.restoration.protocol import Clip, Enhancer, Restoration
+from extrags.restoration.surface_texture import SurfaceTexture
+from extrags.restoration.training_data.augmentation import drop_references, unconfirmed
+from extrags.view_synthesis.conditioning import Layers, condition
+from extrags.view_synthesis.references import ReferenceViews
+
+__all__ = ["AsRendered", "Textured", "WithoutReferences"]
+
+
+class AsRendered:
+    """The restorer that changes nothing: the baseline of all others."""
+
+    name = "none"
+
+    def restore(self, clip: Clip) -> Restoration:
+        """The rendering itself."""
+        return Restoration(as_images(clip.layers.get("rendered").clamp(0, 1)), None, {"backend": self.name})
+
+    def save(self, path: Path) -> None:
+        """Not possible: there is nothing to save.
+
+        Raises:
+            ConfigError: always.
+        """
+        raise ConfigError(f"{path}: the baseline without restoration cannot be saved")
+
+
+class WithoutReferences:
+    """A restorer without its reference views, to measure their contribution.
+
+    Args:
+        enhancer: the restorer.
+    """
+
+    def __init__(self, enhancer: Enhancer) -> None:
+        self.enhancer = enhancer
+        self.name = f"{enhancer.name}/no-references"
+
+    def restore(self, clip: Clip) -> Restoration:
+        """Restore a clip with its references removed; the clip itself is not changed."""
+        alone = drop_references(Layers(clip.layers.data.clone()))
+        restoration = self.enhancer.restore(replace(clip, layers=alone))
+        return replace(restoration, provenance={**restoration.provenance, "references": False})
+
+    def save(self, path: Path) -> None:
+        """Save the wrapped restorer."""
+        self.enhancer.save(path)
+
+
+class Textured:
+    """A restorer whose invented surfaces get texture of the scene's own frames, as restored renders do.
+
+    Args:
+        enhancer: the restorer.
+        references: the scene's real views.
+        seed: which tile lies where.
+
+    Raises:
+        CaptureError: when no frame shows the surface closely enough to give texture.
+    """
+
+    def __init__(self, enhancer: Enhancer, references: ReferenceViews, *, seed: int = 0) -> None:
+        texture = SurfaceTexture.of_references(references, seed=seed)
+        if texture is None:
+            raise CaptureError("no frame shows the surface closely enough to give texture")
+        self.enhancer, self.texture = enhancer, texture
+        self.name = f"{enhancer.name}/textured"
+
+    def restore(self, clip: Clip) -> Restoration:
+        """Restore a clip, then lay texture onto what was invented."""
+        restoration = self.enhancer.restore(clip)
+        depth = (
+            condition(clip.layers, clip.transfer).depth_mm[:, 0]
+            if restoration.depth_mm is None
+            else torch.from_numpy(restoration.depth_mm)
+        )
+        rgb = self.texture.applied(
+            torch.from_numpy(restoration.rgb).permute(0, 3, 1, 2),
+            clip.cameras,
+            depth,
+            unconfirmed(clip.layers)[:, 0],
+        )
+        return replace(
+            restoration, rgb=as_images(rgb), provenance={**restoration.provenance, "textured": True}
+        )
+
+    def save(self, path: Path) -> None:
+        """Save the wrapped restorer."""
+        self.enhancer.save(path)
