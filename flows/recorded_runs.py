@@ -14,9 +14,18 @@ from extrags.store import Manifest, Ref, Store
 from flows.outcome_records import OutcomeRecord, outcome_records, setting_text
 
 if TYPE_CHECKING:
+    from extrags.report.gallery import GalleryRun
     from extrags.report.run_comparison import ComparedRun
 
-__all__ = ["RecordedRun", "board_rows", "chosen_runs", "compared_run", "run_names"]
+__all__ = [
+    "RecordedRun",
+    "board_rows",
+    "chosen_runs",
+    "compared_run",
+    "gallery_run",
+    "last_runs",
+    "run_names",
+]
 
 REPORT = "report-v"
 """Begin of the keys of a sequence's own pages."""
@@ -168,6 +177,68 @@ def compared_run(store: Store, run: RecordedRun, name: str) -> ComparedRun:
         settings={key: plain_value(value) for key, value in settings.items()},
         seconds=sum(float(stage["made_seconds"]) for stage in stages) if stages else None,
         link="" if page is None else _address(f"{page.uri}/{PAGE}"),
+    )
+
+
+def last_runs(
+    store: Store,
+    patterns: Sequence[str] = (),
+    *,
+    methods: Sequence[str] = (),
+    profiles: Sequence[str] = (),
+) -> list[RecordedRun]:
+    """The last finished run of each sequence that has a page, by name.
+
+    Args:
+        store: where they are.
+        patterns: of sequences; all without any.
+        methods: only runs of these; all without any.
+        profiles: the same.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    found: dict[str, RecordedRun] = {}
+    for record in sorted(outcome_records(store).values(), key=lambda item: str(item["ended"])):
+        sequence = str(record["sequence"])
+        if patterns and not any(fnmatchcase(sequence, pattern) for pattern in patterns):
+            continue
+        key = _key_of(record) if record["status"] == "ok" and _wanted(record, methods, profiles, ()) else None
+        manifest = None if key is None else _manifest(store, key)
+        if manifest is not None:
+            found[sequence] = RecordedRun(manifest, record)
+    return [found[sequence] for sequence in sorted(found)]
+
+
+def gallery_run(store: Store, run: RecordedRun) -> GalleryRun:
+    """A run with what a gallery shows of it.
+
+    Raises:
+        StoreError: when an artefact is gone, or the run was not evaluated.
+    """
+    from extrags.metrics.protocol import RenderedViews
+    from extrags.pseudo_views import PseudoViews
+    from extrags.report.gallery import KINDS, GalleryRun
+    from extrags.sequence import EndoscopicSequence
+    from tasks.evaluate import METRICS_FILE
+
+    frames, enhance = run.ref(store, "sequence"), run.ref(store, "enhance")
+    rgb, results = {}, {}
+    for kind in KINDS:
+        renders, metrics = run.ref(store, f"renders_{kind}"), run.ref(store, f"metrics_{kind}")
+        if renders is not None and metrics is not None:
+            rgb[kind] = store.load(RenderedViews, renders).rgb
+            results[kind] = store.load_json(METRICS_FILE, metrics)
+    if frames is None or not rgb:
+        raise StoreError(f"{run.sequence}: the page {run.report.key} was made without an evaluation")
+    traits = run.traits()
+    return GalleryRun(
+        sequence=store.load(EndoscopicSequence, frames),
+        rgb=rgb,
+        results=results,
+        method=traits.get("method", ""),
+        profile=traits.get("profile", ""),
+        pseudo=None if enhance is None else store.load(PseudoViews, enhance),
     )
 
 
