@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from extrags.errors import ConfigError, StoreError
 from extrags.report.leaderboard import BoardRow
@@ -150,8 +152,14 @@ def run_names(runs: Sequence[RecordedRun]) -> list[str]:
     ]
 
 
-def compared_run(store: Store, run: RecordedRun, name: str) -> ComparedRun:
+def compared_run(store: Store, run: RecordedRun, name: str, target: str = "") -> ComparedRun:
     """A run with what is shown of it; where nothing was fine-tuned, its coarse scene.
+
+    Args:
+        store: where it is.
+        run: with its page.
+        name: what it is called.
+        target: the page that links to it; empty for one that lies nowhere yet.
 
     Raises:
         StoreError: when an artefact is gone, or the run was not evaluated.
@@ -176,7 +184,7 @@ def compared_run(store: Store, run: RecordedRun, name: str) -> ComparedRun:
         result=store.load_json(METRICS_FILE, metrics),
         settings={key: plain_value(value) for key, value in settings.items()},
         seconds=sum(float(stage["made_seconds"]) for stage in stages) if stages else None,
-        link="" if page is None else _address(f"{page.uri}/{PAGE}"),
+        link="" if page is None else _address(f"{page.uri}/{PAGE}", target),
     )
 
 
@@ -242,8 +250,13 @@ def gallery_run(store: Store, run: RecordedRun) -> GalleryRun:
     )
 
 
-def board_rows(store: Store, patterns: Sequence[str] = ()) -> list[BoardRow]:
+def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> list[BoardRow]:
     """Every run on record whose sequence matches one of the patterns; all without patterns.
+
+    Args:
+        store: where they are.
+        patterns: of sequences.
+        target: the page that links to them; empty for one that lies nowhere yet.
 
     Raises:
         StoreError: when the store cannot be read.
@@ -266,7 +279,7 @@ def board_rows(store: Store, patterns: Sequence[str] = ()) -> list[BoardRow]:
                 ended=str(record["ended"]),
                 seconds=sum(float(stage["made_seconds"]) for stage in record["stages"]),
                 metrics=tree.get("final") or tree.get("coarse"),
-                link=_address(record["report"]) if record["report"] else "",
+                link=_address(record["report"], target) if record["report"] else "",
             )
         )
     return sorted(rows, key=lambda row: (row.sequence, row.method, row.profile, row.seed, row.settings))
@@ -305,6 +318,18 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _address(place: str) -> str:
-    """Of a page, for a link from anywhere on this machine."""
-    return place if "://" in place else Path(place).absolute().as_uri()
+def _address(place: str, target: str) -> str:
+    """Of a page, for a link from another one.
+
+    Relative where both lie in one folder, however deep, so that this folder can be moved or sent; else the
+    address on this machine.
+    """
+    if "://" in place:
+        return place
+    page = Path(place).absolute()
+    if target:
+        folder = Path(target).expanduser().absolute().parent
+        shared = os.path.commonpath([page, folder]) if page.anchor == folder.anchor else page.anchor
+        if shared != page.anchor:
+            return quote(Path(os.path.relpath(page, folder)).as_posix())
+    return page.as_uri()

@@ -4,8 +4,8 @@ Versions 2, 3 and 4 are read, version 3 is written: every reader knows it. Layou
 little-endian: magic `NGSP`, version, count, SH degree, fractional bits of positions, flags, a zero; then
 positions (3 x 24 bits), opacities (8 bits), colours (3 x 8), logarithms of scales (3 x 8, steps of 1/16 from
 -10), rotations (version 2: x, y, z of 8 bits; version 3: 32 bits, the largest component left out), SH
-coefficients (8 bits, coefficient by coefficient). Version 4 holds the same six planes, each compressed with Zstandard, behind a header that is not
-compressed (`extrags.splat_files.spz_streams`).
+coefficients (8 bits, coefficient by coefficient). Version 4 holds the same six planes, each compressed with
+Zstandard, behind a header that is not compressed (`extrags.splat_files.spz_streams`).
 
 The format's axes are right, up, back; ours are OpenCV's right, down, forward. Positions, rotations and
 harmonics are turned by half a turn about x on the way, as the format's own tools do for PLY files.

@@ -15,7 +15,7 @@ from extrags.store import Store
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.outcome import SequenceOutcome
-from flows.recorded_runs import RecordedRun, board_rows, chosen_runs, last_runs, run_names
+from flows.recorded_runs import RecordedRun, board_rows, chosen_runs, compared_run, last_runs, run_names
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
@@ -125,6 +125,21 @@ def test_both_pages_from_the_command_line(
     board = tmp_path / "board.html"
     assert main(["leaderboard", "phantom/*", "--store", store.root, "-o", str(board), "--quiet"]) == 0
     assert SEQUENCE in board.read_text(encoding="utf-8")
+
+
+def test_links_can_be_moved_with_the_folder_that_holds_page_and_store(store: Store) -> None:
+    """Relative where both are in one folder, else of this machine."""
+    folder = Path(store.root).parent / "pages #1"
+    links = {row.link for row in board_rows(store, target=str(folder / "board.html")) if row.link}
+    for link in links:
+        assert link.startswith("../store/artefacts/report-v")
+        assert (folder / link).resolve().is_file()
+    (apart,) = {row.link[:8] for row in board_rows(store, target="/board.html") if row.link}
+    assert apart == "file:///"
+    run = chosen_runs(store, [SEQUENCE])[0]
+    assert compared_run(store, run, "one", str(folder / "compared.html")).link in links
+    inside = compared_run(store, run, "one", f"{store.root}/here#/x.html").link
+    assert inside.startswith("../artefacts/")
 
 
 def test_the_last_run_of_each_sequence(store: Store) -> None:
