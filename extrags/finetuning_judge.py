@@ -48,6 +48,13 @@ MIN_LEFT_OUT = 4
 reconstruction."""
 
 
+KEPT = (
+    "the scene's own Gaussians stay as they are and new ones fill its holes, which was tried in a scene "
+    "rebuilt from frames"
+)
+"""Of `finetune.keep_scene`, in words."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """One way to fine-tune, tried on left-out frames.
@@ -213,6 +220,8 @@ def judge_finetuning(
     for trial in trials:
         emit(MetricRecorded("finetune", f"left_out_gain_db_at_{trial.amount:g}", trial.gain_db))
     judgement = decide(trials, settings.max_loss_db, np.sort(np.concatenate(left)))
+    if config.keep_scene:
+        judgement = replace(judgement, reason=f"{KEPT}; {judgement.reason}")
     logger.info("finetune: %s", judgement.reason)
     return judgement
 

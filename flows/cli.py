@@ -28,6 +28,7 @@ VERBS = {
     "report": "build the page of a finished run again, from the store",
     "compare": "hold finished runs of one sequence against each other, on a page",
     "leaderboard": "sequences by methods, from the store's records, on a page that sorts and filters",
+    "gallery": "pictures of finished runs with their figures, as a Markdown page",
     "view": "look at a scene in the browser, live: light, layers, camera paths to record",
     "export": "write a reconstructed scene as Gaussians, mesh or video, or a sequence for COLMAP",
     "import": "take a scene that another program has made through the later stages",

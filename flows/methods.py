@@ -253,6 +253,7 @@ def paper(config: PipelineConfig) -> dict[str, Any]:
         "finetune.pseudo_depth": False,
         "finetune.seed_holes": False,
         "finetune.keep_known": False,
+        "finetune.keep_scene": False,
         "finetune.confidence_floor": 0.0,
         "finetune.image_confidence": True,
         "finetune.judge.enabled": False,

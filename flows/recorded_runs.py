@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
 
 from extrags.errors import ConfigError, StoreError
 from extrags.report.leaderboard import BoardRow
@@ -14,9 +16,18 @@ from extrags.store import Manifest, Ref, Store
 from flows.outcome_records import OutcomeRecord, outcome_records, setting_text
 
 if TYPE_CHECKING:
+    from extrags.report.gallery import GalleryRun
     from extrags.report.run_comparison import ComparedRun
 
-__all__ = ["RecordedRun", "board_rows", "chosen_runs", "compared_run", "run_names"]
+__all__ = [
+    "RecordedRun",
+    "board_rows",
+    "chosen_runs",
+    "compared_run",
+    "gallery_run",
+    "last_runs",
+    "run_names",
+]
 
 REPORT = "report-v"
 """Begin of the keys of a sequence's own pages."""
@@ -141,8 +152,14 @@ def run_names(runs: Sequence[RecordedRun]) -> list[str]:
     ]
 
 
-def compared_run(store: Store, run: RecordedRun, name: str) -> ComparedRun:
+def compared_run(store: Store, run: RecordedRun, name: str, target: str = "") -> ComparedRun:
     """A run with what is shown of it; where nothing was fine-tuned, its coarse scene.
+
+    Args:
+        store: where it is.
+        run: with its page.
+        name: what it is called.
+        target: the page that links to it; empty for one that lies nowhere yet.
 
     Raises:
         StoreError: when an artefact is gone, or the run was not evaluated.
@@ -167,12 +184,79 @@ def compared_run(store: Store, run: RecordedRun, name: str) -> ComparedRun:
         result=store.load_json(METRICS_FILE, metrics),
         settings={key: plain_value(value) for key, value in settings.items()},
         seconds=sum(float(stage["made_seconds"]) for stage in stages) if stages else None,
-        link="" if page is None else _address(f"{page.uri}/{PAGE}"),
+        link="" if page is None else _address(f"{page.uri}/{PAGE}", target),
     )
 
 
-def board_rows(store: Store, patterns: Sequence[str] = ()) -> list[BoardRow]:
+def last_runs(
+    store: Store,
+    patterns: Sequence[str] = (),
+    *,
+    methods: Sequence[str] = (),
+    profiles: Sequence[str] = (),
+) -> list[RecordedRun]:
+    """The last finished run of each sequence that has a page, by name.
+
+    Args:
+        store: where they are.
+        patterns: of sequences; all without any.
+        methods: only runs of these; all without any.
+        profiles: the same.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    found: dict[str, RecordedRun] = {}
+    for record in sorted(outcome_records(store).values(), key=lambda item: str(item["ended"])):
+        sequence = str(record["sequence"])
+        if patterns and not any(fnmatchcase(sequence, pattern) for pattern in patterns):
+            continue
+        key = _key_of(record) if record["status"] == "ok" and _wanted(record, methods, profiles, ()) else None
+        manifest = None if key is None else _manifest(store, key)
+        if manifest is not None:
+            found[sequence] = RecordedRun(manifest, record)
+    return [found[sequence] for sequence in sorted(found)]
+
+
+def gallery_run(store: Store, run: RecordedRun) -> GalleryRun:
+    """A run with what a gallery shows of it.
+
+    Raises:
+        StoreError: when an artefact is gone, or the run was not evaluated.
+    """
+    from extrags.metrics.protocol import RenderedViews
+    from extrags.pseudo_views import PseudoViews
+    from extrags.report.gallery import KINDS, GalleryRun
+    from extrags.sequence import EndoscopicSequence
+    from tasks.evaluate import METRICS_FILE
+
+    frames, enhance = run.ref(store, "sequence"), run.ref(store, "enhance")
+    rgb, results = {}, {}
+    for kind in KINDS:
+        renders, metrics = run.ref(store, f"renders_{kind}"), run.ref(store, f"metrics_{kind}")
+        if renders is not None and metrics is not None:
+            rgb[kind] = store.load(RenderedViews, renders).rgb
+            results[kind] = store.load_json(METRICS_FILE, metrics)
+    if frames is None or not rgb:
+        raise StoreError(f"{run.sequence}: the page {run.report.key} was made without an evaluation")
+    traits = run.traits()
+    return GalleryRun(
+        sequence=store.load(EndoscopicSequence, frames),
+        rgb=rgb,
+        results=results,
+        method=traits.get("method", ""),
+        profile=traits.get("profile", ""),
+        pseudo=None if enhance is None else store.load(PseudoViews, enhance),
+    )
+
+
+def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> list[BoardRow]:
     """Every run on record whose sequence matches one of the patterns; all without patterns.
+
+    Args:
+        store: where they are.
+        patterns: of sequences.
+        target: the page that links to them; empty for one that lies nowhere yet.
 
     Raises:
         StoreError: when the store cannot be read.
@@ -195,7 +279,7 @@ def board_rows(store: Store, patterns: Sequence[str] = ()) -> list[BoardRow]:
                 ended=str(record["ended"]),
                 seconds=sum(float(stage["made_seconds"]) for stage in record["stages"]),
                 metrics=tree.get("final") or tree.get("coarse"),
-                link=_address(record["report"]) if record["report"] else "",
+                link=_address(record["report"], target) if record["report"] else "",
             )
         )
     return sorted(rows, key=lambda row: (row.sequence, row.method, row.profile, row.seed, row.settings))
@@ -234,6 +318,18 @@ def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return found
 
 
-def _address(place: str) -> str:
-    """Of a page, for a link from anywhere on this machine."""
-    return place if "://" in place else Path(place).absolute().as_uri()
+def _address(place: str, target: str) -> str:
+    """Of a page, for a link from another one.
+
+    Relative where both lie in one folder, however deep, so that this folder can be moved or sent; else the
+    address on this machine.
+    """
+    if "://" in place:
+        return place
+    page = Path(place).absolute()
+    if target:
+        folder = Path(target).expanduser().absolute().parent
+        shared = os.path.commonpath([page, folder]) if page.anchor == folder.anchor else page.anchor
+        if shared != page.anchor:
+            return quote(Path(os.path.relpath(page, folder)).as_posix())
+    return page.as_uri()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 import re
 import shlex
 import unicodedata
@@ -95,6 +96,13 @@ def test_every_stage_has_a_page() -> None:
     pages = {stage: page for stages, page in rows for stage in stages.split(", ")}
     assert set(STAGES) <= set(pages)
     assert all((REPOSITORY / "docs" / page).is_file() for page in pages.values())
+
+
+def test_every_kind_of_artefact_is_in_the_index() -> None:
+    stages = set(json.loads((REPOSITORY / "tests/stage_inventory.json").read_text())["stages"])
+    text = (REPOSITORY / "docs/index.md").read_text()
+    listed = re.findall(r"^\| (`[a-z`, -]+`) \| .*\]\(", text, re.MULTILINE)
+    assert stages == {name.strip("`") for names in listed for name in names.split(", ")}
 
 
 def test_every_page_can_be_reached_from_the_index() -> None:

@@ -19,6 +19,11 @@ class ImportedConfig(StageConfig):
         "the place of the coarse scene, and all later stages go on from it. Its content counts in cache "
         "keys, not its path; None: the coarse scene is reconstructed",
     )
+    keep: bool = Field(
+        True,
+        description="fine-tuning leaves its Gaussians and light as they are and adds new ones in its holes: "
+        "nothing tells which frames it was made with, so that none can show what further training would cost",
+    )
     scale: float = Field(
         1.0,
         gt=0,

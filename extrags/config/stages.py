@@ -189,6 +189,11 @@ class FinetuneConfig(StageConfig):
     keep_known: bool = Field(
         True, description="u * restored + (1 - u) * rendered instead of the restored image alone"
     )
+    keep_scene: bool = Field(
+        False,
+        description="the scene's own Gaussians and light stay: only new ones in holes are learned. "
+        "imported.keep switches it on for imported scenes",
+    )
     confidence_floor: float = Field(
         0.1, ge=0, le=1, description="smallest pixel-level weight, so that no pixel drifts freely"
     )
@@ -307,7 +312,8 @@ class PipelineConfig(StageConfig):
         """The same settings, for later stages that work on an imported scene.
 
         Folds of the restorer and trials of the judge are reconstructed as the scene is: with or without
-        light, with its degree of harmonics; and fine-tuning may grow from its number of Gaussians on.
+        light, with its degree of harmonics; fine-tuning may grow from its number of Gaussians on, and with
+        `imported.keep` leaves these as they are.
 
         Args:
             count: of its Gaussians.
@@ -318,6 +324,7 @@ class PipelineConfig(StageConfig):
             {
                 "coarse.light.enabled": lit and self.coarse.light.enabled,
                 "coarse.sh_degree": sh_degree,
+                "finetune.keep_scene": self.finetune.keep_scene or self.imported.keep,
                 "coarse.densify.max_gaussians": max(count, self.coarse.densify.max_gaussians),
             }
         )

@@ -113,6 +113,11 @@ class GridLike(Protocol):
         ...
 
     @property
+    def clearance(self) -> np.ndarray:
+        """Distance of each voxel's centre from what is not free, negative inside it, [S, S, S]."""
+        ...
+
+    @property
     def origin_mm(self) -> np.ndarray:
         """Corner of voxel (0, 0, 0), [3]."""
         ...

@@ -30,7 +30,7 @@ def read_splat_file(path: Path) -> Scene:
         raise SourceNotFoundError("no such file", file=path)
     with path.open("rb") as stream:
         start = stream.read(4)
-    if start[:2] == b"\x1f\x8b":
+    if start[:2] == b"\x1f\x8b" or start == b"NGSP":
         scene = Scene(read_spz(path))
     elif start[:3] == b"ply":
         scene = read_ply_scene(path)

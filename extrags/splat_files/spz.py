@@ -1,10 +1,11 @@
 """SPZ, the compressed format of Niantic: fixed-point numbers, packed attribute by attribute, in gzip.
 
-Version 2 and 3 are read, version 3 is written. Layout after gzip, little-endian: magic `NGSP`, version,
-count, SH degree, fractional bits of positions, flags, a zero; then positions (3 x 24 bits), opacities (8
-bits), colours (3 x 8), logarithms of scales (3 x 8, steps of 1/16 from -10), rotations (version 2: x, y, z
-of 8 bits; version 3: 32 bits, the largest component left out), SH coefficients (8 bits, coefficient by
-coefficient).
+Versions 2, 3 and 4 are read, version 3 is written: every reader knows it. Layout of 2 and 3 after gzip,
+little-endian: magic `NGSP`, version, count, SH degree, fractional bits of positions, flags, a zero; then
+positions (3 x 24 bits), opacities (8 bits), colours (3 x 8), logarithms of scales (3 x 8, steps of 1/16 from
+-10), rotations (version 2: x, y, z of 8 bits; version 3: 32 bits, the largest component left out), SH
+coefficients (8 bits, coefficient by coefficient). Version 4 holds the same six planes, each compressed with
+Zstandard, behind a header that is not compressed (`extrags.splat_files.spz_streams`).
 
 The format's axes are right, up, back; ours are OpenCV's right, down, forward. Positions, rotations and
 harmonics are turned by half a turn about x on the way, as the format's own tools do for PLY files.
@@ -24,6 +25,7 @@ from jaxtyping import Float, UInt8
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.gaussians import Gaussians
 from extrags.splat_files.packing import largest_component, unit_quaternions
+from extrags.splat_files.spz_streams import read_header, read_planes
 
 __all__ = ["read_spz", "write_spz"]
 
@@ -84,44 +86,24 @@ def write_spz(gaussians: Gaussians, path: Path) -> None:
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read SPZ of version 2 or 3.
+    """Read SPZ of version 2, 3 or 4; extensions of version 4 other than the one for its axes are passed over.
 
     Raises:
         SourceNotFoundError: when there is no such file.
-        SourceError: when it is damaged, of another version, or announces more than it holds.
+        SourceError: when it is damaged, of another version, has other axes than the format's own, or
+            announces more than it holds.
     """
     if not path.is_file():
         raise SourceNotFoundError("no such file", file=path)
-    try:
-        with gzip.open(path) as stream:
-            start = stream.read(_HEADER.size)
-            if len(start) < _HEADER.size:
-                raise SourceError("it ends within its header", file=path)
-            magic, version, n, degree, bits, _, _ = _HEADER.unpack(start)
-            if magic != _MAGIC:
-                raise SourceError("not an SPZ file: wrong magic number", file=path)
-            if version not in (2, 3):
-                raise SourceError(f"SPZ of version {version}; 2 and 3 are read", file=path, field="version")
-            if degree not in _REST:
-                raise SourceError(f"SH degree {degree}; expected 0 to 3", file=path, field="sh_degree")
-            if n > _LARGEST_COUNT or bits > 24:
-                raise SourceError(f"{n} Gaussians with {bits} fractional bits", file=path, field="count")
-            sizes = [9, 1, 3, 3, 3 if version == 2 else 4, 3 * _REST[degree]]
-            # Not more than announced: a small file can unpack to anything.
-            body = stream.read(n * sum(sizes))
-    except (OSError, EOFError, zlib.error) as error:
-        raise SourceError(f"not an SPZ file, or damaged: {error}", file=path) from error
-    if len(body) < n * sum(sizes):
-        raise SourceError(f"{n} Gaussians announced, but the file is truncated", file=path, field="count")
-    ends = np.cumsum([n * size for size in sizes])[:-1]
-    positions, opacities, colors, scales, rotations, harmonics = np.split(
-        np.frombuffer(body, dtype=np.uint8), ends
-    )
+    with path.open("rb") as stream:
+        compressed = stream.read(2) == b"\x1f\x8b"
+    version, n, degree, bits, planes = _gzipped(path) if compressed else _streams(path)
+    positions, opacities, colors, scales, rotations, harmonics = planes
     fixed = np.zeros((n, 3, 4), dtype=np.uint8)
     fixed[:, :, 1:] = positions.reshape(n, 3, 3)
     means = (fixed.view("<i4")[..., 0] >> 8) / float(1 << bits) * [1, -1, -1]
     share = (opacities.astype(np.float64) / 255).clip(1e-6, 1 - 1e-6)
-    quats = (_smallest_three if version == 3 else _three_bytes)(rotations)
+    quats = (_three_bytes if version == 2 else _smallest_three)(rotations)
     shN = (harmonics.reshape(n, _REST[degree], 3).astype(np.float32) - 128) / 128
     return Gaussians(
         means=torch.from_numpy(means.astype(np.float32)),
@@ -131,6 +113,62 @@ def read_spz(path: Path) -> Gaussians:
         sh0=torch.from_numpy((colors.reshape(n, 1, 3).astype(np.float32) / 255 - 0.5) / _COLOR_SCALE),
         shN=torch.from_numpy(shN * _FLIPPED[: shN.shape[1], None]),
     )
+
+
+_Planes = tuple[int, int, int, int, list[UInt8[np.ndarray, "b"]]]
+"""Version, number of Gaussians, SH degree, fractional bits, and the planes in the order of the file."""
+
+
+def _gzipped(path: Path) -> _Planes:
+    """Versions 2 and 3."""
+    try:
+        with gzip.open(path) as stream:
+            start = stream.read(_HEADER.size)
+            if len(start) < _HEADER.size:
+                raise SourceError("it ends within its header", file=path)
+            magic, version, n, degree, bits, _, _ = _HEADER.unpack(start)
+            if magic != _MAGIC:
+                raise SourceError("not an SPZ file: wrong magic number", file=path)
+            if version not in (2, 3):
+                raise _unknown_version(path, version)
+            _check_header(path, n, degree, bits)
+            sizes = _plane_sizes(version, degree)
+            # Not more than announced: a small file can unpack to anything.
+            body = stream.read(n * sum(sizes))
+    except (OSError, EOFError, zlib.error) as error:
+        raise SourceError(f"not an SPZ file, or damaged: {error}", file=path) from error
+    if len(body) < n * sum(sizes):
+        raise SourceError(f"{n} Gaussians announced, but the file is truncated", file=path, field="count")
+    ends = np.cumsum([n * size for size in sizes])[:-1]
+    return version, n, degree, bits, np.split(np.frombuffer(body, dtype=np.uint8), ends)
+
+
+def _streams(path: Path) -> _Planes:
+    """Version 4."""
+    content = path.read_bytes()
+    header = read_header(content, path)
+    if header.version != 4:
+        raise _unknown_version(path, header.version)
+    _check_header(path, header.count, header.degree, header.bits)
+    sizes = [header.count * size for size in _plane_sizes(4, header.degree)]
+    planes = [np.frombuffer(plane, dtype=np.uint8) for plane in read_planes(content, header, sizes, path)]
+    return 4, header.count, header.degree, header.bits, planes
+
+
+def _plane_sizes(version: int, degree: int) -> list[int]:
+    """Bytes per Gaussian of each plane."""
+    return [9, 1, 3, 3, 3 if version == 2 else 4, 3 * _REST[degree]]
+
+
+def _check_header(path: Path, count: int, degree: int, bits: int) -> None:
+    if degree not in _REST:
+        raise SourceError(f"SH degree {degree}; expected 0 to 3", file=path, field="sh_degree")
+    if count > _LARGEST_COUNT or bits > 24:
+        raise SourceError(f"{count} Gaussians with {bits} fractional bits", file=path, field="count")
+
+
+def _unknown_version(path: Path, version: int) -> SourceError:
+    return SourceError(f"SPZ of version {version}; 2, 3 and 4 are read", file=path, field="version")
 
 
 def _smallest_three(packed: UInt8[np.ndarray, "b"]) -> Float[np.ndarray, "n 4"]:

@@ -17,6 +17,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.threads import one_torch_thread
 from extrags.thresholds import HOLE_ALPHA
+from extrags.training.filling import FillingStep, filling_schedule
 from extrags.training.frame_weights import weighted_views
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
@@ -90,6 +91,9 @@ def finetune(
     learning rate starts anew. Seeds and densification together may bring the scene to `growth` times the
     coarse limit. Without pseudo-observations only real views are used: the control of a comparison.
 
+    With `keep_scene` the scene's own Gaussians and its light stay as they are: only new ones in holes are
+    learned, without densification; where there are none, the scene is returned as it was given.
+
     Args:
         scene: the coarse scene.
         sequence: posed frames; only training frames are used.
@@ -122,6 +126,8 @@ def finetune(
         )
         if new_gaussians is not None:
             start = Scene(Gaussians.concatenated(scene.gaussians, new_gaussians), scene.light)
+    if config.keep_scene and len(start.gaussians) == len(scene.gaussians):
+        return TrainingResult(scene.detached(), [])
     if coarse.inconsistent_frames == "weight":
         real, _ = weighted_views(sequence, frames, coarse)
     else:
@@ -144,6 +150,14 @@ def finetune(
         densify=coarse.densify.model_copy(update=densify),
     )
     schedule = replace(schedule, photometric_weight=config.photometric_weight)
+    if config.keep_scene:
+        fixed = len(scene.gaussians)
+        return optimise(
+            start,
+            draw,
+            filling_schedule(schedule.resumed(seed=config.seed)),
+            make_step=lambda scene, schedule: FillingStep(scene, schedule, fixed),
+        )
     # All harmonics are active from the first step: the scene is optimised already.
     footprint = smallest_footprint(coarse, sequence.cameras[frames])
     return optimise(start, draw, schedule.resumed(seed=config.seed), footprint=footprint)

@@ -75,7 +75,9 @@ def compare(given: argparse.Namespace) -> int:
     from extrags.report.run_comparison import build_run_comparison
     from extrags.sequence import EndoscopicSequence
 
-    shown = [compared_run(store, run, name) for run, name in zip(runs, run_names(runs), strict=True)]
+    shown = [
+        compared_run(store, run, name, given.output) for run, name in zip(runs, run_names(runs), strict=True)
+    ]
     frames = runs[0].ref(store, "sequence")
     if frames is None:
         raise ConfigError(f"{runs[0].sequence}: its page {runs[0].report.key} knows no frames")

@@ -44,7 +44,7 @@ def leaderboard(given: argparse.Namespace) -> int:
     from extrags.report.leaderboard import build_leaderboard
     from flows.recorded_runs import board_rows
 
-    rows = board_rows(Store(root), given.patterns)
+    rows = board_rows(Store(root), given.patterns, given.output)
     if not rows:
         wanted = f" of {', '.join(given.patterns)}" if given.patterns else ""
         raise StoreError(f"no run{wanted} is on record in {root}")

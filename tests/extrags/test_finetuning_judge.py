@@ -124,6 +124,14 @@ def test_the_control_is_compared_frame_by_frame(tube: Tube, monkeypatch: pytest.
     assert found.amount == 0.3
 
 
+def test_a_scene_that_is_kept(tube: Tube) -> None:
+    """Real views alone change nothing of it, and the words say what was tried."""
+    found = judged(tube, None, FINETUNE.model_copy(update={"keep_scene": True}))
+    assert [trial.gain_db for trial in found.trials] == [0.0]
+    assert found.reason.startswith("the scene's own Gaussians stay as they are")
+    assert "rebuilt from frames" in found.reason
+
+
 def test_held_out_frames_are_not_looked_at(tube: Tube) -> None:
     sequence = tube.sequence
     test = np.setdiff1d(np.arange(len(sequence)), sequence.train)

@@ -15,7 +15,7 @@ from extrags.store import Store
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.outcome import SequenceOutcome
-from flows.recorded_runs import RecordedRun, board_rows, chosen_runs, run_names
+from flows.recorded_runs import RecordedRun, board_rows, chosen_runs, compared_run, last_runs, run_names
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
@@ -127,11 +127,47 @@ def test_both_pages_from_the_command_line(
     assert SEQUENCE in board.read_text(encoding="utf-8")
 
 
+def test_links_can_be_moved_with_the_folder_that_holds_page_and_store(store: Store) -> None:
+    """Relative where both are in one folder, else of this machine."""
+    folder = Path(store.root).parent / "pages #1"
+    links = {row.link for row in board_rows(store, target=str(folder / "board.html")) if row.link}
+    for link in links:
+        assert link.startswith("../store/artefacts/report-v")
+        assert (folder / link).resolve().is_file()
+    (apart,) = {row.link[:8] for row in board_rows(store, target="/board.html") if row.link}
+    assert apart == "file:///"
+    run = chosen_runs(store, [SEQUENCE])[0]
+    assert compared_run(store, run, "one", str(folder / "compared.html")).link in links
+    inside = compared_run(store, run, "one", f"{store.root}/here#/x.html").link
+    assert inside.startswith("../artefacts/")
+
+
+def test_the_last_run_of_each_sequence(store: Store) -> None:
+    last = chosen_runs(store, [SEQUENCE])[-1]
+    assert [run.report.key for run in last_runs(store)] == [last.report.key]
+    assert last_runs(store, ["c3vd/*"]) == []
+    assert last_runs(store, methods=["3dgs"]) == []
+
+
+def test_gallery_from_the_command_line(
+    store: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "gallery"
+    assert main(["gallery", "phantom/*", "--store", store.root, "--out", str(folder)]) == 0
+    assert capsys.readouterr().out.strip() == str(folder / "index.md")
+    text = (folder / "index.md").read_text(encoding="utf-8")
+    assert f"extrags run {SEQUENCE} --profile quick\nextrags gallery {SEQUENCE}\n" in text
+    assert str(tmp_path) not in text
+    assert "Virtual view" in text
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["compare", "phantom/7@sparse"], "0 finished runs on record"),
         (["compare", SEQUENCE, "--views", "0"], "--views 0: expected 1 or more"),
+        (["gallery", "c3vd/*"], "no finished run of c3vd/* is on record"),
+        (["gallery", "--kb", "0"], "--kb 0: expected 1 or more"),
         (["leaderboard", "c3vd/*"], "no run of c3vd/* is on record"),
     ],
 )

@@ -20,14 +20,18 @@ from extrags.raster.rendering import ALPHA_MIN, DILATION_PX2
 from extrags.report.inputs import MeshLike, ReportInputs
 from extrags.report.space import HELD_OUT_COLOR, clustered, trajectory_colors
 from extrags.report.viewer.encoding import BLOCK, EncodedScene, Quantity, encoded_scene
+from extrags.report.viewer.free_space import encoded_free_space
 from extrags.report.viewer.quantities import scene_quantities
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["ViewerContent", "encoded_within", "script_text", "viewer_content", "viewer_section"]
 
-SCRIPTS = ("camera.js", "decode.js", "renderer.js", "viewer.js", "controls.js", "compare.js", "start.js")
-SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "shape.vert", "shape.frag")
+SCRIPTS = (
+    "camera.js", "decode.js", "renderer.js", "free_space.js", "viewer.js", "controls.js", "compare.js",
+    "start.js",
+)  # fmt: skip
+SHADERS = ("splat.vert", "splat.frag", "screen.vert", "screen.frag", "shape.vert", "shape.frag", "slice.frag")
 SORTER = "sort.worker.js"
 TRAIN_COLOR = "#e9eef2"
 BASE64_SHARE = 4 / 3
@@ -45,7 +49,9 @@ class ViewerContent:
         scenes: `{name, title, count, said}` of each, for the words round the canvas.
         has_mesh: whether a surface is among the overlays.
         has_virtual: whether there are virtual trajectories.
+        has_free_space: whether the free space of the run is among the overlays.
         has_light: whether a scene has a light.
+        unit: of lengths.
         width: of the run's images in pixels.
         height: the same for the height.
     """
@@ -57,7 +63,9 @@ class ViewerContent:
     scenes: Sequence[Mapping[str, Any]]
     has_mesh: bool
     has_virtual: bool
+    has_free_space: bool
     has_light: bool
+    unit: str
     width: int
     height: int
 
@@ -103,11 +111,13 @@ def viewer_content(inputs: ReportInputs, largest_bytes: int) -> ViewerContent | 
         (scene.light.reference_distance for scene in scenes.values() if scene.light is not None),
         _typical_distance(inputs, scenes),
     )
+    unit = "mm" if sequence.metric else "units"
     data = {
         "scenes": headers,
         "groups": groups,
         "paths": paths,
         "mesh": None if inputs.mesh is None else _surface(inputs.mesh),
+        "free": None if inputs.grid is None else encoded_free_space(inputs.grid, unit),
         "width": sequence.width,
         "height": sequence.height,
         "near": min(scene.near for scene in scenes.values()),
@@ -123,7 +133,9 @@ def viewer_content(inputs: ReportInputs, largest_bytes: int) -> ViewerContent | 
         scenes=words,
         has_mesh=data["mesh"] is not None,
         has_virtual=bool(inputs.trajectories),
+        has_free_space=data["free"] is not None,
         has_light=any(scene.light is not None for scene in scenes.values()),
+        unit=unit,
         width=sequence.width,
         height=sequence.height,
     )

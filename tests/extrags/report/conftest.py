@@ -39,6 +39,7 @@ class Pseudo:
 @dataclass(frozen=True)
 class Grid:
     occupancy: np.ndarray
+    clearance: np.ndarray
     origin_mm: np.ndarray
     axes: np.ndarray
     voxel_mm: float
@@ -202,7 +203,8 @@ def tube_grid() -> Grid:
     _, y, z = np.meshgrid(center - 4, center - 24, center - 24, indexing="ij")
     radius = np.hypot(y, z)
     occupancy = np.where(radius < 9, 0, np.where(radius < 12, 1, 2))
-    return Grid(occupancy.astype(np.uint8), np.array([-4.0, -24.0, -24.0]), np.eye(3), voxel_mm)
+    clearance = (9 - radius).astype(np.float32)
+    return Grid(occupancy.astype(np.uint8), clearance, np.array([-4.0, -24.0, -24.0]), np.eye(3), voxel_mm)
 
 
 def tube_mesh() -> TubeMesh:

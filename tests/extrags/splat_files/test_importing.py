@@ -151,6 +151,9 @@ class TestPipeline:
         assert not config.coarse.light.enabled
         assert config.coarse.sh_degree == 3
         assert config.coarse.densify.max_gaussians == 70_000
+        assert config.finetune.keep_scene
         few = PipelineConfig().of_imported_scene(count=10, sh_degree=0, lit=True)
         assert few.coarse.light.enabled
+        trained = PipelineConfig().with_overrides({"imported.keep": False})
+        assert not trained.of_imported_scene(count=10, sh_degree=0, lit=True).finetune.keep_scene
         assert few.coarse.densify == PipelineConfig().coarse.densify

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -39,7 +40,12 @@ class TestRefused:
             (b"\x1f\x8b\x08\x00", "SPZ"),
             (packed(b"short"), "ends within its header"),
             (packed(bytes(16)), "wrong magic number"),
-            (packed(struct.pack("<4sIIBBBB", b"NGSP", 4, 1, 0, 12, 0, 0)), "SPZ of version 4"),
+            (
+                packed(struct.pack("<4sIIBBBB", b"NGSP", 4, 1, 0, 12, 0, 0)),
+                "SPZ of version 4; 2, 3 and 4",
+            ),
+            (struct.pack("<4sII20x", b"NGSP", 5, 1), "SPZ of version 5; 2, 3 and 4 are read"),
+            (b"NGSP", "ends within its header"),
             (packed(struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 4, 12, 0, 0)), "SH degree 4"),
             (packed(struct.pack("<4sIIBBBB", b"NGSP", 3, 2**31, 0, 12, 0, 0)), "2147483648 Gaussians"),
             (packed(struct.pack("<4sIIBBBB", b"NGSP", 3, 5, 0, 12, 0, 0) + bytes(9)), "truncated"),
@@ -110,3 +116,71 @@ class TestSpz:
         far = with_values(few, means=few.means * 1e6)
         with pytest.raises(SourceError, match="SPZ holds at most"):
             write_spz(far, tmp_path / "a.spz")
+
+
+def version_4(gaussians: Gaussians, folder: Path, extensions: bytes = b"") -> bytes:
+    """What `write_spz` writes, in the container of version 4."""
+    from numcodecs.zstd import compress
+
+    write_spz(gaussians, folder / "three.spz")
+    whole = gzip.decompress((folder / "three.spz").read_bytes())
+    _, _, count, degree, bits, *_ = struct.unpack("<4sIIBBBB", whole[:16])
+    sizes = [count * size for size in (9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)) if size]
+    ends = [16 + sum(sizes[:place]) for place in range(len(sizes) + 1)]
+    streams = [compress(whole[a:b], 3) for a, b in pairwise(ends)]
+    flags = 2 if extensions else 0
+    header = struct.pack(
+        "<4sIIBBBBI12x", b"NGSP", 4, count, degree, bits, flags, len(sizes), 32 + len(extensions)
+    )
+    table = b"".join(struct.pack("<QQ", len(s), size) for s, size in zip(streams, sizes, strict=True))
+    return header + extensions + table + b"".join(streams)
+
+
+class TestSpzVersion4:
+    @pytest.mark.parametrize("harmonics", [True, False])
+    def test_the_same_as_version_3(self, few: Gaussians, harmonics: bool, tmp_path: Path) -> None:
+        given = few if harmonics else with_values(few, shN=few.shN[:, :0])
+        (tmp_path / "four.spz").write_bytes(version_4(given, tmp_path))
+        found = read_splat_file(tmp_path / "four.spz").gaussians
+        for name, values in read_spz(tmp_path / "three.spz").parameters().items():
+            assert torch.equal(found.parameters()[name], values), name
+
+    def test_extensions(self, few: Gaussians, tmp_path: Path) -> None:
+        """Unknown ones are passed over; axes that are not the format's own are refused."""
+        unknown = struct.pack("<II3s", 0xADBE0002, 3, b"abc")
+        for number, message in ((4, None), (6, "axes are number 6"), (None, "extensions are damaged")):
+            axes = unknown[:-1] if number is None else struct.pack("<III", 0xADBE0003, 4, number)
+            (tmp_path / "four.spz").write_bytes(version_4(few, tmp_path, unknown + axes))
+            if message is None:
+                assert len(read_spz(tmp_path / "four.spz")) == len(few)
+            else:
+                with pytest.raises(SourceError, match=message):
+                    read_spz(tmp_path / "four.spz")
+
+    def test_damage(self, few: Gaussians, tmp_path: Path) -> None:
+        whole = version_4(few, tmp_path)
+        for length in range(4, len(whole), 41):
+            (tmp_path / "part.spz").write_bytes(whole[:length])
+            with pytest.raises(SourceError):
+                read_splat_file(tmp_path / "part.spz")
+        for count, message in ((len(few) + 1, "holds not the"), (2**31, "2147483648 Gaussians")):
+            (tmp_path / "part.spz").write_bytes(whole[:8] + struct.pack("<I", count) + whole[12:])
+            with pytest.raises(SourceError, match=message):
+                read_spz(tmp_path / "part.spz")
+        spoiled = whole[:15] + bytes([7]) + whole[16:]
+        (tmp_path / "part.spz").write_bytes(spoiled)
+        with pytest.raises(SourceError, match="streams"):
+            read_spz(tmp_path / "part.spz")
+
+    def test_a_stream_that_unpacks_to_more(self, few: Gaussians, tmp_path: Path) -> None:
+        from numcodecs.zstd import compress
+
+        whole = bytearray(version_4(few, tmp_path))
+        (first,) = struct.unpack_from("<Q", whole, 32)
+        streams = whole[15]
+        begin = 32 + 16 * streams
+        bomb = compress(bytes(10**6), 3)
+        struct.pack_into("<Q", whole, 32, len(bomb))
+        (tmp_path / "bomb.spz").write_bytes(bytes(whole[:begin]) + bomb + bytes(whole[begin + first :]))
+        with pytest.raises(SourceError, match="stream 1"):
+            read_spz(tmp_path / "bomb.spz")

@@ -349,3 +349,36 @@ class TestGrowth:
         for name, value in before.gaussians.parameters().items():
             assert torch.equal(scene.gaussians.parameters()[name], value), name
         assert not torch.equal(result.scene.gaussians.means[:N_GAUSSIANS], scene.gaussians.means)
+
+
+class TestKeptScene:
+    """With `keep_scene` new Gaussians alone are learned."""
+
+    def test_its_gaussians_and_its_light_stay(
+        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews
+    ) -> None:
+        holes = replace(pseudo, alpha=np.zeros_like(pseudo.alpha))
+        config = config_of("paper", growth=1.3, seed_holes=True, keep_scene=True)
+        seeds = prepared(scene, sequence, holes, config, COARSE).start.gaussians
+        result = finetune(scene, sequence, holes, config, COARSE)
+        found = result.scene.gaussians
+        assert len(found) == len(seeds) > N_GAUSSIANS
+        for name, values in scene.detached().gaussians.parameters().items():
+            assert torch.equal(found.parameters()[name][:N_GAUSSIANS], values), name
+        moved = found.sh0[N_GAUSSIANS:] - seeds.sh0.detach()[N_GAUSSIANS:]
+        assert moved.abs().max() > 1e-3
+        assert result.scene.light is not None
+        assert scene.light is not None
+        for name, values in scene.light.detached().parameters().items():
+            assert torch.equal(result.scene.light.parameters()[name], values), name
+
+    @pytest.mark.parametrize("virtual", [True, False])
+    def test_without_new_gaussians_nothing_is_done(
+        self, scene: Scene, sequence: EndoscopicSequence, pseudo: PseudoViews, virtual: bool
+    ) -> None:
+        """Real views alone would fit what is there; a scene without holes has nothing to learn."""
+        config = config_of("paper", seed_holes=False, keep_scene=True)
+        result = finetune(scene, sequence, pseudo if virtual else None, config, COARSE)
+        assert result.history == []
+        for name, values in scene.detached().gaussians.parameters().items():
+            assert torch.equal(result.scene.gaussians.parameters()[name], values), name

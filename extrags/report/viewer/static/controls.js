@@ -48,6 +48,8 @@ function connected(viewer) {
     const at = viewer.camera || viewer.lastCamera || { group: 0, index: -step };
     viewer.jump(at.group, at.index + step);
   };
+  const hasFree = Boolean(data.free), toggled = (what) => hasFree && viewer.show(what, !viewer.shown[what]);
+  const slid = (factor) => hasFree && viewer.setSlice(factor * viewer.sliceDepth);
   const keys = {
     ArrowLeft: () => viewer.orbit(-0.06, 0), ArrowRight: () => viewer.orbit(0.06, 0),
     ArrowUp: () => viewer.orbit(0, -0.06), ArrowDown: () => viewer.orbit(0, 0.06),
@@ -58,6 +60,8 @@ function connected(viewer) {
     j: () => viewer.look(-0.06, 0), l: () => viewer.look(0.06, 0),
     i: () => viewer.look(0, 0.06), k: () => viewer.look(0, -0.06),
     "+": () => viewer.move([0, 0, 0.06]), "-": () => viewer.move([0, 0, -0.06]),
+    f: () => toggled("free"), x: () => toggled("slice"),
+    "[": () => slid(1 / 1.1), "]": () => slid(1.1),
     n: () => neighbour(1), p: () => neighbour(-1), Home: () => viewer.jump(0, 0), " ": () => part("play").click(),
   };
   canvas.addEventListener("keydown", (event) => {
@@ -125,6 +129,13 @@ function connected(viewer) {
   root.querySelectorAll("[data-show]").forEach((input) => {
     input.addEventListener("change", () => viewer.show(input.dataset.show, input.checked));
   });
+  const cut = part("slice");
+  if (cut) {
+    cut.max = 4 * data.distance;
+    cut.step = data.distance / 100;
+    cut.addEventListener("input", () => viewer.setSlice(Number(cut.value)));
+    part("largest").textContent = `${data.free.largest.toPrecision(3)} ${data.free.unit}`;
+  }
   part("full").addEventListener("click", () => {
     if (document.fullscreenElement) document.exitFullscreen();
     else root.requestFullscreen();
@@ -135,7 +146,9 @@ function connected(viewer) {
     if (camera) viewer.lastCamera = camera;
     cameras.value = camera ? `${camera.group} ${camera.index}` : "";
     const where = camera ? `${data.groups[camera.group].title}, ${data.groups[camera.group].cameras[camera.index].name}` : "free view";
-    if (said.textContent !== where) said.textContent = where;
+    const over = [viewer.shown.free && "free space", viewer.shown.slice && `clearance at ${viewer.sliceDepth.toPrecision(3)} ${data.free.unit}`];
+    const told = [where, ...over.filter(Boolean)].join(", ");
+    if (said.textContent !== told) said.textContent = told;
     play.textContent = viewer.flight ? "Pause" : "Play";
     if (viewer.progress && Number(path.value) === viewer.progress.path && !camera) place.value = viewer.progress.at;
     sliders.forEach((input) => {
@@ -147,6 +160,12 @@ function connected(viewer) {
     });
     root.querySelectorAll('[name="scene"]').forEach((input) => { input.checked = input.value === viewer.name; });
     if (listed !== `${viewer.name} ${viewer.quantity}`) quantities();
+    root.querySelectorAll("[data-show]").forEach((input) => { input.checked = viewer.shown[input.dataset.show]; });
+    root.querySelectorAll("[data-legend]").forEach((item) => { item.hidden = !viewer.shown[item.dataset.legend]; });
+    if (cut) {
+      cut.value = viewer.sliceDepth;
+      cut.nextElementSibling.textContent = viewer.sliceDepth.toPrecision(3);
+    }
     part("lit").checked = light.on;
     part("lit").disabled = !viewer.scene.light;
     part("pinned").checked = Boolean(viewer.lampPose);

@@ -1,9 +1,12 @@
 // The encoded scene of the page as arrays: see extrags/report/viewer/encoding.py.
-async function decodedScene(header) {
-  const text = document.getElementById(header.element).textContent;
+async function inflated(text) {
   const packed = Uint8Array.from(atob(text.trim()), (letter) => letter.charCodeAt(0));
   const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
-  const raw = new Uint8Array(await new Response(stream).arrayBuffer());
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+}
+
+async function decodedScene(header) {
+  const raw = await inflated(document.getElementById(header.element).textContent);
   const n = header.count, blocks = Math.ceil(n / header.block);
   let at = 0;
   const take = (size) => raw.subarray(at, (at += size));

@@ -9,6 +9,7 @@ class Viewer {
     this.canvas = root.querySelector("canvas");
     this.renderer = new Renderer(this.canvas, shaders);
     this.worker = worker;
+    this.shaders = shaders;
     this.scenes = {};
     this.name = data.scenes[data.scenes.length - 1].name;
     this.camera = { group: 0, index: 0 };
@@ -17,8 +18,10 @@ class Viewer {
     this.light = null;
     this.lampPose = null;
     this.quantity = "";
-    this.shown = { train: false, held_out: false, virtual: false, mesh: false };
+    this.shown = { train: false, held_out: false, virtual: false, mesh: false, free: false, slice: false };
     this.shapes = {};
+    this.clearance = null;
+    this.sliceDepth = data.distance;
     this.native = false;
     this.sorting = false;
     this.wanted = true;
@@ -39,6 +42,11 @@ class Viewer {
       this.scenes[scene.name] = scene;
     }
     this.makeShapes();
+    if (this.data.free) {
+      const grid = await decodedFreeSpace(this.data.free), { corners, tints } = freeSpaceBoundary(grid);
+      this.shapes.free = this.renderer.makeShape(corners, tints, this.renderer.gl.TRIANGLES);
+      this.clearance = new ClearanceSlice(this.renderer, this.shaders, grid);
+    }
     this.canvas.addEventListener("webglcontextlost", (event) => event.preventDefault());
     this.canvas.addEventListener("webglcontextrestored", () => window.location.reload());
     new ResizeObserver(() => this.change()).observe(this.canvas);
@@ -87,6 +95,13 @@ class Viewer {
 
   show(what, on) {
     this.shown[what] = on;
+    return this.change();
+  }
+
+  // Where the slice of clearance lies: z-depth before the camera.
+  setSlice(depth) {
+    this.sliceDepth = Math.min(Math.max(depth, this.data.near), 4 * this.data.distance);
+    this.shown.slice = true;
     return this.change();
   }
 
@@ -248,6 +263,8 @@ class Viewer {
     const state = this.state(), { renderer } = this;
     renderer.drawSplats(this.scene, state);
     if (this.shown.mesh && this.shapes.mesh) renderer.drawShape(this.shapes.mesh, state, 0.6);
+    if (this.shown.free && this.shapes.free) renderer.drawShape(this.shapes.free, state, 0.55);
+    if (this.shown.slice && this.clearance) this.clearance.draw(this.pose, state, this.sliceDepth);
     this.data.groups.forEach((group, k) => {
       if (this.shown[group.kind]) renderer.drawShape(this.shapes[k], state, 0.9);
     });

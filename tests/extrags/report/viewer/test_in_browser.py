@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from extrags.cameras import pixel_rays
 from extrags.config import ReportConfig
 from extrags.report import ReportInputs, build_report
 from tests.browser import Browser, browser
@@ -151,7 +152,7 @@ def test_a_drawn_camera_can_be_clicked(tab: Browser) -> None:
     assert psnr(picture(tab), lines) < 45
 
 
-@pytest.mark.parametrize("what", ["mesh", "train", "virtual"])
+@pytest.mark.parametrize("what", ["mesh", "train", "virtual", "free", "slice"])
 def test_overlays_are_drawn(tab: Browser, what: str) -> None:
     do(tab, "jump(0, 2)")
     do(tab, "move([0, 0, -0.3])")
@@ -160,6 +161,45 @@ def test_overlays_are_drawn(tab: Browser, what: str) -> None:
     assert psnr(picture(tab), bare) < 50
     do(tab, f"show('{what}', false)")
     assert psnr(picture(tab), bare) > 60
+
+
+def test_the_slice_shows_clearance(tab: Browser, drawn: ReportInputs) -> None:
+    """It is drawn where the grid is free, in the colours of its clearance."""
+    do(tab, "jump(0, 2)")
+    bare = picture(tab)
+    do(tab, "setSlice(16.0)")
+    found = picture(tab)
+    camera = drawn.sequence.cameras[int(drawn.sequence.train[2])]
+    points = camera.centers[:, None, None] + 16.0 * pixel_rays(camera)
+    inside = np.hypot(points[0, ..., 1], points[0, ..., 2])
+    changed = np.abs(found - bare).max(-1) > 0.02
+    # The wall of the free voxels is blocky: nothing is asked within a voxel of it.
+    assert changed[inside < 7].mean() > 0.97
+    assert changed[inside > 11].mean() < 0.03
+    # From dark blue at the wall to yellow in the middle.
+    yellow = (found - bare)[..., 1] - (found - bare)[..., 2]
+    assert yellow[inside < 3].mean() > 0.1 + yellow[(inside > 5) & (inside < 7)].mean()
+    do(tab, "show('slice', false)")
+
+
+def test_free_space_by_keys(tab: Browser) -> None:
+    tab.run("document.querySelector('#viewer canvas').focus()")
+    legend = "!document.querySelector('#viewer [data-legend={}]').hidden"
+    for key, what in (("f", "free"), ("x", "slice")):
+        assert not tab.run(legend.format(what))
+        tab.key(key)
+        assert tab.run(legend.format(what))
+        assert tab.run(f"document.querySelector('#viewer [data-show={what}]').checked")
+    depth = tab.run(f"{VIEWER}.sliceDepth")
+    tab.key("]")
+    assert tab.run(f"{VIEWER}.sliceDepth") == pytest.approx(1.1 * depth)
+    assert "free space, clearance at" in tab.run(
+        "document.querySelector('#viewer [data-part=status]').textContent"
+    )
+    tab.key("f")
+    tab.key("x")
+    assert not tab.run(legend.format("free"))
+    do(tab, "change()")
 
 
 @pytest.mark.parametrize("name", ["observed", "directions", "uncertainty", "expected_error"])

@@ -1,0 +1,89 @@
+"""The gallery: which views, their figures, the files beside the page."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from extrags.errors import ConfigError
+from extrags.report import ReportInputs
+from extrags.report.gallery import GalleryRun, build_gallery
+
+
+@pytest.fixture(scope="module")
+def run(inputs: ReportInputs) -> GalleryRun:
+    return GalleryRun(
+        inputs.sequence,
+        {"coarse": inputs.coarse.rgb, "final": inputs.final.rgb},
+        {"coarse": inputs.coarse_metrics, "final": inputs.final_metrics},
+        method="extrags", profile="quick", pseudo=inputs.pseudo,
+    )  # fmt: skip
+
+
+def built(runs: list[GalleryRun], folder: Path, largest_bytes: int = 400_000) -> str:
+    page = build_gallery(runs, folder, title="Some", command="extrags gallery", largest_bytes=largest_bytes)
+    return page.read_text(encoding="utf-8")
+
+
+def test_every_image_is_there_with_words(run: GalleryRun, tmp_path: Path) -> None:
+    text = built([run], tmp_path)
+    images = re.findall(r"!\[(.+?)\]\((.+?)\)", text)
+    assert {file for _, file in images} == {file.name for file in tmp_path.glob("tube*")}
+    assert len(images) == 5 + 6
+    for alt, file in images:
+        assert len(alt) > 10
+        with Image.open(tmp_path / file) as image:
+            assert image.size == (48, 40)
+    heads = [line for line in text.splitlines() if line.startswith("| Truth")]
+    assert heads == ["| Truth | Coarse | Final | Never observed | Error, final |"]
+    widths = {line.count("|") for line in text.splitlines() if line.startswith("|")}
+    assert widths == {6, 7}
+
+
+def test_the_view_is_the_median_one(run: GalleryRun, tmp_path: Path) -> None:
+    """PSNR rises with the frame; frames 6 to 10 are held out."""
+    text = built([run], tmp_path)
+    assert "frame b_008" in text
+    assert "PSNR 20.00 dB" in text
+    assert "PSNR 22.50 dB" in text
+    assert "Means of 5 held-out views, coarse → final: PSNR 20.00 → 22.50 dB" in text
+    shown = np.asarray(Image.open(tmp_path / "tube_0_sparse_view_1.png"))
+    assert (shown == run.sequence.rgb[8]).all()
+
+
+def test_what_no_frame_saw_is_tinted(run: GalleryRun, tmp_path: Path) -> None:
+    built([run], tmp_path)
+    shown = np.asarray(Image.open(tmp_path / "tube_0_sparse_view_4.png")).astype(int)
+    tinted = shown[..., 0] > shown[..., 2] + 20
+    assert (tinted == ~run.sequence.observed[8]).all()
+
+
+def test_without_virtual_views_or_final_scene(run: GalleryRun, tmp_path: Path) -> None:
+    bare = replace(
+        run, pseudo=None, rgb={"coarse": run.rgb["coarse"]}, results={"coarse": run.results["coarse"]}
+    )
+    text = built([bare], tmp_path)
+    assert "Virtual view" not in text
+    assert "| Truth | Coarse | Never observed |" in text
+
+
+def test_the_images_keep_to_their_bound(run: GalleryRun, tmp_path: Path) -> None:
+    built([run], tmp_path, 70_000)
+    assert sum(file.stat().st_size for file in tmp_path.glob("tube*")) <= 70_000
+
+
+def test_no_runs(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="one run or more"):
+        built([], tmp_path)
+
+
+def test_names_end_no_cell(run: GalleryRun, tmp_path: Path) -> None:
+    names = tuple(f"a|b](x)<{k}" for k in range(11))
+    text = built([replace(run, sequence=replace(run.sequence, frame_names=names))], tmp_path)
+    assert "a b" in text
+    assert {line.count("|") for line in text.splitlines() if line.startswith("|")} == {6, 7}
