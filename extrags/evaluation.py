@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -66,6 +66,7 @@ def evaluate_renders(
     mesh: Mesh | None = None,
     true_surface: TrueSurface | None = None,
     lpips: LpipsByNet | None = None,
+    per_view: list[dict[str, Any]] | None = None,
 ) -> EvaluationResult:
     """Metrics of rendered held-out views, and of the surface where ground truth is known.
 
@@ -75,6 +76,7 @@ def evaluate_renders(
         mesh: the scene's surface (`extrags.metrics.surface.scene_surface`); None where it has none.
         true_surface: ground truth of the surface; None omits the surface metrics.
         lpips: LPIPS by backbone; None searches for the weights of the default backbones.
+        per_view: as `extrags.metrics.protocol.evaluate_views` takes it.
 
     Raises:
         ShapeError: when renders and frames differ in number or size.
@@ -90,6 +92,7 @@ def evaluate_renders(
         surface_reason="the sequence has no true depth"
         if sequence.true_depth_mm is None
         else "no true surface given",
+        per_view=per_view,
     )
 
 

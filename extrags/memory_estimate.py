@@ -145,6 +145,8 @@ def estimate_memory(
     restored = references + CLIP * CLIP_VIEWS * working + network + ENLARGED * CLIP_VIEWS * pixels
     if not explored or config.evaluate.restored == "none":
         restored = 0
+    # The views of all renders are measured together: coarse, final, restored.
+    stacks = 1 + ("finetune" not in leave_out) + (restored > 0)
     found: dict[StageName, float] = {
         "ingest": PROCESS + SEQUENCE * all_frames * pixels + DECODED * source,
         "poses": whole,
@@ -163,7 +165,7 @@ def estimate_memory(
         + steps
         + gaussian * config.finetune.growth * coarse_gaussians
         + PSEUDO_VIEW * views * working,
-        "evaluate": whole + rendered + max(metrics, restored),
+        "evaluate": whole + max(stacks * rendered + metrics, rendered + restored),
         "report": whole + 2 * rendered,
     }
     wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in leave_out]

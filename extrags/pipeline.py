@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from extrags.exploration import Exploration
     from extrags.finetuning_judge import Judgement
     from extrags.freespace import FreeSpace
-    from extrags.metrics.lpips import LpipsByNet
     from extrags.metrics.protocol import EvaluationResult, RenderedViews
     from extrags.metrics.surface import TrueSurface
     from extrags.pseudo_views import PseudoViews
@@ -531,6 +530,7 @@ class InMemoryPipeline(Pipeline):
         """`extrags.evaluation` of the coarse and the final scene."""
         from extrags.evaluation import evaluate_renders, render
         from extrags.metrics.lpips import available_lpips
+        from extrags.metrics.protocol import figures_per_view
         from extrags.metrics.surface import scene_surface
 
         lpips = available_lpips(self.config.evaluate)
@@ -552,26 +552,32 @@ class InMemoryPipeline(Pipeline):
                     self.result.renders[which] = render(scene, sequence, train_on=self.config.coarse.train_on)
                     if self.true_surface is not None:
                         meshes[which] = scene_surface(scene, sequence)
-            for which, renders in self.result.renders.items():
+            restored = self._restored_renders()
+            if restored is not None:
+                self.result.renders["restored"] = restored
+                # The surface is the scene's.
+                meshes["restored"] = meshes.get("final", meshes.get("coarse"))
+            renders = self.result.renders
+            found = figures_per_view(list(renders.values()), sequence, sequence.test, lpips)
+            for which, per_view in zip(renders, found, strict=True):
                 self.result.evaluations[which] = evaluate_renders(
-                    renders,
+                    renders[which],
                     sequence,
                     mesh=meshes.get(which),
                     true_surface=self.true_surface,
                     lpips=lpips,
+                    per_view=per_view,
                 )
-            self._evaluate_restored(meshes.get("final", meshes.get("coarse")), lpips)
         # Where nothing was fine-tuned, the coarse scene is the final one.
         self.result.evaluations.setdefault("final", self.result.evaluations["coarse"])
 
-    def _evaluate_restored(self, mesh: Mesh | None, lpips: LpipsByNet) -> None:
-        """The final scene's views once more, restored (`evaluate.restored`); the surface is the scene's."""
-        from extrags.evaluation import evaluate_renders
+    def _restored_renders(self) -> RenderedViews | None:
+        """The final scene's views once more, restored (`evaluate.restored`)."""
         from extrags.restoration.restored_renders import restored_renders
 
         if self._enhancer is None or self.config.evaluate.restored == "none":
-            return
-        views = self.result.renders["restored"] = restored_renders(
+            return None
+        return restored_renders(
             self.result.coarse,
             self.result.renders.get("final", self.result.renders["coarse"]),
             self.result.sequence,
@@ -579,9 +585,6 @@ class InMemoryPipeline(Pipeline):
             self._enhancer,
             self.config.enhance,
             textured=self.config.evaluate.restored == "textured",
-        )
-        self.result.evaluations["restored"] = evaluate_renders(
-            views, self.result.sequence, mesh=mesh, true_surface=self.true_surface, lpips=lpips
         )
 
     def report(self) -> None:

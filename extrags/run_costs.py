@@ -45,7 +45,7 @@ STAGE_TASKS: dict[str, tuple[str, ...]] = {
     "explore": ("explore",),
     "enhance": ("enhance-train", "enhance"),
     "finetune": ("finetune-judge", "finetune"),
-    "evaluate": ("evaluate-render", "evaluate-restore", "evaluate"),
+    "evaluate": ("evaluate-render", "evaluate-restore", "evaluate-views", "evaluate"),
     "report": ("report",),
 }
 """The tasks of each stage that are modelled. `explore` stands for all of its waves, `enhance` for the
@@ -67,7 +67,8 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
     "finetune": ("tuning", "tuning*pixels", "tuning*gaussians"),
     "evaluate-render": ("test", "test*pixels"),
     "evaluate-restore": ("test*pixels", "test*restored"),
-    "evaluate": ("one", "test", "test*pixels", "test*pixels*vgg"),
+    "evaluate-views": ("test*pixels*stacks", "test*pixels*vgg*passes"),
+    "evaluate": ("one",),
     "report": ("one", "frames*pixels"),
 }
 """Terms of the time of each task; others have a constant alone. Terms that records cannot tell apart (one
@@ -92,6 +93,7 @@ class Workload:
         config: settings of all stages.
         views: virtual views to restore; None takes the setting.
         width: of an image, in pixels; None: of one that is narrow enough to be restored as it is.
+        stacks: renders of the held-out frames that are measured together.
     """
 
     pixels: float | int
@@ -101,6 +103,7 @@ class Workload:
     config: PipelineConfig
     views: float | int | None = None
     width: float | int | None = None
+    stacks: int = 3
 
     def numbers(self) -> dict[str, float]:
         """By name in terms. Gaussians are the limit, which densification reaches in nearly every scene."""
@@ -124,6 +127,9 @@ class Workload:
             "tuning": float(config.finetune.iterations),
             # LPIPS with this backbone takes longer than all other metrics together.
             "vgg": float("vgg" in config.evaluate.lpips_nets),
+            "stacks": float(self.stacks),
+            # Of a network over a view: the frame once, each render as it is and aligned.
+            "passes": 1.0 + 2.0 * self.stacks,
         }
 
     def _restored_share(self) -> float:

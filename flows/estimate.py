@@ -21,7 +21,7 @@ EXPECTED_SECONDS: dict[StageName, dict[str, float]] = {
     "explore": {"explore": 25.0},
     "enhance": {"enhance-train": 15.0, "enhance-keyframes": 5.0, "enhance-restore": 35.0, "enhance": 4.0},
     "finetune": {"finetune-judge": 18.0, "finetune": 25.0},
-    "evaluate": {"evaluate-render": 8.0, "evaluate": 15.0},
+    "evaluate": {"evaluate-render": 8.0, "evaluate-views": 6.0, "evaluate": 3.0},
     "report": {"report": 8.0},
 }
 """How long the tasks of each stage take, in the order in which they run.

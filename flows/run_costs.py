@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from data_catalog import describe
@@ -123,13 +123,15 @@ def predict_run(
         pace = dict.fromkeys(model.time, probe_seconds() / model.probe_s)
     found: list[StageCost] = []
     unknown: list[str] = []
+    restored = int("enhance" in stages and work.config.evaluate.restored != "none")
+    work = replace(work, stacks=measured_scenes + restored)
     for stage in STAGES:
         if stage not in stages:
             continue
         if not any(task in model.time for task in STAGE_TASKS[stage]):
             unknown.append(stage)
             continue
-        repeats = _repeats(stage, stages, work, measured_scenes)
+        repeats = _repeats(stage, measured_scenes, restored)
         costs = [model.predict(task, work) for task in repeats if task in model.time]
         peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
         found.append(
@@ -145,14 +147,14 @@ def predict_run(
     return RunPrediction(found, source, len(processor), unknown)
 
 
-def _repeats(stage: str, stages: Collection[str], work: Workload, measured_scenes: int) -> dict[str, int]:
+def _repeats(stage: str, measured_scenes: int, restored: int) -> dict[str, int]:
     """How often each task of a stage runs; those that do not run are left out."""
     if stage != "evaluate":
         return dict.fromkeys(STAGE_TASKS[stage], 1)
-    restored = int("enhance" in stages and work.config.evaluate.restored != "none")
     found = {
         "evaluate-render": measured_scenes,
         "evaluate-restore": restored,
+        "evaluate-views": 1,
         "evaluate": measured_scenes + restored,
     }
     return {task: found[task] for task in STAGE_TASKS[stage] if found[task]}
@@ -280,8 +282,16 @@ def _workload(
         return None
     width, height, frames, train, test = (float(value or 0) for value in size)
     views = manifest.counts.get("views") if manifest.stage == "enhance" else None
+    stacks = manifest.counts.get("stacks")
     return Workload(
-        width * height, frames, train, test, _config(line, fallback), float(views) if views else None, width
+        width * height,
+        frames,
+        train,
+        test,
+        _config(line, fallback),
+        float(views) if views else None,
+        width,
+        int(stacks) if stacks else 1,
     )
 
 
@@ -307,7 +317,9 @@ def _config(line: list[Manifest], fallback: PipelineConfig) -> PipelineConfig:
             if isinstance(settings, dict) and group not in changed:
                 known = type(getattr(fallback, group)).model_fields
                 changed[group] = {name: value for name, value in settings.items() if name in known}
-    networks = next((item.config.get("lpips_digests") for item in line if item.stage == "evaluate"), None)
+    networks = next(
+        (item.config.get("lpips_digests") for item in line if item.stage.startswith("evaluate")), None
+    )
     if isinstance(networks, dict):
         nets = tuple(sorted(networks))
         fallback = fallback.model_copy(

@@ -35,7 +35,7 @@ from tasks.enhance import (
     train,
 )
 from tasks.enhance import keyed_settings as keyed_enhance_settings
-from tasks.evaluate import METRICS_FILE, measure, render
+from tasks.evaluate import METRICS_FILE, measure, measure_views, render
 from tasks.evaluate import restore as restore_renders
 from tasks.evaluate import restoring_settings as renders_settings
 from tasks.explore import branch, explore, merge, next_anchors, start
@@ -45,6 +45,7 @@ from tasks.ingest import ingest, training_frames
 from tasks.poses import estimating_settings, poses
 from tasks.progress import StageProgress, notify
 from tasks.report import PAGE, REPORT_PARTS, report
+from tasks.stage import stage_key
 from tasks.surface import surface
 from tasks.uc_nerf import render_uc_nerf, uc_nerf
 from tasks.weights import (
@@ -399,9 +400,7 @@ class SequenceRun(Pipeline):
                 "added": added_metrics(),
             }
             measured = renders + ([] if restored is None else [restored])
-            figures = self._run_tasks(
-                row, [Call(measure, {"renders": ref, "sequence": sequence, **settings}) for ref in measured]
-            )
+            figures = self._figures(row, measured, {"sequence": sequence, **settings})
             self.refs["renders_coarse"], self.refs["metrics_coarse"] = renders[0], figures[0]
             if "finetune" in self.refs:
                 self.refs["renders_final"], self.refs["metrics_final"] = renders[1], figures[1]
@@ -412,6 +411,24 @@ class SequenceRun(Pipeline):
                 self.refs["metrics_restored"] = measurements["restored"] = figures[-1]
             for which, ref in measurements.items():
                 self.outcome.metrics[which] = self.store.load_json(METRICS_FILE, ref)["metrics"]
+
+    def _figures(self, row: StageRow, renders: list[Ref], shared: dict[str, Any]) -> list[Ref]:
+        """Metrics of each of the renders; views of all that are not in the store are measured together."""
+        calls = [Call(measure, {"renders": ref, **shared}) for ref in renders]
+        refresh = getattr(self.runner, "refresh", False)
+        waiting = {
+            ref.digest: ref
+            for ref, call in zip(renders, calls, strict=True)
+            if refresh or self.store.find(stage_key(call.task, call.inputs)) is None
+        }
+        if waiting:
+            together = Call(measure_views, {"renders": list(waiting.values()), **shared})
+            views = self._run_task(row, together)
+            calls = [
+                Call(measure, {**call.inputs, "views": views if ref.digest in waiting else None})
+                for ref, call in zip(renders, calls, strict=True)
+            ]
+        return self._run_tasks(row, calls)
 
     def _restored_renders(self, row: StageRow, renders: Ref) -> Ref | None:
         """The final scene's held-out views, restored; None without a restorer."""

@@ -12,10 +12,12 @@ from tasks.enhance import RESTORER
 from tasks.stage import stage
 from tasks.weights import Weights, lpips_by_net
 
-__all__ = ["METRICS_FILE", "measure", "render", "restore", "restoring_settings"]
+__all__ = ["METRICS_FILE", "measure", "measure_views", "render", "restore", "restoring_settings"]
 
 METRICS_FILE = "metrics.json"
 """`EvaluationResult.to_json()`, per-view figures included."""
+VIEWS_FILE = "views.json"
+"""`EvaluationResult.per_view` by the digest of the renders."""
 
 
 @stage("evaluate-render", version=4)
@@ -92,8 +94,36 @@ def restore(
         slot.save(slot.load(Mesh, renders))
 
 
-# Metrics are a separate stage, so that a new version of the protocol does not repeat the rendering.
-@stage("evaluate", version=PROTOCOL_VERSION, ignore=("weights",))
+# Metrics are separate stages, so that a new version of the protocol does not repeat the rendering.
+@stage("evaluate-views", version=PROTOCOL_VERSION, ignore=("weights",))
+def measure_views(
+    slot: Slot,
+    renders: list[Ref],
+    sequence: Ref,
+    lpips_digests: dict[LpipsNet, str | None],
+    weights: list[Weights],
+    added: list[str],
+) -> None:
+    """Figures of each held-out view, of several stacks of renders at once; writes `views.json`.
+
+    LPIPS then looks at each frame once for all stacks. `lpips_digests` names the backbones of LPIPS with the
+    digests of their weights, None for missing ones. `added` names the metrics that a program has registered
+    beside the protocol's (`extrags.metrics.registry.added_metrics`).
+    """
+    from extrags.metrics.protocol import RenderedViews, figures_per_view
+    from extrags.sequence import EndoscopicSequence
+
+    _check_added(added)
+    frames = slot.load(EndoscopicSequence, sequence)
+    stacks = [slot.load(RenderedViews, ref) for ref in renders]
+    found = figures_per_view(stacks, frames, frames.test, lpips_by_net(weights))
+    by_digest = {ref.digest: views for ref, views in zip(renders, found, strict=True)}
+    slot.save_json(VIEWS_FILE, by_digest, indent=1)
+    slot.counts.update(stacks=len(by_digest), views=len(frames.test))
+
+
+# What the views have been measured to be follows from the renders: whether it was at hand is not in the key.
+@stage("evaluate", version=PROTOCOL_VERSION, ignore=("weights", "views"))
 def measure(
     slot: Slot,
     renders: Ref,
@@ -101,27 +131,22 @@ def measure(
     lpips_digests: dict[LpipsNet, str | None],
     weights: list[Weights],
     added: list[str],
+    views: Ref | None = None,
 ) -> None:
     """Metrics of rendered views and of the surface; writes `metrics.json`.
 
-    `lpips_digests` names the backbones of LPIPS with the digests of their weights, None for missing ones.
-    `added` names the metrics that a program has registered beside the protocol's
-    (`extrags.metrics.registry.added_metrics`).
+    `views` is what `measure_views` made of these renders among others; without it they are measured here. The
+    other arguments are those of `measure_views`.
     """
     from data_catalog.true_surface import true_surface
-    from extrags.errors import ConfigError
     from extrags.evaluation import evaluate_renders
     from extrags.metrics.comparison import figure_of
     from extrags.metrics.protocol import RenderedViews
-    from extrags.metrics.registry import added_metrics, figures, metric_named
+    from extrags.metrics.registry import figures, metric_named
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
 
-    if added != added_metrics():
-        raise ConfigError(
-            f"metrics to be measured beside the protocol's: {', '.join(added) or 'none'}; registered in this "
-            f"process: {', '.join(added_metrics()) or 'none'}. Register them in every process of the run"
-        )
+    _check_added(added)
     frames = slot.load(EndoscopicSequence, sequence)
     result = evaluate_renders(
         slot.load(RenderedViews, renders),
@@ -129,8 +154,20 @@ def measure(
         mesh=slot.load(Mesh, renders) if group_exists(slot.open(renders) / Mesh.stored_as) else None,
         true_surface=None if frames.true_depth_mm is None else true_surface(frames),
         lpips=lpips_by_net(weights),
+        per_view=None if views is None else slot.load_json(VIEWS_FILE, views)[renders.digest],
     )
     slot.save_json(METRICS_FILE, result.to_json(), indent=1)
     for figure in figures("counts"):
         if metric_named(figure.key).lpips_net is None or figure.key in result.metrics:
             slot.counts[figure.key] = figure_of(result.metrics, figure.name)
+
+
+def _check_added(added: list[str]) -> None:
+    from extrags.errors import ConfigError
+    from extrags.metrics.registry import added_metrics
+
+    if added != added_metrics():
+        raise ConfigError(
+            f"metrics to be measured beside the protocol's: {', '.join(added) or 'none'}; registered in this "
+            f"process: {', '.join(added_metrics()) or 'none'}. Register them in every process of the run"
+        )

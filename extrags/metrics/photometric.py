@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from functools import partial
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.errors import NonFiniteError, ShapeError
-from extrags.metrics.lpips import Lpips, LpipsByNet
+from extrags.metrics.lpips import Lpips, LpipsByNet, TargetActivations
 from extrags.metrics.registry import Metric
 
 __all__ = ["photometric_values"]
@@ -21,6 +22,7 @@ def photometric_values(
     regions: dict[str, Bool[Tensor, "n h w"]],
     metrics: Iterable[Metric],
     lpips: LpipsByNet | None,
+    targets: TargetActivations | None = None,
 ) -> dict[str, dict[str, list[float | None]]]:
     """Values of photometric metrics for each image inside each region.
 
@@ -30,6 +32,7 @@ def photometric_values(
         regions: pixels that count, by name.
         metrics: what to measure.
         lpips: LPIPS by backbone; None leaves it out.
+        targets: of `target`, where several renders are compared with it.
 
     Returns:
         By region and by key of the metric, one value per image; None where there is none. LPIPS has a key for
@@ -48,7 +51,9 @@ def photometric_values(
         measure = metric.measure
         if metric.lpips_net is not None:
             network = asked[metric.lpips_net]
-            measure = network.regional_distances if isinstance(network, Lpips) else None
+            measure = (
+                partial(network.regional_distances, targets=targets) if isinstance(network, Lpips) else None
+            )
         if measure is None:
             continue
         values = measure(render, target, regions)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, ClassVar
@@ -25,7 +26,7 @@ from extrags.events import Progress, emit
 from extrags.metrics.depth import depth_errors
 from extrags.metrics.exposure import align_exposure, exposure_gain
 from extrags.metrics.image import mean_of_known
-from extrags.metrics.lpips import LpipsByNet
+from extrags.metrics.lpips import LpipsByNet, TargetActivations
 from extrags.metrics.photometric import photometric_values
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.metrics.registry import metrics as registered_metrics
@@ -35,7 +36,7 @@ from extrags.store.storable import Storable
 from extrags.threads import in_threads
 from extrags.zarr_io import group_exists, new_group, open_group, read_array, write_frames
 
-__all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views"]
+__all__ = ["PROTOCOL_VERSION", "EvaluationResult", "RenderedViews", "evaluate_views", "figures_per_view"]
 
 logger = logging.getLogger(__name__)
 
@@ -152,6 +153,7 @@ def evaluate_views(
     *,
     surface: SurfaceResult | None = None,
     surface_reason: str = "no surface was given",
+    per_view: list[dict[str, Any]] | None = None,
 ) -> EvaluationResult:
     """Compare rendered views with the frames they show, by the protocol of this module.
 
@@ -164,6 +166,7 @@ def evaluate_views(
             without weights has the figure None, with its reason in `reasons`.
         surface: figures of the scene's surface, from `extrags.metrics.surface`.
         surface_reason: said in `reasons` when `surface` is None.
+        per_view: of these renders, where `figures_per_view` has measured them with others; None measures.
 
     Returns:
         Metrics per view and their means.
@@ -172,20 +175,8 @@ def evaluate_views(
         ShapeError: when renders and frames do not fit each other, or there are none.
         NonFiniteError: for NaN or infinity in the renders; names the frame.
     """
-    _check(renders, sequence, frames)
-    for net, network in ({} if lpips is None else lpips).items():
-        if isinstance(network, str):
-            logger.warning("%s: LPIPS with %s is not measured: %s", sequence.name, net, network)
-    at_once = max(1, _PIXELS_AT_ONCE // (sequence.height * sequence.width))
-    done = itertools.count(1)
-
-    def evaluated(start: int) -> list[dict[str, Any]]:
-        found = _evaluate_chunk(renders, sequence, frames, slice(start, start + at_once), lpips)
-        emit(Progress("evaluate", min(next(done) * at_once, len(frames)), len(frames)))
-        return found
-
-    # Each with one thread of torch: filters divided among several would add up in another order.
-    per_view = [view for part in in_threads(evaluated, range(0, len(frames), at_once)) for view in part]
+    if per_view is None:
+        (per_view,) = figures_per_view([renders], sequence, frames, lpips)
     metrics = _mean_tree([{k: v for k, v in view.items() if k not in ("frame", "name")} for view in per_view])
     metrics["n_gaussians"] = renders.n_gaussians
     metrics["surface"] = _NO_SURFACE if surface is None else surface.to_json()
@@ -198,6 +189,45 @@ def evaluate_views(
         reasons,
         true_surface=None if surface is None else surface.kind,
     )
+
+
+def figures_per_view(
+    stacks: Sequence[RenderedViews],
+    sequence: EndoscopicSequence,
+    frames: Int[np.ndarray, "v"],
+    lpips: LpipsByNet | None,
+) -> list[list[dict[str, Any]]]:
+    """`EvaluationResult.per_view` of several stacks of renders of the same frames.
+
+    LPIPS looks at each frame once for all of them. The figures are those of each stack alone, to the last
+    bit.
+
+    Args:
+        stacks: renders, each as `evaluate_views` takes them.
+        sequence: as there.
+        frames: as there.
+        lpips: as there.
+
+    Raises:
+        ShapeError: when renders and frames do not fit each other, or there are none.
+        NonFiniteError: for NaN or infinity in the renders; names the frame.
+    """
+    for renders in stacks:
+        _check(renders, sequence, frames)
+    for net, network in ({} if lpips is None else lpips).items():
+        if isinstance(network, str):
+            logger.warning("%s: LPIPS with %s is not measured: %s", sequence.name, net, network)
+    at_once = max(1, _PIXELS_AT_ONCE // (sequence.height * sequence.width))
+    done = itertools.count(1)
+
+    def evaluated(start: int) -> list[list[dict[str, Any]]]:
+        found = _evaluate_chunk(stacks, sequence, frames, slice(start, start + at_once), lpips)
+        emit(Progress("evaluate", min(next(done) * at_once, len(frames)), len(frames)))
+        return found
+
+    # Each with one thread of torch: filters divided among several would add up in another order.
+    parts = in_threads(evaluated, range(0, len(frames), at_once))
+    return [[view for part in parts for view in part[index]] for index in range(len(stacks))]
 
 
 def _check(renders: RenderedViews, sequence: EndoscopicSequence, frames: np.ndarray) -> None:
@@ -216,45 +246,84 @@ def _check(renders: RenderedViews, sequence: EndoscopicSequence, frames: np.ndar
 
 
 def _evaluate_chunk(
-    renders: RenderedViews,
+    stacks: Sequence[RenderedViews],
     sequence: EndoscopicSequence,
     frames: np.ndarray,
     part: slice,
     lpips: LpipsByNet | None,
-) -> list[dict[str, Any]]:
+) -> list[list[dict[str, Any]]]:
     chosen = frames[part]
-    render = torch.from_numpy(renders.rgb[part].astype(np.float32)).clamp(0, 1)
-    render = (render * COLOR_LEVELS).round() / COLOR_LEVELS
     target = torch.from_numpy(sequence.rgb[chosen].astype(np.float32) / 255)
     valid = torch.from_numpy(np.ascontiguousarray(sequence.mask[chosen]))
     parts, shares = _parts_of(sequence, chosen)
+    inside = valid[..., None].to(target.dtype)
+    renders = [_in_8_bits(stack.rgb[part]) for stack in stacks]
 
-    inside = valid[..., None].to(render.dtype)
     regions = {"valid": valid, **parts}
-    plain = _photometric(render * inside, target * inside, regions, lpips)
-    aligned = _photometric(align_exposure(render, target, valid) * inside, target * inside, regions, lpips)
-    gains = exposure_gain(render, target, valid)[:, 0].tolist()
-    full = bool(valid.all())
-    everything = {"whole": torch.ones_like(valid)}
-    whole = plain["valid"] if full else _photometric(render, target, everything, lpips)["whole"]
+    masked = target * inside
+    known = TargetActivations(masked)
+    plain = [_photometric(render * inside, masked, regions, lpips, known) for render in renders]
+    aligned = [
+        _photometric(align_exposure(render, target, valid) * inside, masked, regions, lpips, known)
+        for render in renders
+    ]
+    if bool(valid.all()):
+        whole = [found["valid"] for found in plain]
+    else:
+        everything = {"whole": torch.ones_like(valid)}
+        known = TargetActivations(target)
+        whole = [_photometric(render, target, everything, lpips, known)["whole"] for render in renders]
 
-    depth = np.where(renders.alpha[part] >= SURFACE_ALPHA, renders.depth_mm[part], 0)
-    views = []
-    for index, frame in enumerate(chosen):
-        view: dict[str, Any] = {"frame": int(frame), "name": sequence.frame_name(int(frame))}
-        view |= plain["valid"][index] | _depth_metrics(depth[index], sequence, int(frame), valid[index])
-        view["aligned"] = aligned["valid"][index] | {
-            "gain": gains[index] if bool(valid[index].any()) else None
-        }
-        for name, region in parts.items():
-            view[name] = (
-                plain[name][index]
-                | _depth_metrics(depth[index], sequence, int(frame), region[index])
-                | {"aligned": aligned[name][index], "pixel_share": shares[name][index]}
-            )
-        view["whole"] = whole[index]
-        views.append(view)
-    return views
+    found = []
+    for index, (stack, render) in enumerate(zip(stacks, renders, strict=True)):
+        gains = exposure_gain(render, target, valid)[:, 0].tolist()
+        depth = np.where(stack.alpha[part] >= SURFACE_ALPHA, stack.depth_mm[part], 0)
+        found.append(
+            [
+                _view(
+                    sequence,
+                    int(frame),
+                    depth[at],
+                    valid[at],
+                    {name: region[at] for name, region in parts.items()},
+                    {name: values[at] for name, values in plain[index].items()},
+                    {name: values[at] for name, values in aligned[index].items()},
+                    whole[index][at],
+                )
+                for at, frame in enumerate(chosen)
+            ]
+        )
+        for at, view in enumerate(found[-1]):
+            view["aligned"]["gain"] = gains[at] if bool(valid[at].any()) else None
+            for name in parts:
+                view[name]["pixel_share"] = shares[name][at]
+    return found
+
+
+def _in_8_bits(rgb: np.ndarray) -> Float[Tensor, "n h w 3"]:
+    render = torch.from_numpy(rgb.astype(np.float32)).clamp(0, 1)
+    return (render * COLOR_LEVELS).round() / COLOR_LEVELS
+
+
+def _view(
+    sequence: EndoscopicSequence,
+    frame: int,
+    depth: np.ndarray,
+    valid: Tensor,
+    parts: dict[str, Tensor],
+    plain: dict[str, dict[str, Any]],
+    aligned: dict[str, dict[str, Any]],
+    whole: dict[str, Any],
+) -> dict[str, Any]:
+    """The figures of one view, group by group."""
+    view: dict[str, Any] = {"frame": frame, "name": sequence.frame_name(frame)}
+    view |= plain["valid"] | _depth_metrics(depth, sequence, frame, valid)
+    view["aligned"] = dict(aligned["valid"])
+    for name, region in parts.items():
+        depths = _depth_metrics(depth, sequence, frame, region)
+        view[name] = plain[name] | depths | {"aligned": aligned[name]}
+    view["whole"] = whole
+    return view
 
 
 def _parts_of(
@@ -285,9 +354,10 @@ def _photometric(
     target: Float[Tensor, "n h w 3"],
     regions: dict[str, Tensor],
     lpips: LpipsByNet | None,
+    known: TargetActivations,
 ) -> dict[str, list[dict[str, Any]]]:
     """Photometric figures of each image inside each region."""
-    found = photometric_values(render, target, regions, registered_metrics("photometric"), lpips)
+    found = photometric_values(render, target, regions, registered_metrics("photometric"), lpips, known)
     return {
         name: [{key: values[index] for key, values in columns.items()} for index in range(len(render))]
         for name, columns in found.items()

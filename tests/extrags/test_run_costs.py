@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,9 +92,17 @@ class TestPackaged:
     def test_more_work_costs_more(self) -> None:
         model = packaged_model()
         small, large = work(20_000, frames=20), work(200_000, 3000, 40_000, frames=60)
-        for task in ("ingest", "coarse", "enhance", "evaluate"):
+        for task in ("ingest", "coarse", "enhance", "evaluate-views"):
             assert model.predict(task, large).seconds > model.predict(task, small).seconds
         assert model.probe_s > 0
+
+    def test_renders_that_are_measured_together_share_the_frames(self) -> None:
+        model = packaged_model()
+        item = replace(work(20_000), config=profile_config("balanced"))
+        alone, together = (
+            model.predict("evaluate-views", replace(item, stacks=stacks)).seconds for stacks in (1, 3)
+        )
+        assert 2 * alone < together < 2.6 * alone
 
     def test_knows_the_tasks_of_the_stages(self) -> None:
         known = {task for tasks in STAGE_TASKS.values() for task in tasks}

@@ -64,6 +64,10 @@ class RecordedRun:
             self.plans[ref.uri] = made
         return ref
 
+    def find(self, key: str) -> Ref | None:
+        """Nothing is there."""
+        return None
+
     def manifest(self, ref: Ref) -> Manifest:
         """One for all."""
         # One wave of two branches.

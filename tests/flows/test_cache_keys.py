@@ -34,8 +34,16 @@ from tests.flows.tiny import SEQUENCE, tiny_config
 SETTINGS = settings_of(PipelineConfig)
 
 FOLLOWS = {
-    "ingest": ["poses", "training-frames", "evaluate-render", "uc-nerf-render", "evaluate", "report"],
-    "poses": ["training-frames", "evaluate-render", "uc-nerf-render", "evaluate", "report"],
+    "ingest": [
+        "poses",
+        "training-frames",
+        "evaluate-render",
+        "uc-nerf-render",
+        "evaluate-views",
+        "evaluate",
+        "report",
+    ],
+    "poses": ["training-frames", "evaluate-render", "uc-nerf-render", "evaluate-views", "evaluate", "report"],
     "training-frames": ["depth", "depth-frames", "coarse", "uc-nerf", "after-coarse"],
     "depth": ["depth-frames", "report"],
     "depth-frames": ["coarse", "uc-nerf", "after-coarse"],
@@ -71,9 +79,10 @@ FOLLOWS = {
     # Of the judgement only the amount that is kept counts later.
     "finetune-judge": [],
     "finetune": ["evaluate-render", "report"],
-    "evaluate-render": ["evaluate-restore", "evaluate", "report"],
-    "evaluate-restore": ["evaluate", "report"],
-    "uc-nerf-render": ["evaluate", "report"],
+    "evaluate-render": ["evaluate-restore", "evaluate-views", "evaluate", "report"],
+    "evaluate-restore": ["evaluate-views", "evaluate", "report"],
+    "uc-nerf-render": ["evaluate-views", "evaluate", "report"],
+    "evaluate-views": [],
     "evaluate": ["report"],
     "report": [],
 }
@@ -128,7 +137,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "finetune.iterations": ("plan", "finetune-judge", "finetune"),
     "finetune.*": ("finetune-judge", "finetune"),
     "evaluate.restored": ("evaluate-restore",),
-    "evaluate.lpips_nets": ("evaluate",),
+    "evaluate.lpips_nets": ("evaluate-views", "evaluate"),
     "evaluate.lpips_weights": (),  # By content, below.
     "report.*": (),
 }
@@ -322,7 +331,7 @@ def test_the_oracle_is_another_reconstruction() -> None:
     before = recorded_keys(SEQUENCE, BASE, has_poses=True, has_depth=True, leave_out=left_out)
     oracle = BASE.with_overrides({"coarse.train_on": "all"})
     after = recorded_keys(SEQUENCE, oracle, has_poses=True, has_depth=True, leave_out=left_out)
-    assert changed(before, after) == {"coarse", "evaluate-render", "evaluate", "report"}
+    assert changed(before, after) == {"coarse", "evaluate-render", "evaluate-views", "evaluate", "report"}
 
 
 class TestContent:

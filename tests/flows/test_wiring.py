@@ -123,7 +123,11 @@ def test_control_on_real_views_alone(finished: tuple[str, SequenceOutcome]) -> N
     left_out = dict.fromkeys(("surface", "freespace", "explore", "enhance"), "control")
     runner = DirectRunner(store)
     config = tiny_config(finetune__iterations=21)
+    before = {item.key for item in Store(store).ls("evaluate-views")}
     outcome = run_sequence(SEQUENCE, config, store, runner, until="evaluate", leave_out=left_out)
+    # The coarse scene's views have been measured: only the new scene's are.
+    (added,) = (item for item in Store(store).ls("evaluate-views") if item.key not in before)
+    assert added.counts["stacks"] == 1
     assert states(outcome)["explore"] == "skipped"
     assert states(outcome)["finetune"] == "ran"
     assert outcome.digests["finetune"] != first.digests["finetune"]

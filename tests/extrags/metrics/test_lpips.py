@@ -12,8 +12,9 @@ from jaxtyping import TypeCheckError
 
 from extrags.config import EvaluateConfig, LpipsNet
 from extrags.errors import ConfigError, ShapeError, WeightsError
+from extrags.metrics import lpips as lpips_module
 from extrags.metrics import lpips_weights as weights_module
-from extrags.metrics.lpips import Lpips, available_lpips
+from extrags.metrics.lpips import Lpips, TargetActivations, available_lpips
 from extrags.metrics.lpips_weights import WEIGHTS_VARIABLE, download_backbone, find_weights, read_weights
 from tests.extrags.random_lpips import random_weights
 
@@ -103,6 +104,30 @@ def test_regions(alex: Lpips) -> None:
     assert halves["left"][0] is not None
     assert halves["right"][0] is not None
     assert halves["left"][0] > 3 * halves["right"][0]
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg"])
+def test_kept_activations_of_the_targets_change_no_bit(net: LpipsNet) -> None:
+    lpips = Lpips(net, random_weights(net))
+    target, first = random_pair(2, 64, 80)
+    regions = {
+        "all": torch.ones(2, 64, 80, dtype=torch.bool),
+        "left": torch.zeros(2, 64, 80, dtype=torch.bool),
+    }
+    regions["left"][:, :, :40] = True
+    kept = TargetActivations(target)
+    for render in (first, 0.5 * first, target):
+        alone = lpips.regional_distances(render, target, regions)
+        assert lpips.regional_distances(render, target, regions, kept) == alone
+    assert alone == {"all": [0, 0], "left": [0, 0]}
+
+
+def test_differences_in_parts_are_those_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    lpips = Lpips("alex", random_weights("alex"))
+    first, second = random_pair(2, 64, 80)
+    whole = lpips.distance_map(first, second)
+    monkeypatch.setattr(lpips_module, "_VALUES_AT_ONCE", 7000)
+    torch.testing.assert_close(lpips.distance_map(first, second), whole, atol=1e-6, rtol=1e-5)
 
 
 def test_batches_longer_than_a_chunk_change_nothing(alex: Lpips) -> None:

@@ -16,10 +16,17 @@ from extrags.events import Event, subscribed
 from extrags.metrics import protocol
 from extrags.metrics.image import psnr
 from extrags.metrics.lpips import Lpips
-from extrags.metrics.protocol import PROTOCOL_VERSION, EvaluationResult, RenderedViews, evaluate_views
+from extrags.metrics.protocol import (
+    PROTOCOL_VERSION,
+    EvaluationResult,
+    RenderedViews,
+    evaluate_views,
+    figures_per_view,
+)
 from extrags.metrics.surface import SurfaceErrors, SurfaceResult
 from extrags.raster import native
 from extrags.sequence import EndoscopicSequence, Split
+from tests.extrags.random_lpips import random_weights
 
 FRAMES, HEIGHT, WIDTH = 5, 48, 64
 TEST = np.array([1, 3])
@@ -85,6 +92,31 @@ def test_stable_keys_and_json(sequence: EndoscopicSequence) -> None:
     assert tree["true_surface"] is None
     assert [view["name"] for view in tree["per_view"]] == ["0001", "0003"]
     assert tree["n_views"] == 2
+
+
+def test_several_stacks_at_once_have_the_figures_of_each_alone(
+    sequence: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    network = Lpips("alex", random_weights("alex"))
+    clean = renders_of(sequence, TEST)
+    dark = replace(clean, rgb=0.7 * clean.rgb, depth_mm=1.1 * clean.depth_mm)
+    alone = [evaluate_views(renders, sequence, TEST, {"alex": network}) for renders in (clean, dark)]
+    assert alone[1].metrics["lpips_alex"] > alone[1].metrics["aligned"]["lpips_alex"]
+    seen = 0
+    activations = Lpips.activations
+
+    def counted(lpips: Lpips, images: torch.Tensor) -> object:
+        nonlocal seen
+        seen += len(images)
+        return activations(lpips, images)
+
+    monkeypatch.setattr(Lpips, "activations", counted)
+    together = figures_per_view([clean, dark], sequence, TEST, {"alex": network})
+    assert together == [result.per_view for result in alone]
+    # Per frame: the target inside the mask and whole; of both stacks plain, aligned and whole.
+    assert seen == len(TEST) * (2 + 2 * 3)
+    again = evaluate_views(dark, sequence, TEST, {"alex": network}, per_view=together[1])
+    assert again == alone[1]
 
 
 def test_masked_out_pixels_do_not_count(sequence: EndoscopicSequence) -> None:
