@@ -6,6 +6,7 @@ them, splits them, reads their pixels, undoes lenses, shrinks, masks, and checks
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,10 +26,13 @@ from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
 from extrags.lens import Lens
+from extrags.radial_lens import RadialLens
 from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["MaskFinder", "PosedFrame", "SourceFrames", "assembled"]
 
+
+logger = logging.getLogger(__name__)
 
 _EXACT_POSE = 1e-14
 
@@ -166,11 +170,14 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     rgb, mask = np.stack(pixels.colours), pixels.masks(kept)
     if source.intrinsics == "guessed":
         K = fitted_to_picture(K, mask)
+    lens = pixels.lens(kept, source.pose_file)
     depth_mm = np.stack(pixels.depths) if pixels.depths else None
     observed = None
     if world_from_camera is not None:
-        cameras = Cameras(K, world_from_camera, rgb.shape[2], rgb.shape[1])
+        cameras = Cameras(K, world_from_camera, rgb.shape[2], rgb.shape[1], lens)
         observed = source.observed(cameras, mask, depth_mm, split)
+    used = np.mean([(pixels.samplings[f.lens].source_share * m).sum() for f, m in zip(kept, mask, strict=True)])
+    logger.info("%s: %.1f %% of the source's pixels are used, in the mean over its frames", name, 100 * used)
     sequence = EndoscopicSequence(
         name=name,
         rgb=rgb,
@@ -186,6 +193,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         points=source.points,
         points_rgb=source.points_rgb,
         intrinsics=source.intrinsics,
+        lens=lens,
     )
     return sequence if source.truth is None else replace(sequence, truth=source.truth(sequence))
 
@@ -221,6 +229,22 @@ class _Pixels:
             check_depth(depth, frame=frame.label, file=frame.depth_file)
             _check_size(depth, frame, frame.depth_file, "depth", None)
             self.depths.append(sampling.depth(depth, file=frame.depth_file, frame=frame.label))
+
+    def lens(self, frames: Sequence[PosedFrame], file: Path) -> RadialLens | None:
+        """The lens of all frames that were read; None for pinholes.
+
+        Raises:
+            SourceError: when frames have several.
+        """
+        found = {self.samplings[frame.lens].radial_lens for frame in frames}
+        if len(found) != 1:
+            raise SourceError(
+                f"the frames have {len(found)} lenses, and sequences that keep their pixels have one; take "
+                "ingest.lens=pinhole",
+                file=file,
+                field="lens",
+            )
+        return found.pop()
 
     def masks(self, frames: Sequence[PosedFrame]) -> Bool[np.ndarray, "f h w"]:
         """Masks of all frames, once they were read."""
