@@ -176,7 +176,9 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     if world_from_camera is not None:
         cameras = Cameras(K, world_from_camera, rgb.shape[2], rgb.shape[1], lens)
         observed = source.observed(cameras, mask, depth_mm, split)
-    used = np.mean([(pixels.samplings[f.lens].source_share * m).sum() for f, m in zip(kept, mask, strict=True)])
+    used = np.mean(
+        [(pixels.samplings[f.lens].source_share * m).sum() for f, m in zip(kept, mask, strict=True)]
+    )
     logger.info("%s: %.1f %% of the source's pixels are used, in the mean over its frames", name, 100 * used)
     sequence = EndoscopicSequence(
         name=name,

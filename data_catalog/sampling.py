@@ -175,12 +175,14 @@ class LensSampling:
             SourceError: when the model is too far from the lens, or frames have several lenses.
         """
         if config.field_of_view_deg is not None:
-            raise ConfigError("ingest.lens=native keeps the lens's own field: leave ingest.field_of_view_deg out")
+            raise ConfigError(
+                "ingest.lens=native keeps the lens's own field: leave ingest.field_of_view_deg out"
+            )
         found = fit()
         scale = resampling.width / resampling.crop_width
         logger.info(
-            "lens kept up to %.1f degrees from its axis: the radial model is at most %.2f px from the source's, "
-            "%.2f px in the root mean square",
+            "lens kept up to %.1f degrees from its axis: the radial model is at most %.2f px from the "
+            "source's, %.2f px in the root mean square",
             np.degrees(found.lens.max_angle_rad),
             found.error_px * scale,
             found.rms_px * scale,
@@ -245,7 +247,7 @@ class LensSampling:
         shrunk = self.resampling.mask(straight, file=file, frame=frame)
         if self.radial_lens is None:
             return shrunk
-        return shrunk & field_mask(self.K, self.radial_lens, self.width, self.height)
+        return np.asarray(shrunk & field_mask(self.K, self.radial_lens, self.width, self.height))
 
     def depth(
         self, depth: Float[np.ndarray, "h w"], *, file: object = None, frame: object = None
@@ -262,4 +264,4 @@ class LensSampling:
 def source_areas(u: Float[np.ndarray, "h w"], v: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Area in source pixels of each pixel that is looked up at (u, v); 0 where that is unknown."""
     (u_down, u_right), (v_down, v_right) = np.gradient(u), np.gradient(v)
-    return np.nan_to_num(np.abs(u_right * v_down - u_down * v_right))
+    return np.asarray(np.nan_to_num(np.abs(u_right * v_down - u_down * v_right)))

@@ -383,13 +383,17 @@ def _undistorted(
     """Rays (X / Z, Y / Z) of image positions; cameras of the same intrinsics share the work."""
     if cameras.lens is None:
         return x, y
-    _, first, which = np.unique(cameras.K.reshape(len(cameras), 9), axis=0, return_index=True, return_inverse=True)
+    _, first, which = np.unique(
+        cameras.K.reshape(len(cameras), 9), axis=0, return_index=True, return_inverse=True
+    )
     found_x, found_y = cameras.lens.undistorted(x[first], y[first])
     which = which.reshape(-1)
     return found_x[which], found_y[which]
 
 
-def field_mask(K: Float[np.ndarray, "3 3"], lens: RadialLens, width: int, height: int) -> Bool[np.ndarray, "h w"]:
+def field_mask(
+    K: Float[np.ndarray, "3 3"], lens: RadialLens, width: int, height: int
+) -> Bool[np.ndarray, "h w"]:
     """Pixels of which all four corners lie inside the field of view of a lens.
 
     Args:

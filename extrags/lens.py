@@ -20,7 +20,14 @@ from jaxtyping import Bool, Float, UInt8
 from extrags.errors import SourceError
 from extrags.radial_lens import LARGEST_ANGLE_RAD, LensFit, RadialLens, fitted_lens
 
-__all__ = ["LENS_PARAMETERS", "Lens", "Undistortion", "distortion_of_pinhole", "sample_depth", "size_for_focal"]
+__all__ = [
+    "LENS_PARAMETERS",
+    "Lens",
+    "Undistortion",
+    "distortion_of_pinhole",
+    "sample_depth",
+    "size_for_focal",
+]
 
 LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),

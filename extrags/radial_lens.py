@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 LARGEST_ANGLE_RAD = float(np.radians(85))
-"""Largest field angle that is kept: z-depth vanishes at 90 degrees, and with it all that is measured by it."""
+"""Largest field angle that is kept: z-depth vanishes at 90 degrees, and all that is measured by it."""
 
 VIRTUAL_FIELD_DEG = 100.0
 """Horizontal field of view of virtual cameras, where the frames' lens shows that much."""
@@ -83,8 +83,8 @@ class RadialLens:
             )
         if not 0 < self.max_angle_rad <= LARGEST_ANGLE_RAD + 1e-9:
             raise SourceError(
-                f"the lens reaches {np.degrees(self.max_angle_rad):.1f} degrees from its axis; expected above 0 "
-                f"and at most {np.degrees(LARGEST_ANGLE_RAD):.0f}",
+                f"the lens reaches {np.degrees(self.max_angle_rad):.1f} degrees from its axis; expected more "
+                f"than 0 and at most {np.degrees(LARGEST_ANGLE_RAD):.0f}",
                 field="lens",
             )
         angle = np.linspace(0, self.linear_from_rad, 512)
@@ -107,7 +107,7 @@ class RadialLens:
         return min(self.max_angle_rad + MARGIN_RAD, LARGEST_PROJECTED_RAD)
 
     def _polynomial(self, angle: Any) -> tuple[Any, Any]:
-        """r and its derivative, by the polynomial alone."""
+        """R and its derivative, by the polynomial alone."""
         k1, k2, k3, k4 = self.coefficients
         square = np.square(angle)
         radius = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
@@ -122,11 +122,11 @@ class RadialLens:
 
     @cached_property
     def max_radius(self) -> float:
-        """r at the end of the field of view."""
+        """R at the end of the field of view."""
         return float(self.radius(np.array(self.max_angle_rad)))
 
     def angle(self, radius: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
-        """theta of r: the inverse of `radius`, by Newton's method from a table; at most 88 degrees."""
+        """Theta of r: the inverse of `radius`, by Newton's method from a table; at most 88 degrees."""
         angle_table = np.linspace(0, LARGEST_PROJECTED_RAD, _TABLE_SIZE)
         radius_table = self.radius(angle_table)
         angle = np.interp(radius, radius_table, angle_table)
@@ -232,7 +232,8 @@ class LensFit:
 
 def fitted_lens(
     project: Callable[
-        [Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]], tuple[Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]]
+        [Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]],
+        tuple[Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]],
     ],
     K: Float[np.ndarray, "3 3"],
     width: int,

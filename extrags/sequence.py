@@ -306,9 +306,7 @@ class EndoscopicSequence(Storable):
             return self
         K, which = np.unique(self.K.reshape(len(self), 9), axis=0, return_inverse=True)
         plans = [
-            Undistortion.of_radial(
-                one.reshape(3, 3), self.lens, self.width, self.height, field_of_view_deg
-            )
+            Undistortion.of_radial(one.reshape(3, 3), self.lens, self.width, self.height, field_of_view_deg)
             for one in K
         ]
         plan = [plans[index] for index in which.reshape(-1)]

@@ -241,9 +241,7 @@ def _through_lens(
     assert lens is not None
     parts: list[list[np.ndarray]] = [[], []]
     for index in range(len(sequence)):
-        back = distortion_of_pinhole(
-            sequence.K[index], lens, flat.K[index], sequence.width, sequence.height
-        )
+        back = distortion_of_pinhole(sequence.K[index], lens, flat.K[index], sequence.width, sequence.height)
         known = sequence.mask[index] & (back.depth(flat.mask[index].astype(np.float32)) > 0)
         for part, image in zip(parts, (estimate.depth, estimate.expected_error), strict=True):
             part.append(np.where(known, back.depth(image[index]), 0).astype(np.float32))

@@ -110,7 +110,7 @@ def rasterize(
         MissingDependencyError: when the chosen backend is not installed.
 
     Source: Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023; Ye et al., gsplat, JMLR 2025. Lens: Zwicker et
-    al., "EWA splatting", TVCG 2002, with the Jacobian of Kannala and Brandt's model, PAMI 2006.
+    al., "EWA volume splatting", 2001, with the Jacobian of Kannala and Brandt's model, PAMI 2006.
     """
     packed = None if light is None else light.packed()
     inputs = RasterInputs(

@@ -28,8 +28,8 @@ def rasterize_gsplat(inputs: RasterInputs, options: RasterOptions) -> Rendering:
     """
     if options.lens is not None:
         raise ConfigError(
-            "the backend gsplat renders pinholes here, not the lens of the frames: take ingest.lens=pinhole, or "
-            "render on the processor"
+            "the backend gsplat renders pinholes here, not the lens of the frames: take ingest.lens=pinhole, "
+            "or render on the processor"
         )
     import gsplat
 

@@ -1,13 +1,15 @@
 r"""Projection through a radial lens and its Jacobian, in torch: the specification of the kernels.
 
 With the slopes :math:`a = x/z`, :math:`b = y/z`, :math:`w = a^2 + b^2 = \tan^2\theta` and the gain
-:math:`G(w) = r(\theta) / \tan\theta`, a centre falls on :math:`u = f_x G a + c_x`, :math:`v = f_y G b + c_y`, and
+:math:`G(w) = r(\theta) / \tan\theta`, a centre falls on :math:`u = f_x G a + c_x`,
+:math:`v = f_y G b + c_y`, and
 
 .. math::
     J = \begin{pmatrix} f_x (G + 2 a^2 G') & 2 f_x a b G' \\ 2 f_y a b G' & f_y (G + 2 b^2 G') \end{pmatrix}
         \begin{pmatrix} 1/z & 0 & -a/z \\ 0 & 1/z & -b/z \end{pmatrix} .
 
-Source: Zwicker et al., "EWA splatting", TVCG 2002; Kannala and Brandt, PAMI 2006.
+Source: Zwicker et al., "EWA volume splatting", 2001; Kannala and Brandt, "A generic camera model and
+calibration method for conventional, wide-angle and fish-eye lenses", PAMI 2006.
 """
 
 from __future__ import annotations
@@ -32,9 +34,7 @@ def within_lens(
     return (z.detach() > 0) & (a.square() + b.square() <= limit)
 
 
-def lens_gain(
-    square: Float[Tensor, "n"], lens: RadialLens
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+def lens_gain(square: Float[Tensor, "n"], lens: RadialLens) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
     """G and its derivative by w, both differentiable.
 
     Args:

@@ -128,12 +128,12 @@ def _through_pinholes(
     plans = [
         Undistortion.of_radial(K, lens, width, height, WIDE_FIELD_DEG) for K in sequence.K[sequence.test]
     ]
+
+    def flattened(images: np.ndarray) -> np.ndarray:
+        return np.stack([plan.image(image) for plan, image in zip(plans, images, strict=True)])
+
     flat = RenderedViews(
-        *(
-            np.stack([plan.image(image) for plan, image in zip(plans, images, strict=True)])
-            for images in (renders.rgb, renders.alpha, renders.depth_mm)
-        ),
-        renders.n_gaussians,
+        flattened(renders.rgb), flattened(renders.alpha), flattened(renders.depth_mm), renders.n_gaussians
     )
     restored = restored_renders(
         coarse,

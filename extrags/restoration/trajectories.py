@@ -68,7 +68,9 @@ def at_working_size(
         config: the settings.
     """
     width = config.working_width(sequence.width)
-    return sequence.as_pinhole().at_most_width(width), [cameras.at_most_width(width) for cameras in trajectories]
+    return sequence.as_pinhole().at_most_width(width), [
+        cameras.at_most_width(width) for cameras in trajectories
+    ]
 
 
 def restored_batches(

@@ -1,10 +1,11 @@
 """Native lens against pinhole, on a phantom seen through a fisheye: `python -m tests.benchmarks.bench_lens`.
 
-A development phantom is photographed with the lens of C3VDv2's endoscope. The frames are reconstructed twice:
-in their own pixels (`ingest.lens=native`), and resampled to the pinhole of 100 degrees. Both scenes render the
-held-out frames through the lens; printed are their errors inside the pinhole's field and outside it, the share
-of the source's pixels that each uses, and processor seconds per iteration. `--sequence` takes a source on disk
-whose frames have distortion instead. `--write FOLDER` writes the phantom as a COLMAP workspace and stops.
+A development phantom is photographed with the lens of C3VDv2's endoscope. The frames are reconstructed
+twice: in their own pixels (`ingest.lens=native`), and resampled to the pinhole of 100 degrees. Both scenes
+render the held-out frames through the lens; printed are their errors inside the pinhole's field and outside
+it, the share of the source's pixels that each uses, and processor time per iteration. `--sequence` takes a
+source on disk whose frames have distortion instead. `--write FOLDER` writes the phantom as a COLMAP workspace
+and stops.
 """
 
 from __future__ import annotations

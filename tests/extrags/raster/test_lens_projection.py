@@ -1,4 +1,4 @@
-"""Gaussians seen through a radial lens: kernels against the reference, the reference against the lens itself."""
+"""Gaussians through a radial lens: kernels against the reference, the reference against the lens itself."""
 
 from __future__ import annotations
 
@@ -103,7 +103,9 @@ def test_jacobian_is_that_of_the_projection(lens: RadialLens) -> None:
     for axis in range(3):
         ahead, behind = [x, y, z], [x, y, z]
         ahead[axis], behind[axis] = ahead[axis] + step, behind[axis] - step
-        slope = (project_through_lens(*ahead, K, lens)[0] - project_through_lens(*behind, K, lens)[0]) / (2 * step)
+        slope = (project_through_lens(*ahead, K, lens)[0] - project_through_lens(*behind, K, lens)[0]) / (
+            2 * step
+        )
         assert relative_l2(slope, jacobian[:, :, axis]) < 1e-6
 
 
@@ -132,7 +134,8 @@ def test_covariance_is_that_of_many_samples() -> None:
 @pytest.mark.parametrize("backend", ["native", "reference"])
 def test_behind_and_beyond_is_culled(backend: str) -> None:
     means = torch.tensor(
-        [[0.0, 0, -1], [5, 0, 0.02], [1e18, 0, 1e-2], [0, 3, -2], [0, 0, 1.0], [-30, 0, 0.5]], requires_grad=True
+        [[0.0, 0, -1], [5, 0, 0.02], [1e18, 0, 1e-2], [0, 3, -2], [0, 0, 1.0], [-30, 0, 0.5]],
+        requires_grad=True,
     )
     n = len(means)
     rendering = rasterize(
@@ -159,7 +162,16 @@ def test_behind_and_beyond_is_culled(backend: str) -> None:
 def test_gsplat_refuses_a_lens() -> None:
     scene = tube(4, 8, 8, sh_degree=None)
     inputs = RasterInputs(
-        scene.means, scene.quats, scene.scales, scene.opacities, None, scene.colors, scene.viewmats, scene.Ks, None, None
+        scene.means,
+        scene.quats,
+        scene.scales,
+        scene.opacities,
+        None,
+        scene.colors,
+        scene.viewmats,
+        scene.Ks,
+        None,
+        None,
     )
     with pytest.raises(ConfigError, match=r"ingest\.lens=pinhole"):
         rasterize_gsplat(inputs, RasterOptions(8, 8, 0, 0.01, False, False, False, LENS))
