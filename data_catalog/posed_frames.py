@@ -21,7 +21,7 @@ from data_catalog.images import COLOUR_SUFFIXES, read_colour, read_depth, read_m
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from data_catalog.splits import every_nth
 from data_catalog.visibility import observed_by_depth
-from extrags.cameras import Cameras
+from extrags.cameras import Cameras, rotation_about
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
@@ -171,6 +171,8 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     if source.intrinsics == "guessed":
         K = fitted_to_picture(K, mask)
     lens = pixels.lens(kept, source.pose_file)
+    if world_from_camera is not None:
+        world_from_camera = _rolled(world_from_camera, [pixels.samplings[f.lens].roll_rad for f in kept])
     depth_mm = np.stack(pixels.depths) if pixels.depths else None
     observed = None
     if world_from_camera is not None:
@@ -308,6 +310,16 @@ def _poses(frames: Sequence[PosedFrame], source: SourceFrames) -> Float[np.ndarr
             exact = np.allclose(rigid, frame.world_from_camera, rtol=0, atol=_EXACT_POSE)
             found.append(frame.world_from_camera if exact else rigid)
     return np.stack(found) if found else None
+
+
+def _rolled(poses: Float[np.ndarray, "f 4 4"], rolls_rad: Sequence[float]) -> Float[np.ndarray, "f 4 4"]:
+    """The poses of cameras whose images are turned about their axes."""
+    if not any(rolls_rad):
+        return poses
+    turned = poses.copy()
+    for pose, roll in zip(turned, rolls_rad, strict=True):
+        pose[:3, :3] = pose[:3, :3] @ rotation_about(np.array([0.0, 0.0, 1.0]), roll).T
+    return turned
 
 
 def _frame_names(frames: Sequence[PosedFrame]) -> tuple[str, ...]:

@@ -53,6 +53,10 @@ class Sampling(Protocol):
         """Of the sequence's images; None where they are a pinhole's."""
 
     @property
+    def roll_rad(self) -> float:
+        """Turn of the images about the axis, from right to down, against the axes of the source's poses."""
+
+    @property
     def source_share(self) -> Float[np.ndarray, "h2 w2"]:
         """Share of the source's image that each pixel stands for; 0 where the source shows nothing."""
 
@@ -105,12 +109,14 @@ class LensSampling:
         resampling: crop and size.
         K: of the result.
         radial_lens: that was kept; None for a pinhole.
+        roll_rad: turn of a kept lens's image about the axis.
     """
 
     undistortion: Undistortion | None
     resampling: Resampling
     K: Float[np.ndarray, "3 3"]
     radial_lens: RadialLens | None = None
+    roll_rad: float = 0.0
 
     @classmethod
     def planned(
@@ -197,7 +203,7 @@ class LensSampling:
             raise SourceError(
                 "frames of several lenses cannot keep their pixels; take ingest.lens=pinhole", field="lens"
             )
-        return cls(None, resampling, resampling.intrinsics(found.K), found.lens)
+        return cls(None, resampling, resampling.intrinsics(found.K), found.lens, found.roll_rad)
 
     @cached_property
     def source_share(self) -> Float[np.ndarray, "h2 w2"]:

@@ -57,6 +57,7 @@ _TABLE_SIZE = 2048
 _NEWTON_STEPS = 4
 _FIT_ANGLES = 400
 _FIT_DIRECTIONS = 32
+_LEAST_ROLL_RAD = 1e-5
 
 
 @dataclass(frozen=True)
@@ -222,12 +223,15 @@ class LensFit:
         K: its focal lengths and principal point.
         error_px: largest distance of its pixels from the true ones, inside the image and the field of view.
         rms_px: root mean square of the same.
+        roll_rad: turn of the image about the axis, from right to down, that a model with shear has and a
+            radial one has not: the camera that is fitted stands turned by it.
     """
 
     lens: RadialLens
     K: Float[np.ndarray, "3 3"]
     error_px: float
     rms_px: float
+    roll_rad: float = 0.0
 
 
 def fitted_lens(
@@ -265,6 +269,12 @@ def fitted_lens(
     if not inside.any():
         raise SourceError("no direction in front of the lens falls into the image", field="lens")
     end = float(angle[np.flatnonzero(inside.any(axis=1))[-1]])
+    with np.errstate(invalid="ignore"):
+        seen_turn = np.arctan2((v - K[1, 2]) / K[1, 1], (u - K[0, 2]) / K[0, 0])
+    roll = float(np.mean((seen_turn - turn + np.pi)[inside] % (2 * np.pi) - np.pi))
+    # Tangential terms have no mean turn but for rounding, and for where the image ends.
+    roll = roll if abs(roll) > _LEAST_ROLL_RAD else 0.0
+    turn = turn + roll
     powers = angle[:, None] ** np.array([1, 3, 5, 7, 9])
     across, along = K[0, 0] * np.cos(turn), K[1, 1] * np.sin(turn)
     rows = np.concatenate(
@@ -279,4 +289,4 @@ def fitted_lens(
     fitted[1, 1] *= found[0]
     off = (rows @ found - sought).reshape(2, -1)
     distance = np.hypot(off[0], off[1])
-    return LensFit(lens, fitted, float(distance.max()), float(np.sqrt(np.mean(distance**2))))
+    return LensFit(lens, fitted, float(distance.max()), float(np.sqrt(np.mean(distance**2))), roll)

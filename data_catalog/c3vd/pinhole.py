@@ -119,6 +119,11 @@ class PinholeResampling:
         return None
 
     @property
+    def roll_rad(self) -> float:
+        """None is left: the grid has the axes of the poses."""
+        return 0.0
+
+    @property
     def source_share(self) -> Float[np.ndarray, "h w"]:
         """Share of the source's image that each pixel stands for; 0 where the source shows nothing."""
         areas = source_areas(self.centres[..., 0], self.centres[..., 1])

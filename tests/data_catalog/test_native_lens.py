@@ -8,10 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from data_catalog.c3vd.scaramuzza import CALIBRATIONS
 from data_catalog.catalog import read
 from data_catalog.readers.colmap_files import read_model, write_model
 from data_catalog.readers.colmap_model import write_colmap
 from data_catalog.readers.transforms_json import write_transforms
+from extrags.cameras import pixel_rays, project_points, rotation_about, rotation_angle_deg
 from extrags.config import IngestConfig, PipelineConfig
 from extrags.errors import ConfigError, SourceError
 from extrags.lens import Lens
@@ -41,9 +43,9 @@ def test_a_fisheye_keeps_its_pixels(fisheye: dict[str, EndoscopicSequence]) -> N
     assert 0.97 < native.mask.mean() < 1  # the corners lie beyond 85 degrees
     assert native.K[0, 0, 0] > 1.2 * pinhole.K[0, 0, 0]
     # The depth of one frame, carried into the next through the lens, lies on the surface seen there.
-    np.testing.assert_allclose(native.world_from_camera, pinhole.world_from_camera)
+    np.testing.assert_allclose(native.world_from_camera, pinhole.world_from_camera, atol=5e-4)
     points = native.cameras[3].centers[0] + (
-        native.depth_mm[3][..., None] * _rays(native, 3)  # type: ignore[index]
+        native.depth_mm[3][..., None] * pixel_rays(native.cameras[3])[0]  # type: ignore[index]
     ).reshape(-1, 3)
     (pixels,), (z,) = native.cameras[4].project(points)
     inside = native.cameras.contains(pixels)
@@ -53,12 +55,6 @@ def test_a_fisheye_keeps_its_pixels(fisheye: dict[str, EndoscopicSequence]) -> N
     assert np.median(np.abs(found / z[inside] - 1)) < 0.02
 
 
-def _rays(sequence: EndoscopicSequence, frame: int) -> np.ndarray:
-    from extrags.cameras import pixel_rays
-
-    return pixel_rays(sequence.cameras[frame])[0]
-
-
 def test_as_a_pinhole_it_is_what_ingest_makes(fisheye: dict[str, EndoscopicSequence]) -> None:
     flat, pinhole = fisheye["native"].as_pinhole(), fisheye["pinhole"]
     np.testing.assert_allclose(flat.K, pinhole.K)
@@ -66,7 +62,7 @@ def test_as_a_pinhole_it_is_what_ingest_makes(fisheye: dict[str, EndoscopicSeque
     assert both.mean() > 0.95
     assert np.abs(flat.rgb.astype(float) - pinhole.rgb)[both].mean() < 6
     ratio = flat.depth_mm[both] / pinhole.depth_mm[both]  # type: ignore[index]
-    assert np.median(np.abs(ratio - 1)) < 0.01
+    assert np.median(np.abs(ratio - 1)) < 0.02
     median, agree = reprojection_mm(flat, 3, 4)
     assert median < 0.1
     assert agree > 0.8
@@ -122,6 +118,35 @@ def test_refused(clip, tmp_path, parameters, settings, error, said) -> None:
     write_model(replace(model, lenses={1: lens}), tmp_path / "scene" / "sparse" / "0")
     with pytest.raises(error, match=said):
         read(tmp_path / "scene", IngestConfig(lens="native", **settings))
+
+
+@pytest.mark.parametrize(("name", "largest_px", "roll_deg"), [("c3vd", 0.8, 0.167), ("c3vdv2", 1.2, 0.008)])
+def test_published_lenses(name, largest_px, roll_deg) -> None:
+    """At their full size; the shear of the first is a turn about the axis, which goes into the pose."""
+    camera = CALIBRATIONS[name]
+    fit = camera.radial()
+    assert np.degrees(fit.roll_rad) == pytest.approx(roll_deg, abs=0.002)
+    rng = np.random.default_rng(0)
+    points = np.stack([*rng.uniform(-3, 3, (2, 4000)), rng.uniform(0.3, 2, 4000)], axis=-1)
+    true = camera.project(points) + 0.5
+    turned = points @ rotation_about(np.array([0.0, 0, 1]), fit.roll_rad).T
+    off = np.linalg.norm(project_points(turned, fit.K, fit.lens) - true, axis=-1)
+    inside = (true >= 0).all(axis=-1) & (true <= [camera.width, camera.height]).all(axis=-1)
+    off = off[inside & np.isfinite(off)]
+    assert len(off) > 1000
+    assert off.max() < largest_px
+    assert np.sqrt(np.mean(off**2)) < 0.25
+
+
+def test_a_turned_lens_turns_its_poses(tmp_path) -> None:
+    written = write_video(tmp_path / "colon_v1", frames=2, first=0, layout="c3vd")
+    native, pinhole = (
+        read(written.folder, IngestConfig.model_validate({"width": 45, "lens": lens}))
+        for lens in ("native", "pinhole")
+    )
+    turned = rotation_angle_deg(native.world_from_camera[:, :3, :3], pinhole.world_from_camera[:, :3, :3])
+    np.testing.assert_allclose(turned, 0.167, atol=0.002)
+    np.testing.assert_array_equal(native.world_from_camera[:, :3, 3], pinhole.world_from_camera[:, :3, 3])
 
 
 def test_a_pinhole_has_no_lens_to_keep(clip, tmp_path) -> None:

@@ -112,7 +112,7 @@ def test_jacobian_is_that_of_the_projection(lens: RadialLens) -> None:
 def test_reference_gradients_are_slopes() -> None:
     """Of the pixel and the Jacobian, which the covariance is made of, by central differences."""
     K = torch.tensor([[30.0, 0, 33], [0, 31, 24], [0, 0, 1]], dtype=torch.float64)
-    points = tuple(value.requires_grad_() for value in _points(12))
+    points = tuple(value.requires_grad_() for value in _points(5))
     assert torch.autograd.gradcheck(lambda x, y, z: project_through_lens(x, y, z, K, LENS), points, eps=1e-6)
     square = torch.tensor([0.0, 1e-8, 0.1, 0.17, 0.19, 3.0], dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda w: lens_gain(w, LENS), (square,), eps=1e-7)
