@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from data_catalog.c3vd.pinhole import PinholeResampling
+from data_catalog.c3vd.pinhole import PinholeResampling, own_pixels
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera, camera_from_json
 from data_catalog.file_storage import read_file_storage
 from data_catalog.posed_frames import SourceFrames
@@ -116,6 +116,8 @@ def _sampling(camera: Any, config: IngestConfig, first: Sampling | None) -> Samp
     usual: dict[str, Any] = {}
     if config.width is None and config.downscale is None:
         usual["downscale"] = 1
+    if config.lens == "native":
+        return own_pixels(camera, config.model_copy(update=usual), first)
     if config.field_of_view_deg is None:
         usual["field_of_view_deg"] = float(np.degrees(2 * np.arctan(camera.width / 2 / camera.a0)))
     return PinholeResampling.planned(camera, config.model_copy(update=usual))

@@ -285,10 +285,12 @@ def _reprojection_error(
     for first, second in pairs:
         z = sequence.depth_mm[first][v, u].astype(np.float64)
         known = (z > 0) & sequence.mask[first][v, u]
-        rays = unproject_pixels(np.stack([u[known], v[known]], axis=1) + 0.5, sequence.K[first])
+        rays = unproject_pixels(
+            np.stack([u[known], v[known]], axis=1) + 0.5, sequence.K[first], sequence.lens
+        )
         relative = invert_poses(poses[second][None])[0] @ poses[first]
         carried = transform_points(relative, rays * z[known, None])
-        pixels = project_points(carried, sequence.K[second])
+        pixels = project_points(carried, sequence.K[second], sequence.lens)
         inside = sequence.cameras.contains(pixels)
         column, row = pixels[inside].astype(np.int64).T
         found = sequence.depth_mm[second][row, column]

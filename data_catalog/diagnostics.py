@@ -353,7 +353,7 @@ def _seen_share(sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"])
     if sequence.points is None:
         return 0.0
     shares = []
-    cameras = Cameras(sequence.K, poses, sequence.width, sequence.height)
+    cameras = Cameras(sequence.K, poses, sequence.width, sequence.height, sequence.lens)
     for index in range(len(cameras)):
         pixels, _ = cameras[index].project(sequence.points)
         shares.append(float(cameras.contains(pixels).mean()))

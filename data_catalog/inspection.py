@@ -108,7 +108,7 @@ def facts(sequence: EndoscopicSequence) -> dict[str, Any]:
         "cx": float(K[0, 0, 2]),
         "cy": float(K[0, 1, 2]),
         "intrinsics": len(np.unique(K.reshape(len(K), -1), axis=0)),
-        "field_of_view_deg": float(np.degrees(2 * np.arctan(sequence.width / 2 / K[0, 0, 0]))),
+        "field_of_view_deg": _field_of_view_deg(sequence),
         "length_unit": "mm" if sequence.metric else "arbitrary",
         "has_poses": sequence.world_from_camera is not None,
         "has_depth": sequence.depth_mm is not None,
@@ -208,3 +208,12 @@ class _HeardWarnings(logging.Handler):
 
     def __exit__(self, *_: object) -> None:
         logging.getLogger("data_catalog").removeHandler(self)
+
+
+def _field_of_view_deg(sequence: EndoscopicSequence) -> float:
+    """Horizontal, of the first frame."""
+    K, lens = sequence.K[0], sequence.lens
+    if lens is None:
+        return float(np.degrees(2 * np.arctan(sequence.width / 2 / K[0, 0])))
+    edges = np.array([K[0, 2], sequence.width - K[0, 2]]) / K[0, 0]
+    return float(np.degrees(np.minimum(lens.angle(edges), lens.max_angle_rad).sum()))

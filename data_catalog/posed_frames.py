@@ -6,6 +6,7 @@ them, splits them, reads their pixels, undoes lenses, shrinks, masks, and checks
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,15 +21,18 @@ from data_catalog.images import COLOUR_SUFFIXES, read_colour, read_depth, read_m
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from data_catalog.splits import every_nth
 from data_catalog.visibility import observed_by_depth
-from extrags.cameras import Cameras
+from extrags.cameras import Cameras, rotation_about
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
 from extrags.lens import Lens
+from extrags.radial_lens import RadialLens
 from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["MaskFinder", "PosedFrame", "SourceFrames", "assembled"]
 
+
+logger = logging.getLogger(__name__)
 
 _EXACT_POSE = 1e-14
 
@@ -166,11 +170,18 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     rgb, mask = np.stack(pixels.colours), pixels.masks(kept)
     if source.intrinsics == "guessed":
         K = fitted_to_picture(K, mask)
+    lens = pixels.lens(kept, source.pose_file)
+    if world_from_camera is not None:
+        world_from_camera = _rolled(world_from_camera, [pixels.samplings[f.lens].roll_rad for f in kept])
     depth_mm = np.stack(pixels.depths) if pixels.depths else None
     observed = None
     if world_from_camera is not None:
-        cameras = Cameras(K, world_from_camera, rgb.shape[2], rgb.shape[1])
+        cameras = Cameras(K, world_from_camera, rgb.shape[2], rgb.shape[1], lens)
         observed = source.observed(cameras, mask, depth_mm, split)
+    used = np.mean(
+        [(pixels.samplings[f.lens].source_share * m).sum() for f, m in zip(kept, mask, strict=True)]
+    )
+    logger.info("%s: %.1f %% of the source's pixels are used, in the mean over its frames", name, 100 * used)
     sequence = EndoscopicSequence(
         name=name,
         rgb=rgb,
@@ -186,6 +197,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         points=source.points,
         points_rgb=source.points_rgb,
         intrinsics=source.intrinsics,
+        lens=lens,
     )
     return sequence if source.truth is None else replace(sequence, truth=source.truth(sequence))
 
@@ -221,6 +233,22 @@ class _Pixels:
             check_depth(depth, frame=frame.label, file=frame.depth_file)
             _check_size(depth, frame, frame.depth_file, "depth", None)
             self.depths.append(sampling.depth(depth, file=frame.depth_file, frame=frame.label))
+
+    def lens(self, frames: Sequence[PosedFrame], file: Path) -> RadialLens | None:
+        """The lens of all frames that were read; None for pinholes.
+
+        Raises:
+            SourceError: when frames have several.
+        """
+        found = {self.samplings[frame.lens].radial_lens for frame in frames}
+        if len(found) != 1:
+            raise SourceError(
+                f"the frames have {len(found)} lenses, and sequences that keep their pixels have one; take "
+                "ingest.lens=pinhole",
+                file=file,
+                field="lens",
+            )
+        return found.pop()
 
     def masks(self, frames: Sequence[PosedFrame]) -> Bool[np.ndarray, "f h w"]:
         """Masks of all frames, once they were read."""
@@ -282,6 +310,16 @@ def _poses(frames: Sequence[PosedFrame], source: SourceFrames) -> Float[np.ndarr
             exact = np.allclose(rigid, frame.world_from_camera, rtol=0, atol=_EXACT_POSE)
             found.append(frame.world_from_camera if exact else rigid)
     return np.stack(found) if found else None
+
+
+def _rolled(poses: Float[np.ndarray, "f 4 4"], rolls_rad: Sequence[float]) -> Float[np.ndarray, "f 4 4"]:
+    """The poses of cameras whose images are turned about their axes."""
+    if not any(rolls_rad):
+        return poses
+    turned = poses.copy()
+    for pose, roll in zip(turned, rolls_rad, strict=True):
+        pose[:3, :3] = pose[:3, :3] @ rotation_about(np.array([0.0, 0.0, 1.0]), roll).T
+    return turned
 
 
 def _frame_names(frames: Sequence[PosedFrame]) -> tuple[str, ...]:

@@ -1,18 +1,30 @@
-"""From the pixels of a file to those of the sequence: lens undone, box cut out, shrunk."""
+"""From the pixels of a file to those of the sequence: lens undone or kept, box cut out, shrunk."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.images import Resampling
+from extrags.cameras import field_mask
 from extrags.config import IngestConfig
+from extrags.errors import ConfigError, SourceError
 from extrags.lens import Lens, Undistortion, size_for_focal
+from extrags.radial_lens import LensFit, RadialLens
 
-__all__ = ["CameraModel", "LensSampling", "Sampling", "keeps_central_resolution"]
+__all__ = ["CameraModel", "LensSampling", "Sampling", "keeps_central_resolution", "source_areas"]
+
+logger = logging.getLogger(__name__)
+
+LARGEST_FIT_ERROR_PX = 1.0
+"""A radial model that is farther from the calibrated lens, in pixels of the sequence, is refused: root mean
+square over the image."""
 
 
 @runtime_checkable
@@ -35,6 +47,18 @@ class Sampling(Protocol):
     @property
     def K(self) -> Float[np.ndarray, "3 3"]:
         """Of the sequence's pinhole, pixel centres at +0.5."""
+
+    @property
+    def radial_lens(self) -> RadialLens | None:
+        """Of the sequence's images; None where they are a pinhole's."""
+
+    @property
+    def roll_rad(self) -> float:
+        """Turn of the images about the axis, from right to down, against the axes of the source's poses."""
+
+    @property
+    def source_share(self) -> Float[np.ndarray, "h2 w2"]:
+        """Share of the source's image that each pixel stands for; 0 where the source shows nothing."""
 
     @property
     def width(self) -> int:
@@ -78,17 +102,21 @@ def keeps_central_resolution(config: IngestConfig) -> bool:
 
 @dataclass(frozen=True)
 class LensSampling:
-    """A COLMAP lens undone at full size, then the crop and shrinking that all frames share.
+    """A lens undone at full size or kept, then the crop and shrinking that all frames share.
 
     Args:
-        undistortion: None for a pinhole, whose pixels are taken as they are.
+        undistortion: None where the source's pixels are taken as they are.
         resampling: crop and size.
         K: of the result.
+        radial_lens: that was kept; None for a pinhole.
+        roll_rad: turn of a kept lens's image about the axis.
     """
 
     undistortion: Undistortion | None
     resampling: Resampling
     K: Float[np.ndarray, "3 3"]
+    radial_lens: RadialLens | None = None
+    roll_rad: float = 0.0
 
     @classmethod
     def planned(
@@ -115,6 +143,9 @@ class LensSampling:
         """
         undistortion = None
         width, height = lens.width, lens.height
+        if config.lens == "native" and not lens.is_pinhole:
+            resampling = Resampling.planned(width, height, config, usual_downscale, box)
+            return cls.native(lens.radial, resampling, config, first)
         if not lens.is_pinhole:
             undistortion = Undistortion.planned(
                 lens, config.field_of_view_deg, size=_enlarged_size(lens, config, first)
@@ -128,6 +159,66 @@ class LensSampling:
         if undistortion is None:
             return cls(None, resampling, resampling.intrinsics(lens.K))
         return cls(undistortion, resampling, resampling.intrinsics(undistortion.K))
+
+    @classmethod
+    def native(
+        cls,
+        fit: Callable[[], LensFit],
+        resampling: Resampling,
+        config: IngestConfig,
+        first: Sampling | None,
+    ) -> LensSampling:
+        """Keep the pixels of a wide lens.
+
+        Args:
+            fit: of a radial model to the source's.
+            resampling: crop and size of the sequence's first lens.
+            config: must ask for no pinhole.
+            first: of the sequence's first lens; None for the first itself.
+
+        Raises:
+            ConfigError: when a pinhole's field of view is asked for.
+            SourceError: when the model is too far from the lens, or frames have several lenses.
+        """
+        if config.field_of_view_deg is not None:
+            raise ConfigError(
+                "ingest.lens=native keeps the lens's own field: leave ingest.field_of_view_deg out"
+            )
+        found = fit()
+        scale = resampling.width / resampling.crop_width
+        logger.info(
+            "lens kept up to %.1f degrees from its axis: the radial model is at most %.2f px from the "
+            "source's, %.2f px in the root mean square",
+            np.degrees(found.lens.max_angle_rad),
+            found.error_px * scale,
+            found.rms_px * scale,
+        )
+        if found.rms_px * scale > LARGEST_FIT_ERROR_PX:
+            raise SourceError(
+                f"a radial model is {found.rms_px * scale:.2f} px from this lens in the root mean square, "
+                f"expected at most {LARGEST_FIT_ERROR_PX:g}; take ingest.lens=pinhole",
+                field="lens",
+            )
+        if first is not None and first.radial_lens != found.lens:
+            raise SourceError(
+                "frames of several lenses cannot keep their pixels; take ingest.lens=pinhole", field="lens"
+            )
+        return cls(None, resampling, resampling.intrinsics(found.K), found.lens, found.roll_rad)
+
+    @cached_property
+    def source_share(self) -> Float[np.ndarray, "h2 w2"]:
+        """Share of the source's image that each pixel stands for; 0 where the source shows nothing."""
+        sizes = self.resampling
+        if self.undistortion is None:
+            cropped = sizes.crop_width * sizes.crop_height / (sizes.source_width * sizes.source_height)
+            return np.full((self.height, self.width), cropped / (self.width * self.height))
+        plan = self.undistortion
+        share = source_areas(plan.u, plan.v) * plan.valid / plan.valid.size
+        share = share[sizes.top : sizes.top + sizes.crop_height, sizes.left : sizes.left + sizes.crop_width]
+        import cv2
+
+        mean = cv2.resize(share, (self.width, self.height), interpolation=cv2.INTER_AREA)
+        return np.asarray(mean * (share.size / (self.width * self.height)))
 
     @property
     def width(self) -> int:
@@ -159,7 +250,10 @@ class LensSampling:
             SourceError: the mask is not of the sequence's size.
         """
         straight = mask if self.undistortion is None else self.undistortion.mask(mask)
-        return self.resampling.mask(straight, file=file, frame=frame)
+        shrunk = self.resampling.mask(straight, file=file, frame=frame)
+        if self.radial_lens is None:
+            return shrunk
+        return np.asarray(shrunk & field_mask(self.K, self.radial_lens, self.width, self.height))
 
     def depth(
         self, depth: Float[np.ndarray, "h w"], *, file: object = None, frame: object = None
@@ -171,3 +265,9 @@ class LensSampling:
         """
         straight = depth if self.undistortion is None else self.undistortion.depth(depth)
         return self.resampling.depth(straight, file=file, frame=frame)
+
+
+def source_areas(u: Float[np.ndarray, "h w"], v: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Area in source pixels of each pixel that is looked up at (u, v); 0 where that is unknown."""
+    (u_down, u_right), (v_down, v_right) = np.gradient(u), np.gradient(v)
+    return np.asarray(np.nan_to_num(np.abs(u_right * v_down - u_down * v_right)))

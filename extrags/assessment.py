@@ -80,7 +80,7 @@ def measure(
     depth_unit_mm, training_holes = _training_view_measurements(scene, small, settings)
     covered = training_coverage(scene, small, **coverage.options)
     directions = direction_counts(covered)
-    probes = probe_views(scene, small, depth_unit_mm, settings)
+    probes = probe_views(scene, small.as_pinholes(), depth_unit_mm, settings)
     holes, poor = _lacking_pixels(scene, probes, directions < settings.min_directions, settings)
     lacking = float((holes | poor).mean())
     seen = directions > 0
@@ -162,9 +162,10 @@ def _training_view_measurements(scene: Scene, cameras: Cameras, config: AssessCo
     with torch.no_grad():
         for start in range(0, len(cameras), PROBES_PER_BATCH):
             rendering = scene.render(cameras[start : start + PROBES_PER_BATCH], sh_degree=0)
-            surface = rendering.alpha >= config.hole_alpha
+            field = torch.from_numpy(cameras[start : start + PROBES_PER_BATCH].field)
+            surface = (rendering.alpha >= config.hole_alpha) & field
             depths.append(rendering.depth[surface].numpy())
-            holes.append((~surface).numpy())
+            holes.append((field & ~surface)[field].numpy())
             emit(Progress("assess", min(start + PROBES_PER_BATCH, len(cameras)), len(cameras)))
     depth = np.concatenate(depths)
     if depth.size == 0:

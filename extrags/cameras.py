@@ -1,4 +1,7 @@
-"""Pinhole cameras and rigid motions.
+"""Cameras and rigid motions.
+
+A camera is a pinhole unless it has a radial lens: virtual views and resampled frames are pinholes, frames in
+their original pixels have the lens they were taken with.
 
 Axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5. Poses are kept as
 `world_from_camera` in float64; the rasteriser gets `viewmats` (camera from world) in float32.
@@ -13,11 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from extrags.errors import PoseError, ShapeError
+from extrags.radial_lens import VIRTUAL_FIELD_DEG, RadialLens
 
 __all__ = [
     "Cameras",
     "as_rotation",
     "compose",
+    "field_mask",
     "invert_poses",
     "look_at",
     "pixel_rays",
@@ -35,13 +40,14 @@ ROTATION_TOLERANCE = 1e-2
 
 @dataclass(frozen=True, slots=True)
 class Cameras:
-    """A batch of pinhole cameras that share one image size.
+    """A batch of cameras that share one image size, and one lens if they have one.
 
     Args:
         K: intrinsics in pixels, [C, 3, 3], float64.
         world_from_camera: rigid camera-to-world motions, [C, 4, 4], float64.
         width: image width in pixels.
         height: image height in pixels.
+        lens: how rays are bent before `K`; None for pinholes.
 
     Raises:
         ShapeError: when the arrays do not fit each other.
@@ -51,6 +57,7 @@ class Cameras:
     world_from_camera: Float[np.ndarray, "c 4 4"]
     width: int
     height: int
+    lens: RadialLens | None = None
 
     def __post_init__(self) -> None:
         n = self.world_from_camera.shape[0]
@@ -67,7 +74,7 @@ class Cameras:
         """Select cameras; an integer keeps the batch axis."""
         chosen = np.arange(len(self))[index]
         chosen = np.atleast_1d(chosen)
-        return Cameras(self.K[chosen], self.world_from_camera[chosen], self.width, self.height)
+        return Cameras(self.K[chosen], self.world_from_camera[chosen], self.width, self.height, self.lens)
 
     @property
     def viewmats(self) -> Float[np.ndarray, "c 4 4"]:
@@ -110,20 +117,38 @@ class Cameras:
         poses[:, :3, 3] = (1 - share) * self.centers[before] + share * self.centers[before + 1]
         share = share[..., None]
         K = (1 - share) * self.K[before] + share * self.K[before + 1]
-        return Cameras(K, poses, self.width, self.height)
+        return Cameras(K, poses, self.width, self.height, self.lens)
 
     def resized(self, width: int, height: int) -> Cameras:
         """The same views at another resolution, in pixels; intrinsics are scaled, image borders stay."""
         K = self.K.copy()
         K[:, 0] *= width / self.width
         K[:, 1] *= height / self.height
-        return Cameras(K, self.world_from_camera, width, height)
+        return Cameras(K, self.world_from_camera, width, height, self.lens)
 
     def at_most_width(self, width: int) -> Cameras:
         """The same views, downscaled to this width in pixels if they are wider; the aspect ratio is kept."""
         if self.width <= width:
             return self
         return self.resized(width, max(1, round(self.height * width / self.width)))
+
+    def as_pinholes(self, field_of_view_deg: float = VIRTUAL_FIELD_DEG) -> Cameras:
+        """Pinholes of the same poses and image size; pinholes are returned as they are.
+
+        Args:
+            field_of_view_deg: horizontal, at most; less where the lens's images show less.
+        """
+        if self.lens is None:
+            return self
+        K = [self.lens.pinhole(K, self.width, self.height, field_of_view_deg) for K in self.K]
+        return Cameras(np.reshape(K, (-1, 3, 3)), self.world_from_camera, self.width, self.height)
+
+    @property
+    def field(self) -> Bool[np.ndarray, "c h w"]:
+        """Pixels inside the field of view of the lens; all of a pinhole's."""
+        if self.lens is None:
+            return np.ones((len(self), self.height, self.width), dtype=bool)
+        return np.stack([field_mask(K, self.lens, self.width, self.height) for K in self.K])
 
     def project(
         self, points: Float[np.ndarray, "*p 3"]
@@ -134,11 +159,11 @@ class Cameras:
             points: in world coordinates.
 
         Returns:
-            Pixels (u, v), NaN for points that are not in front of the camera, and z-depths in world units.
-            Both float64.
+            Pixels (u, v), NaN for points that are not in front of the camera or outside the field of its
+            lens, and z-depths in world units. Both float64.
         """
         local = np.stack([transform_points(viewmat, points) for viewmat in self.viewmats])
-        pixels = np.stack([project_points(part, K) for part, K in zip(local, self.K, strict=True)])
+        pixels = np.stack([project_points(part, K, self.lens) for part, K in zip(local, self.K, strict=True)])
         return pixels, local[..., 2]
 
     def contains(self, pixels: Float[np.ndarray, "*p 2"]) -> Bool[np.ndarray, "*p"]:
@@ -151,16 +176,19 @@ class Cameras:
         """Concatenate batches along the camera axis.
 
         Raises:
-            ShapeError: when the image sizes differ.
+            ShapeError: when the image sizes or the lenses differ.
         """
         sizes = {(part.width, part.height) for part in parts}
         if len(sizes) != 1:
             raise ShapeError(f"cameras of different image sizes cannot be joined: {sorted(sizes)}")
+        if len({part.lens for part in parts}) != 1:
+            raise ShapeError("cameras of different lenses cannot be joined")
         return Cameras(
             np.concatenate([part.K for part in parts]),
             np.concatenate([part.world_from_camera for part in parts]),
             parts[0].width,
             parts[0].height,
+            parts[0].lens,
         )
 
 
@@ -288,21 +316,47 @@ def transform_points(
 
 
 def project_points(
-    points: Float[np.ndarray, "*p 3"], K: Float[np.ndarray, "3 3"]
+    points: Float[np.ndarray, "*p 3"], K: Float[np.ndarray, "3 3"], lens: RadialLens | None = None
 ) -> Float[np.ndarray, "*p 2"]:
-    """Pixels (u, v) of points in a camera's own frame; NaN where z is not positive."""
+    """Pixels (u, v) of points in a camera's own frame; NaN where z is not positive or the lens sees nothing.
+
+    Args:
+        points: x right, y down, z forward.
+        K: intrinsics in pixels.
+        lens: None for a pinhole; else points outside its field of view have no pixel.
+    """
     z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+    if lens is not None:
+        x, y = points[..., 0] / z, points[..., 1] / z
+        seen = np.hypot(x, y) <= np.tan(lens.max_angle_rad)
+        x, y = lens.distorted(x, y)
+        return np.stack(
+            [
+                np.where(seen, K[0, 0] * x + K[0, 2], np.nan),
+                np.where(seen, K[1, 1] * y + K[1, 2], np.nan),
+            ],
+            axis=-1,
+        )
     u = K[0, 0] * points[..., 0] / z + K[0, 2]
     v = K[1, 1] * points[..., 1] / z + K[1, 2]
     return np.stack([u, v], axis=-1)
 
 
 def unproject_pixels(
-    pixels: Float[np.ndarray, "*p 2"], K: Float[np.ndarray, "3 3"]
+    pixels: Float[np.ndarray, "*p 2"], K: Float[np.ndarray, "3 3"], lens: RadialLens | None = None
 ) -> Float[np.ndarray, "*p 3"]:
-    """Rays through pixels (u, v) in a camera's own frame, with unit z: the inverse of `project_points`."""
+    """Rays through pixels (u, v) in a camera's own frame, with unit z: the inverse of `project_points`.
+
+    Args:
+        pixels: centres at +0.5.
+        K: intrinsics in pixels.
+        lens: None for a pinhole. Pixels beyond a lens's field of view get rays at most 88 degrees from its
+            axis; `field_mask` tells them apart.
+    """
     x = (pixels[..., 0] - K[0, 2]) / K[0, 0]
     y = (pixels[..., 1] - K[1, 2]) / K[1, 1]
+    if lens is not None:
+        x, y = lens.undistorted(np.asarray(x), np.asarray(y))
     return np.stack([x, y, np.ones_like(x)], axis=-1)
 
 
@@ -317,5 +371,38 @@ def pixel_rays(cameras: Cameras) -> Float[np.ndarray, "c h w 3"]:
     x = (u[None, None, :] - K[:, 0, 2, None, None]) / K[:, 0, 0, None, None]
     y = (v[None, :, None] - K[:, 1, 2, None, None]) / K[:, 1, 1, None, None]
     x, y = np.broadcast_arrays(x, y)
+    if cameras.lens is not None:
+        x, y = _undistorted(cameras, x, y)
     local = np.stack([x, y, np.ones_like(x)], axis=-1)
     return np.asarray(np.einsum("cij,chwj->chwi", cameras.world_from_camera[:, :3, :3], local))
+
+
+def _undistorted(
+    cameras: Cameras, x: Float[np.ndarray, "c h w"], y: Float[np.ndarray, "c h w"]
+) -> tuple[Float[np.ndarray, "c h w"], Float[np.ndarray, "c h w"]]:
+    """Rays (X / Z, Y / Z) of image positions; cameras of the same intrinsics share the work."""
+    if cameras.lens is None:
+        return x, y
+    _, first, which = np.unique(
+        cameras.K.reshape(len(cameras), 9), axis=0, return_index=True, return_inverse=True
+    )
+    found_x, found_y = cameras.lens.undistorted(x[first], y[first])
+    which = which.reshape(-1)
+    return found_x[which], found_y[which]
+
+
+def field_mask(
+    K: Float[np.ndarray, "3 3"], lens: RadialLens, width: int, height: int
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels of which all four corners lie inside the field of view of a lens.
+
+    Args:
+        K: intrinsics in pixels.
+        lens: of the images.
+        width: of the images, in pixels.
+        height: of the images, in pixels.
+    """
+    x = (np.arange(width + 1) - K[0, 2]) / K[0, 0]
+    y = (np.arange(height + 1) - K[1, 2]) / K[1, 1]
+    seen = np.hypot(*np.meshgrid(x, y)) <= lens.max_radius
+    return np.asarray(seen[:-1, :-1] & seen[:-1, 1:] & seen[1:, :-1] & seen[1:, 1:])

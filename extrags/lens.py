@@ -18,8 +18,16 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from extrags.errors import SourceError
+from extrags.radial_lens import LARGEST_ANGLE_RAD, LensFit, RadialLens, fitted_lens
 
-__all__ = ["LENS_PARAMETERS", "Lens", "Undistortion", "sample_depth", "size_for_focal"]
+__all__ = [
+    "LENS_PARAMETERS",
+    "Lens",
+    "Undistortion",
+    "distortion_of_pinhole",
+    "sample_depth",
+    "size_for_focal",
+]
 
 LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -100,6 +108,28 @@ class Lens:
         """
         parameters = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
         return cls("PINHOLE", parameters, width, height)
+
+    @classmethod
+    def fisheye(cls, K: Float[np.ndarray, "3 3"], radial: RadialLens, width: int, height: int) -> Lens:
+        """OpenCV's fisheye of a radial lens.
+
+        Args:
+            K: without skew.
+            radial: how rays are bent.
+            width: image width in pixels.
+            height: image height in pixels.
+        """
+        linear = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+        return cls("OPENCV_FISHEYE", (*linear, *radial.coefficients), width, height)
+
+    def radial(self) -> LensFit:
+        """The radial lens nearest to this one, up to where the model folds back.
+
+        Raises:
+            SourceError: when no direction falls into the image, or the fit folds back.
+        """
+        end = np.arctan(self.fold_radius(float(np.tan(LARGEST_ANGLE_RAD))))
+        return fitted_lens(self.project, self.K, self.width, self.height, float(end))
 
     def value(self, name: str) -> float:
         """One parameter by name; 0 where the model has none of that name."""
@@ -227,6 +257,45 @@ class Undistortion:
         valid &= radius < lens.fold_radius(float(radius.max()) * 1.01)
         return cls(K, u, v, valid)
 
+    @classmethod
+    def of_radial(
+        cls,
+        K: Float[np.ndarray, "3 3"],
+        radial: RadialLens,
+        width: int,
+        height: int,
+        field_of_view_deg: float,
+    ) -> Undistortion:
+        """The plan from images of a radial lens to its pinhole of the same size (`RadialLens.pinhole`).
+
+        Args:
+            K: of the images.
+            radial: of the images.
+            width: of the images, in pixels.
+            height: of the images, in pixels.
+            field_of_view_deg: horizontal, at most.
+        """
+        pinhole = radial.pinhole(K, width, height, field_of_view_deg)
+        x, y = np.meshgrid(
+            (np.arange(width) + 0.5 - pinhole[0, 2]) / pinhole[0, 0],
+            (np.arange(height) + 0.5 - pinhole[1, 2]) / pinhole[1, 1],
+        )
+        inside = np.hypot(x, y) <= np.tan(radial.max_angle_rad)
+        bent_x, bent_y = radial.distorted(np.where(inside, x, 0), np.where(inside, y, 0))
+        u, v = K[0, 0] * bent_x + K[0, 2], K[1, 1] * bent_y + K[1, 2]
+        inside &= (u >= 0.5) & (u <= width - 0.5) & (v >= 0.5) & (v <= height - 0.5)
+        return cls(pinhole, u, v, inside)
+
+    def image(self, image: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "h w *c"]:
+        """Values of any number of channels, float32, bilinear; zero where nothing was seen."""
+        import cv2
+
+        moved = cv2.remap(
+            image.astype(np.float32), *self._maps(), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+        moved[~self.valid] = 0
+        return np.asarray(moved)
+
     def colour(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """Colours, bilinear; black where nothing was seen."""
         import cv2
@@ -251,6 +320,32 @@ class Undistortion:
     def _maps(self) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
         # OpenCV counts from pixel centres.
         return (self.u - 0.5).astype(np.float32), (self.v - 0.5).astype(np.float32)
+
+
+def distortion_of_pinhole(
+    K: Float[np.ndarray, "3 3"],
+    radial: RadialLens,
+    pinhole: Float[np.ndarray, "3 3"],
+    width: int,
+    height: int,
+) -> Undistortion:
+    """The way back: from images of a pinhole to those of a radial lens with the same axes and size.
+
+    Args:
+        K: of the radial lens's images, which come out.
+        radial: the lens.
+        pinhole: intrinsics of the images that go in.
+        width: of both, in pixels.
+        height: of both, in pixels.
+    """
+    x, y = np.meshgrid(
+        (np.arange(width) + 0.5 - K[0, 2]) / K[0, 0], (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]
+    )
+    inside = np.hypot(x, y) <= radial.max_radius
+    x, y = radial.undistorted(x, y)
+    u, v = pinhole[0, 0] * x + pinhole[0, 2], pinhole[1, 1] * y + pinhole[1, 2]
+    inside &= (u >= 0.5) & (u <= width - 0.5) & (v >= 0.5) & (v <= height - 0.5)
+    return Undistortion(K, u, v, inside)
 
 
 def size_for_focal(width: int, height: int, angle_rad: float, focal_px: float) -> tuple[int, int]:

@@ -115,6 +115,7 @@ class Scene(Storable):
             torch.from_numpy(cameras.K.astype(np.float32)),
             cameras.width,
             cameras.height,
+            lens=cameras.lens,
             **{"near": self.near, **options},
         )
 

@@ -12,6 +12,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
+from extrags.lens import Undistortion
+from extrags.radial_lens import VIRTUAL_FIELD_DEG, RadialLens
 from extrags.store.storable import Storable
 from extrags.thresholds import RELIABLE_DEPTH_ERROR, SATURATED
 from extrags.zarr_io import has_array, new_group, open_group, read_array, write_array, write_frames
@@ -77,7 +79,7 @@ class EndoscopicSequence(Storable):
     Args:
         name: `DATASET/SEQUENCE[@SETTING]`.
         rgb: colour images, uint8, [F, H, W, 3].
-        K: pinhole intrinsics in pixels, [F, 3, 3].
+        K: intrinsics in pixels, [F, 3, 3].
         mask: validity mask, true where a pixel shows tissue (in the field of view, no overlay), [F, H, W].
         split: training and held-out frames.
         world_from_camera: poses, or None until the poses stage has found them.
@@ -100,6 +102,7 @@ class EndoscopicSequence(Storable):
         scale_source: what the unit of length rests on; of no account where it is arbitrary.
         depth_error: expected relative error of an estimated `depth_mm`, [F, H, W]; None where the depth was
             measured.
+        lens: of all frames, where they are the original pixels of a wide lens; None for pinholes.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -128,6 +131,7 @@ class EndoscopicSequence(Storable):
     withheld_depth_mm: Float[np.ndarray, "f h w"] | None = None
     scale_source: ScaleSource = "source"
     depth_error: Float[np.ndarray, "f h w"] | None = None
+    lens: RadialLens | None = None
 
     def __post_init__(self) -> None:
         frames, height, width = self.rgb.shape[:3]
@@ -169,7 +173,7 @@ class EndoscopicSequence(Storable):
         """
         if self.world_from_camera is None:
             raise ShapeError(f"{self.name} has no poses yet; the poses stage finds them")
-        return Cameras(self.K, self.world_from_camera, self.width, self.height)
+        return Cameras(self.K, self.world_from_camera, self.width, self.height, self.lens)
 
     @property
     def train(self) -> Int[np.ndarray, "n_train"]:
@@ -289,6 +293,44 @@ class EndoscopicSequence(Storable):
         """A copy of the sequence with other poses, `world_from_camera` [F, 4, 4]."""
         return replace(self, world_from_camera=world_from_camera, pose_source=source)
 
+    def as_pinhole(self, field_of_view_deg: float = VIRTUAL_FIELD_DEG) -> EndoscopicSequence:
+        """The same frames resampled to a centred pinhole of their size; those of a pinhole as they are.
+
+        What works on image planes (virtual views and their references, stereo) is given these; the periphery
+        of a wide lens does not fit. A pixel is valid where all source pixels round its centre are.
+
+        Args:
+            field_of_view_deg: horizontal, at most; less where the frames show less.
+        """
+        if self.lens is None:
+            return self
+        K, which = np.unique(self.K.reshape(len(self), 9), axis=0, return_inverse=True)
+        plans = [
+            Undistortion.of_radial(one.reshape(3, 3), self.lens, self.width, self.height, field_of_view_deg)
+            for one in K
+        ]
+        plan = [plans[index] for index in which.reshape(-1)]
+
+        def depths(stack: np.ndarray | None) -> np.ndarray | None:
+            return None if stack is None else np.stack([p.depth(d) for p, d in zip(plan, stack, strict=True)])
+
+        def masks(stack: np.ndarray | None) -> np.ndarray | None:
+            return None if stack is None else np.stack([p.mask(m) for p, m in zip(plan, stack, strict=True)])
+
+        specular = None if self.specular is None else masks(~self.specular)
+        return replace(
+            self,
+            rgb=np.stack([p.colour(image) for p, image in zip(plan, self.rgb, strict=True)]),
+            K=np.stack([p.K for p in plan]),
+            mask=cast("np.ndarray", masks(self.mask)),
+            depth_mm=depths(self.depth_mm),
+            withheld_depth_mm=depths(self.withheld_depth_mm),
+            observed=masks(self.observed),
+            specular=None if specular is None else ~specular,
+            depth_error=depths(self.depth_error),
+            lens=None,
+        )
+
     def at_most_width(self, width: int) -> EndoscopicSequence:
         """The same frames, downscaled to this width in pixels if they are wider; the aspect ratio is kept.
 
@@ -399,6 +441,8 @@ class EndoscopicSequence(Storable):
                 group.attrs["intrinsics"] = self.intrinsics
             if self.focal_std_px is not None:
                 group.attrs["focal_std_px"] = self.focal_std_px
+            if self.lens is not None:
+                group.attrs["lens"] = self.lens.to_json()
             if self.scale_source != "source":
                 group.attrs["scale_source"] = self.scale_source
 
@@ -423,6 +467,7 @@ class EndoscopicSequence(Storable):
             )
         }
         truth: Any = attributes["truth"]
+        lens: Any = attributes.get("lens")
         names: Any = attributes["frame_names"]
         return cls(
             name=str(attributes["name"]),
@@ -442,6 +487,7 @@ class EndoscopicSequence(Storable):
             intrinsics=cast("IntrinsicsSource", attributes.get("intrinsics", "given")),
             focal_std_px=cast("float | None", attributes.get("focal_std_px")),
             scale_source=cast("ScaleSource", attributes.get("scale_source", "source")),
+            lens=None if lens is None else RadialLens.from_json(lens),
             **optional,
         )
 

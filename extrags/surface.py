@@ -15,6 +15,7 @@ from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
+from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
 from extrags.store.storable import Storable
 from extrags.zarr_io import new_group, open_group, read_array, write_array
@@ -112,9 +113,9 @@ def rendered_depth(
         config: settings; images wider than `max_width` are rendered smaller.
 
     Returns:
-        The cameras at the size rendered, and their depth.
+        The cameras at the size rendered, wide pinholes in place of a lens, and their depth.
     """
-    cameras = cameras.at_most_width(config.max_width)
+    cameras = cameras.as_pinholes(WIDE_FIELD_DEG).at_most_width(config.max_width)
     batches = []
     with torch.no_grad():
         for start in range(0, len(cameras), VIEWS_PER_BATCH):
@@ -137,9 +138,11 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         The mesh, small clusters removed, in canonical order.
 
     Raises:
-        ShapeError: when depth maps and cameras do not fit each other.
+        ShapeError: when depth maps and cameras do not fit each other, or the cameras have a lens.
         CaptureError: when there is no valid depth or no surface comes out of it.
     """
+    if cameras.lens is not None:
+        raise ShapeError("depth is fused from pinholes; take `Cameras.as_pinholes`")
     if depth_mm.shape != (len(cameras), cameras.height, cameras.width):
         raise ShapeError(
             f"depth has shape {depth_mm.shape}, expected {(len(cameras), cameras.height, cameras.width)}"

@@ -72,7 +72,7 @@ class ReconstructedScene:
 
     def cameras(self, poses: np.ndarray) -> Cameras:
         """Virtual views at the size and with the intrinsics of the training views."""
-        cameras = self.training.training_cameras
+        cameras = self.training.training_cameras.as_pinholes()
         K = np.broadcast_to(np.median(cameras.K, axis=0), (len(poses), 3, 3)).copy()
         return Cameras(K, poses, cameras.width, cameras.height)
 
@@ -121,7 +121,7 @@ def _by_moves(
     way: Callable[[Moves, Cameras, int, int], list[Clip]],
 ) -> Callable[[ReconstructedScene, int], Chosen]:
     def choose(given: ReconstructedScene, n_views: int) -> Chosen:
-        cameras = given.training.training_cameras
+        cameras = given.training.training_cameras.as_pinholes()
         return Chosen(way(given.moves(n_views), cameras, n_views, given.seed))
 
     return choose
@@ -131,7 +131,7 @@ def _by_truth(
     way: Callable[[SurfaceTruth, Moves, Cameras, int, int], list[Clip]],
 ) -> Callable[[ReconstructedScene, int], Chosen]:
     def choose(given: ReconstructedScene, n_views: int) -> Chosen:
-        cameras = given.training.training_cameras
+        cameras = given.training.training_cameras.as_pinholes()
         return Chosen(way(given.truth, given.moves(n_views), cameras, n_views, given.seed))
 
     return choose

@@ -1,4 +1,4 @@
-"""Straight from a fisheye image to an ideal pinhole: one grid for all frames.
+"""Straight from a fisheye image to an ideal pinhole: one grid for all frames. Or the fisheye's own pixels.
 
 Colour is averaged over each new pixel's footprint (as many bicubic samples as the largest footprint has
 source pixels), so that shrinking does not alias and the corners, which the pinhole stretches, do not blur.
@@ -19,13 +19,14 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
 from data_catalog.images import Resampling
-from data_catalog.sampling import keeps_central_resolution
+from data_catalog.sampling import LensSampling, Sampling, keeps_central_resolution, source_areas
 from extrags.cameras import unproject_pixels
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.lens import sample_depth, size_for_focal
+from extrags.radial_lens import RadialLens
 
-__all__ = ["USUAL_FIELD_OF_VIEW_DEG", "USUAL_WIDTH", "PinholeResampling"]
+__all__ = ["USUAL_FIELD_OF_VIEW_DEG", "USUAL_WIDTH", "PinholeResampling", "own_pixels"]
 
 logger = logging.getLogger(__name__)
 
@@ -112,6 +113,22 @@ class PinholeResampling:
         stored = np.where(np.isfinite(samples), samples, -1).astype(np.float32)
         return cls(camera, K, width, height, supersample, centres, stored, _all_of_block(within, supersample))
 
+    @property
+    def radial_lens(self) -> RadialLens | None:
+        """None: the result is a pinhole's."""
+        return None
+
+    @property
+    def roll_rad(self) -> float:
+        """None is left: the grid has the axes of the poses."""
+        return 0.0
+
+    @property
+    def source_share(self) -> Float[np.ndarray, "h w"]:
+        """Share of the source's image that each pixel stands for; 0 where the source shows nothing."""
+        areas = source_areas(self.centres[..., 0], self.centres[..., 1])
+        return np.asarray(areas * self.inside / (self.camera.width * self.camera.height))
+
     def colour(
         self, image: UInt8[np.ndarray, "h w 3"], *, file: object = None, frame: object = None
     ) -> UInt8[np.ndarray, "h2 w2 3"]:
@@ -181,6 +198,23 @@ class PinholeResampling:
                 frame=frame,
                 field=field,
             )
+
+
+def own_pixels(camera: ScaramuzzaCamera, config: IngestConfig, first: Sampling | None) -> LensSampling:
+    """The fisheye's images as they are, with a radial lens fitted to its model.
+
+    Args:
+        camera: of the source images.
+        config: `width`, `height`, `downscale` or `size`.
+        first: of the sequence's first camera; None for the first itself.
+
+    Raises:
+        ConfigError: a size that the source cannot give, or a pinhole's field of view.
+        SourceError: when no radial lens is near enough, or frames have several lenses.
+    """
+    divisor = max(1, round(camera.width / USUAL_WIDTH))
+    resampling = Resampling.planned(camera.width, camera.height, config, divisor)
+    return LensSampling.native(camera.radial, resampling, config, first)
 
 
 def _source_pixels(

@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.c3vd.coverage import Alignment, CoverageMesh, Surface, align, read_coverage_mesh
-from data_catalog.c3vd.pinhole import PinholeResampling
+from data_catalog.c3vd.pinhole import PinholeResampling, own_pixels
 from data_catalog.c3vd.published import PublishedSet, Recording, RecordingPair, find_recording, published_sets
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
 from data_catalog.c3vd.video import CALIBRATION_FILE, POSE_FILE, Video, is_video, read_depth_mm
@@ -234,6 +234,8 @@ def _source_frames(parts: list[_Part], mesh: CoverageMesh | None, truth: dict[st
 
 def _sampling(camera: ScaramuzzaCamera, config: IngestConfig, first: Sampling | None) -> Sampling:
     """The grid of a video; to the pinhole of the first where there is one already."""
+    if config.lens == "native":
+        return own_pixels(camera, config, first)
     if first is None:
         return PinholeResampling.planned(camera, config)
     return PinholeResampling.to_pinhole(camera, first.K, first.width, first.height)

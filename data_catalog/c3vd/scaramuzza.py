@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from extrags.errors import SourceError
+from extrags.radial_lens import LARGEST_ANGLE_RAD, LensFit, fitted_lens
 
 __all__ = ["CALIBRATIONS", "CalibrationName", "ScaramuzzaCamera", "camera_from_json"]
 
@@ -122,6 +123,22 @@ class ScaramuzzaCamera:
         u = rays[..., :2] / length[..., None] * share[..., None]
         pixels = u @ self._stretch.T + np.array([self.cx, self.cy])
         return np.where((angle <= angle_table[-1])[..., None], pixels, np.nan)
+
+    def radial(self) -> LensFit:
+        """The radial lens nearest to this one, in extrags' pixels (centres at +0.5).
+
+        Raises:
+            SourceError: when the fit folds back.
+        """
+        K = np.array([[self.c * self.a0, 0, self.cx + 0.5], [0, self.a0, self.cy + 0.5], [0, 0, 1.0]])
+
+        def project(
+            x: Float[np.ndarray, "*s"], y: Float[np.ndarray, "*s"]
+        ) -> tuple[Float[np.ndarray, "*s"], Float[np.ndarray, "*s"]]:
+            pixels = self.project(np.stack([x, y, np.ones_like(x)], axis=-1)) + 0.5
+            return pixels[..., 0], pixels[..., 1]
+
+        return fitted_lens(project, K, self.width, self.height, LARGEST_ANGLE_RAD)
 
     @property
     def _stretch(self) -> Float[np.ndarray, "2 2"]:

@@ -192,6 +192,8 @@ def write_colmap(
     distinct, group = np.unique(cameras.K[:, [0, 1, 0, 1], [0, 1, 2, 2]], axis=0, return_inverse=True)
     lenses = {
         number: Lens("PINHOLE", tuple(float(value) for value in row), sequence.width, sequence.height)
+        if sequence.lens is None
+        else Lens.fisheye(cameras.K[group == number - 1][0], sequence.lens, sequence.width, sequence.height)
         for number, row in enumerate(distinct, start=1)
     }
     located = np.zeros((0, 3)) if points is None else np.asarray(points, dtype=np.float64)

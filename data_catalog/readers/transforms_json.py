@@ -173,10 +173,12 @@ def write_transforms(
             np.save(place, sequence.depth_mm[index].astype(np.float64) / _NERFSTUDIO_DEPTH_SCALE)
         frames.append({**entry, "transform_matrix": pose.tolist()})
     content: dict[str, Any] = {
-        "camera_model": "PINHOLE",
+        "camera_model": "PINHOLE" if sequence.lens is None else "OPENCV_FISHEYE",
         "length_unit": "mm" if sequence.metric else "arbitrary",
         "frames": frames,
     }
+    if sequence.lens is not None:
+        content |= dict(zip(("k1", "k2", "k3", "k4"), sequence.lens.coefficients, strict=True))
     for split, indices in (("train", sequence.train), ("test", sequence.test)):
         content[f"{split}_filenames"] = [frames[int(index)]["file_path"] for index in indices]
     content["val_filenames"] = []

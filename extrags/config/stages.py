@@ -92,6 +92,13 @@ class IngestConfig(StageConfig):
         description="horizontal field of view of the pinhole that distorted sources are resampled to; None: "
         "the source's usual one (C3VD and C3VDv2 100; others: that of their central resolution)",
     )
+    lens: Literal["pinhole", "native"] = Field(
+        "pinhole",
+        description="of sources with distortion. pinhole: frames are resampled to one, and what it does not "
+        "show is left out; native: frames keep their original pixels, and Gaussians are projected through "
+        "the lens itself (a radial model fitted to the source's; the log states its error and the share of "
+        "pixels used). Virtual views are pinholes either way; on a GPU with gsplat native is refused",
+    )
     calibration: str | None = Field(
         None,
         min_length=1,
@@ -276,7 +283,7 @@ class PipelineConfig(StageConfig):
         return self.model_copy(update=seeded)
 
     def check_imported(self) -> None:
-        """Refuse settings that an imported scene makes meaningless.
+        """Refuse settings that an imported scene, or a radiance field, makes meaningless.
 
         Raises:
             ConfigError: names them.
@@ -287,6 +294,8 @@ class PipelineConfig(StageConfig):
             "coarse.refine_poses": self.coarse.refine_poses is True,
             "poses.replace_given": self.poses.replace_given,
         }
+        if self.uc_nerf.enabled and self.ingest.lens == "native":
+            raise ConfigError("ingest.lens=native: uc_nerf renders pinholes; take ingest.lens=pinhole")
         wrong = [name for name, is_set in against.items() if is_set]
         if self.imported.scene is not None and wrong:
             raise ConfigError(

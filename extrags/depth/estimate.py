@@ -33,7 +33,9 @@ from extrags.depth.weights import BUNDLED, NONE, completion_digest, load_complet
 from extrags.devices import chosen_device
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
+from extrags.lens import distortion_of_pinhole
 from extrags.poses.triangulation import triangulate_points
+from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.sequence import EndoscopicSequence
 from extrags.store.storable import Storable
 from extrags.threads import in_threads, one_torch_thread
@@ -152,6 +154,11 @@ def estimate_depth(
         MissingDependencyError: when a monocular network is asked for without the package it needs.
     """
     config = DepthConfig() if config is None else config
+    if sequence.lens is not None:
+        flat = sequence.as_pinhole(WIDE_FIELD_DEG)
+        return _through_lens(
+            sequence, flat, estimate_depth(flat, config, poses, monocular=monocular, stage=stage)
+        )
     device = chosen_device(config.device, "depth.device")
     if len(sequence) < 2:
         raise CaptureError(f"{sequence.name}: depth from other frames needs at least two, found one")
@@ -224,6 +231,22 @@ def estimate_depth(
         "median_expected_error": float(np.median(expected[sequence.mask])) if sequence.mask.any() else 1.0,
     }
     return DepthEstimate(depth, expected, points.astype(np.float64), points_rgb, report)
+
+
+def _through_lens(
+    sequence: EndoscopicSequence, flat: EndoscopicSequence, estimate: DepthEstimate
+) -> DepthEstimate:
+    """The depth of wide pinholes, at the pixels of the frames they were resampled from; 0 outside them."""
+    lens = sequence.lens
+    assert lens is not None
+    parts: list[list[np.ndarray]] = [[], []]
+    for index in range(len(sequence)):
+        back = distortion_of_pinhole(sequence.K[index], lens, flat.K[index], sequence.width, sequence.height)
+        known = sequence.mask[index] & (back.depth(flat.mask[index].astype(np.float32)) > 0)
+        for part, image in zip(parts, (estimate.depth, estimate.expected_error), strict=True):
+            part.append(np.where(known, back.depth(image[index]), 0).astype(np.float32))
+    depth, expected = (np.stack(part) for part in parts)
+    return replace(estimate, depth=depth, expected_error=expected)
 
 
 def with_estimated_depth(sequence: EndoscopicSequence, estimate: DepthEstimate) -> EndoscopicSequence:

@@ -62,7 +62,7 @@ class SceneMeasurements(Storable):
     """Measurements of a scene that all branches share.
 
     Args:
-        training: the training views, at the sequence's image size.
+        training: pinholes at the training views, at the sequence's image size: what virtual views are.
         depth_unit_mm: median rendered depth of the training views.
         pairs: (Gaussian, direction) pairs that the training views cover, packed, [N].
         known: what they show of each row, in the terms of `value`, [R].
@@ -184,9 +184,11 @@ def measure_scene(
         for index, view in enumerate(views):
             value.add(known, seen_pairs(scene, small[index], view, frontier, config.directions))
         none = Destinations.of(np.zeros((0, 4, 4)), [])
-        return SceneMeasurements(cameras, depth_unit_mm, pairs, known, value, None, none, len(views))
+        virtual = cameras.as_pinholes()
+        return SceneMeasurements(virtual, depth_unit_mm, pairs, known, value, None, none, len(views))
 
-    probes = probe_cameras(small, freespace, depth_unit_mm, config.safety_share * depth_unit_mm, config)
+    virtual = small.as_pinholes()
+    probes = probe_cameras(virtual, freespace, depth_unit_mm, config.safety_share * depth_unit_mm, config)
     probed = observe(scene, probes, frontier, config, depth_unit_mm=depth_unit_mm)
     model = measure_sizes(
         [probe.sizes for probe in probed], n, len(frontier), small.width * small.height, config
@@ -198,7 +200,7 @@ def measure_scene(
     levels[n:] = 0.0
     fit = _fit_to_be_views(probed, freespace, depth_unit_mm, config)
     return SceneMeasurements(
-        training=cameras,
+        training=cameras.as_pinholes(),
         depth_unit_mm=depth_unit_mm,
         pairs=pairs,
         known=levels,

@@ -237,7 +237,7 @@ class _Seen:
         rows = np.arange(len(self.points)) if rows is None else rows
         camera = view.camera
         local = transform_points(camera.viewmats[0], self.points[rows])
-        pixels = project_points(local, camera.K[0])
+        pixels = project_points(local, camera.K[0], camera.lens)
         with np.errstate(invalid="ignore"):
             inside = np.flatnonzero(camera.contains(pixels))
         rows, pixels = rows[inside], pixels[inside]

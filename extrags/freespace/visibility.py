@@ -14,6 +14,7 @@ from extrags.cameras import Cameras
 from extrags.config import FreespaceConfig
 from extrags.events import Progress, emit
 from extrags.freespace.grid import rotated
+from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import NEAR, Scene
 
 __all__ = ["ViewDepths", "seen_through", "voxel_visibility"]
@@ -43,8 +44,8 @@ class ViewDepths:
 
     @classmethod
     def rendered(cls, scene: Scene, cameras: Cameras, config: FreespaceConfig) -> ViewDepths:
-        """Render views at `render_width`, at most."""
-        cameras = cameras.at_most_width(config.render_width)
+        """Render views at `render_width`, at most; of frames with a lens their wide pinholes."""
+        cameras = cameras.as_pinholes(WIDE_FIELD_DEG).at_most_width(config.render_width)
         parts = []
         with torch.no_grad():
             for start in range(0, len(cameras), VIEWS_PER_BATCH):

@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int
 from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ConfigError
+from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.surface import Mesh, fuse_depth, rendered_depth
@@ -162,8 +163,13 @@ def surface_from_depth(sequence: EndoscopicSequence) -> TrueSurface | None:
     """The true surface from the true depth of all frames; None without poses, depth or surface."""
     if sequence.true_depth_mm is None or sequence.world_from_camera is None:
         return None
+    # Fused as reconstructions are: see `extrags.surface.rendered_depth`.
+    sequence = sequence.as_pinhole(WIDE_FIELD_DEG)
     frames = _all_frames(sequence)
-    depth = np.where(sequence.mask[frames], sequence.true_depth_mm[frames], 0).astype(np.float32)
+    true_depth_mm = sequence.true_depth_mm
+    if true_depth_mm is None:
+        return None
+    depth = np.where(sequence.mask[frames], true_depth_mm[frames], 0).astype(np.float32)
     depth[~np.isfinite(depth)] = 0
     try:
         return TrueSurface(_fused(sequence.cameras[frames], depth), "depth")

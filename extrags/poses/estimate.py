@@ -144,6 +144,8 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
     """
     config = PosesConfig() if config is None else config
+    # COLMAP and the alignment are told of pinholes; poses are those of the frames.
+    sequence = sequence.as_pinhole()
     if not sequence.training_depth_known:
         # Held-out frames may have depth for the evaluation alone.
         sequence = replace(sequence, depth_mm=None)

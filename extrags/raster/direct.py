@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrags.errors import ShapeError
+from extrags.radial_lens import RadialLens
 from extrags.raster import native
 from extrags.raster.loss import huber_depth_gradient
 from extrags.raster.rendering import Rendering, nonfinite_error
@@ -30,6 +31,7 @@ class Target:
     Args:
         viewmat: camera from world, [4, 4].
         K: intrinsics in pixels, [3, 3].
+        lens: of the camera; None for a pinhole.
         rgb: ground-truth colours, [H, W, 3].
         weight: weight of the colour loss per pixel, [H, W]; None weights all pixels equally.
         ssim_weight: weight of its SSIM term where that is another, [H, W]; None takes `weight`.
@@ -48,6 +50,7 @@ class Target:
         K: Float[np.ndarray, "3 3"],
         rgb: Float[Tensor, "h w 3"],
         *,
+        lens: RadialLens | None = None,
         weight: Float[Tensor, "h w"] | None = None,
         ssim_weight: Float[Tensor, "h w"] | None = None,
         normalisation: float | None = None,
@@ -73,6 +76,7 @@ class Target:
                 raise ShapeError(f"{name} has shape {image.shape}, expected {(self.height, self.width)}")
         self.viewmat = np.ascontiguousarray(viewmat, dtype=np.float32)
         self.K = np.ascontiguousarray(K, dtype=np.float32)
+        self.lens = None if lens is None else lens.packed()
         for name, matrix in (("viewmats", self.viewmat), ("Ks", self.K)):
             if not np.isfinite(matrix).all():
                 raise nonfinite_error(name, torch.from_numpy(matrix)[None])
@@ -250,6 +254,7 @@ class DirectStep:
             height=target.height,
             near=near,
             light=light,
+            lens=target.lens,
         )
         frame = kernels.render(self._gaussians, camera, images.filled, degree=sh_degree)
         loss, image_gradients = images.loss_and_gradients(

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrags.errors import ConfigError, MissingDependencyError
+from extrags.radial_lens import RadialLens
 from extrags.raster.light import CameraLight
 from extrags.raster.native import native_isa, rasterize_native
 from extrags.raster.reference import rasterize_reference
@@ -65,6 +66,7 @@ def rasterize(
     query_points: Float[Tensor, "q 3"] | None = None,
     absgrad: bool = False,
     light: CameraLight | None = None,
+    lens: RadialLens | None = None,
 ) -> Rendering:
     """Render Gaussians with differentiable splatting, as `gsplat.rasterization` does.
 
@@ -95,6 +97,8 @@ def rasterize(
         query_points: world points at which `Rendering.transmittance` is wanted.
         absgrad: fill `means2d.absgrad` on backward.
         light: near-field light of the cameras; `sh` or `colors` are then albedo. Differentiable.
+        lens: radial lens of all cameras, None for pinholes. Gaussians are projected with its own Jacobian;
+            what lies outside its field of view by a margin, or behind the camera, is culled.
 
     Returns:
         The images and the optional outputs requested; see `Rendering` for shapes and meaning.
@@ -105,14 +109,15 @@ def rasterize(
         ConfigError: when the chosen backend cannot take these tensors.
         MissingDependencyError: when the chosen backend is not installed.
 
-    Source: Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023; Ye et al., gsplat, JMLR 2025.
+    Source: Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023; Ye et al., gsplat, JMLR 2025. Lens: Zwicker et
+    al., "EWA volume splatting", 2001, with the Jacobian of Kannala and Brandt's model, PAMI 2006.
     """
     packed = None if light is None else light.packed()
     inputs = RasterInputs(
         means, quats, scales, opacities, sh, colors, viewmats, Ks, background, query_points, packed
     )
     inputs, degree = checked_inputs(inputs, width, height, near, sh_degree)
-    options = RasterOptions(width, height, degree, near, median_depth, visibility, absgrad)
+    options = RasterOptions(width, height, degree, near, median_depth, visibility, absgrad, lens)
     chosen = _chosen(backend, means)
     if chosen == "native":
         return rasterize_native(inputs, options)

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from extrags.errors import ConfigError
 from extrags.raster.native import native_isa, rasterize_native
 from extrags.raster.reference import camera_colors, rasterize_reference
 from extrags.raster.rendering import DILATION_PX2, RasterInputs, RasterOptions, Rendering
@@ -21,7 +22,15 @@ def rasterize_gsplat(inputs: RasterInputs, options: RasterOptions) -> Rendering:
     gsplat has no median depth, no visibility and no transmittance at points. If requested, they are computed
     from the same Gaussians by the native kernels on the CPU (or by the reference if those are not built);
     they are not differentiable in any backend.
+
+    Raises:
+        ConfigError: for cameras with a radial lens.
     """
+    if options.lens is not None:
+        raise ConfigError(
+            "the backend gsplat renders pinholes here, not the lens of the frames: take ingest.lens=pinhole, "
+            "or render on the processor"
+        )
     import gsplat
 
     images, alphas, meta = gsplat.rasterization(

@@ -218,6 +218,7 @@ class _Rasterize(torch.autograd.Function):
         alpha = torch.empty(c, options.height, options.width)
         depth = torch.empty_like(alpha)
         differentiable = any(ctx.needs_input_grad)
+        lens = None if options.lens is None else options.lens.packed()
         for index in range(c):
             camera = kernels.Camera(
                 viewmat=viewmats[index],
@@ -227,6 +228,7 @@ class _Rasterize(torch.autograd.Function):
                 near=options.near,
                 background=_of_camera(background, index),
                 light=_of_camera(light, index),
+                lens=lens,
             )
             images = kernels.Images(
                 rgb=rgb[index],

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from extrags.errors import ShapeError
+from extrags.raster.lens_projection import project_through_lens, within_lens
 from extrags.raster.light import lit_colors, shortest_axes
 from extrags.raster.rendering import (
     ALPHA_EPS,
@@ -154,21 +155,27 @@ def _project(inputs: RasterInputs, options: RasterOptions, camera: int) -> _Proj
     rotation, translation = inputs.viewmats[camera, :3, :3], inputs.viewmats[camera, :3, 3]
     fx, fy = inputs.Ks[camera, 0, 0], inputs.Ks[camera, 1, 1]
     cx, cy = inputs.Ks[camera, 0, 2], inputs.Ks[camera, 1, 2]
-    width, height = options.width, options.height
+    width, height, lens = options.width, options.height, options.lens
     z_all = (inputs.means @ rotation[2] + translation[2]).detach()
     ids = torch.nonzero((z_all >= options.near) & (inputs.opacities.detach() >= ALPHA_MIN))[:, 0]
 
     x, y, z = (inputs.means[ids] @ rotation.T + translation).unbind(-1)
-    margin_x, margin_y = (
-        FIELD_OF_VIEW_MARGIN * 0.5 * width / fx,
-        FIELD_OF_VIEW_MARGIN * 0.5 * height / fy,
-    )
-    slope_x = torch.clamp(x / z, -(cx / fx + margin_x), (width - cx) / fx + margin_x)
-    slope_y = torch.clamp(y / z, -(cy / fy + margin_y), (height - cy) / fy + margin_y)
-    zero = torch.zeros_like(z)
-    jacobian = torch.stack([fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1).reshape(
-        -1, 2, 3
-    )
+    if lens is not None:
+        seen = torch.nonzero(within_lens(x, y, z, lens))[:, 0]
+        ids, x, y, z = ids[seen], x[seen], y[seen], z[seen]
+        means2d, jacobian = project_through_lens(x, y, z, inputs.Ks[camera], lens)
+    else:
+        margin_x, margin_y = (
+            FIELD_OF_VIEW_MARGIN * 0.5 * width / fx,
+            FIELD_OF_VIEW_MARGIN * 0.5 * height / fy,
+        )
+        slope_x = torch.clamp(x / z, -(cx / fx + margin_x), (width - cx) / fx + margin_x)
+        slope_y = torch.clamp(y / z, -(cy / fy + margin_y), (height - cy) / fy + margin_y)
+        zero = torch.zeros_like(z)
+        jacobian = torch.stack(
+            [fx / z, zero, -fx * slope_x / z, zero, fy / z, -fy * slope_y / z], -1
+        ).reshape(-1, 2, 3)
+        means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
     axes = rotation_matrices(inputs.quats[ids]) * inputs.scales[ids][:, None, :]
     half = jacobian @ rotation @ axes
     covariance = half @ half.transpose(1, 2)
@@ -176,7 +183,6 @@ def _project(inputs: RasterInputs, options: RasterOptions, camera: int) -> _Proj
     xy = covariance[:, 0, 1]
     yy = covariance[:, 1, 1] + DILATION_PX2
     determinant = xx * yy - xy * xy
-    means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], -1)
     opacities = inputs.opacities[ids]
 
     reach = 2 * torch.log(opacities.detach() / ALPHA_MIN).clamp_min(0)
@@ -302,8 +308,14 @@ def _query(inputs: RasterInputs, options: RasterOptions, camera: int, seen: _Pro
     x, y, z = (points @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
     ahead = z >= options.near
     safe = torch.where(ahead, z, torch.ones_like(z))
-    column = torch.floor(K[0, 0] * x / safe + K[0, 2])
-    row = torch.floor(K[1, 1] * y / safe + K[1, 2])
+    if options.lens is None:
+        column = torch.floor(K[0, 0] * x / safe + K[0, 2])
+        row = torch.floor(K[1, 1] * y / safe + K[1, 2])
+    else:
+        ahead &= within_lens(x, y, safe, options.lens)
+        here = torch.where(ahead, x, torch.zeros_like(x)), torch.where(ahead, y, torch.zeros_like(y))
+        centres, _ = project_through_lens(*here, safe, K, options.lens)
+        column, row = torch.floor(centres).unbind(-1)
     inside = ahead & (column >= 0) & (column < options.width)
     inside &= (row >= 0) & (row < options.height)
     result = torch.full_like(z, torch.nan)

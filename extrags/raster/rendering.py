@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.errors import NonFiniteError, ShapeError
+from extrags.radial_lens import RadialLens
 
 __all__ = ["RasterInputs", "RasterOptions", "Rendering", "checked_inputs"]
 
@@ -100,6 +101,7 @@ class RasterOptions:
     median_depth: bool
     visibility: bool
     absgrad: bool
+    lens: RadialLens | None = None
 
 
 def checked_inputs(

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from extrags.errors import ConfigError, NonFiniteError
+from extrags.radial_lens import LARGEST_ANGLE_RAD, RadialLens
 from extrags.raster import native
 from extrags.raster.bench import BenchSize, bench_scene, machine
 from extrags.raster.dispatch import rasterize
@@ -46,6 +47,7 @@ class _Case:
         scene: arrays in the layout of `bench_scene`.
         compared: whether results are compared with float64; if not, they only have to be finite.
         note: remark for the table.
+        lens: of the camera; None for a pinhole.
     """
 
     axis: str
@@ -53,6 +55,7 @@ class _Case:
     scene: Scene
     compared: bool = True
     note: str = ""
+    lens: RadialLens | None = None
 
 
 def bench_stability(axes: Sequence[str] | None = None, *, threads: int = 1) -> dict[str, Any]:
@@ -89,7 +92,7 @@ def bench_stability(axes: Sequence[str] | None = None, *, threads: int = 1) -> d
 
 
 def _case_result(case: _Case) -> dict[str, Any]:
-    found = _outputs_and_gradients(case.scene, "native", torch.float32)
+    found = _outputs_and_gradients(case.scene, "native", torch.float32, case.lens)
     result: dict[str, Any] = {"axis": case.axis, "value": case.value, "error": None}
     bad = [name for name, value in found.items() if not bool(torch.isfinite(value).all())]
     alpha = found["alpha"]
@@ -99,8 +102,8 @@ def _case_result(case: _Case) -> dict[str, Any]:
         return {**result, "ok": False, "note": "alpha outside [0, 1]"}
     if not case.compared:
         return {**result, "ok": True, "note": case.note or "finite"}
-    exact = _outputs_and_gradients(case.scene, "reference", torch.float64)
-    plain = _outputs_and_gradients(case.scene, "reference", torch.float32)
+    exact = _outputs_and_gradients(case.scene, "reference", torch.float64, case.lens)
+    plain = _outputs_and_gradients(case.scene, "reference", torch.float32, case.lens)
     image, gradient = _errors(found, exact)
     plain_image, plain_gradient = _errors(plain, exact)
     good_image = image <= max(IMAGE_TOLERANCE, FLOAT32_FACTOR * plain_image)
@@ -120,7 +123,9 @@ def _case_result(case: _Case) -> dict[str, Any]:
     }
 
 
-def _outputs_and_gradients(scene: Scene, backend: Any, dtype: torch.dtype) -> dict[str, Tensor]:
+def _outputs_and_gradients(
+    scene: Scene, backend: Any, dtype: torch.dtype, lens: RadialLens | None = None
+) -> dict[str, Tensor]:
     """All outputs, and the gradients of a fixed random linear function of colour, alpha and depth."""
     values = {name: value.to(dtype, copy=True) for name, value in scene.items()}
     leaves = {name: values[name].requires_grad_() for name in LEARNED}
@@ -141,6 +146,7 @@ def _outputs_and_gradients(scene: Scene, backend: Any, dtype: torch.dtype) -> di
         median_depth=more,
         visibility=more,
         absgrad=more,
+        lens=lens,
     )
     generator = torch.Generator().manual_seed(1)
     total = rendering.rgb.new_zeros(())
@@ -295,6 +301,29 @@ def _focal_lengths() -> Iterator[_Case]:
         yield _Case("focal length", f"{focal:g} px", _with(base, Ks=K))
 
 
+def _lenses() -> Iterator[_Case]:
+    base = _with(_base(), viewmats=torch.eye(4)[None])
+    lenses = {
+        "barrel of 170 degrees": RadialLens((-0.21, 0.04, 0.008, -0.003), LARGEST_ANGLE_RAD),
+        "nearly folding back": RadialLens((-0.149, 0.0, 0.0, 0.0), LARGEST_ANGLE_RAD),
+        "pincushion of 60 degrees": RadialLens((0.4, 0.3, 0.2, 0.1), math.radians(30)),
+        "10 degrees": RadialLens((2.0, 0.0, 0.0, 0.0), math.radians(5)),
+    }
+    for name, lens in lenses.items():
+        yield _Case("lens", name, base, lens=lens)
+    barrel = lenses["barrel of 170 degrees"]
+    for share in (1e-20, 1e-6, 1e-3):
+        means = base["means"] * torch.tensor([share, share, 1.0])
+        yield _Case("lens", f"{share:g} from its axis", _with(base, means=means), lens=barrel)
+    slope = base["means"][:, :2].norm(dim=1, keepdim=True)
+    for degrees in (23.0, 60.0, 84.9, 85.1, 87.9):
+        z = slope / math.tan(math.radians(degrees))
+        means = torch.cat([base["means"][:, :2], z], dim=1)
+        yield _Case("lens", f"{degrees:g} degrees from its axis", _with(base, means=means), lens=barrel)
+    means = torch.cat([base["means"][:, :2], slope * torch.linspace(-0.1, 0.1, len(slope))[:, None]], dim=1)
+    yield _Case("lens", "beside and behind", _with(base, means=means), compared=False, lens=barrel)
+
+
 def _colours() -> Iterator[_Case]:
     base = _base()
     for factor in (0.0, 1e4):
@@ -321,6 +350,7 @@ AXES: dict[str, Callable[[], Iterator[_Case]]] = {
     "means": _far_means,
     "duplicate depths": _depths,
     "focal length": _focal_lengths,
+    "lens": _lenses,
     "harmonics": _colours,
     "number of Gaussians": _counts,
 }

@@ -153,7 +153,7 @@ def _space(inputs: ReportInputs) -> dict[str, Any]:
     }
     if sequence.world_from_camera is None:
         return found
-    cameras = sequence.cameras
+    cameras = sequence.cameras.as_pinholes()
     train, held_out = cameras[sequence.train], cameras[inputs.frames]
     found["scene_figures"] = scene_views(
         train, held_out, inputs.trajectories, inputs.mesh, inputs.grid, unit=unit

@@ -81,6 +81,9 @@ def intrinsics_in_words(sequence: EndoscopicSequence) -> str:
     angle_deg = math.degrees(2 * math.atan(sequence.width / 2 / focal_px))
     if sequence.intrinsics == "guessed":
         return f"guessed: {focal_px:.1f} px ({angle_deg:.0f} degrees), not determined"
+    if sequence.lens is not None:
+        lens_deg = 2 * math.degrees(sequence.lens.max_angle_rad)
+        return f"{focal_px:.1f} px on the axis of a lens of {lens_deg:.0f} degrees, in its own pixels"
     spread = "" if sequence.focal_std_px is None else f" \N{PLUS-MINUS SIGN} {sequence.focal_std_px:.1f}"
     return f"{focal_px:.1f} px{spread} (field of view {angle_deg:.0f} degrees), {sequence.intrinsics}"
 

@@ -133,7 +133,8 @@ def train_enhancer(
         MissingDependencyError: when a pretrained backend lacks a package.
         ConfigError: when its settings do not fit.
     """
-    return backend_of(config.backend).prepare(scene, sequence, config, coarse)
+    # Virtual views are pinholes, and so are all views that a restorer learns from.
+    return backend_of(config.backend).prepare(scene, sequence.as_pinhole(), config, coarse)
 
 
 def load_enhancer(path: Path) -> Enhancer:

@@ -25,8 +25,10 @@ from extrags.cameras import Cameras
 from extrags.config import EnhanceConfig
 from extrags.errors import ShapeError
 from extrags.events import Progress, emit
+from extrags.lens import Undistortion, distortion_of_pinhole
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.metrics.protocol import RenderedViews
+from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.restoration.benchmark.evaluation import held_out_clips
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import FEATHER_RADIUS_PX, FEATHER_SIGMA_PX
@@ -83,6 +85,8 @@ def restored_renders(
     """
     if len(renders) != len(sequence.test):
         raise ShapeError(f"{len(renders)} renders of {len(sequence.test)} held-out frames")
+    if sequence.lens is not None:
+        return _through_pinholes(coarse, renders, sequence, training, enhancer, config, textured=textured)
     width = config.working_width(sequence.width)
     small, training = sequence.at_most_width(width), training.at_most_width(width)
     references = gather_references(coarse, training, training.train)
@@ -102,6 +106,50 @@ def restored_renders(
         done += len(clip)
         emit(Progress("restore renders", done, len(renders)))
     return replace(renders, rgb=np.concatenate(restored))
+
+
+def _through_pinholes(
+    coarse: Scene,
+    renders: RenderedViews,
+    sequence: EndoscopicSequence,
+    training: EndoscopicSequence,
+    enhancer: Enhancer,
+    config: EnhanceConfig,
+    *,
+    textured: bool,
+) -> RenderedViews:
+    """Views through a lens, restored as wide pinholes: what restoration changes there is carried back.
+
+    What a pinhole does not show, and what restoration leaves alone, stays as it was rendered.
+    """
+    lens = sequence.lens
+    assert lens is not None
+    width, height = sequence.width, sequence.height
+    plans = [
+        Undistortion.of_radial(K, lens, width, height, WIDE_FIELD_DEG) for K in sequence.K[sequence.test]
+    ]
+
+    def flattened(images: np.ndarray) -> np.ndarray:
+        return np.stack([plan.image(image) for plan, image in zip(plans, images, strict=True)])
+
+    flat = RenderedViews(
+        flattened(renders.rgb), flattened(renders.alpha), flattened(renders.depth_mm), renders.n_gaussians
+    )
+    restored = restored_renders(
+        coarse,
+        flat,
+        sequence.as_pinhole(WIDE_FIELD_DEG),
+        training.as_pinhole(),
+        enhancer,
+        config,
+        textured=textured,
+    )
+    changed = []
+    for index, plan in enumerate(plans):
+        back = distortion_of_pinhole(sequence.K[sequence.test[index]], lens, plan.K, width, height)
+        change = np.where(plan.valid[..., None], restored.rgb[index] - flat.rgb[index], 0)
+        changed.append(renders.rgb[index] + back.image(change))
+    return replace(renders, rgb=np.stack(changed).astype(np.float32))
 
 
 def _mixed(

@@ -63,12 +63,14 @@ def at_working_size(
     """Frames and virtual views at the size that views are restored at (`enhance.max_width`).
 
     Args:
-        sequence: frames of any size; those that are small enough are returned as they are.
+        sequence: frames of any size; those that are small enough, and pinholes, are returned as they are.
         trajectories: virtual views.
         config: the settings.
     """
     width = config.working_width(sequence.width)
-    return sequence.at_most_width(width), [cameras.at_most_width(width) for cameras in trajectories]
+    return sequence.as_pinhole().at_most_width(width), [
+        cameras.at_most_width(width) for cameras in trajectories
+    ]
 
 
 def restored_batches(

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrags.cameras import Cameras
+from extrags.cameras import Cameras, unproject_pixels
 
 __all__ = ["APPLIED_EVERY", "SmallestFootprint"]
 
@@ -51,6 +51,11 @@ class SmallestFootprint:
             (pixels,), (z,) = self._cameras[index].project(means)
             inside = self._cameras.contains(pixels)
             focal_px = min(self._cameras.K[index, 0, 0], self._cameras.K[index, 1, 1])
+            if self._cameras.lens is not None:
+                # A lens packs its rim: there a pixel is wider, across the radius, than on its axis.
+                rays = unproject_pixels(pixels[inside], self._cameras.K[index], self._cameras.lens)
+                slope = np.maximum(np.hypot(rays[:, 0], rays[:, 1]), 1e-6)
+                z[inside] *= slope / self._cameras.lens.radius(np.arctan(slope))
             nearest[inside] = np.minimum(nearest[inside], z[inside] / focal_px)
         return np.where(np.isfinite(nearest), self._pixels * nearest, 0.0)
 

@@ -125,7 +125,8 @@ def frame_weights(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) ->
     if sequence.depth_mm is None or not (sequence.depth_mm[frames] > 0).any():
         logger.info("%s: without depth no blurred or moved frames are looked for", sequence.name)
         return None
-    compared = ComparedFrames(sequence, frames)
+    # On image planes: homographies and flow know no lens.
+    compared = ComparedFrames(sequence.as_pinhole(), frames)
     pairs: set[tuple[int, int]] = set()
     for frame in range(len(compared)):
         for source in compared.sources(frame):

@@ -251,6 +251,7 @@ class NativeStep:
             camera.viewmats[0].astype(np.float32),
             camera.K[0].astype(np.float32),
             view.rgb,
+            lens=camera.lens,
             weight=view.weight,
             ssim_weight=view.ssim_weight,
             normalisation=view.normalisation,

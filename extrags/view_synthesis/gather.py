@@ -43,8 +43,10 @@ def gather_references(
 
     Raises:
         CaptureError: without any frame, or when none has usable depth.
-        ShapeError: when the light's exposures are not those of the frames.
+        ShapeError: when the light's exposures are not those of the frames, or these are no pinholes.
     """
+    if sequence.lens is not None:
+        raise ShapeError(f"{sequence.name}: references are pinholes; take `EndoscopicSequence.as_pinhole`")
     frames = np.asarray(frames, dtype=np.int64)
     if len(frames) == 0:
         raise CaptureError(f"{sequence.name}: no real views to refer to")

@@ -235,7 +235,7 @@ def _cameras(given: argparse.Namespace, along: str, steps: int) -> Cameras:
     # Between recordings of one scene there is no way.
     recording = np.zeros(len(chosen)) if frames.recording is None else frames.recording[chosen]
     return flight_through(
-        [frames.cameras[chosen[recording == index]] for index in np.unique(recording)], steps
+        [frames.cameras.as_pinholes()[chosen[recording == index]] for index in np.unique(recording)], steps
     )
 
 

@@ -154,4 +154,4 @@ def _from_store(given: argparse.Namespace) -> _Shown:
     # Where fine-tuning was left out, the coarse scene is the final one.
     scene = run.store.load(Scene, run.refs.get("finetune", coarse) if which == "final" else coarse)
     frames = run.store.load(EndoscopicSequence, run.refs["sequence"])
-    return _Shown(f"{which} scene of {given.sequence}", scene, frames.training_cameras)
+    return _Shown(f"{which} scene of {given.sequence}", scene, frames.training_cameras.as_pinholes())

@@ -22,10 +22,23 @@ constexpr float kCovarianceMax = 1e12f;
 // first caches, large enough that few Gaussians touch several.
 constexpr int kTileBlocks = 8, kTilePx = 4 * kTileBlocks;
 
+// A radial lens, as `RadialLens.packed` of radial_lens.py gives it.
+constexpr int kSeriesTerms = 14;
+constexpr float kSeriesSquare = 0.18f;  // up to this squared tangent the series holds
+struct RadialLens {
+  float coefficients[4];      // k1 to k4 of r(angle)
+  float series[kSeriesTerms];  // of r / tan(angle) by the squared tangent
+  float linear_from;           // angle from which r grows linearly
+  float culled_from;           // squared tangent of the angle beyond which Gaussians are culled
+};
+static_assert(sizeof(RadialLens) == 80, "the caller hands over twenty floats");
+
 struct Camera {
   float rotation[9];  // camera from world, row-major
   float translation[3];
   float fx, fy, cx, cy;
+  bool bent;  // by the lens; else a pinhole
+  RadialLens lens;
 };
 
 // The light that rides on the camera; see light.py.

@@ -40,14 +40,15 @@ struct ViewContext {
   const SceneGradients* scene_gradients;
 };
 
+template <bool kLens>
 static void project_task(void* data, int chunk, int) {
   const ViewContext& c = *static_cast<ViewContext*>(data);
-  if (c.scene->colors != nullptr) return project_chunk<0, true>(c.view, c.scene, c.images, chunk);
+  if (c.scene->colors != nullptr) return project_chunk<0, true, kLens>(c.view, c.scene, c.images, chunk);
   switch (c.scene->degree) {
-    case 0: return project_chunk<0, false>(c.view, c.scene, c.images, chunk);
-    case 1: return project_chunk<1, false>(c.view, c.scene, c.images, chunk);
-    case 2: return project_chunk<2, false>(c.view, c.scene, c.images, chunk);
-    default: return project_chunk<3, false>(c.view, c.scene, c.images, chunk);
+    case 0: return project_chunk<0, false, kLens>(c.view, c.scene, c.images, chunk);
+    case 1: return project_chunk<1, false, kLens>(c.view, c.scene, c.images, chunk);
+    case 2: return project_chunk<2, false, kLens>(c.view, c.scene, c.images, chunk);
+    default: return project_chunk<3, false, kLens>(c.view, c.scene, c.images, chunk);
   }
 }
 
@@ -91,23 +92,25 @@ static void tile_backward_task(void* data, int tile, int slot) {
   backward_tile(c.view, c.image_gradients, c.scene_gradients->absolute2d != nullptr, tile, slot);
 }
 
-template <int kDegree, bool kColors>
+template <int kDegree, bool kColors, bool kLens>
 static void project_backward(const ViewContext& c, int chunk) {
-  if (c.scene_gradients->viewmat != nullptr) {
-    project_chunk_backward<kDegree, kColors, true>(c.view, c.scene, c.scene_gradients, chunk);
+  // With a lens the gradient of the pose is always carried along: fewer instances to compile.
+  if (kLens || c.scene_gradients->viewmat != nullptr) {
+    project_chunk_backward<kDegree, kColors, true, kLens>(c.view, c.scene, c.scene_gradients, chunk);
   } else {
-    project_chunk_backward<kDegree, kColors, false>(c.view, c.scene, c.scene_gradients, chunk);
+    project_chunk_backward<kDegree, kColors, kLens, kLens>(c.view, c.scene, c.scene_gradients, chunk);
   }
 }
 
+template <bool kLens>
 static void project_backward_task(void* data, int chunk, int) {
   const ViewContext& c = *static_cast<ViewContext*>(data);
-  if (c.scene->colors != nullptr) return project_backward<0, true>(c, chunk);
+  if (c.scene->colors != nullptr) return project_backward<0, true, kLens>(c, chunk);
   switch (c.scene->degree) {
-    case 0: return project_backward<0, false>(c, chunk);
-    case 1: return project_backward<1, false>(c, chunk);
-    case 2: return project_backward<2, false>(c, chunk);
-    default: return project_backward<3, false>(c, chunk);
+    case 0: return project_backward<0, false, kLens>(c, chunk);
+    case 1: return project_backward<1, false, kLens>(c, chunk);
+    case 2: return project_backward<2, false, kLens>(c, chunk);
+    default: return project_backward<3, false, kLens>(c, chunk);
   }
 }
 
@@ -169,7 +172,7 @@ static void forward(View* view, const Scene* scene, const Images* images) {
   const double started = monotonic_seconds();
   lay_out(view, scene->n);
   ViewContext c{view, scene, images, nullptr, nullptr};
-  parallel_for(view->chunks, project_task, &c);
+  parallel_for(view->chunks, view->camera.bent ? project_task<true> : project_task<false>, &c);
 
   // Where each tile's pairs start, and in it those of each chunk
   const size_t tiles = static_cast<size_t>(view->tiles_x) * view->tiles_y;
@@ -225,7 +228,7 @@ static void backward(View* view, const Scene* scene, const ImageGradients* in, c
   parallel_for(view->tiles_x * view->tiles_y, tile_backward_task, &c);
   const double carried = monotonic_seconds();
   reserve(&view->partials, sizeof(float) * kPartials * (view->chunks + 1));
-  parallel_for(view->chunks, project_backward_task, &c);
+  parallel_for(view->chunks, view->camera.bent ? project_backward_task<true> : project_backward_task<false>, &c);
   view->seconds[2] = carried - started;
   view->seconds[3] = monotonic_seconds() - carried;
   const float* partials = static_cast<const float*>(view->partials.data);

@@ -174,12 +174,14 @@ struct CameraSettings {
   CameraLight light{};
 
   CameraSettings(const In& viewmat, const In& K, int width, int height, float near,
-                 const std::optional<In>& background, const std::optional<In>& light)
+                 const std::optional<In>& background, const std::optional<In>& light,
+                 const std::optional<In>& lens)
       : width(width), height(height), near(near), lit(light.has_value()) {
     expect(viewmat.size() == 16, "viewmat");
     expect(K.size() == 9, "K");
     expect(!background || background->size() == 3, "background");
     expect(!light || light->size() == 12, "light");
+    expect(!lens || lens->size() * sizeof(float) == sizeof(RadialLens), "lens");
     const float* v = viewmat.data();
     for (int i = 0; i < 3; ++i) {
       for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = v[4 * i + j];
@@ -190,6 +192,8 @@ struct CameraSettings {
     camera.fy = k[4];
     camera.cx = k[2];
     camera.cy = k[5];
+    camera.bent = lens.has_value();
+    if (lens) std::memcpy(&camera.lens, lens->data(), sizeof camera.lens);
     if (background) std::copy_n(background->data(), 3, this->background);
     if (light) std::memcpy(&this->light, light->data(), sizeof this->light);
   }
@@ -491,10 +495,12 @@ NB_MODULE(_native, m) {
            nb::kw_only(), nb::arg("means").noconvert(), nb::arg("quats").noconvert(),
            nb::arg("scales").noconvert(), nb::arg("opacities").noconvert(),
            nb::arg("sh").none().noconvert() = nb::none(), nb::arg("colors").none().noconvert() = nb::none());
-  nb::class_<CameraSettings>(m, "Camera", "A pinhole camera, the light it carries and what it sees behind all.")
-      .def(nb::init<const In&, const In&, int, int, float, const std::optional<In>&, const std::optional<In>&>(),
+  nb::class_<CameraSettings>(m, "Camera", "A camera, the light it carries and what it sees behind all.")
+      .def(nb::init<const In&, const In&, int, int, float, const std::optional<In>&, const std::optional<In>&,
+                    const std::optional<In>&>(),
            nb::kw_only(), nb::arg("viewmat"), nb::arg("K"), nb::arg("width"), nb::arg("height"),
-           nb::arg("near"), nb::arg("background").none() = nb::none(), nb::arg("light").none() = nb::none());
+           nb::arg("near"), nb::arg("background").none() = nb::none(), nb::arg("light").none() = nb::none(),
+           nb::arg("lens").none() = nb::none());
   nb::class_<ImageArrays>(m, "Images", "What a forward pass fills.")
       .def(nb::init<Out, Out, Out, Out, Out, std::optional<Out>, std::optional<Out>, std::optional<Out>>(),
            nb::kw_only(), nb::arg("rgb").noconvert(), nb::arg("alpha").noconvert(),

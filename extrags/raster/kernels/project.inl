@@ -1,5 +1,7 @@
 // EWA projection of Gaussians and its gradient, sixteen at a time.
 
+#include "lens.inl"
+
 // How many of a task's chunk are in a group
 EXTRAGS_INLINE int rows_of(int n, int first) { return n - first < 16 ? n - first : 16; }
 
@@ -14,12 +16,16 @@ struct Projected {
   Vec axes[9];                      // camera rotation * rotation * scale
   Vec half[6];                      // Jacobian * axes, two rows
   Vec j00, j02, j11, j12;           // Jacobian
+  Vec j01, j10;                     // the same, of a lens; zero for a pinhole
+  Gain gain;                        // of the lens
+  Vec image_x, image_y;             // centre in focal lengths from the principal point, of a lens
   Vec xx, xy, yy, determinant;      // 2D covariance
   Vec opacity;
   Vec direction[3], inverse_distance;
 };
 
 // Returns the lanes that pass the near plane, the opacity cut and the covariance limit.
+template <bool kLens>
 EXTRAGS_INLINE Mask project(const View* view, const Scene* scene, int first, int rows, Projected& p) {
   const Camera& c = view->camera;
   const float* r = c.rotation;
@@ -38,17 +44,28 @@ EXTRAGS_INLINE Mask project(const View* view, const Scene* scene, int first, int
 
   p.z = select(ok, p.z, Vec(1.f));
   p.inverse_z = Vec(1.f) / p.z;
-  const float w = static_cast<float>(view->width), h = static_cast<float>(view->height);
-  const float margin_x = kFieldOfViewMargin * 0.5f * w / c.fx;
-  const float margin_y = kFieldOfViewMargin * 0.5f * h / c.fy;
-  const Vec low_x(-(c.cx / c.fx + margin_x)), high_x((w - c.cx) / c.fx + margin_x);
-  const Vec low_y(-(c.cy / c.fy + margin_y)), high_y((h - c.cy) / c.fy + margin_y);
   p.raw_x = p.x * p.inverse_z;
   p.raw_y = p.y * p.inverse_z;
-  p.slope_x = min(max(p.raw_x, low_x), high_x);
-  p.slope_y = min(max(p.raw_y, low_y), high_y);
-  p.free_x = ge(p.raw_x, low_x) & ge(high_x, p.raw_x);
-  p.free_y = ge(p.raw_y, low_y) & ge(high_y, p.raw_y);
+  if constexpr (kLens) {
+    const Vec squared = fma(p.raw_x, p.raw_x, p.raw_y * p.raw_y);
+    ok = ok & ge(Vec(c.lens.culled_from), squared);
+    if (!any(ok)) return ok;
+    p.raw_x = keep(ok, p.raw_x);
+    p.raw_y = keep(ok, p.raw_y);
+    p.gain = lens_gain(c.lens, keep(ok, squared));
+    p.image_x = p.gain.value * p.raw_x;
+    p.image_y = p.gain.value * p.raw_y;
+  } else {
+    const float w = static_cast<float>(view->width), h = static_cast<float>(view->height);
+    const float margin_x = kFieldOfViewMargin * 0.5f * w / c.fx;
+    const float margin_y = kFieldOfViewMargin * 0.5f * h / c.fy;
+    const Vec low_x(-(c.cx / c.fx + margin_x)), high_x((w - c.cx) / c.fx + margin_x);
+    const Vec low_y(-(c.cy / c.fy + margin_y)), high_y((h - c.cy) / c.fy + margin_y);
+    p.slope_x = min(max(p.raw_x, low_x), high_x);
+    p.slope_y = min(max(p.raw_y, low_y), high_y);
+    p.free_x = ge(p.raw_x, low_x) & ge(high_x, p.raw_x);
+    p.free_y = ge(p.raw_y, low_y) & ge(high_y, p.raw_y);
+  }
 
   load_rows<4>(scene->quats + 4 * static_cast<size_t>(first), rows, q);
   // Scaled by its largest entry first, so that the squares neither overflow nor vanish.
@@ -81,11 +98,25 @@ EXTRAGS_INLINE Mask project(const View* view, const Scene* scene, int first, int
   }
   p.j00 = Vec(c.fx) * p.inverse_z;
   p.j11 = Vec(c.fy) * p.inverse_z;
-  p.j02 = negated(p.j00 * p.slope_x);
-  p.j12 = negated(p.j11 * p.slope_y);
-  for (int j = 0; j < 3; ++j) {
-    p.half[j] = fma(p.j00, p.axes[j], p.j02 * p.axes[6 + j]);
-    p.half[3 + j] = fma(p.j11, p.axes[3 + j], p.j12 * p.axes[6 + j]);
+  if constexpr (kLens) {
+    const Vec turn = two * p.gain.first, a_turn = turn * p.raw_x;
+    p.j01 = p.j00 * (a_turn * p.raw_y);
+    p.j10 = p.j11 * (a_turn * p.raw_y);
+    p.j00 = p.j00 * fma(a_turn, p.raw_x, p.gain.value);
+    p.j11 = p.j11 * fma(turn * p.raw_y, p.raw_y, p.gain.value);
+    p.j02 = negated(fma(p.j00, p.raw_x, p.j01 * p.raw_y));
+    p.j12 = negated(fma(p.j11, p.raw_y, p.j10 * p.raw_x));
+    for (int j = 0; j < 3; ++j) {
+      p.half[j] = fma(p.j00, p.axes[j], fma(p.j01, p.axes[3 + j], p.j02 * p.axes[6 + j]));
+      p.half[3 + j] = fma(p.j11, p.axes[3 + j], fma(p.j10, p.axes[j], p.j12 * p.axes[6 + j]));
+    }
+  } else {
+    p.j02 = negated(p.j00 * p.slope_x);
+    p.j12 = negated(p.j11 * p.slope_y);
+    for (int j = 0; j < 3; ++j) {
+      p.half[j] = fma(p.j00, p.axes[j], p.j02 * p.axes[6 + j]);
+      p.half[3 + j] = fma(p.j11, p.axes[3 + j], p.j12 * p.axes[6 + j]);
+    }
   }
   const Vec *a = p.half, *b = p.half + 3;
   const Vec aa = fma(a[0], a[0], fma(a[1], a[1], a[2] * a[2]));
@@ -127,7 +158,7 @@ EXTRAGS_INLINE void mark_culled(View* view, const Images* out, int first, int ro
 }
 
 // Projects one chunk of Gaussians and counts the tiles they touch.
-template <int kDegree, bool kColors>
+template <int kDegree, bool kColors, bool kLens>
 static void project_chunk(View* view, const Scene* scene, const Images* out, int chunk) {
   Record* records = static_cast<Record*>(view->records.data);
   TileRect* rects = static_cast<TileRect*>(view->rects.data);
@@ -141,13 +172,13 @@ static void project_chunk(View* view, const Scene* scene, const Images* out, int
   for (int first = begin; first < end; first += 16) {
     const int rows = rows_of(end, first);
     Projected p;
-    Mask ok = project(view, scene, first, rows, p);
+    Mask ok = project<kLens>(view, scene, first, rows, p);
     if (!any(ok)) {
       mark_culled(view, out, first, rows);
       continue;
     }
-    const Vec u = fma(Vec(view->camera.fx), p.raw_x, Vec(view->camera.cx));
-    const Vec v = fma(Vec(view->camera.fy), p.raw_y, Vec(view->camera.cy));
+    const Vec u = fma(Vec(view->camera.fx), kLens ? p.image_x : p.raw_x, Vec(view->camera.cx));
+    const Vec v = fma(Vec(view->camera.fy), kLens ? p.image_y : p.raw_y, Vec(view->camera.cy));
     const Vec log2_opacity = log2(max(p.opacity, Vec(kAlphaMin)));
     // alpha = 1/255 where the squared Mahalanobis distance is `reach`
     const Vec reach = max(Vec(2 * kLn2) * (log2_opacity + Vec(7.994353436858858f)), Vec(0.f));
@@ -260,7 +291,7 @@ EXTRAGS_INLINE void apply_conic(const Projected& p, Vec inverse, Vec x, Vec y, V
 }
 
 // Carries gradients from the image plane to the parameters of one chunk of Gaussians.
-template <int kDegree, bool kColors, bool kPose>
+template <int kDegree, bool kColors, bool kPose, bool kLens>
 static void project_chunk_backward(View* view, const Scene* scene, const SceneGradients* out, int chunk) {
   const TileRect* rects = static_cast<const TileRect*>(view->rects.data);
   const uint32_t* starts = static_cast<const uint32_t*>(view->pair_starts.data);
@@ -294,7 +325,7 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
     for (int i = 0; i < 16; ++i) flags[i] = static_cast<float>(seen >> i & 1);
     transpose16(gathered, columns);
     Projected p;
-    project(view, scene, first, rows, p);
+    project<kLens>(view, scene, first, rows, p);
     const Mask ok = gt(load(flags), zero);
     // Moments of the gradient g of half the squared Mahalanobis distance: sums of g, g dx, g dy, ...
     const Vec s0 = load(columns), sx = load(columns + 16), sy = load(columns + 32);
@@ -307,6 +338,7 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
     // The gradient of the covariance is -conic S conic / 2 with S the second moments, that of a column h of
     // `half` -conic (S (conic h)): taken so, a needle's long axis does not drown in its short one's rounding.
     Vec v_axes[9], v_j00 = zero, v_j02 = zero, v_j11 = zero, v_j12 = zero;
+    [[maybe_unused]] Vec v_j01 = zero, v_j10 = zero;
     for (int j = 0; j < 3; ++j) {
       Vec q_x, q_y, v_a, v_b;
       apply_conic(p, inverse, p.half[j], p.half[3 + j], &q_x, &q_y);
@@ -315,6 +347,12 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
       v_b = keep(ok, negated(v_b));
       v_axes[j] = p.j00 * v_a;
       v_axes[3 + j] = p.j11 * v_b;
+      if constexpr (kLens) {
+        v_axes[j] = fma(p.j10, v_b, v_axes[j]);
+        v_axes[3 + j] = fma(p.j01, v_a, v_axes[3 + j]);
+        v_j01 = fma(v_a, p.axes[3 + j], v_j01);
+        v_j10 = fma(v_b, p.axes[j], v_j10);
+      }
       v_axes[6 + j] = fma(p.j02, v_a, p.j12 * v_b);
       v_j00 = fma(v_a, p.axes[j], v_j00);
       v_j02 = fma(v_a, p.axes[6 + j], v_j02);
@@ -324,14 +362,33 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
     // Position in the camera frame, through the centre and through the Jacobian
     // Products are ordered so that neither a near nor a very far Gaussian overflows on the way.
     const Vec iz = p.inverse_z;
-    const Vec turn_x = p.j00 * (iz * v_j02), turn_y = p.j11 * (iz * v_j12);
-    const Vec bend_x = p.slope_x * turn_x, bend_y = p.slope_y * turn_y;
     Vec v_point[3];
-    v_point[0] = p.j00 * v_u - keep(p.free_x, turn_x);
-    v_point[1] = p.j11 * v_v - keep(p.free_y, turn_y);
-    v_point[2] = keep(ok, load(columns + 144)) - fma(p.raw_x, p.j00 * v_u, p.raw_y * (p.j11 * v_v)) -
-                 iz * fma(p.j00, v_j00, p.j11 * v_j11) + bend_x + keep(p.free_x, bend_x) + bend_y +
-                 keep(p.free_y, bend_y);
+    if constexpr (kLens) {
+      // The Jacobian is (a b; b' c)(1 0 -x; 0 1 -y) / z with the slopes x and y; a, b, c depend on these.
+      const Vec x = p.raw_x, y = p.raw_y;
+      const Vec fx = Vec(camera.fx) * iz, fy = Vec(camera.fy) * iz;
+      const Vec s00 = fx * fnma(x, v_j02, v_j00), s01 = fx * fnma(y, v_j02, v_j01);
+      const Vec s10 = fy * fnma(x, v_j12, v_j10), s11 = fy * fnma(y, v_j12, v_j11);
+      const Vec once = two * p.gain.first, twice = two * two * p.gain.second;
+      const Vec cross = s01 + s10, both = s00 + s11;
+      // d(a) = once (x' + 2 x dx) + twice x^2 (x dx + y dy), d(b) = once (x dy + y dx) + twice x y (...)
+      const Vec along = twice * fma(x * x, s00, fma(x * y, cross, y * y * s11));
+      const Vec v_x = fma(x, along, once * fma(x, both + two * s00, y * cross));
+      const Vec v_y = fma(y, along, once * fma(y, both + two * s11, x * cross));
+      v_point[0] = fma(p.j00, v_u, p.j10 * v_v) + iz * (v_x - fma(p.j00, v_j02, p.j10 * v_j12));
+      v_point[1] = fma(p.j01, v_u, p.j11 * v_v) + iz * (v_y - fma(p.j01, v_j02, p.j11 * v_j12));
+      v_point[2] = keep(ok, load(columns + 144)) - fma(x, v_point[0], y * v_point[1]) -
+                   iz * (fma(p.j00, v_j00, fma(p.j01, v_j01, p.j02 * v_j02)) +
+                         fma(p.j10, v_j10, fma(p.j11, v_j11, p.j12 * v_j12)));
+    } else {
+      const Vec turn_x = p.j00 * (iz * v_j02), turn_y = p.j11 * (iz * v_j12);
+      const Vec bend_x = p.slope_x * turn_x, bend_y = p.slope_y * turn_y;
+      v_point[0] = p.j00 * v_u - keep(p.free_x, turn_x);
+      v_point[1] = p.j11 * v_v - keep(p.free_y, turn_y);
+      v_point[2] = keep(ok, load(columns + 144)) - fma(p.raw_x, p.j00 * v_u, p.raw_y * (p.j11 * v_v)) -
+                   iz * fma(p.j00, v_j00, p.j11 * v_j11) + bend_x + keep(p.free_x, bend_x) + bend_y +
+                   keep(p.free_y, bend_y);
+    }
     Vec v_color[3], v_normal[3] = {zero, zero, zero};
     for (int channel = 0; channel < 3; ++channel) v_color[channel] = finite(load(columns + 96 + 16 * channel));
     Vec albedo[3];

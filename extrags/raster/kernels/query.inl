@@ -66,7 +66,15 @@ static void project_queries(void* data, int task, int) {
     c.blocks[i] = -1;
     c.out[i] = __builtin_nanf("");
     if (!(z >= view->near)) continue;
-    const float u = camera.fx * x / z + camera.cx, v = camera.fy * y / z + camera.cy;
+    float u = camera.fx * x / z + camera.cx, v = camera.fy * y / z + camera.cy;
+    if (camera.bent) {
+      const float a = x / z, b = y / z, w = a * a + b * b;
+      if (!(w <= camera.lens.culled_from)) continue;
+      alignas(64) float gain[16];
+      store(gain, lens_gain(camera.lens, Vec(w)).value);
+      u = camera.fx * (gain[0] * a) + camera.cx;
+      v = camera.fy * (gain[0] * b) + camera.cy;
+    }
     if (!(u >= 0 && u < width && v >= 0 && v < height)) continue;
     const int column = static_cast<int>(u), row = static_cast<int>(v);
     const int tile = row / kTilePx * view->tiles_x + column / kTilePx;

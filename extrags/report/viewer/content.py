@@ -213,7 +213,8 @@ def _header(
 def _cameras(inputs: ReportInputs, scenes: Mapping[str, Scene]) -> tuple[list[Any], list[Any]]:
     """Cameras by group, with the exposures each scene is drawn at, and the paths one can fly along."""
     sequence = inputs.sequence
-    cameras = sequence.cameras
+    # The page draws pinholes.
+    cameras = sequence.cameras.as_pinholes()
     groups = []
     named = (
         ("train", "Training", TRAIN_COLOR, np.sort(sequence.train)),

@@ -131,3 +131,12 @@ def weighted_sum(rendering: Rendering, seed: int = 1) -> Tensor:
 def relative_l2(found: Tensor, expected: Tensor) -> float:
     difference = (found.detach().double() - expected.detach().double()).norm()
     return float(difference / expected.detach().double().norm().clamp_min(1e-30))
+
+
+def same_transmittance(found: Rendering, expected: Rendering) -> None:
+    """At query points: the same ones are in the image, and what is left of the light agrees."""
+    assert found.transmittance is not None
+    assert expected.transmittance is not None
+    known = ~expected.transmittance.isnan()
+    assert torch.equal(~found.transmittance.isnan(), known)
+    assert relative_l2(found.transmittance[known], expected.transmittance[known]) < 1e-5

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from extrags.errors import ConfigError
+from extrags.radial_lens import RadialLens
 from extrags.raster import stability
 from extrags.raster.stability import AXES, REFUSED, bench_stability
 
@@ -54,8 +55,10 @@ class TestFailures:
     def erring(self, monkeypatch: pytest.MonkeyPatch, name: str, change: float) -> None:
         true = stability._outputs_and_gradients
 
-        def wrong(scene: stability.Scene, backend: str, dtype: torch.dtype) -> dict[str, torch.Tensor]:
-            found = true(scene, backend, dtype)
+        def wrong(
+            scene: stability.Scene, backend: str, dtype: torch.dtype, *lens: RadialLens | None
+        ) -> dict[str, torch.Tensor]:
+            found = true(scene, backend, dtype, *lens)
             if backend == "native":
                 found[name] = found[name] * change
             return found
