@@ -7,8 +7,8 @@ STORE ?= .extrags/demo
 # Actively waiting OpenMP threads slow each other down on machines with few cores.
 export OMP_WAIT_POLICY := passive
 
-# One process per core, each with one thread: most tests are too small for more.
-# One process more than cores: those of the flows wait for their server a good part of the time.
+# Processes of one thread each: most tests are too small for more. One more than cores: that of the flows waits
+# for its server a good part of the time.
 PARALLEL := --numprocesses $(shell expr $$(nproc) + 1) --dist loadgroup
 
 .PHONY: help setup system demo test test-slow lint same-results bench clean
