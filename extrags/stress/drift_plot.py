@@ -36,7 +36,7 @@ def write_drift_plot(trainings: Mapping[str, Sequence[Drift]], path: Path) -> No
                 (panels[1], "float32_loss", "other_loss"),
             ):
                 panel.plot(at, [getattr(d, single) for d in drifts], color=color, label=f"{label}, float32")
-                # The neighbour that any training has: it tells how chaotic this one is.
+                # The neighbours that any training has: they tell how chaotic this one is.
                 neighbour = [getattr(d, other) for d in drifts]
                 panel.plot(
                     at, neighbour, color=color, linestyle=(0, (4, 3)), label=f"{label}, a rounding away"

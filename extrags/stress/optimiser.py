@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from decimal import Decimal, localcontext
 from functools import cache, partial
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -42,7 +43,14 @@ with a margin; the value itself is rounded once to its own size."""
 SAME_LOSS = 0.01
 """Trainings whose losses differ by this share are equally good."""
 OTHER_START = EPS
-"""Relative change of a scene that both the drift of float32 and that of float64 are compared with."""
+"""Relative change of a scene by which the starts of the float64 trainings differ."""
+OTHERS = 4
+"""Float64 trainings beside the exact one: together they tell how far trainings come apart by themselves."""
+LOSS_WINDOW_SHARE = 0.05
+"""The loss of an iteration is the mean over so many of the iterations before it: with a fixed rate, that of a
+single step of Adam leaps."""
+FALSE_ALARM = 0.01
+"""Chance that a training which is as good as those in float64 fails at any of the iterations told."""
 
 
 def _steps_of(iterations: int) -> list[int]:
@@ -184,15 +192,18 @@ def _rounds(effort: Effort) -> Iterator[Trial]:
 
 @dataclass(frozen=True)
 class Drift:
-    """Two trainings of one scene, compared with a third, in float64.
+    """A training in float32 beside float64 ones whose starts differ by a rounding.
+
+    Losses are means over the last twentieth of the iterations.
 
     Args:
         iteration: how many steps were taken.
-        loss: of the float64 training.
-        float32_parameters: distance of the float32 parameters, as a share of the way from the start.
-        other_parameters: the same of a float64 training whose start differs by a rounding.
-        float32_loss: relative difference of the loss of the float32 training.
-        other_loss: the same of the other start.
+        loss: mean of the float64 trainings.
+        float32_parameters: distance of the float32 parameters from the exact ones, as a share of the way
+            that these have come from their start.
+        other_parameters: the largest such distance of the other float64 trainings.
+        float32_loss: difference of the float32 training's loss from `loss`, relative to it.
+        other_loss: standard deviation of the float64 trainings' losses, relative to `loss`.
     """
 
     iteration: int
@@ -230,10 +241,10 @@ def _drift_scene(lit: bool) -> LitScene:
 
 @cache
 def training_drift(iterations: int, *, lit: bool = True, points: int = 24) -> tuple[Drift, ...]:
-    """Train in float32, in float64, and in float64 from a start that differs by a rounding.
+    """Train in float32 and, from starts that differ by a rounding, several times in float64.
 
     Training is a chaotic map: what differs by a rounding differs more with every step. Float32 is good
-    enough where it goes no farther than such a neighbour goes, and where it is as good.
+    enough where its loss cannot be told from those of the float64 trainings.
 
     Args:
         iterations: of each training.
@@ -242,25 +253,31 @@ def training_drift(iterations: int, *, lit: bool = True, points: int = 24) -> tu
     """
     scene = _drift_scene(lit)
     generator = torch.Generator().manual_seed(5)
-    noise = {k: 2 * torch.rand(v.shape, generator=generator) - 1 for k, v in scene.parameters.items()}
-    near = {k: v.double() * (1 + OTHER_START * noise[k].double()) for k, v in scene.parameters.items()}
-    exact = _Training(scene, {k: v.double() for k, v in scene.parameters.items()})
-    other, single = _Training(scene, near), _Training(scene, dict(scene.parameters))
+    start = {name: value.double() for name, value in scene.parameters.items()}
+    exact = [_Training(scene, start)]
+    for _ in range(OTHERS):
+        noise = {k: 2 * torch.rand(v.shape, generator=generator) - 1 for k, v in scene.parameters.items()}
+        near = {k: v * (1 + OTHER_START * noise[k].double()) for k, v in start.items()}
+        exact.append(_Training(scene, near))
+    single = _Training(scene, dict(scene.parameters))
     told = {round(math.exp(math.log(iterations) * k / points)) for k in range(points + 1)}
     told |= {count for count in CHECKPOINTS if count <= iterations}
     found = []
     for iteration in range(1, iterations + 1):
-        losses = [training.step() for training in (exact, single, other)]
+        for training in (single, *exact):
+            training.step()
         if iteration in told:
-            way = exact.distance({k: v.double() for k, v in scene.parameters.items()})
+            way = exact[0].distance(start)
+            losses = np.array([training.loss() for training in exact])
+            loss = float(losses.mean())
             found.append(
                 Drift(
                     iteration,
-                    losses[0],
-                    exact.distance(single.values) / way,
-                    exact.distance(other.values) / way,
-                    abs(losses[1] / losses[0] - 1),
-                    abs(losses[2] / losses[0] - 1),
+                    loss,
+                    exact[0].distance(single.values) / way,
+                    max(exact[0].distance(other.values) for other in exact[1:]) / way,
+                    abs(single.loss() / loss - 1),
+                    float(losses.std(ddof=1)) / loss,
                 )
             )
     return tuple(found)
@@ -274,16 +291,21 @@ class _Training:
         leaves = {name: value.clone() for name, value in values.items()}
         self._adam = SelectiveAdam(leaves, RATES)
         self._single = all(value.dtype == torch.float32 for value in values.values())
+        self._losses: list[float] = []
 
     @property
     def values(self) -> dict[str, Tensor]:
         return {name: value.detach() for name, value in self._adam.parameters.items()}
 
-    def step(self) -> float:
+    def step(self) -> None:
         scene = self._scene.with_parameters(**self.values)
         found = native_step(scene) if self._single else autograd_step(scene, rounded=False)
         self._adam.step(None, {name: found[name] for name in scene.parameters})
-        return float(found["loss"])
+        self._losses.append(float(found["loss"]))
+
+    def loss(self) -> float:
+        """Mean over the last iterations."""
+        return float(np.mean(self._losses[-max(1, round(LOSS_WINDOW_SHARE * len(self._losses))) :]))
 
     def distance(self, others: dict[str, Tensor]) -> float:
         squares = [
@@ -293,10 +315,15 @@ class _Training:
 
 
 def _training(lit: bool, effort: Effort) -> Iterator[Trial]:
-    for drift in training_drift(effort.iterations, lit=lit):
+    from scipy.stats import t
+
+    drifts = training_drift(effort.iterations, lit=lit)
+    # One more training of the same kind lies within this many deviations of the mean of those there are.
+    quantile = float(t.ppf(1 - FALSE_ALARM / len(drifts) / 2, OTHERS)) * math.sqrt(1 + 1 / (OTHERS + 1))
+    for drift in drifts:
         place = f"{drift.iteration} iterations, loss off by {drift.float32_loss:.1e}, parameters by "
         place += f"{drift.float32_parameters:.1e} of their way"
-        yield place, drift.float32_loss / max(SAME_LOSS, 10 * drift.other_loss)
+        yield place, drift.float32_loss / max(SAME_LOSS, quantile * drift.other_loss)
 
 
 def _rows() -> Iterator[Row]:
@@ -312,7 +339,7 @@ def _rows() -> Iterator[Row]:
         yield Row(
             "training",
             name,
-            "difference of the loss, over 1 % or ten times that of a start a rounding away",
+            "difference of the loss, over 1 % or what float64 trainings differ by",
             1.0,
             partial(_training, lit),
         )

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.stress import ROWS, Effort, run_rows, steps
+from extrags.stress import ROWS, Effort, optimiser, run_rows, steps
 from extrags.stress.inputs import lit_tube, random_lit_scene
-from extrags.stress.optimiser import training_drift
+from extrags.stress.optimiser import Drift, training_drift
 
 PARTS = {
     "rasteriser",
@@ -86,3 +86,16 @@ def test_drift_grows_from_rounding() -> None:
     assert drifts[0].float32_parameters < 1e-3
     assert all(np.isfinite([drift.loss, drift.float32_loss, drift.other_loss]).all() for drift in drifts)
     assert drifts[-1].loss < drifts[0].loss
+
+
+@pytest.mark.parametrize(
+    ("float32_loss", "other_loss", "passes"),
+    [(0.009, 1e-6, True), (0.02, 1e-6, False), (0.05, 0.02, True), (0.5, 0.02, False)],
+)
+def test_drift_is_judged_by_the_spread_of_float64(
+    monkeypatch: pytest.MonkeyPatch, float32_loss: float, other_loss: float, passes: bool
+) -> None:
+    drifts = (Drift(1, 1.0, 0.0, 0.0, 0.0, 0.0), Drift(9, 1.0, 0.1, 0.1, float32_loss, other_loss))
+    monkeypatch.setattr(optimiser, "training_drift", lambda *_, **__: drifts)
+    (row,) = run_rows(optimiser.ROWS, ["training/float32 to float64, lit"], Effort(iterations=9))
+    assert row["passed"] == passes
