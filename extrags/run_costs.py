@@ -105,6 +105,12 @@ class Workload:
     width: float | int | None = None
     stacks: int = 3
 
+    @property
+    def size(self) -> dict[str, float]:
+        """What the sequence tells: pixels, frames, those for training and held out, width."""
+        found = {name: float(getattr(self, name)) for name in ("pixels", "frames", "train", "test")}
+        return found if self.width is None else {**found, "width": float(self.width)}
+
     def numbers(self) -> dict[str, float]:
         """By name in terms. Gaussians are the limit, which densification reaches in nearly every scene."""
         config = self.config

@@ -21,6 +21,7 @@ from flows.outcome_records import OUTCOME, OutcomeRecord, outcome_records, setti
 from flows.runners import NotInStoreError, StoreRunner
 from flows.selection import Chosen
 from flows.wiring import run_sequence
+from flows.workloads import frames_work, known_work
 from tasks.progress import observed
 
 __all__ = [
@@ -211,8 +212,11 @@ def record_outcome(
         StoreError: when it cannot be written.
     """
     failed = next((row for row in outcome.stages if row.state == "failed"), None)
+    work = known_work(case.sequence, config)
+    if work is None and "ingest" in outcome.refs:
+        work = frames_work(store.manifest(outcome.refs["ingest"]), config)
     expected: dict[str, float] = {
-        stage: sum(tasks.values()) for stage, tasks in expected_seconds(config).items()
+        stage: sum(tasks.values()) for stage, tasks in expected_seconds(config, work).items()
     }
     record: OutcomeRecord = {
         "sequence": case.sequence,
@@ -227,6 +231,7 @@ def record_outcome(
         "ended": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "seconds": round(outcome.seconds, 3),
         "config": digest_of(config),
+        "size": None if work is None else work.size,
         "stages": [_stage_record(row, expected.get(row.stage, 0.0)) for row in outcome.stages],
         "metrics": outcome.metrics,
         "report": outcome.report,
@@ -251,6 +256,6 @@ def _stage_record(row: StageRow, expected: float) -> dict[str, Any]:
         "state": row.state,
         "reason": row.reason,
         "made_seconds": round(row.made_seconds, 3),
-        "expected": round(expected, 3),
+        "expected_cpu_s": round(expected, 6),
         "artefacts": row.made,
     }

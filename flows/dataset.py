@@ -31,6 +31,7 @@ from flows.selection import chosen_sequences
 from flows.sequence import open_store, reconstruct_sequence
 from flows.settings import run_store, task_runner
 from flows.tables import dataset_markdown
+from flows.workloads import known_work
 from tasks.run_page import artifact_key, attempt
 
 __all__ = ["reconstruct_dataset"]
@@ -155,7 +156,11 @@ def reconstruct_dataset(
         return DatasetOutcome(outcomes, report)
 
     config = cases[0].config()
-    with run_lease(store), run_page(name, config, until, sequences=len(cases), bars=False) as page:
+    work = known_work(cases[0].sequence, config)
+    with (
+        run_lease(store),
+        run_page(name, config, until, sequences=len(cases), bars=False, work=work) as page,
+    ):
         found = again_after_damage(Store(store), run_all)
         if found.report is not None:
             page.link(found.report, artifact_key("report", name), f"Report of {name}")

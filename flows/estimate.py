@@ -6,30 +6,17 @@ from dataclasses import dataclass, field
 
 from extrags.config import PipelineConfig
 from extrags.pipeline import STAGES, StageName
+from extrags.run_costs import Workload, packaged_model
+from flows.workloads import task_repeats, usual_work
 from tasks.progress import StageProgress, duration_text
 
-__all__ = ["EXPECTED_SECONDS", "RunEstimate", "SequenceEstimate", "expected_seconds"]
+__all__ = ["RunEstimate", "SequenceEstimate", "expected_seconds"]
 
-EXPECTED_SECONDS: dict[StageName, dict[str, float]] = {
-    "ingest": {"ingest": 12.0},
-    "poses": {"poses": 20.0},
-    "depth": {"depth": 30.0},
-    "coarse": {"coarse": 18.0},
-    "assess": {"assess": 0.4},
-    "surface": {"surface": 1.2},
-    "freespace": {"freespace": 1.2},
-    "explore": {"explore": 25.0},
-    "enhance": {"enhance-train": 15.0, "enhance-keyframes": 5.0, "enhance-restore": 35.0, "enhance": 4.0},
-    "finetune": {"finetune-judge": 18.0, "finetune": 25.0},
-    "evaluate": {"evaluate-render": 8.0, "evaluate-views": 6.0, "evaluate": 3.0},
-    "report": {"report": 8.0},
-}
-"""How long the tasks of each stage take, in the order in which they run.
-
-Rounded, from some runs of the profile `quick` on two cores. They count in proportion to each other
-only: how fast this machine is with this sequence is learned from the stages that have run.
-"""
-QUICK_ITERATIONS = {"coarse": 1500, "finetune": 1000}
+OTHER_SECONDS: dict[str, float] = {"poses": 20.0, "depth": 30.0, "report": 4.0}
+"""Of processor time: tasks whose cost no model knows, for a recording of the phantom. Poses and depth grow
+with the pixels of all frames."""
+RESTORATION = {"enhance-keyframes": 0.1, "enhance-restore": 0.8, "enhance": 0.1}
+"""Shares of its tasks in the time of the restoration, which is modelled as one."""
 
 LEARNED_SECONDS = 10.0
 """So much of what is expected must have run before anything is said of what is left."""
@@ -37,12 +24,34 @@ ALMOST = 0.95
 """Share of a task that has outlasted what was expected of it."""
 
 
-def expected_seconds(config: PipelineConfig) -> dict[StageName, dict[str, float]]:
-    """`EXPECTED_SECONDS` with the iterations of these settings."""
-    times = {stage: dict(tasks) for stage, tasks in EXPECTED_SECONDS.items()}
-    times["coarse"]["coarse"] *= config.coarse.iterations / QUICK_ITERATIONS["coarse"]
-    times["finetune"]["finetune"] *= config.finetune.iterations / QUICK_ITERATIONS["finetune"]
-    return times
+def expected_seconds(
+    config: PipelineConfig, work: Workload | None = None
+) -> dict[StageName, dict[str, float]]:
+    """How much processor time the tasks of each stage take on the reference machine, in the order they run.
+
+    They count in proportion to each other: how fast this machine is with this sequence is learned from the
+    stages that have run.
+
+    Args:
+        config: settings of all stages.
+        work: size of the sequence; None takes that of a phantom.
+    """
+    model, work = packaged_model(), usual_work(config) if work is None else work
+    usual = usual_work(config)
+    larger = work.pixels * work.frames / (usual.pixels * usual.frames)
+    found: dict[StageName, dict[str, float]] = {}
+    for stage in STAGES:
+        repeats = task_repeats(stage, measured_scenes=2, restored=1)
+        tasks: dict[str, float] = {}
+        for task, times in repeats.items():
+            if task in model.time and stage not in OTHER_SECONDS:
+                seconds = times * model.predict(task, work).seconds
+            else:
+                seconds = OTHER_SECONDS.get(task, 0.0) * (1.0 if stage == "report" else larger)
+            for part, share in (RESTORATION if task == "enhance" else {task: 1.0}).items():
+                tasks[part] = share * seconds
+        found[stage] = tasks
+    return found
 
 
 @dataclass

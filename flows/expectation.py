@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from statistics import median
 
-from data_catalog import Descriptor, describe
 from extrags.config import PipelineConfig
-from extrags.errors import ExtragsError
+from extrags.errors import ConfigError
 from extrags.pipeline import STAGES, StageName
+from extrags.run_costs import Workload
 from extrags.store import Store, digest_of
 from flows.cases import SequenceCase
 from flows.estimate import expected_seconds
 from flows.methods import METHODS
 from flows.outcome_records import OutcomeRecord, outcome_records
+from flows.settings import usable_cores
+from flows.workloads import catalogue_work
 from tasks.progress import duration_text
 
-__all__ = ["Expectation", "expectations", "expected_words", "longest_first", "read_size"]
+__all__ = ["Expectation", "expectations", "expected_words", "longest_first"]
 
-REFERENCE_FRAMES, REFERENCE_PIXELS = 48, 160 * 128
-"""Of the sequences that `flows.estimate.EXPECTED_SECONDS` was measured on."""
-USUAL_WIDTH = 340
-"""About the width that sources are read at where no divisor is set, in pixels."""
-PER_FRAME: frozenset[StageName] = frozenset({"ingest", "poses", "depth", "evaluate"})
-"""Stages whose time grows with the number of frames as well as with that of pixels."""
+USED_SHARE = 0.8
+"""Of every core but the first, which whole runs keep busy: the part of their time that threads divide."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +45,9 @@ def expectations(
 ) -> list[Expectation]:
     """How long each case will take, in the order given.
 
-    A stage takes as long as in the last run of the same sequence, in proportion to its iterations; else what
-    its frames suggest, at the pace of the runs that are on record. Cases that are in the store with the same
-    settings take no time.
+    A stage takes as long as in the last run of the same sequence, in proportion to what the cost model
+    expects of the settings; else what that expects of its frames, at the pace of the runs that are on record.
+    Cases that are in the store with the same settings take no time.
 
     Args:
         cases: to be run.
@@ -78,17 +76,17 @@ def expectations(
         wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in left_out]
         earlier = [*([own] if own is not None else []), *by_sequence.get(case.sequence, [])]
         times = _measured(earlier)
-        local = _pace(earlier) or pace or 1.0
-        base = expected_seconds(config)
-        scale = {} if times else _scales(case.sequence, config)
+        local = _pace(earlier) or pace or _usual_pace()
+        work, possible = _work(case.sequence, config, earlier)
+        base = expected_seconds(config, work)
         seconds = 0.0
         for stage in wanted:
             usual = sum(base[stage].values())
             if stage in times:
                 took, expected = times[stage]
                 seconds += took * (usual / expected if expected else 1.0)
-            elif not times or not _was_skipped(earlier, stage):
-                seconds += usual * local * scale.get(stage, 1.0)
+            elif stage in possible and (not times or not _was_skipped(earlier, stage)):
+                seconds += usual * local
         found.append(Expectation(case, seconds, measured=bool(times)))
     return found
 
@@ -131,7 +129,7 @@ def _measured(records: Sequence[OutcomeRecord]) -> dict[str, tuple[float, float]
     for record in records:
         for row in record["stages"]:
             if row["state"] in ("ran", "cached") and row["made_seconds"] > 0:
-                found.setdefault(row["stage"], (row["made_seconds"], row["expected"]))
+                found.setdefault(row["stage"], (row["made_seconds"], row.get("expected_cpu_s", 0.0)))
     return found
 
 
@@ -149,34 +147,26 @@ def _pace(records: Sequence[OutcomeRecord]) -> float | None:
     """Seconds per expected second, the median over records."""
     paces = []
     for record in records:
-        rows = [row for row in record["stages"] if row["state"] in ("ran", "cached") and row["expected"]]
-        whole = sum(row["expected"] for row in rows)
+        rows = [
+            row for row in record["stages"] if row["state"] in ("ran", "cached") and row.get("expected_cpu_s")
+        ]
+        whole = sum(row["expected_cpu_s"] for row in rows)
         if whole:
             paces.append(sum(row["made_seconds"] for row in rows) / whole)
     return median(paces) if paces else None
 
 
-def _scales(sequence: str, config: PipelineConfig) -> Mapping[StageName, float]:
-    """By how much more frames and pixels there are than in the sequences whose times are known."""
+def _usual_pace() -> float:
+    """Elapsed seconds per second of processor time, of a run that has this machine to itself."""
+    return 1 / (1 + USED_SHARE * (usable_cores() - 1))
+
+
+def _work(
+    sequence: str, config: PipelineConfig, records: Sequence[OutcomeRecord]
+) -> tuple[Workload | None, Collection[str]]:
+    """Size and stages of a sequence as far as they are known before it is read: a path's by its last run."""
     try:
-        about: Descriptor = describe(sequence)
-    except ExtragsError:
-        return {}  # A path: nothing is known of it before it is read.
-    frames = min(about.frames, config.ingest.max_frames or about.frames)
-    width, height = read_size(about, config)
-    pixels = width * height
-    by_pixels = pixels / REFERENCE_PIXELS
-    by_frames = by_pixels * frames / REFERENCE_FRAMES
-    return {stage: by_frames if stage in PER_FRAME else by_pixels for stage in STAGES}
-
-
-def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:
-    """About the width and height that a sequence of the catalogue is read at, in pixels."""
-    ingest = config.ingest
-    if ingest.width and ingest.height and about.format in ("phantom", "caverns"):
-        return ingest.width, ingest.height
-    if about.format in ("phantom", "caverns"):
-        return about.width, about.height
-    usual = max(1, round(about.width / USUAL_WIDTH)) if ingest.size == "thumbnail" else 1
-    divisor = ingest.downscale or usual
-    return about.width / divisor, about.height / divisor
+        return catalogue_work(sequence, config, ())
+    except ConfigError:
+        size = next((record["size"] for record in records if record.get("size")), None)
+        return None if size is None else Workload(config=config, **size), STAGES

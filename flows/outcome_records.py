@@ -13,9 +13,11 @@ OUTCOME = "outcome."
 """Begin of the names of these records."""
 
 OutcomeRecord = dict[str, Any]
-"""`{sequence, method, profile, seed, variant, until, status, stage, reason, ended, seconds, config, stages,
-metrics, report, extrags}` of the last run of a case that came to an end; of each stage
-`{stage, state, reason, made_seconds, expected, artefacts: {KEY: BYTES}}`."""
+"""`{sequence, method, profile, seed, variant, until, status, stage, reason, ended, seconds, config, size,
+stages, metrics, report, extrags}` of the last run of a case that came to an end: its size is that of
+`extrags.run_costs.Workload`. Of each stage
+`{stage, state, reason, made_seconds, expected_cpu_s, artefacts: {KEY: BYTES}}`: seconds that it took, and
+those of processor time that the cost model expects on its reference machine."""
 
 
 def outcome_records(store: Store) -> dict[str, OutcomeRecord]:

@@ -19,9 +19,10 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from extrags.config import profile_config
 from extrags.pipeline import STAGES, StageName
 from extrags.store import Store
-from flows.estimate import EXPECTED_SECONDS, RunEstimate
+from flows.estimate import RunEstimate, expected_seconds
 from flows.previews import stage_preview
 from flows.terminal import console
 from tasks.progress import IN_PARALLEL, Pace, StageProgress, duration_text, observed, rate_text
@@ -55,7 +56,9 @@ class RunInView:
     """
 
     sequences: int = 0
-    expected: Mapping[StageName, dict[str, float]] = field(default_factory=lambda: EXPECTED_SECONDS)
+    expected: Mapping[StageName, dict[str, float]] = field(
+        default_factory=lambda: expected_seconds(profile_config("balanced"))
+    )
     until: StageName = "report"
     store: str | None = None
 

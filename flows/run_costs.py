@@ -6,9 +6,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from data_catalog import describe
 from extrags.config import PipelineConfig
-from extrags.errors import ConfigError, ExtragsError, StoreError
+from extrags.errors import StoreError
 from extrags.pipeline import STAGES
 from extrags.run_costs import (
     STAGE_TASKS,
@@ -20,10 +19,10 @@ from extrags.run_costs import (
 )
 from extrags.scene_plan import ScenePlan
 from extrags.store import Manifest, Store
-from flows.expectation import read_size
 from flows.outcome import SequenceOutcome
+from flows.workloads import frames_work, task_repeats
 
-__all__ = ["RunPrediction", "StageCost", "catalogue_work", "planned_work", "predict_run", "recorded_costs"]
+__all__ = ["RunPrediction", "StageCost", "planned_work", "predict_run", "recorded_costs"]
 
 Record = tuple[Workload, TaskCost]
 ENOUGH_SECONDS = 10.0
@@ -131,7 +130,7 @@ def predict_run(
         if not any(task in model.time for task in STAGE_TASKS[stage]):
             unknown.append(stage)
             continue
-        repeats = _repeats(stage, measured_scenes, restored)
+        repeats = task_repeats(stage, measured_scenes, restored)
         costs = [model.predict(task, work) for task in repeats if task in model.time]
         peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
         found.append(
@@ -147,19 +146,6 @@ def predict_run(
     return RunPrediction(found, source, len(processor), unknown)
 
 
-def _repeats(stage: str, measured_scenes: int, restored: int) -> dict[str, int]:
-    """How often each task of a stage runs; those that do not run are left out."""
-    if stage != "evaluate":
-        return dict.fromkeys(STAGE_TASKS[stage], 1)
-    found = {
-        "evaluate-render": measured_scenes,
-        "evaluate-restore": restored,
-        "evaluate-views": 1,
-        "evaluate": measured_scenes + restored,
-    }
-    return {task: found[task] for task in STAGE_TASKS[stage] if found[task]}
-
-
 def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig) -> tuple[Workload, set[str]]:
     """Size and settings of a sequence that has been read and assessed, and the stages that will run.
 
@@ -171,10 +157,6 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
     Raises:
         StoreError: when the sequence's manifest cannot be read.
     """
-    counts = store.manifest(outcome.refs["ingest"]).counts
-    width, height, frames, train, test = (
-        float(counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
-    )
     skipped = {row.stage for row in outcome.stages if row.state == "skipped"}
     if outcome.plan is not None:
         decided = ScenePlan.model_validate(
@@ -182,33 +164,8 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
         )
         config = decided.applied_to(config)
         skipped |= {line.stage for line in decided.decisions if not line.run}
-    work = Workload(width * height, frames, train, test, config, width=width)
+    work = frames_work(store.manifest(outcome.refs["ingest"]), config)
     return work, {str(stage) for stage in STAGES if stage not in skipped}
-
-
-def catalogue_work(
-    name: str, config: PipelineConfig, leave_out: Collection[str]
-) -> tuple[Workload, set[str]]:
-    """Size and settings of a sequence of the catalogue that has not been read, and the stages that may run.
-
-    How many frames are held out is not in the catalogue: half of them are taken to be, and all stages to run.
-
-    Raises:
-        ConfigError: for a path, of which nothing is known before it is read.
-    """
-    try:
-        about: Any = describe(name)
-    except ExtragsError as error:
-        raise ConfigError(
-            f"{name} is not in the catalogue: its size is known once it is read; leave out --before ({error})"
-        ) from error
-    width, height = read_size(about, config)
-    frames = float(min(about.frames, config.ingest.max_frames or about.frames))
-    stages = {str(stage) for stage in STAGES if stage not in leave_out}
-    stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
-    stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
-    stages -= set() if config.imported.scene is None else {"coarse"}
-    return Workload(float(width * height), frames, frames / 2, frames / 2, config, width=width), stages
 
 
 def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record], list[Record]]:

@@ -12,6 +12,7 @@ from prefect.artifacts import create_image_artifact, create_link_artifact
 
 from extrags.config import PipelineConfig
 from extrags.pipeline import StageName
+from extrags.run_costs import Workload
 from extrags.store import Store
 from flows.estimate import RunEstimate, expected_seconds
 from flows.outcome import SequenceOutcome
@@ -153,6 +154,7 @@ def run_page(
     *,
     sequences: int = 1,
     bars: bool = True,
+    work: Workload | None = None,
 ) -> Iterator[RunPage | NoPage]:
     """The page and the log of the current flow run.
 
@@ -163,6 +165,7 @@ def run_page(
         sequences: how many it takes through the stages.
         bars: whether stages get bars of their own here, and sequences their pictures; not where flow runs
             inside this one have them.
+        work: size of a sequence, where it is known; stages then count as they will take.
 
     Yields:
         A page that is told when a sequence ends. One that says nothing where none is wanted
@@ -172,7 +175,7 @@ def run_page(
         if not page_wanted():
             yield NoPage()
             return
-        page = RunPage(name, sequences, expected_seconds(config), until, bars=bars)
+        page = RunPage(name, sequences, expected_seconds(config, work), until, bars=bars)
         try:
             with observed(page):
                 yield page

@@ -29,7 +29,7 @@ from extrags.report.run_tables import facts, plan_rows, setting_groups, stage_ro
 from extrags.report.space import occupancy_slices, scene_views, trajectory_colors
 from extrags.report.viewer.content import viewer_section
 from extrags.report.views import depth_rows, held_out_rows, virtual_rows
-from extrags.report.wording import count, number
+from extrags.report.wording import count, number, restorer_words
 
 __all__ = ["build_pages", "build_report"]
 
@@ -131,6 +131,7 @@ def _views(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]:
         if inputs.pseudo is not None and virtual
         else None,
         "virtual_absent": inputs.why_absent("pseudo", "enhance"),
+        "restorer": None if inputs.pseudo is None else restorer_words(inputs.pseudo.provenance),
     }
 
 

@@ -102,6 +102,11 @@ class PseudoLike(Protocol):
         """Index of the clip each view belongs to, [V]."""
         ...
 
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Backend, steps, and how it was judged on left-out frames; JSON types."""
+        ...
+
 
 @runtime_checkable
 class GridLike(Protocol):

@@ -20,11 +20,14 @@ __all__ = [
     "metric_of",
     "number",
     "percent",
+    "restorer_words",
     "shown_metrics",
 ]
 
 MINUS = "\N{MINUS SIGN}"
 MISSING = "\N{EN DASH}"
+UNLIKE = 1.5
+"""So many times the error that a restorer expects of itself in a scene unlike those it has learned from."""
 Verdict = Literal["better", "worse", "equal", ""]
 
 
@@ -48,6 +51,31 @@ def number(value: float | int | None, digits: int, *, signed: bool = False) -> s
     if float(text) == 0:
         text = f"{'±' if signed else ''}{0:.{digits}f}"
     return text.replace("-", MINUS)
+
+
+def restorer_words(provenance: Mapping[str, Any]) -> str:
+    """What restored the virtual views, and how it did on left-out frames; empty where nothing is known.
+
+    Args:
+        provenance: of the restored views; `judged` is `{restored_db, filled_db, error_over_expected}`.
+    """
+    if "backend" not in provenance:
+        return ""
+    said = f"Restored by {provenance['backend']}."
+    judged = provenance.get("judged")
+    if not judged:
+        return said
+    said += (
+        f" On left-out frames of this scene the network reaches {number(judged['restored_db'], 2)} dB, "
+        f"blending and filling {number(judged['filled_db'], 2)} dB."
+    )
+    ratio = judged.get("error_over_expected")
+    if ratio is None:
+        return said
+    said += f" Its error there is {number(ratio, 2)} times what it expected of itself"
+    if ratio > UNLIKE:
+        return f"{said}: this scene is unlike those it has learned from; trust what is invented less."
+    return f"{said}, as in scenes like those it has learned from."
 
 
 def percent(share: float | None) -> str:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -32,9 +34,12 @@ class ClassicalEnhancer:
 
     Args:
         reason: why it replaces another restorer; empty where it was asked for.
+        judged: what both reached on left-out frames, `{restored_db, filled_db, error_over_expected}`; None
+            where they were not compared.
     """
 
     reason: str = ""
+    judged: Mapping[str, float | None] | None = None
 
     name = "classical"
     follows_keyframes = True
@@ -51,8 +56,9 @@ class ClassicalEnhancer:
         write_description(path, self._description)
 
     @property
-    def _description(self) -> dict[str, str]:
-        return {"backend": self.name, **({"reason": self.reason} if self.reason else {})}
+    def _description(self) -> dict[str, Any]:
+        said = {"reason": self.reason or None, "judged": None if self.judged is None else dict(self.judged)}
+        return {"backend": self.name, **{name: value for name, value in said.items() if value is not None}}
 
 
 class ClassicalBackend:
@@ -85,7 +91,9 @@ class ClassicalBackend:
         file = path / DESCRIPTION
         description = read_description(file)
         with description_fields(file):
-            return ClassicalEnhancer(text_field(description, "reason") if "reason" in description else "")
+            reason = text_field(description, "reason") if "reason" in description else ""
+            judged = description.get("judged")
+            return ClassicalEnhancer(reason, None if judged is None else dict(judged))
 
 
 CLASSICAL = ClassicalBackend()

@@ -51,7 +51,8 @@ def plan(given: argparse.Namespace) -> int:
 
         config = run_config(given)
         prepare(Store(store_root(given)).state, debug=given.debug)
-        from flows.run_costs import catalogue_work, predict_run
+        from flows.run_costs import predict_run
+        from flows.workloads import catalogue_work
 
         work, stages = catalogue_work(given.sequence, config, left_out)
         scenes = 2 if "finetune" in stages else 1

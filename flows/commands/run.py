@@ -266,6 +266,7 @@ def execute(
     from flows.dataset import reconstruct_dataset
     from flows.estimate import expected_seconds
     from flows.progress_display import RunInView, progress_display
+    from flows.workloads import known_work
 
     # Names were checked by the parser; flows have literals for them.
     arguments: dict[str, Any] = {
@@ -285,7 +286,9 @@ def execute(
         "only": several.only,
         "limits": stage_limits(given),
     }
-    view = RunInView(len(cases), expected_seconds(cases[0].config()), until, root)
+    first_config = cases[0].config()
+    expected_of = expected_seconds(first_config, known_work(cases[0].sequence, first_config))
+    view = RunInView(len(cases), expected_of, until, root)
     with temporary_server(), without_heartbeat(), progress_display(showing(given), view):
         try:
             outcome: DatasetOutcome = reconstruct_dataset(**arguments)

@@ -93,7 +93,7 @@ def measured(given: argparse.Namespace) -> list[dict[str, Any]]:
 def source_size(name: str, config: PipelineConfig) -> tuple[int, int]:
     """Width and height at which a sequence of the catalogue is read."""
     from data_catalog import describe
-    from flows.expectation import read_size
+    from flows.workloads import read_size
 
     width, height = read_size(describe(name), config)
     return round(width), round(height)

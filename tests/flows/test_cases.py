@@ -121,7 +121,7 @@ class TestExpected:
         assert 0 < found[0].seconds < found[1].seconds
         assert [item.case for item in longest_first(found)] == [many, few]
 
-    def test_as_measured_in_proportion_to_iterations(self, tmp_path: Path) -> None:
+    def test_as_measured_in_proportion_to_what_is_expected(self, tmp_path: Path) -> None:
         store, before = str(tmp_path), case()
         leave(
             store,
@@ -136,7 +136,8 @@ class TestExpected:
         (found,) = expectations([twice], store, "coarse")
         assert same.measured
         assert same.seconds == pytest.approx(12.0)
-        assert found.seconds == pytest.approx(22.0)
+        # Part of the stage does not depend on the iterations.
+        assert 12.5 < found.seconds < 22.0
         # Another sequence: by its frames, at the pace of those that were measured.
         (other,) = expectations([case("phantom/1@sparse")], store, "coarse")
         assert not other.measured

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
 
-from extrags.pipeline import STAGES
-from flows.estimate import EXPECTED_SECONDS, RunEstimate, SequenceEstimate
+from extrags.config import profile_config
+from extrags.pipeline import STAGES, StageName
+from flows.estimate import RunEstimate, SequenceEstimate, expected_seconds
+from flows.workloads import usual_work
 from tasks.progress import StageProgress
 from tasks.stage import stage_versions
+
+EXPECTED: dict[StageName, dict[str, float]] = {
+    stage: {"ingest": {"ingest": 12.0}, "coarse": {"coarse": 18.0}}.get(stage, tasks)
+    for stage, tasks in expected_seconds(profile_config("quick")).items()
+}
 
 
 def step(stage: str, state: str = "running", done: int = 0, total: int = 0, seconds: float = 0.0) -> Any:
@@ -18,17 +26,27 @@ def step(stage: str, state: str = "running", done: int = 0, total: int = 0, seco
 
 class TestEstimate:
     def test_every_stage_is_expected_and_its_tasks_exist(self) -> None:
-        assert tuple(EXPECTED_SECONDS) == STAGES
-        named = {task for tasks in EXPECTED_SECONDS.values() for task in tasks}
+        assert tuple(EXPECTED) == STAGES
+        named = {task for tasks in EXPECTED.values() for task in tasks}
         assert named <= set(stage_versions())
 
+    def test_larger_frames_take_longer_where_pixels_count(self) -> None:
+        config = profile_config("balanced")
+        small, large = (
+            expected_seconds(config, replace(usual_work(config), pixels=pixels, width=width))
+            for pixels, width in ((160 * 128, 160), (640 * 512, 640))
+        )
+        for stage in ("ingest", "poses", "coarse", "evaluate"):
+            assert sum(large[stage].values()) > 1.5 * sum(small[stage].values())
+        assert large["freespace"] == small["freespace"]
+
     def test_nothing_is_said_before_something_ran(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS)
+        estimate = SequenceEstimate(EXPECTED)
         estimate.receive(step("ingest"), 0.0)
         assert estimate.seconds_left(1.0) is None
 
     def test_what_is_left_goes_at_the_pace_of_what_ran(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS, until="coarse")
+        estimate = SequenceEstimate(EXPECTED, until="coarse")
         estimate.receive(step("ingest"), 0.0)
         estimate.receive(step("ingest", "ran", seconds=24.0), 24.0)
         for skipped in ("poses", "depth"):
@@ -45,7 +63,7 @@ class TestEstimate:
         assert estimate.seconds_left(60.0) == 0.0
 
     def test_a_failure_keeps_its_share(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS, until="coarse")
+        estimate = SequenceEstimate(EXPECTED, until="coarse")
         estimate.receive(step("ingest"), 0.0)
         estimate.receive(step("ingest", "failed", seconds=1.0), 1.0)
         for skipped in ("poses", "depth", "coarse"):
@@ -53,9 +71,9 @@ class TestEstimate:
         assert estimate.share(1.0) == 0.0
 
     def test_shares_never_fall(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS)
+        estimate = SequenceEstimate(EXPECTED)
         shares, now = [], 0.0
-        for name, tasks in EXPECTED_SECONDS.items():
+        for name, tasks in EXPECTED.items():
             estimate.receive(step(name), now)
             for task in tasks:
                 for done in (1, 2):
@@ -68,7 +86,7 @@ class TestEstimate:
         assert shares[-1] == pytest.approx(1.0)
 
     def test_cached_stages_teach_nothing_of_the_pace(self) -> None:
-        estimate = SequenceEstimate(EXPECTED_SECONDS)
+        estimate = SequenceEstimate(EXPECTED)
         for name in ("ingest", "poses", "depth", "coarse"):
             estimate.receive(step(name), 0.0)
             estimate.receive(step(name, "cached"), 0.0)
@@ -77,7 +95,7 @@ class TestEstimate:
 
 class TestRun:
     def test_waiting_sequences_take_as_long_as_those_before(self) -> None:
-        run = RunEstimate(3, EXPECTED_SECONDS, "ingest")
+        run = RunEstimate(3, EXPECTED, "ingest")
         run.receive(step("ingest"), 0.0)
         run.receive(step("ingest", "ran", seconds=12.0), 12.0)
         run.sequence_ended("scene", 12.0, failed=False, ran=True)
@@ -86,7 +104,7 @@ class TestRun:
         assert run.text(12.0) == "1 of 3 sequences done; about 24 s left"
 
     def test_more_sequences_than_were_announced_do_no_harm(self) -> None:
-        run = RunEstimate(1, EXPECTED_SECONDS, "ingest")
+        run = RunEstimate(1, EXPECTED, "ingest")
         for _ in range(2):
             run.sequence_ended("scene", 0.0, failed=False, ran=True)
         assert run.share(0.0) == 1.0

@@ -11,9 +11,10 @@ from extrags.errors import ConfigError
 from extrags.run_costs import CostModel, Workload
 from extrags.store import Store
 from flows import run_costs
-from flows.run_costs import catalogue_work, predict_run, recorded_costs
+from flows.run_costs import predict_run, recorded_costs
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
+from flows.workloads import catalogue_work
 from tests.flows.tiny import SEQUENCE, TINY
 
 CONFIG: PipelineConfig = profile_config("quick").with_overrides(TINY)

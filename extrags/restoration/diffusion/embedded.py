@@ -244,6 +244,7 @@ class EmbeddedEnhancer:
             "domain_score": self.domain_score,
             "validation": self.record.get("validation", {}),
             "scene_training_kept": self.record.get("scene_training_kept"),
+            "judged": self.record.get("judged"),
         }
 
     def save(self, path: Path, *, half: bool = False) -> None:

@@ -12,12 +12,12 @@ from torch import Tensor
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.validation import validation_pairs
 from extrags.restoration.training_data.pairs import Pairs
-from extrags.restoration.uncertainty.calibration import Calibration, cell_means
+from extrags.restoration.uncertainty.calibration import SMALLEST_ERROR, Calibration, cell_means
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
 from extrags.threads import in_threads
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["cell_errors", "with_calibration", "with_error_model"]
+__all__ = ["cell_errors", "error_over_expected", "with_calibration", "with_error_model"]
 
 MIN_VALID_SHARE = 0.5
 """Cells with a smaller share of valid pixels are not counted."""
@@ -38,6 +38,26 @@ def with_calibration(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTr
         return enhancer
     calibration = Calibration.fitted(*cell_errors(enhancer, chosen, transfer))
     return replace(enhancer, calibration=calibration) if calibration.predicted else enhancer
+
+
+def error_over_expected(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> float | None:
+    """How many times larger its error on the validation pairs is than what the restorer expects of itself.
+
+    About 1 in scenes like those that it was calibrated on; well above, the scene is not what it knows. None
+    without validation pairs or valid cells.
+
+    Args:
+        enhancer: with the calibration of its weights, not of this scene.
+        pairs: all pairs.
+        transfer: how brightness changes with distance.
+    """
+    chosen = validation_pairs(pairs)
+    if chosen is None:
+        return None
+    expected, true = cell_errors(enhancer, chosen, transfer)
+    if len(true) == 0:
+        return None
+    return float(true.mean() / max(float(enhancer.calibration.applied(expected).mean()), SMALLEST_ERROR))
 
 
 def with_error_model(

@@ -12,6 +12,7 @@ from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.events import MetricRecorded, emit
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
+from extrags.restoration.diffusion.error_fit import error_over_expected, with_calibration
 from extrags.restoration.diffusion.patches import choose_patches
 from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.diffusion.validation import validation_scores
@@ -53,7 +54,9 @@ def scene_restorer(
         # Nothing is trained, so all leave-out pairs validate; synthetic ones would favour filling holes.
         fresh = make_pairs(scene, sequence, config.model_copy(update={"synthetic_views": 0}), coarse)
         pairs = replace(fresh, validation=np.ones(len(fresh), dtype=bool))
-        return better_of_both(untouched, pairs, transfer)
+        judged = better_of_both(untouched, pairs, transfer)
+        # How far off it is differs more from scene to scene than where.
+        return with_calibration(judged, pairs, transfer) if isinstance(judged, EmbeddedEnhancer) else judged
     pairs = make_pairs(scene, sequence, config, coarse)
     trained = train_on_scene(pairs, transfer, config, start)
     return better_of_both(trained, pairs, transfer) if config.judge else trained
@@ -74,6 +77,14 @@ def better_of_both(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTran
     scores = validation_scores(replace(enhancer, drawing=False), pairs, transfer, (enhancer.steps,))
     restored, filled = scores[f"embedded_{enhancer.steps}"]["psnr"], scores["classical"]["psnr"]
     emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
+    ratio = error_over_expected(enhancer, pairs, transfer)
+    if ratio is not None:
+        emit(MetricRecorded("enhance", "error_over_expected", ratio))
+    judged = {
+        "restored_db": round(restored, 3),
+        "filled_db": round(filled, 3),
+        "error_over_expected": None if ratio is None else round(ratio, 3),
+    }
     score = enhancer.domain_score
     tolerated = MAX_LOSS_DB
     if score is not None:
@@ -91,9 +102,9 @@ def better_of_both(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTran
             f"filling {filled:.2f} dB"
         )
         logger.warning("%s; the scene is restored by blending and filling", reason)
-        return ClassicalEnhancer(reason)
+        return ClassicalEnhancer(reason, judged)
     validation = {**enhancer.record.get("validation", {}), **scores}
-    return replace(enhancer, record={**enhancer.record, "validation": validation})
+    return replace(enhancer, record={**enhancer.record, "validation": validation, "judged": judged})
 
 
 def _scene_gamut(sequence: EndoscopicSequence) -> Gamut:

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["CELL_PX", "Calibration", "cell_means", "non_decreasing"]
+__all__ = ["CELL_PX", "SMALLEST_ERROR", "Calibration", "cell_means", "non_decreasing"]
 
 CELL_PX = 8
 """Side of the square cells in which errors are compared; errors of single pixels are too noisy."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +35,7 @@ class Pseudo:
     image_confidence: np.ndarray
     reference: np.ndarray
     clip: np.ndarray
+    provenance: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,10 @@ def inputs(sequence: EndoscopicSequence) -> ReportInputs:
         image_confidence=random.random(12).astype(np.float32),
         reference=np.arange(12) % 6,
         clip=np.arange(12) // 6,
+        provenance={
+            "backend": "embedded",
+            "judged": {"restored_db": 26.04, "filled_db": 25.1, "error_over_expected": 1.24},
+        },
     )
     trajectories = []
     for anchor in (0, 3):

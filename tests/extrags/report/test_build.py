@@ -112,6 +112,19 @@ def test_error_that_trajectories_take_away_is_told(inputs: ReportInputs) -> None
     assert "10.00 %" in text
 
 
+def test_how_the_restorer_was_judged_is_told(inputs: ReportInputs, html: str) -> None:
+    assert "reaches 26.04 dB, blending and filling 25.10 dB. Its error there is 1.24 times" in html
+    assert "as in scenes like those it has learned from" in html
+    assert inputs.pseudo is not None
+    judged = {"restored_db": 20.0, "filled_db": 26.0, "error_over_expected": 2.5}
+    for provenance, words in (
+        ({"backend": "classical", "judged": judged}, "is unlike those it has learned from"),
+        ({"backend": "classical"}, "Restored by classical."),
+    ):
+        pseudo = replace(inputs.pseudo, provenance=provenance)
+        assert words in build_report(replace(inputs, pseudo=pseudo), ReportConfig())
+
+
 def test_what_the_plan_left_out_is_named_with_its_reason(inputs: ReportInputs) -> None:
     plan = {
         "measurements": {"hole_share": 0.0004},

@@ -13,6 +13,7 @@ from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import render_clips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.error_fit import cell_errors, error_over_expected
 from extrags.restoration.diffusion.network import build_network
 from extrags.restoration.diffusion.network_training import (
     TrainingSettings,
@@ -22,6 +23,7 @@ from extrags.restoration.diffusion.network_training import (
 from extrags.restoration.diffusion.rectified_flow import Predicted, sample
 from extrags.restoration.diffusion.scene_restorer import better_of_both
 from extrags.restoration.diffusion.scene_training import train_on_scene
+from extrags.restoration.diffusion.validation import validation_pairs
 from extrags.restoration.protocol import Clip, Enhancer
 from extrags.restoration.training_data.augmentation import Batch
 from extrags.restoration.training_data.pairs import Pairs
@@ -248,6 +250,8 @@ class TestEmbedded:
         kept = better_of_both(trained, tube_pairs, transfer)
         assert isinstance(kept, EmbeddedEnhancer)
         assert f"embedded_{trained.steps}" in kept.provenance["validation"]
+        told = kept.provenance["judged"]
+        assert told["restored_db"] > told["filled_db"]
         network = copy.deepcopy(trained.network)
         torch.nn.init.normal_(network.exit.weight, std=0.3, generator=torch.Generator().manual_seed(3))
         served = better_of_both(replace(trained, network=network), tube_pairs, transfer)
@@ -255,7 +259,21 @@ class TestEmbedded:
         assert "restored by blending and filling" in caplog.text
         served.save(tmp_path)
         loaded = load_enhancer(tmp_path)
-        assert "on leave-out pairs of this scene" in loaded.restore(clip).provenance["reason"]
+        provenance = loaded.restore(clip).provenance
+        assert "on leave-out pairs of this scene" in provenance["reason"]
+        assert provenance["judged"]["restored_db"] < provenance["judged"]["filled_db"]
+
+    def test_error_over_what_was_expected(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
+    ) -> None:
+        transfer = tube.references.transfer
+        plain = replace(trained, calibration=Calibration((0.01, 1.0), (0.01, 1.0)))
+        doubled = replace(trained, calibration=Calibration((0.01, 1.0), (0.02, 2.0)))
+        ratio, half = (error_over_expected(each, tube_pairs, transfer) for each in (plain, doubled))
+        assert ratio is not None
+        assert half == pytest.approx(ratio / 2, rel=1e-5)
+        expected, true = cell_errors(plain, validation_pairs(tube_pairs), transfer)
+        assert ratio == pytest.approx(true.mean() / expected.mean(), rel=1e-5)
 
     def test_a_plain_regression_needs_no_noise(self, tube: Tube, tube_pairs: Pairs, clip: Clip) -> None:
         plain = train_on_scene(tube_pairs, tube.references.transfer, SMALL, deterministic=True)

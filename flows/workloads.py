@@ -1,0 +1,94 @@
+"""Size of the work that a sequence is: of the catalogue before it is read, or as it was read."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+from data_catalog import Descriptor, describe
+from extrags.config import PipelineConfig
+from extrags.errors import ConfigError, ExtragsError
+from extrags.pipeline import STAGES
+from extrags.run_costs import STAGE_TASKS, Workload
+from extrags.store import Manifest
+
+__all__ = ["catalogue_work", "frames_work", "known_work", "read_size", "task_repeats", "usual_work"]
+
+USUAL_WIDTH = 340
+"""About the width that sources are read at where no divisor is set, in pixels."""
+
+
+def known_work(name: str, config: PipelineConfig) -> Workload | None:
+    """That of a sequence as far as the catalogue tells; None for a path, which has to be read."""
+    try:
+        return catalogue_work(name, config, ())[0]
+    except ConfigError:
+        return None
+
+
+def usual_work(config: PipelineConfig) -> Workload:
+    """That of a phantom's recording, for sequences of which nothing is known."""
+    return Workload(160 * 128, 48, 24, 24, config, width=160)
+
+
+def frames_work(ingested: Manifest, config: PipelineConfig) -> Workload:
+    """That of a sequence that has been read.
+
+    Args:
+        ingested: manifest of its `ingest`.
+        config: settings of all stages.
+    """
+    width, height, frames, train, test = (
+        float(ingested.counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
+    )
+    return Workload(width * height, frames, train, test, config, width=width)
+
+
+def catalogue_work(
+    name: str, config: PipelineConfig, leave_out: Collection[str]
+) -> tuple[Workload, set[str]]:
+    """Size and settings of a sequence of the catalogue that has not been read, and the stages that may run.
+
+    How many frames are held out is not in the catalogue: half of them are taken to be, and all stages to run.
+
+    Raises:
+        ConfigError: for a path, of which nothing is known before it is read.
+    """
+    try:
+        about: Any = describe(name)
+    except ExtragsError as error:
+        raise ConfigError(
+            f"{name} is not in the catalogue: its size is known once it is read; leave out --before ({error})"
+        ) from error
+    width, height = read_size(about, config)
+    frames = float(min(about.frames, config.ingest.max_frames or about.frames))
+    stages = {str(stage) for stage in STAGES if stage not in leave_out}
+    stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
+    stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
+    stages -= set() if config.imported.scene is None else {"coarse"}
+    return Workload(float(width * height), frames, frames / 2, frames / 2, config, width=width), stages
+
+
+def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:
+    """About the width and height that a sequence of the catalogue is read at, in pixels."""
+    ingest = config.ingest
+    if ingest.width and ingest.height and about.format in ("phantom", "caverns"):
+        return ingest.width, ingest.height
+    if about.format in ("phantom", "caverns"):
+        return about.width, about.height
+    usual = max(1, round(about.width / USUAL_WIDTH)) if ingest.size == "thumbnail" else 1
+    divisor = ingest.downscale or usual
+    return about.width / divisor, about.height / divisor
+
+
+def task_repeats(stage: str, measured_scenes: int, restored: int) -> dict[str, int]:
+    """How often each task of a stage runs; those that do not run are left out."""
+    if stage != "evaluate":
+        return dict.fromkeys(STAGE_TASKS[stage], 1)
+    found = {
+        "evaluate-render": measured_scenes,
+        "evaluate-restore": restored,
+        "evaluate-views": 1,
+        "evaluate": measured_scenes + restored,
+    }
+    return {task: found[task] for task in STAGE_TASKS[stage] if found[task]}
