@@ -326,32 +326,58 @@ static void forward_tile(View* view, const Images* out, int tile, int slot) {
   }
 }
 
-// Working memory of a tile's backward pass. A row of sums has, for pixel coordinates (X, Y) about the
-// tile's centre, at even places minus the sums of g, gX, gY, gXX, gXY, gYY, |g du|, |g dv| and at odd places
-// those of the weight times the gradient of red, green, blue and depth.
+// Places in a row of gradient sums. With pixel coordinates (X, Y) about the tile's centre, rows hold minus the
+// sums of g, gX, gY, gXX, gXY, gYY, those of |g du| and |g dv|, and those of the weight times the gradient of
+// red, green, blue and depth. The Gaussian's mean about the tile's centre travels along: nothing is added to it.
+enum SumPlace {
+  kSum = 0, kSumX = 4, kSumY = 8, kSumXX = 12, kSumXY = 1, kSumYY = 5, kSumAbsU = 9, kSumAbsV = 13,
+  kSumRed = 2, kSumGreen = 6, kSumBlue = 10, kSumDepth = 14, kSumMeanX = 3, kSumMeanY = 7
+};
+constexpr int kTogether = 4;  // entries whose gradients share vectors
+
+// Working memory of a tile's backward pass
 struct TileWork {
   float (*sums)[16];
-  float pairs[kEntriesAhead][32];  // g and weight of the sixteen pixels, interleaved
-  float basis[16][16];             // what each pixel's g and weight are multiplied by
+  float g[kEntriesAhead][16], weight[kEntriesAhead][16];  // of a block's pixels
+  // Per column of a block: X in the first place, its square in the next, the gradients of red, green, blue and
+  // depth of the four pixels, each over a quad
+  float column_x[4][2];
+  float column_gradients[4][4][16];
 };
 
-// Adds `count` entries, the last first, to the sums of their Gaussians.
-EXTRAGS_INLINE void reduce_entries(const TileWork* work, const uint32_t* entries, int count) {
+// Adds `count` entries, the last first, to the sums of their Gaussians; `y` holds the Y of the pixels. Four
+// entries at a time are turned round so that a vector holds a column: lane 4 row + entry. Sums over columns then
+// take no permutation, and those over rows yield four sums of four entries together.
+EXTRAGS_INLINE void reduce_entries(const TileWork* work, Vec y, const uint32_t* entries, int count) {
   for (int k = 0; k < count; k += kTogether) {
-    // Several at a time; what the last, incomplete ones hold beyond `count` is not added.
-    Vec total[kTogether];
-    for (int i = 0; i < kTogether; ++i) total[i] = Vec(0.f);
-#pragma GCC unroll 16
-    for (int pair = 0; pair < 16; ++pair) {
-      const Vec basis = load(work->basis[kLaneOfPair[pair]]);
-      for (int i = 0; i < kTogether; ++i) {
-        total[i] = fma(broadcast_pair(work->pairs[k + i] + 2 * pair), basis, total[i]);
+    // What the last, incomplete ones hold beyond `count` is not added.
+    Vec g[4], w[4];
+    for (int i = 0; i < 4; ++i) g[i] = load(work->g[k + i]);
+    transpose_in_quads(g);
+    const Vec total = (g[0] + g[1]) + (g[2] + g[3]);
+    Vec total_x = Vec(work->column_x[0][0]) * g[0], total_xx = Vec(work->column_x[0][1]) * g[0];
+    for (int i = 1; i < 4; ++i) {
+      total_x = fma(Vec(work->column_x[i][0]), g[i], total_x);
+      total_xx = fma(Vec(work->column_x[i][1]), g[i], total_xx);
+    }
+    const Vec total_y = y * total;
+    for (int i = 0; i < 4; ++i) w[i] = load(work->weight[k + i]);
+    transpose_in_quads(w);
+    Vec color[4];
+    for (int channel = 0; channel < 4; ++channel) {
+      color[channel] = load(work->column_gradients[0][channel]) * w[0];
+      for (int i = 1; i < 4; ++i) {
+        color[channel] = fma(load(work->column_gradients[i][channel]), w[i], color[channel]);
       }
     }
+    const Vec zero(0.f);
+    Vec rows[4] = {sum_quads(total, total_x, total_y, total_xx), sum_quads(y * total_x, y * total_y, zero, zero),
+                   sum_quads(color[0], color[1], color[2], color[3]), zero};
+    transpose_in_quads(rows);
     for (int i = 0; i < kTogether; ++i) {
       if (k + i >= count) break;
       float* row = work->sums[entries[-k - i]];
-      store(row, load(row) + total[i]);
+      store(row, load(row) + rows[i]);
     }
   }
 }
@@ -392,15 +418,18 @@ static void block_backward(const View* view, const ImageGradients* in, const Til
   block_lanes(&lane_x, &lane_y);
   const Vec px = lane_x + Vec(x0 + 0.5f), py = lane_y + Vec(y0 + 0.5f);
   const PixelGradients v = pixel_gradients(view, in, x0, y0, transmittance);
-  {
-    // Column `pixel` of the basis, built for all pixels at once and turned round
-    const Vec x = lane_x + Vec(x0 + 0.5f - t.x0 - t.centre_x);
-    const Vec y = lane_y + Vec(y0 + 0.5f - t.y0 - t.centre_y);
-    alignas(64) float rows[256];
-    const Vec columns[16] = {Vec(1.f), v.red, x,     v.green,  y,     v.blue,   x * x, v.depth,
-                             x * y,    Vec(0.f), y * y, Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
-    for (int k = 0; k < 16; ++k) store(rows + 16 * k, columns[k]);
-    transpose16(rows, work->basis[0]);
+  for (int i = 0; i < 4; ++i) {
+    const float x = static_cast<float>(x0 + i - t.x0) + 0.5f - t.centre_x;
+    work->column_x[i][0] = x;
+    work->column_x[i][1] = x * x;
+  }
+  const Vec y = lane_y + Vec(y0 + 0.5f - t.y0 - t.centre_y);
+  const Vec gradients[4] = {v.red, v.green, v.blue, v.depth};
+  for (int channel = 0; channel < 4; ++channel) {
+    store(work->column_gradients[0][channel], splat_in_quads<0>(gradients[channel]));
+    store(work->column_gradients[1][channel], splat_in_quads<1>(gradients[channel]));
+    store(work->column_gradients[2][channel], splat_in_quads<2>(gradients[channel]));
+    store(work->column_gradients[3][channel], splat_in_quads<3>(gradients[channel]));
   }
   const Vec threshold(kLog2AlphaMin), alpha_max(kAlphaMax), one(1.f);
   Vec behind = v.behind, place(static_cast<float>(kept) - 1.f);
@@ -426,17 +455,18 @@ static void block_backward(const View* view, const ImageGradients* in, const Til
       const Vec weight = transmittance * alpha;
       // minus d loss / d (half the squared Mahalanobis distance); none where alpha was clipped
       const Vec g = keep(ge(alpha_max, raw), weight * difference);
-      store_pairs(work->pairs[i], g, weight);
+      store(work->g[i], g);
+      store(work->weight[i], weight);
       if constexpr (kAbsolute) {
         const Vec scale(-1.f / kLog2E), two(2.f);
         float* row = work->sums[local];
         const Vec du = scale * fma(two * Vec(r.xx), dx, Vec(r.xy) * dy);
         const Vec dv = scale * fma(two * Vec(r.yy), dy, Vec(r.xy) * dx);
-        row[12] += sum(abs(g * du));
-        row[14] += sum(abs(g * dv));
+        row[kSumAbsU] += sum(abs(g * du));
+        row[kSumAbsV] += sum(abs(g * dv));
       }
     }
-    reduce_entries(work, entries + left - 1, count);
+    reduce_entries(work, y, entries + left - 1, count);
     left -= count;
   }
 }
@@ -445,28 +475,23 @@ static void block_backward(const View* view, const ImageGradients* in, const Til
 static void file_pair_rows(View* view, const TileFrame& t, const float (*sums)[16]) {
   const Record* locals = static_cast<const Record*>(view->locals.data) + t.first_pair;
   float* out = static_cast<float*>(view->pair_rows.data);
-  alignas(64) float columns[256], rows[256], x[16], y[16];
-  const float centre_x = t.x0 + t.centre_x, centre_y = t.y0 + t.centre_y;
+  alignas(64) float columns[256], rows[256];
   for (int first = 0; first < t.count; first += 16) {
     const int count = t.count - first < 16 ? t.count - first : 16;
-    for (int i = 0; i < 16; ++i) {
-      store(rows + 16 * i, i < count ? load(sums[first + i]) : Vec(0.f));
-      x[i] = i < count ? locals[first + i].x - centre_x : 0;
-      y[i] = i < count ? locals[first + i].y - centre_y : 0;
-      if (i < count) __builtin_prefetch(out + 16 * static_cast<size_t>(locals[first + i].pair), 1);
-    }
-    transpose16(rows, columns);
-    const Vec mx = load(x), my = load(y);
+    for (int i = 0; i < count; ++i) __builtin_prefetch(out + 16 * static_cast<size_t>(locals[first + i].pair), 1);
+    transpose16(sums[first], columns);
+    const Vec mx = load(columns + 16 * kSumMeanX), my = load(columns + 16 * kSumMeanY);
     // The sums hold minus the gradient.
-    const Vec s0 = negated(load(columns)), sx = negated(load(columns + 32)), sy = negated(load(columns + 64));
-    const Vec sxx = negated(load(columns + 96)), sxy = negated(load(columns + 128));
-    const Vec syy = negated(load(columns + 160));
+    const Vec s0 = negated(load(columns + 16 * kSum));
+    const Vec sx = negated(load(columns + 16 * kSumX)), sy = negated(load(columns + 16 * kSumY));
+    const Vec sxx = negated(load(columns + 16 * kSumXX)), sxy = negated(load(columns + 16 * kSumXY));
+    const Vec syy = negated(load(columns + 16 * kSumYY));
     const Vec dx = fma(mx, s0, negated(sx)), dy = fma(my, s0, negated(sy));
     const Vec moments[16] = {
         s0, dx, dy,
         fma(mx, dx, fnma(mx, sx, sxx)), fma(mx, dy, fnma(my, sx, sxy)), fma(my, dy, fnma(my, sy, syy)),
-        load(columns + 16), load(columns + 48), load(columns + 80), load(columns + 112),
-        load(columns + 192), load(columns + 224),
+        load(columns + 16 * kSumRed), load(columns + 16 * kSumGreen), load(columns + 16 * kSumBlue),
+        load(columns + 16 * kSumDepth), load(columns + 16 * kSumAbsU), load(columns + 16 * kSumAbsV),
         Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
     for (int k = 0; k < 16; ++k) store(columns + 16 * k, moments[k]);
     transpose16(columns, rows);
@@ -485,10 +510,17 @@ static void backward_tile(View* view, const ImageGradients* in, bool absolute, i
   const float* lasts = static_cast<const float*>(view->lasts.data) + static_cast<size_t>(tile) * kBlocks * 16;
   const Record* locals = static_cast<const Record*>(view->locals.data) + t.first_pair;
   const uint32_t* entries = static_cast<const uint32_t*>(static_cast<Buffer*>(view->tile_entries.data)[tile].data);
-  reserve(&view->scratch[slot], sizeof(float) * 16 * t.count);
+  // Whole groups of sixteen, as they are filed
+  const int padded = (t.count + 15) / 16 * 16;
+  reserve(&view->scratch[slot], sizeof(float) * 16 * padded);
   alignas(64) TileWork work;
   work.sums = static_cast<float(*)[16]>(view->scratch[slot].data);
-  memset(work.sums, 0, sizeof(float) * 16 * t.count);
+  for (int i = 0; i < padded; ++i) {
+    store(work.sums[i], Vec(0.f));
+    if (i >= t.count) continue;
+    work.sums[i][kSumMeanX] = locals[i].x - (t.x0 + t.centre_x);
+    work.sums[i][kSumMeanY] = locals[i].y - (t.y0 + t.centre_y);
+  }
   for (int by = 0; by < t.blocks_y; ++by) {
     for (int bx = 0; bx < t.blocks_x; ++bx) {
       const int block = by * kSide + bx;

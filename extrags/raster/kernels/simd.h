@@ -13,9 +13,6 @@ constexpr float kLn2 = 0.6931471805599453f;
 
 #if defined(__AVX512F__) && defined(__AVX512DQ__) && defined(__AVX512VL__)
 
-// Vectors that fit into the registers beside a few others
-constexpr int kTogether = 8;
-
 struct Mask {
   __mmask16 bits;
 };
@@ -84,16 +81,25 @@ EXTRAGS_INLINE void store_packed(uint32_t* p, Vec low, Vec high) {
   const __m512i a = _mm512_cvttps_epi32(low.v), b = _mm512_cvttps_epi32(high.v);
   _mm512_storeu_si512(p, _mm512_or_si512(a, _mm512_slli_epi32(b, 16)));
 }
-// p[0], p[1], p[0], p[1], ...
-EXTRAGS_INLINE Vec broadcast_pair(const float* p) {
-  double pair;
-  memcpy(&pair, p, 8);
-  return _mm512_castpd_ps(_mm512_set1_pd(pair));
+// Lanes as four quads: quad j of vector i and place i of quad j change places.
+EXTRAGS_INLINE void transpose_in_quads(Vec* r) {
+  const __m512 a = _mm512_unpacklo_ps(r[0].v, r[1].v), b = _mm512_unpackhi_ps(r[0].v, r[1].v);
+  const __m512 c = _mm512_unpacklo_ps(r[2].v, r[3].v), d = _mm512_unpackhi_ps(r[2].v, r[3].v);
+  r[0].v = _mm512_shuffle_ps(a, c, 0x44);
+  r[1].v = _mm512_shuffle_ps(a, c, 0xee);
+  r[2].v = _mm512_shuffle_ps(b, d, 0x44);
+  r[3].v = _mm512_shuffle_ps(b, d, 0xee);
 }
-// Pairs a[i], b[i]. The j-th pair in memory is that of lane kLaneOfPair[j], which costs no permutation.
-EXTRAGS_INLINE void store_pairs(float* p, Vec a, Vec b) {
-  _mm512_storeu_ps(p, _mm512_unpacklo_ps(a.v, b.v));
-  _mm512_storeu_ps(p + 16, _mm512_unpackhi_ps(a.v, b.v));
+// Each quad filled with its own place kPlace
+template <int kPlace>
+EXTRAGS_INLINE Vec splat_in_quads(Vec a) {
+  return _mm512_permute_ps(a.v, kPlace * 0x55);
+}
+// The sums over the quads of a, b, c and d, as quads 0 to 3: (0 + 2) + (1 + 3)
+EXTRAGS_INLINE Vec sum_quads(Vec a, Vec b, Vec c, Vec d) {
+  const __m512 s = _mm512_add_ps(_mm512_shuffle_f32x4(a.v, b.v, 0x44), _mm512_shuffle_f32x4(a.v, b.v, 0xee));
+  const __m512 t = _mm512_add_ps(_mm512_shuffle_f32x4(c.v, d.v, 0x44), _mm512_shuffle_f32x4(c.v, d.v, 0xee));
+  return _mm512_add_ps(_mm512_shuffle_f32x4(s, t, 0x88), _mm512_shuffle_f32x4(s, t, 0xdd));
 }
 // Sixteen rows of three or four floats, to and from one vector per column
 EXTRAGS_INLINE void load_triples(const float* p, Vec* columns) {
@@ -180,7 +186,6 @@ constexpr int kNative = 8;
 constexpr int kNative = 4;
 #endif
 constexpr int kParts = 16 / kNative;
-constexpr int kTogether = kNative == 8 ? 4 : 2;
 
 typedef float NativeFloat __attribute__((vector_size(kNative * 4)));
 typedef float UnalignedFloat __attribute__((vector_size(kNative * 4), aligned(4)));
@@ -374,28 +379,63 @@ EXTRAGS_INLINE void store_packed(uint32_t* p, Vec low, Vec high) {
     memcpy(p + kNative * i, &packed, sizeof packed);
   }
 }
-EXTRAGS_INLINE Vec broadcast_pair(const float* p) {
+EXTRAGS_INLINE NativeFloat native_shuffle_44(NativeFloat a, NativeFloat b) {
 #if defined(__AVX2__) && defined(__FMA__)
-  double pair;
-  memcpy(&pair, p, 8);
-  const NativeFloat both = _mm256_castpd_ps(_mm256_set1_pd(pair));
+  return _mm256_shuffle_ps(a, b, 0x44);
 #else
-  const NativeFloat both = {p[0], p[1], p[0], p[1]};
+  return __builtin_shufflevector(a, b, 0, 1, 4, 5);
 #endif
-  EXTRAGS_EACH(both);
 }
-EXTRAGS_INLINE void store_pairs(float* p, Vec a, Vec b) {
-  for (int i = 0; i < kParts; ++i) {
+EXTRAGS_INLINE NativeFloat native_shuffle_ee(NativeFloat a, NativeFloat b) {
 #if defined(__AVX2__) && defined(__FMA__)
-    _mm256_storeu_ps(p + 8 * i, _mm256_unpacklo_ps(a.v[i], b.v[i]));
-    _mm256_storeu_ps(p + 16 + 8 * i, _mm256_unpackhi_ps(a.v[i], b.v[i]));
+  return _mm256_shuffle_ps(a, b, 0xee);
 #else
-    *reinterpret_cast<UnalignedFloat*>(p + 4 * i) =
-        __builtin_shufflevector(a.v[i], b.v[i], 0, 4, 1, 5);
-    *reinterpret_cast<UnalignedFloat*>(p + 16 + 4 * i) =
-        __builtin_shufflevector(a.v[i], b.v[i], 2, 6, 3, 7);
+  return __builtin_shufflevector(a, b, 2, 3, 6, 7);
 #endif
+}
+EXTRAGS_INLINE NativeFloat native_unpack_low(NativeFloat a, NativeFloat b) {
+#if defined(__AVX2__) && defined(__FMA__)
+  return _mm256_unpacklo_ps(a, b);
+#else
+  return __builtin_shufflevector(a, b, 0, 4, 1, 5);
+#endif
+}
+EXTRAGS_INLINE NativeFloat native_unpack_high(NativeFloat a, NativeFloat b) {
+#if defined(__AVX2__) && defined(__FMA__)
+  return _mm256_unpackhi_ps(a, b);
+#else
+  return __builtin_shufflevector(a, b, 2, 6, 3, 7);
+#endif
+}
+EXTRAGS_INLINE void transpose_in_quads(Vec* r) {
+  for (int i = 0; i < kParts; ++i) {
+    const NativeFloat a = native_unpack_low(r[0].v[i], r[1].v[i]), b = native_unpack_high(r[0].v[i], r[1].v[i]);
+    const NativeFloat c = native_unpack_low(r[2].v[i], r[3].v[i]), d = native_unpack_high(r[2].v[i], r[3].v[i]);
+    r[0].v[i] = native_shuffle_44(a, c);
+    r[1].v[i] = native_shuffle_ee(a, c);
+    r[2].v[i] = native_shuffle_44(b, d);
+    r[3].v[i] = native_shuffle_ee(b, d);
   }
+}
+template <int kPlace>
+EXTRAGS_INLINE Vec splat_in_quads(Vec a) {
+#if defined(__AVX2__) && defined(__FMA__)
+  EXTRAGS_EACH(_mm256_permute_ps(a.v[i], kPlace * 0x55));
+#else
+  EXTRAGS_EACH(__builtin_shufflevector(a.v[i], a.v[i], kPlace, kPlace, kPlace, kPlace));
+#endif
+}
+EXTRAGS_INLINE Vec sum_quads(Vec a, Vec b, Vec c, Vec d) {
+  Vec r;
+#if defined(__AVX2__) && defined(__FMA__)
+  const __m256 s = a.v[0] + a.v[1], t = b.v[0] + b.v[1], u = c.v[0] + c.v[1], v = d.v[0] + d.v[1];
+  r.v[0] = _mm256_permute2f128_ps(s, t, 0x20) + _mm256_permute2f128_ps(s, t, 0x31);
+  r.v[1] = _mm256_permute2f128_ps(u, v, 0x20) + _mm256_permute2f128_ps(u, v, 0x31);
+#else
+  const Vec* in[4] = {&a, &b, &c, &d};
+  for (int i = 0; i < 4; ++i) r.v[i] = (in[i]->v[0] + in[i]->v[2]) + (in[i]->v[1] + in[i]->v[3]);
+#endif
+  return r;
 }
 template <int kColumns>
 EXTRAGS_INLINE void load_interleaved(const float* p, Vec* columns) {
@@ -466,8 +506,6 @@ EXTRAGS_INLINE void transpose16(const float* source, float* target) {
 #undef EXTRAGS_EACH_MASK
 
 #endif
-
-constexpr int kLaneOfPair[16] = {0, 1, 4, 5, 8, 9, 12, 13, 2, 3, 6, 7, 10, 11, 14, 15};
 
 EXTRAGS_INLINE Vec negated(Vec a) { return Vec(0.f) - a; }
 EXTRAGS_INLINE Vec ramp() {
