@@ -129,10 +129,14 @@ static void bin_tile(View* view, int tile, int slot, const TileFrame& t) {
                     static_cast<DepthKey*>(view->scratch[slot].data), t.count);
   const uint32_t tile_x = static_cast<uint32_t>(tile % view->tiles_x);
   const uint32_t tile_y = static_cast<uint32_t>(tile / view->tiles_x);
+  const uint32_t* chunk_pairs = static_cast<const uint32_t*>(view->chunk_pairs.data);
+  const int chunk_bits = __builtin_ctz(static_cast<unsigned>(view->chunk));
   for (int i = 0; i < t.count; ++i) {
     __builtin_prefetch(&records[keys[i + 8 < t.count ? i + 8 : i].id]);
-    store(&locals[i].x, load(&records[keys[i].id].x));
-    locals[i].pair += tile_y * locals[i].tiles_across + tile_x;
+    const Record& record = records[keys[i].id];
+    const uint32_t pair = record.pair + tile_y * record.tiles_across + tile_x;
+    store(&locals[i].x, load(&record.x));
+    locals[i].pair = pair + chunk_pairs[keys[i].id >> chunk_bits];
   }
 
   uint16_t* masks = static_cast<uint16_t*>(view->scratch[slot].data);

@@ -75,7 +75,7 @@ const KernelTable*& active() {
 
 struct ViewDeleter {
   void operator()(View* view) const {
-    Buffer* all[] = {&view->records, &view->rects, &view->pair_starts, &view->counts, &view->chunk_pairs,
+    Buffer* all[] = {&view->records, &view->rects, &view->depths, &view->pair_starts, &view->counts, &view->chunk_pairs,
                      &view->tile_starts, &view->keys, &view->locals, &view->block_starts, &view->block_kept,
                      &view->finals, &view->lasts, &view->pair_rows, &view->partials, &view->query};
     for (Buffer* buffer : all) release(buffer);

@@ -148,10 +148,12 @@ EXTRAGS_INLINE Mask project(const View* view, const Scene* scene, int first, int
 #include "harmonics.inl"
 #include "light.inl"
 
-EXTRAGS_INLINE void mark_culled(View* view, const Images* out, int first, int rows) {
+EXTRAGS_INLINE void mark_culled(View* view, const Images* out, int first, int rows, uint32_t pair) {
   TileRect* rects = static_cast<TileRect*>(view->rects.data);
+  uint32_t* starts = static_cast<uint32_t*>(view->pair_starts.data);
   for (int i = first; i < first + rows; ++i) {
     rects[i] = TileRect{1, 1, 0, 0};
+    starts[i] = pair;
     out->radius[i] = 0;
     out->means2d[2 * i] = out->means2d[2 * i + 1] = 0;
   }
@@ -162,6 +164,8 @@ template <int kDegree, bool kColors, bool kLens>
 static void project_chunk(View* view, const Scene* scene, const Images* out, int chunk) {
   Record* records = static_cast<Record*>(view->records.data);
   TileRect* rects = static_cast<TileRect*>(view->rects.data);
+  uint32_t* starts = static_cast<uint32_t*>(view->pair_starts.data);  // from the chunk's first, for now
+  uint32_t* depths = static_cast<uint32_t*>(view->depths.data);
   const int tiles = view->tiles_x * view->tiles_y;
   uint32_t* counts = static_cast<uint32_t*>(view->counts.data) + static_cast<size_t>(chunk) * tiles;
   memset(counts, 0, sizeof(uint32_t) * tiles);
@@ -174,7 +178,7 @@ static void project_chunk(View* view, const Scene* scene, const Images* out, int
     Projected p;
     Mask ok = project<kLens>(view, scene, first, rows, p);
     if (!any(ok)) {
-      mark_culled(view, out, first, rows);
+      mark_culled(view, out, first, rows, pairs);
       continue;
     }
     const Vec u = fma(Vec(view->camera.fx), kLens ? p.image_x : p.raw_x, Vec(view->camera.cx));
@@ -188,7 +192,7 @@ static void project_chunk(View* view, const Scene* scene, const Images* out, int
          gt(h, v - extent_y);
     const uint32_t seen = to_bits(ok);
     if (seen == 0) {
-      mark_culled(view, out, first, rows);
+      mark_culled(view, out, first, rows, pairs);
       continue;
     }
     Vec color[3];
@@ -228,7 +232,7 @@ static void project_chunk(View* view, const Scene* scene, const Images* out, int
       const int id = first + i;
       out->radius[id] = radius[i];
       if ((seen >> i & 1) == 0) {
-        mark_culled(view, out, id, 1);
+        mark_culled(view, out, id, 1, pairs);
         continue;
       }
       Record* record = records + id;
@@ -238,7 +242,13 @@ static void project_chunk(View* view, const Scene* scene, const Images* out, int
       const TileRect rect{static_cast<uint16_t>(corner0[i]), static_cast<uint16_t>(corner0[i] >> 16),
                           static_cast<uint16_t>(corner1[i]), static_cast<uint16_t>(corner1[i] >> 16)};
       rects[id] = rect;
-      pairs += (rect.x1 - rect.x0 + 1u) * (rect.y1 - rect.y0 + 1u);
+      memcpy(depths + id, &record->depth, sizeof *depths);
+      // Unsigned arithmetic wraps: only the number of a tile the Gaussian touches means anything.
+      const uint32_t across = rect.x1 - rect.x0 + 1u;
+      record->tiles_across = across;
+      record->pair = pairs - rect.y0 * across - rect.x0;
+      starts[id] = pairs;
+      pairs += across * (rect.y1 - rect.y0 + 1u);
       for (int ty = rect.y0; ty <= rect.y1; ++ty) {
         for (int tx = rect.x0; tx <= rect.x1; ++tx) ++counts[ty * view->tiles_x + tx];
       }
