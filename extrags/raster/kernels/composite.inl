@@ -475,14 +475,14 @@ static void block_backward(const View* view, const ImageGradients* in, const Til
   }
 }
 
-// Turns sums about the tile's centre into moments about each Gaussian's mean, and files them by pair.
+// Turns sums about the tile's centre into moments about each Gaussian's mean, and files them by pair: whole cache
+// lines in no order, written past the caches.
 static void file_pair_rows(View* view, const TileFrame& t, const float (*sums)[16]) {
   const Record* locals = static_cast<const Record*>(view->locals.data) + t.first_pair;
   float* out = static_cast<float*>(view->pair_rows.data);
   alignas(64) float columns[256], rows[256];
   for (int first = 0; first < t.count; first += 16) {
     const int count = t.count - first < 16 ? t.count - first : 16;
-    for (int i = 0; i < count; ++i) __builtin_prefetch(out + 16 * static_cast<size_t>(locals[first + i].pair), 1);
     transpose16(sums[first], columns);
     const Vec mx = load(columns + 16 * kSumMeanX), my = load(columns + 16 * kSumMeanY);
     // The sums hold minus the gradient.
@@ -500,9 +500,10 @@ static void file_pair_rows(View* view, const TileFrame& t, const float (*sums)[1
     for (int k = 0; k < 16; ++k) store(columns + 16 * k, moments[k]);
     transpose16(columns, rows);
     for (int i = 0; i < count; ++i) {
-      store(out + 16 * static_cast<size_t>(locals[first + i].pair), load(rows + 16 * i));
+      stream(out + 16 * static_cast<size_t>(locals[first + i].pair), load(rows + 16 * i));
     }
   }
+  finish_streams();
 }
 
 static void backward_tile(View* view, const ImageGradients* in, bool absolute, int tile, int slot) {

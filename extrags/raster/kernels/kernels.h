@@ -122,6 +122,8 @@ struct View {
   Buffer partials;   // float [chunks, kPartials]: gradients of camera and light
   Buffer query;      // working memory of transmittance queries
   Buffer scratch[kMaxThreads];
+  bool check;   // whether the projection looks for NaN and infinities
+  bool finite;  // it found none
   double seconds[4];  // projection, tiles, tiles backward, projection backward of the last calls
 };
 

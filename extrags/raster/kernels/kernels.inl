@@ -40,9 +40,38 @@ struct ViewContext {
   const SceneGradients* scene_gradients;
 };
 
+// Whether all values are finite: x - x is zero for finite x, else NaN, and a NaN stays in the sum.
+static bool all_finite(const float* values, int64_t count) {
+  Vec total[4] = {Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
+  int64_t i = 0;
+  for (; i + 64 <= count; i += 64) {
+    for (int k = 0; k < 4; ++k) {
+      const Vec x = load(values + i + 16 * k);
+      total[k] = total[k] + (x - x);
+    }
+  }
+  float poison = sum((total[0] + total[1]) + (total[2] + total[3]));
+  for (; i < count; ++i) poison += values[i] - values[i];
+  return poison == 0.f;
+}
+
+// A chunk's parameters, just before they are projected: they are read from memory once.
+static bool chunk_finite(const Scene& scene, int64_t begin, int64_t end) {
+  const int64_t count = end - begin, of_sh = 3 * static_cast<int64_t>(scene.coefficients);
+  return all_finite(scene.means + 3 * begin, 3 * count) && all_finite(scene.quats + 4 * begin, 4 * count) &&
+         all_finite(scene.scales + 3 * begin, 3 * count) && all_finite(scene.opacities + begin, count) &&
+         (scene.colors == nullptr || all_finite(scene.colors + 3 * begin, 3 * count)) &&
+         (scene.sh == nullptr || all_finite(scene.sh + of_sh * begin, of_sh * count));
+}
+
 template <bool kLens>
 static void project_task(void* data, int chunk, int) {
   const ViewContext& c = *static_cast<ViewContext*>(data);
+  const int begin = chunk * c.view->chunk, rest = c.scene->n - begin;
+  if (c.view->check && !chunk_finite(*c.scene, begin, begin + (rest < c.view->chunk ? rest : c.view->chunk))) {
+    __atomic_store_n(&c.view->finite, false, __ATOMIC_RELAXED);
+    return;
+  }
   if (c.scene->colors != nullptr) return project_chunk<0, true, kLens>(c.view, c.scene, c.images, chunk);
   switch (c.scene->degree) {
     case 0: return project_chunk<0, false, kLens>(c.view, c.scene, c.images, chunk);
@@ -167,7 +196,9 @@ static void forward(View* view, const Scene* scene, const Images* images) {
   const double started = monotonic_seconds();
   lay_out(view, scene->n);
   ViewContext c{view, scene, images, nullptr, nullptr};
+  view->finite = true;
   parallel_for(view->chunks, view->camera.bent ? project_task<true> : project_task<false>, &c);
+  if (!view->finite) return;
 
   // Where each tile's pairs start, and in it those of each chunk
   const size_t tiles = static_cast<size_t>(view->tiles_x) * view->tiles_y;
@@ -251,21 +282,6 @@ static void backward(View* view, const Scene* scene, const ImageGradients* in, c
     }
     out->viewmat[4 * i + 3] = finite_float(v_translation);
   }
-}
-
-// Whether all values are finite: x - x is zero for finite x, else NaN, and a NaN stays in the sum.
-static bool all_finite(const float* values, int64_t count) {
-  Vec total[4] = {Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
-  int64_t i = 0;
-  for (; i + 64 <= count; i += 64) {
-    for (int k = 0; k < 4; ++k) {
-      const Vec x = load(values + i + 16 * k);
-      total[k] = total[k] + (x - x);
-    }
-  }
-  float poison = sum((total[0] + total[1]) + (total[2] + total[3]));
-  for (; i < count; ++i) poison += values[i] - values[i];
-  return poison == 0.f;
 }
 
 constexpr int64_t kFiniteValues = 1 << 18;  // a task, at least

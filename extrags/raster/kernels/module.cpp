@@ -270,7 +270,7 @@ struct CameraGradientArrays {
 };
 
 std::unique_ptr<Frame> render(const GaussianArrays& gaussians, const CameraSettings& camera,
-                              const ImageArrays& images, int degree) {
+                              const ImageArrays& images, int degree, bool check) {
   const Scene scene = gaussians.scene(degree);
   images.check(static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height), gaussians.count());
   auto frame = std::make_unique<Frame>();
@@ -278,7 +278,9 @@ std::unique_ptr<Frame> render(const GaussianArrays& gaussians, const CameraSetti
   camera.apply(frame->view.get());
   const Images out = images.pointers();
   nb::gil_scoped_release release_gil;
+  frame->view->check = check;
   frame->kernels->forward(frame->view.get(), &scene, &out);
+  if (!frame->view->finite) return nullptr;
   return frame;
 }
 
@@ -535,7 +537,9 @@ NB_MODULE(_native, m) {
            "Of the projection, the tiles, the tiles backward and the projection backward.")
       .def("query", &frame_query, nb::arg("points"), nb::arg("transmittance").noconvert());
   m.def("render", &render, nb::arg("gaussians"), nb::arg("camera"), nb::arg("images"), nb::kw_only(),
-        nb::arg("degree"), "Render one camera; `degree` is that of the harmonics used.");
+        nb::arg("degree"), nb::arg("check") = false,
+        "Render one camera; `degree` is that of the harmonics used. With `check`, None where an array of the "
+        "Gaussians holds a NaN or an infinity.");
   m.def("l1_ssim", &l1_ssim, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(),
         nb::arg("gradient").noconvert(), nb::arg("dssim_weight"), nb::arg("scale"),
         nb::arg("ssim_mask").none() = nb::none());

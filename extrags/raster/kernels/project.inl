@@ -502,6 +502,7 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
       store_rows<2>(out->absolute2d + 2 * at, rows, absolute, false);
     }
   }
+  finish_streams();
   if (view->partials.data == nullptr) return;
   float* partial = static_cast<float*>(view->partials.data) + kPartials * static_cast<size_t>(chunk);
   if constexpr (kPose) {

@@ -35,6 +35,9 @@ EXTRAGS_INLINE Vec sqrt(Vec a) { return _mm512_sqrt_ps(a.v); }
 EXTRAGS_INLINE Vec abs(Vec a) { return _mm512_abs_ps(a.v); }
 EXTRAGS_INLINE Vec load(const float* p) { return _mm512_loadu_ps(p); }
 EXTRAGS_INLINE void store(float* p, Vec a) { _mm512_storeu_ps(p, a.v); }
+// A whole cache line, 64-byte aligned, past the caches; seen by other threads after `finish_streams`
+EXTRAGS_INLINE void stream(float* p, Vec a) { _mm512_stream_ps(p, a.v); }
+EXTRAGS_INLINE void finish_streams() { _mm_sfence(); }
 EXTRAGS_INLINE Vec load_first(const float* p, int n) {
   return _mm512_maskz_loadu_ps(static_cast<__mmask16>((1u << n) - 1), p);
 }
@@ -282,6 +285,20 @@ EXTRAGS_INLINE Vec load(const float* p) {
 }
 EXTRAGS_INLINE void store(float* p, Vec a) {
   for (int i = 0; i < kParts; ++i) *reinterpret_cast<UnalignedFloat*>(p + kNative * i) = a.v[i];
+}
+EXTRAGS_INLINE void stream(float* p, Vec a) {
+#if defined(__AVX2__) && defined(__FMA__)
+  for (int i = 0; i < kParts; ++i) _mm256_stream_ps(p + kNative * i, a.v[i]);
+#elif defined(__SSE2__)
+  for (int i = 0; i < kParts; ++i) _mm_stream_ps(p + kNative * i, a.v[i]);
+#else
+  store(p, a);
+#endif
+}
+EXTRAGS_INLINE void finish_streams() {
+#if defined(__SSE2__)
+  _mm_sfence();
+#endif
 }
 EXTRAGS_INLINE Vec load_first(const float* p, int n) {
   alignas(64) float t[16] = {};
