@@ -155,7 +155,7 @@ static void bin_tile(View* view, int tile, int slot, const TileFrame& t) {
   }
   starts[kBlocks] = total;
   Buffer* buffer = static_cast<Buffer*>(view->tile_entries.data) + tile;
-  reserve(buffer, sizeof(uint32_t) * (static_cast<size_t>(total) + 16));
+  reserve(buffer, (sizeof(uint32_t) + sizeof(uint16_t)) * (static_cast<size_t>(total) + 16));
   for (int block = 0; block < kBlocks; ++block) {
     if (starts[block] == starts[block + 1]) continue;
     // Block after block: what is written beyond a block's end is overwritten by the next.
@@ -226,15 +226,20 @@ EXTRAGS_INLINE void get_color_block(const float* image, const View* view, int x0
   load_triples(t, color);
 }
 
+// Beside a tile's entries: for each that was kept, the pixels that composited it.
+EXTRAGS_INLINE uint16_t* entry_hits(uint32_t* entries, uint32_t total) {
+  return reinterpret_cast<uint16_t*>(entries + total + 16);
+}
+
 // Composites the blocks of a tile front to back. Entries no pixel used are dropped from the lists.
 template <bool kMedian, bool kVisibility>
 static void composite_tile(View* view, const Images* out, int tile, const TileFrame& t, float* visibility) {
   const uint32_t* starts = static_cast<const uint32_t*>(view->block_starts.data) + static_cast<size_t>(tile) * (kBlocks + 1);
   uint32_t* kept_counts = static_cast<uint32_t*>(view->block_kept.data) + static_cast<size_t>(tile) * kBlocks;
   float* finals = static_cast<float*>(view->finals.data) + static_cast<size_t>(tile) * kBlocks * 16;
-  float* lasts = static_cast<float*>(view->lasts.data) + static_cast<size_t>(tile) * kBlocks * 16;
   const Record* locals = static_cast<const Record*>(view->locals.data) + t.first_pair;
   uint32_t* all_entries = static_cast<uint32_t*>(static_cast<Buffer*>(view->tile_entries.data)[tile].data);
+  uint16_t* all_hits = entry_hits(all_entries, starts[kBlocks]);
   Vec lane_x, lane_y;
   block_lanes(&lane_x, &lane_y);
   const Vec alpha_max(kAlphaMax), transmittance_min(kTransmittanceMin), one(1.f), half(0.5f);
@@ -244,8 +249,9 @@ static void composite_tile(View* view, const Images* out, int tile, const TileFr
       const int block = by * kSide + bx, x0 = t.x0 + 4 * bx, y0 = t.y0 + 4 * by;
       const Vec px = lane_x + Vec(x0 + 0.5f), py = lane_y + Vec(y0 + 0.5f);
       uint32_t* entries = all_entries + starts[block];
+      uint16_t* hits = all_hits + starts[block];
       const uint32_t count = starts[block + 1] - starts[block];
-      Vec transmittance(1.f), red(0.f), green(0.f), blue(0.f), depth(0.f), median(0.f), last(0.f);
+      Vec transmittance(1.f), red(0.f), green(0.f), blue(0.f), depth(0.f), median(0.f);
       // Lanes outside the image are finished from the start.
       const Mask inside = gt(Vec(static_cast<float>(view->width)), px) & gt(Vec(static_cast<float>(view->height)), py);
       Vec threshold = select(inside, Vec(kLog2AlphaMin), finished);
@@ -284,12 +290,11 @@ static void composite_tile(View* view, const Images* out, int tile, const TileFr
           of_local[1] += sum(weight);
         }
         transmittance = select(hit, behind, transmittance);
+        hits[kept] = static_cast<uint16_t>(to_bits(hit));
         entries[kept++] = local;
-        last = select(hit, Vec(static_cast<float>(kept)), last);
       }
       kept_counts[block] = kept;
       store(finals + 16 * block, transmittance);
-      store(lasts + 16 * block, last);
       const Vec color[3] = {fma(transmittance, Vec(view->background[0]), red),
                             fma(transmittance, Vec(view->background[1]), green),
                             fma(transmittance, Vec(view->background[2]), blue)};
@@ -415,8 +420,8 @@ EXTRAGS_INLINE PixelGradients pixel_gradients(const View* view, const ImageGradi
 
 template <bool kAbsolute>
 static void block_backward(const View* view, const ImageGradients* in, const TileFrame& t, int block,
-                           const Record* locals, const uint32_t* entries, uint32_t kept,
-                           Vec transmittance, Vec last, TileWork* work) {
+                           const Record* locals, const uint32_t* entries, const uint16_t* hits, uint32_t kept,
+                           Vec transmittance, TileWork* work) {
   const int x0 = t.x0 + 4 * (block % kSide), y0 = t.y0 + 4 * (block / kSide);
   Vec lane_x, lane_y;
   block_lanes(&lane_x, &lane_y);
@@ -435,8 +440,8 @@ static void block_backward(const View* view, const ImageGradients* in, const Til
     store(work->column_gradients[2][channel], splat_in_quads<2>(gradients[channel]));
     store(work->column_gradients[3][channel], splat_in_quads<3>(gradients[channel]));
   }
-  const Vec threshold(kLog2AlphaMin), alpha_max(kAlphaMax), one(1.f);
-  Vec behind = v.behind, place(static_cast<float>(kept) - 1.f);
+  const Vec alpha_max(kAlphaMax), one(1.f);
+  Vec behind = v.behind;
   for (int left = static_cast<int>(kept); left > 0;) {
     const int count = left < kEntriesAhead ? left : kEntriesAhead;
     for (int i = 0; i < count; ++i) {
@@ -447,8 +452,7 @@ static void block_backward(const View* view, const ImageGradients* in, const Til
       const Record& r = locals[local];
       const Vec dx = Vec(r.x) - px, dy = Vec(r.y) - py;
       const Vec power = exponent(r, dx, dy);
-      const Mask hit = ge(power, threshold) & gt(last, place);
-      place = place - one;
+      const Mask hit = from_bits(hits[k]);
       const Vec raw = exp2(power), alpha = keep(hit, min(raw, alpha_max));
       transmittance = transmittance * (one / (one - alpha));
       // `behind` is the gradient-weighted value of all that lies behind, per unit of transmittance.
@@ -512,9 +516,9 @@ static void backward_tile(View* view, const ImageGradients* in, bool absolute, i
   const uint32_t* starts = static_cast<const uint32_t*>(view->block_starts.data) + static_cast<size_t>(tile) * (kBlocks + 1);
   const uint32_t* kept = static_cast<const uint32_t*>(view->block_kept.data) + static_cast<size_t>(tile) * kBlocks;
   const float* finals = static_cast<const float*>(view->finals.data) + static_cast<size_t>(tile) * kBlocks * 16;
-  const float* lasts = static_cast<const float*>(view->lasts.data) + static_cast<size_t>(tile) * kBlocks * 16;
   const Record* locals = static_cast<const Record*>(view->locals.data) + t.first_pair;
-  const uint32_t* entries = static_cast<const uint32_t*>(static_cast<Buffer*>(view->tile_entries.data)[tile].data);
+  uint32_t* entries = static_cast<uint32_t*>(static_cast<Buffer*>(view->tile_entries.data)[tile].data);
+  const uint16_t* hits = entry_hits(entries, starts[kBlocks]);
   // Whole groups of sixteen, as they are filed
   const int padded = (t.count + 15) / 16 * 16;
   reserve(&view->scratch[slot], sizeof(float) * 16 * padded);
@@ -530,13 +534,13 @@ static void backward_tile(View* view, const ImageGradients* in, bool absolute, i
     for (int bx = 0; bx < t.blocks_x; ++bx) {
       const int block = by * kSide + bx;
       if (kept[block] == 0) continue;
-      const Vec transmittance = load(finals + 16 * block), last = load(lasts + 16 * block);
+      const Vec transmittance = load(finals + 16 * block);
       if (absolute) {
-        block_backward<true>(view, in, t, block, locals, entries + starts[block], kept[block],
-                             transmittance, last, &work);
+        block_backward<true>(view, in, t, block, locals, entries + starts[block], hits + starts[block],
+                             kept[block], transmittance, &work);
       } else {
-        block_backward<false>(view, in, t, block, locals, entries + starts[block], kept[block],
-                              transmittance, last, &work);
+        block_backward<false>(view, in, t, block, locals, entries + starts[block], hits + starts[block],
+                              kept[block], transmittance, &work);
       }
     }
   }

@@ -116,7 +116,7 @@ struct View {
   Buffer block_kept;    // uint32 [tiles, blocks]: entries that some pixel composited
   Buffer finals;        // float [tiles, blocks, 16]: final transmittance
   Buffer lasts;         // float [tiles, blocks, 16]: how many kept entries a pixel went through
-  Buffer tile_entries;  // Buffer [tiles]: indices into the tile's locals, per block
+  Buffer tile_entries;  // Buffer [tiles]: indices into the tile's locals, per block, and `entry_hits`
   int tile_entries_count;
   Buffer pair_rows;  // float [pairs, 16], per Gaussian: gradients, or visibility
   Buffer partials;   // float [chunks, kPartials]: gradients of camera and light

@@ -178,7 +178,6 @@ static void lay_out(View* view, int n) {
   reserve(&view->block_starts, sizeof(uint32_t) * tiles * (blocks + 1));
   reserve(&view->block_kept, sizeof(uint32_t) * tiles * blocks);
   reserve(&view->finals, sizeof(float) * tiles * blocks * 16);
-  reserve(&view->lasts, sizeof(float) * tiles * blocks * 16);
   if (view->tile_entries_count < static_cast<int>(tiles)) {
     Buffer fresh{nullptr, 0};
     reserve(&fresh, sizeof(Buffer) * tiles);

@@ -77,7 +77,7 @@ struct ViewDeleter {
   void operator()(View* view) const {
     Buffer* all[] = {&view->records, &view->rects, &view->depths, &view->pair_starts, &view->counts, &view->chunk_pairs,
                      &view->tile_starts, &view->keys, &view->locals, &view->block_starts, &view->block_kept,
-                     &view->finals, &view->lasts, &view->pair_rows, &view->partials, &view->query};
+                     &view->finals, &view->pair_rows, &view->partials, &view->query};
     for (Buffer* buffer : all) release(buffer);
     for (int tile = 0; tile < view->tile_entries_count; ++tile) {
       release(static_cast<Buffer*>(view->tile_entries.data) + tile);

@@ -50,6 +50,7 @@ EXTRAGS_INLINE Mask operator&(Mask a, Mask b) { return {static_cast<__mmask16>(a
 EXTRAGS_INLINE Mask without(Mask a, Mask b) { return {static_cast<__mmask16>(a.bits & ~b.bits)}; }
 EXTRAGS_INLINE bool any(Mask a) { return a.bits != 0; }
 EXTRAGS_INLINE uint32_t to_bits(Mask a) { return a.bits; }
+EXTRAGS_INLINE Mask from_bits(uint16_t bits) { return {bits}; }
 EXTRAGS_INLINE Vec select(Mask m, Vec a, Vec b) { return _mm512_mask_blend_ps(m.bits, b.v, a.v); }
 EXTRAGS_INLINE Vec keep(Mask m, Vec a) { return _mm512_maskz_mov_ps(m.bits, a.v); }
 EXTRAGS_INLINE float sum(Vec a) {
@@ -318,6 +319,16 @@ EXTRAGS_INLINE uint32_t to_bits(Mask a) {
   uint32_t bits = 0;
   for (int i = 0; i < kParts; ++i) bits |= native_bits(a.m[i]) << (kNative * i);
   return bits;
+}
+EXTRAGS_INLINE Mask from_bits(uint16_t bits) {
+  alignas(64) static const int32_t lanes[16] = {1,      1 << 1, 1 << 2,  1 << 3,  1 << 4,  1 << 5,  1 << 6,  1 << 7,
+                                                1 << 8, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 15};
+  Mask r;
+  for (int i = 0; i < kParts; ++i) {
+    const NativeInt lane = *reinterpret_cast<const NativeInt*>(lanes + kNative * i);
+    r.m[i] = ((NativeInt{} + bits) & lane) == lane;
+  }
+  return r;
 }
 EXTRAGS_INLINE bool any(Mask a) {
   NativeInt some = a.m[0];
