@@ -23,6 +23,7 @@ namespace EXTRAGS_ISA {
 #include "simd.h"
 
 #include "project.inl"
+#include "project_backward.inl"
 
 #include "composite.inl"
 #include "query.inl"
