@@ -16,7 +16,7 @@ HISTORY = "history.json"
 """Training curve: a list of `{iteration, loss, psnr, n_gaussians}`."""
 
 
-@stage("coarse", version=7)
+@stage("coarse", version=8)
 def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     """Optimise the coarse scene; writes `scene/` and `history.json`.
 

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from extrags.errors import ShapeError
+from extrags.errors import NonFiniteError, ShapeError
 from extrags.radial_lens import RadialLens
 from extrags.raster import native
 from extrags.raster.loss import huber_depth_gradient
@@ -245,7 +245,8 @@ class DirectStep:
         kernels = native.compiled_kernels()
         torch.exp(self._values["scales"], out=self._linear["scales"])
         torch.sigmoid(self._values["opacities"], out=self._linear["opacities"])
-        self._check_finite(kernels, light)
+        if light is not None and kernels.first_nonfinite(light) >= 0:
+            raise nonfinite_error("light", torch.from_numpy(light)[None])
         images = self._images_of(target)
         camera = kernels.Camera(
             viewmat=target.viewmat,
@@ -256,7 +257,9 @@ class DirectStep:
             light=light,
             lens=target.lens,
         )
-        frame = kernels.render(self._gaussians, camera, images.filled, degree=sh_degree)
+        frame = kernels.render(self._gaussians, camera, images.filled, degree=sh_degree, check=True)
+        if frame is None:
+            raise self._nonfinite_error(kernels)
         loss, image_gradients = images.loss_and_gradients(
             target,
             dssim_weight=dssim_weight,
@@ -307,9 +310,11 @@ class DirectStep:
             g_opacities, self._linear["opacities"], grad_input=g_opacities
         )
 
-    def _check_finite(self, kernels: Any, light: np.ndarray | None) -> None:
-        for name, tensor, array in self._checked:
-            if array.size and kernels.first_nonfinite(array) >= 0:
-                raise nonfinite_error(name, tensor)
-        if light is not None and kernels.first_nonfinite(light) >= 0:
-            raise nonfinite_error("light", torch.from_numpy(light)[None])
+    def _nonfinite_error(self, kernels: Any) -> NonFiniteError:
+        """That of the first array with a NaN or an infinity, of which there is one."""
+        found = (
+            (name, tensor)
+            for name, tensor, array in self._checked
+            if array.size and kernels.first_nonfinite(array) >= 0
+        )
+        return nonfinite_error(*next(found))

@@ -1,12 +1,6 @@
-// Tiles: depth sort, exact binning of ellipses to blocks of 4 x 4 pixels, compositing and its gradient.
-//
-// A block is one vector, lane = 4 row + column. A tile is small enough for its records, its entries and
-// its gradient sums to stay in the nearest caches.
+// Compositing of a tile and its gradient.
 
-constexpr float kLog2AlphaMin = -7.994353436858858f;
-constexpr int kSide = kTileBlocks, kBlocks = kSide * kSide;
-constexpr int kEntriesAhead = 32;  // entries whose gradients are reduced together
-constexpr int kPrefetch = 8;       // entries ahead whose records are fetched
+#include "bin.inl"
 
 EXTRAGS_INLINE void block_lanes(Vec* column, Vec* row) {
   alignas(64) static const float x[16] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
@@ -15,157 +9,7 @@ EXTRAGS_INLINE void block_lanes(Vec* column, Vec* row) {
   *row = load(y);
 }
 
-// Stable radix sort by depth. Keys are the bits of positive floats, whose order is that of the floats;
-// equal depths keep the order of the ids.
-static DepthKey* sort_by_depth(DepthKey* keys, DepthKey* spare, int n) {
-  if (n <= 24) {
-    for (int i = 1; i < n; ++i) {
-      const DepthKey key = keys[i];
-      int j = i;
-      for (; j > 0 && keys[j - 1].depth_bits > key.depth_bits; --j) keys[j] = keys[j - 1];
-      keys[j] = key;
-    }
-    return keys;
-  }
-  uint32_t low = ~0u, high = 0;
-  for (int i = 0; i < n; ++i) {
-    low = keys[i].depth_bits < low ? keys[i].depth_bits : low;
-    high = keys[i].depth_bits > high ? keys[i].depth_bits : high;
-  }
-  int bits = 0;
-  while (bits < 32 && (high - low) >> bits != 0) ++bits;
-  constexpr int kDigit = 9, kSize = 1 << kDigit;
-  uint32_t histogram[kSize];
-  for (int shift = 0; shift < bits; shift += kDigit) {
-    memset(histogram, 0, sizeof histogram);
-    for (int i = 0; i < n; ++i) ++histogram[(keys[i].depth_bits - low) >> shift & (kSize - 1)];
-    uint32_t at = 0;
-    for (int d = 0; d < kSize; ++d) {
-      const uint32_t count = histogram[d];
-      histogram[d] = at;
-      at += count;
-    }
-    for (int i = 0; i < n; ++i) {
-      spare[histogram[(keys[i].depth_bits - low) >> shift & (kSize - 1)]++] = keys[i];
-    }
-    DepthKey* swapped = keys;
-    keys = spare;
-    spare = swapped;
-  }
-  return keys;
-}
-
-// Which of sixteen ellipses reach which blocks of a tile: bit `lane` of reached[block * stride].
-static void block_masks(const Record* records, int rows, float tile_x, float tile_y, uint16_t* reached,
-                        size_t stride) {
-  alignas(64) float gathered[256], columns[256];
-  for (int i = 0; i < 16; ++i) store(gathered + 16 * i, load(&records[i < rows ? i : 0].x));
-  transpose16(gathered, columns);
-  const Vec x = load(columns) - Vec(tile_x), y = load(columns + 16) - Vec(tile_y);
-  const Vec height = load(columns + 160), slope = load(columns + 176);
-  const Vec shape = load(columns + 192), right_dy = load(columns + 208);
-  // Slack for rounding: the mean is known to 1e-7 of its value, the extent to 1e-6 of its own.
-  const Vec slack = fma(Vec(2e-6f), height + sqrt(shape) * height, Vec(0.01f));
-  const Vec top = negated(height) - slack, bottom = height + slack, square = height * height;
-  const Vec quarter(0.25f), zero(0.f), left_dy = negated(right_dy);
-  // A block's pixel centres lie at 4 i + 0.5 ... 4 i + 3.5.
-  const Vec x_left = (x - slack + Vec(0.5f)) * quarter, x_right = (x + slack - Vec(0.5f)) * quarter;
-  const Vec slope_4 = slope * quarter;
-  const Mask valid = first_lanes(rows);
-  for (int row = 0; row < kSide; ++row) {
-    const Vec first_dy = Vec(4.f * static_cast<float>(row) + 0.5f) - y;
-    const Vec low = max(first_dy, top), high = min(first_dy + Vec(3.f), bottom);
-    const Mask ok = ge(high, low) & valid;
-    // Between low and high the ellipse reaches furthest at its extreme points, or next to them.
-    const Vec dy_right = min(max(right_dy, low), high), dy_left = min(max(left_dy, low), high);
-    const Vec half_right = sqrt(max(shape * fnma(dy_right, dy_right, square), zero));
-    const Vec half_left = sqrt(max(shape * fnma(dy_left, dy_left, square), zero));
-    const Vec right = fma(slope_4, dy_right, fma(quarter, half_right, x_right));
-    const Vec left = fma(slope_4, dy_left, fnma(quarter, half_left, x_left));
-    uint16_t* out = reached + static_cast<size_t>(row) * kSide * stride;
-    for (int column = 0; column < kSide; ++column) {
-      const Mask hit = ok & ge(right, Vec(static_cast<float>(column))) &
-                       gt(Vec(static_cast<float>(column) + 1.f), left);
-      out[column * stride] = static_cast<uint16_t>(to_bits(hit));
-    }
-  }
-}
-
-struct TileFrame {
-  int x0, y0;  // first pixel
-  int blocks_x, blocks_y;  // blocks inside the image
-  // What moments are taken about, in pixels from the first. It lies in the middle of what the image holds of
-  // the tile: about a point far from a Gaussian, its second moments would be differences of large sums.
-  float centre_x, centre_y;
-  int count;   // Gaussians
-  size_t first_pair;
-};
-
-static TileFrame tile_frame(const View* view, int tile) {
-  const uint32_t* starts = static_cast<const uint32_t*>(view->tile_starts.data);
-  TileFrame t;
-  t.x0 = tile % view->tiles_x * kTilePx;
-  t.y0 = tile / view->tiles_x * kTilePx;
-  const int columns = (view->width - t.x0 + 3) / 4, rows = (view->height - t.y0 + 3) / 4;
-  t.blocks_x = columns < kSide ? columns : kSide;
-  t.blocks_y = rows < kSide ? rows : kSide;
-  t.centre_x = 2.f * t.blocks_x;
-  t.centre_y = 2.f * t.blocks_y;
-  t.first_pair = starts[tile];
-  t.count = static_cast<int>(starts[tile + 1] - starts[tile]);
-  return t;
-}
-
-// Sorts a tile's Gaussians, copies their records and lists, per block, those that reach it.
-static void bin_tile(View* view, int tile, int slot, const TileFrame& t) {
-  const size_t groups = (static_cast<size_t>(t.count) + 15) / 16;
-  const size_t masks_bytes = sizeof(uint16_t) * kBlocks * groups, keys_bytes = sizeof(DepthKey) * t.count;
-  reserve(&view->scratch[slot], masks_bytes > keys_bytes ? masks_bytes : keys_bytes);
-  uint32_t* starts = static_cast<uint32_t*>(view->block_starts.data) + static_cast<size_t>(tile) * (kBlocks + 1);
-  Record* locals = static_cast<Record*>(view->locals.data) + t.first_pair;
-  const Record* records = static_cast<const Record*>(view->records.data);
-  const DepthKey* keys =
-      sort_by_depth(static_cast<DepthKey*>(view->keys.data) + t.first_pair,
-                    static_cast<DepthKey*>(view->scratch[slot].data), t.count);
-  const uint32_t tile_x = static_cast<uint32_t>(tile % view->tiles_x);
-  const uint32_t tile_y = static_cast<uint32_t>(tile / view->tiles_x);
-  for (int i = 0; i < t.count; ++i) {
-    __builtin_prefetch(&records[keys[i + 8 < t.count ? i + 8 : i].id]);
-    store(&locals[i].x, load(&records[keys[i].id].x));
-    locals[i].pair += tile_y * locals[i].tiles_across + tile_x;
-  }
-
-  uint16_t* masks = static_cast<uint16_t*>(view->scratch[slot].data);
-  for (size_t group = 0; group < groups; ++group) {
-    const int first = static_cast<int>(16 * group), rows = t.count - first < 16 ? t.count - first : 16;
-    block_masks(locals + first, rows, static_cast<float>(t.x0), static_cast<float>(t.y0), masks + group, groups);
-  }
-  uint32_t total = 0;
-  for (int block = 0; block < kBlocks; ++block) {
-    starts[block] = total;
-    if (block % kSide >= t.blocks_x || block / kSide >= t.blocks_y) continue;
-    const uint16_t* of_block = masks + groups * block;
-    for (size_t group = 0; group < groups; ++group) {
-      total += static_cast<uint32_t>(__builtin_popcount(of_block[group]));
-    }
-  }
-  starts[kBlocks] = total;
-  Buffer* buffer = static_cast<Buffer*>(view->tile_entries.data) + tile;
-  reserve(buffer, sizeof(uint32_t) * (static_cast<size_t>(total) + 16));
-  for (int block = 0; block < kBlocks; ++block) {
-    if (starts[block] == starts[block + 1]) continue;
-    // Block after block: what is written beyond a block's end is overwritten by the next.
-    uint32_t* entry = static_cast<uint32_t*>(buffer->data) + starts[block];
-    const uint16_t* of_block = masks + groups * block;
-    for (size_t group = 0; group < groups; ++group) {
-      entry += append_lanes(entry, of_block[group], static_cast<uint32_t>(16 * group));
-    }
-  }
-  // Read, never used, by the prefetch of the last block
-  memset(static_cast<uint32_t*>(buffer->data) + total, 0, sizeof(uint32_t) * 16);
-}
-
-// Exponent of alpha in powers of two. The same expression forward and backward: the same pixels pass.
+// Exponent of alpha in powers of two
 EXTRAGS_INLINE Vec exponent(const Record& r, Vec dx, Vec dy) {
   return fma(dx, fma(Vec(r.xx), dx, Vec(r.xy) * dy), fma(Vec(r.yy) * dy, dy, Vec(r.log2_opacity)));
 }
@@ -222,15 +66,20 @@ EXTRAGS_INLINE void get_color_block(const float* image, const View* view, int x0
   load_triples(t, color);
 }
 
+// Beside a tile's entries: for each that was kept, the pixels that composited it.
+EXTRAGS_INLINE uint16_t* entry_hits(uint32_t* entries, uint32_t total) {
+  return reinterpret_cast<uint16_t*>(entries + total + 16);
+}
+
 // Composites the blocks of a tile front to back. Entries no pixel used are dropped from the lists.
 template <bool kMedian, bool kVisibility>
 static void composite_tile(View* view, const Images* out, int tile, const TileFrame& t, float* visibility) {
   const uint32_t* starts = static_cast<const uint32_t*>(view->block_starts.data) + static_cast<size_t>(tile) * (kBlocks + 1);
   uint32_t* kept_counts = static_cast<uint32_t*>(view->block_kept.data) + static_cast<size_t>(tile) * kBlocks;
   float* finals = static_cast<float*>(view->finals.data) + static_cast<size_t>(tile) * kBlocks * 16;
-  float* lasts = static_cast<float*>(view->lasts.data) + static_cast<size_t>(tile) * kBlocks * 16;
   const Record* locals = static_cast<const Record*>(view->locals.data) + t.first_pair;
   uint32_t* all_entries = static_cast<uint32_t*>(static_cast<Buffer*>(view->tile_entries.data)[tile].data);
+  uint16_t* all_hits = entry_hits(all_entries, starts[kBlocks]);
   Vec lane_x, lane_y;
   block_lanes(&lane_x, &lane_y);
   const Vec alpha_max(kAlphaMax), transmittance_min(kTransmittanceMin), one(1.f), half(0.5f);
@@ -240,8 +89,9 @@ static void composite_tile(View* view, const Images* out, int tile, const TileFr
       const int block = by * kSide + bx, x0 = t.x0 + 4 * bx, y0 = t.y0 + 4 * by;
       const Vec px = lane_x + Vec(x0 + 0.5f), py = lane_y + Vec(y0 + 0.5f);
       uint32_t* entries = all_entries + starts[block];
+      uint16_t* hits = all_hits + starts[block];
       const uint32_t count = starts[block + 1] - starts[block];
-      Vec transmittance(1.f), red(0.f), green(0.f), blue(0.f), depth(0.f), median(0.f), last(0.f);
+      Vec transmittance(1.f), red(0.f), green(0.f), blue(0.f), depth(0.f), median(0.f);
       // Lanes outside the image are finished from the start.
       const Mask inside = gt(Vec(static_cast<float>(view->width)), px) & gt(Vec(static_cast<float>(view->height)), py);
       Vec threshold = select(inside, Vec(kLog2AlphaMin), finished);
@@ -280,12 +130,11 @@ static void composite_tile(View* view, const Images* out, int tile, const TileFr
           of_local[1] += sum(weight);
         }
         transmittance = select(hit, behind, transmittance);
+        hits[kept] = static_cast<uint16_t>(to_bits(hit));
         entries[kept++] = local;
-        last = select(hit, Vec(static_cast<float>(kept)), last);
       }
       kept_counts[block] = kept;
       store(finals + 16 * block, transmittance);
-      store(lasts + 16 * block, last);
       const Vec color[3] = {fma(transmittance, Vec(view->background[0]), red),
                             fma(transmittance, Vec(view->background[1]), green),
                             fma(transmittance, Vec(view->background[2]), blue)};
@@ -326,32 +175,58 @@ static void forward_tile(View* view, const Images* out, int tile, int slot) {
   }
 }
 
-// Working memory of a tile's backward pass. A row of sums has, for pixel coordinates (X, Y) about the
-// tile's centre, at even places minus the sums of g, gX, gY, gXX, gXY, gYY, |g du|, |g dv| and at odd places
-// those of the weight times the gradient of red, green, blue and depth.
+// Places in a row of gradient sums. With pixel coordinates (X, Y) about the tile's centre, rows hold minus the
+// sums of g, gX, gY, gXX, gXY, gYY, those of |g du| and |g dv|, and those of the weight times the gradient of
+// red, green, blue and depth. The Gaussian's mean about the tile's centre travels along: nothing is added to it.
+enum SumPlace {
+  kSum = 0, kSumX = 4, kSumY = 8, kSumXX = 12, kSumXY = 1, kSumYY = 5, kSumAbsU = 9, kSumAbsV = 13,
+  kSumRed = 2, kSumGreen = 6, kSumBlue = 10, kSumDepth = 14, kSumMeanX = 3, kSumMeanY = 7
+};
+constexpr int kTogether = 4;  // entries whose gradients share vectors
+
+// Working memory of a tile's backward pass
 struct TileWork {
   float (*sums)[16];
-  float pairs[kEntriesAhead][32];  // g and weight of the sixteen pixels, interleaved
-  float basis[16][16];             // what each pixel's g and weight are multiplied by
+  float g[kEntriesAhead][16], weight[kEntriesAhead][16];  // of a block's pixels
+  // Per column of a block: X in the first place, its square in the next, the gradients of red, green, blue and
+  // depth of the four pixels, each over a quad
+  float column_x[4][2];
+  float column_gradients[4][4][16];
 };
 
-// Adds `count` entries, the last first, to the sums of their Gaussians.
-EXTRAGS_INLINE void reduce_entries(const TileWork* work, const uint32_t* entries, int count) {
+// Adds `count` entries, the last first, to the sums of their Gaussians; `y` holds the Y of the pixels. Four
+// entries at a time are turned round so that a vector holds a column: lane 4 row + entry. Sums over columns then
+// take no permutation, and those over rows yield four sums of four entries together.
+EXTRAGS_INLINE void reduce_entries(const TileWork* work, Vec y, const uint32_t* entries, int count) {
   for (int k = 0; k < count; k += kTogether) {
-    // Several at a time; what the last, incomplete ones hold beyond `count` is not added.
-    Vec total[kTogether];
-    for (int i = 0; i < kTogether; ++i) total[i] = Vec(0.f);
-#pragma GCC unroll 16
-    for (int pair = 0; pair < 16; ++pair) {
-      const Vec basis = load(work->basis[kLaneOfPair[pair]]);
-      for (int i = 0; i < kTogether; ++i) {
-        total[i] = fma(broadcast_pair(work->pairs[k + i] + 2 * pair), basis, total[i]);
+    // What the last, incomplete ones hold beyond `count` is not added.
+    Vec g[4], w[4];
+    for (int i = 0; i < 4; ++i) g[i] = load(work->g[k + i]);
+    transpose_in_quads(g);
+    const Vec total = (g[0] + g[1]) + (g[2] + g[3]);
+    Vec total_x = Vec(work->column_x[0][0]) * g[0], total_xx = Vec(work->column_x[0][1]) * g[0];
+    for (int i = 1; i < 4; ++i) {
+      total_x = fma(Vec(work->column_x[i][0]), g[i], total_x);
+      total_xx = fma(Vec(work->column_x[i][1]), g[i], total_xx);
+    }
+    const Vec total_y = y * total;
+    for (int i = 0; i < 4; ++i) w[i] = load(work->weight[k + i]);
+    transpose_in_quads(w);
+    Vec color[4];
+    for (int channel = 0; channel < 4; ++channel) {
+      color[channel] = load(work->column_gradients[0][channel]) * w[0];
+      for (int i = 1; i < 4; ++i) {
+        color[channel] = fma(load(work->column_gradients[i][channel]), w[i], color[channel]);
       }
     }
+    const Vec zero(0.f);
+    Vec rows[4] = {sum_quads(total, total_x, total_y, total_xx), sum_quads(y * total_x, y * total_y, zero, zero),
+                   sum_quads(color[0], color[1], color[2], color[3]), zero};
+    transpose_in_quads(rows);
     for (int i = 0; i < kTogether; ++i) {
       if (k + i >= count) break;
       float* row = work->sums[entries[-k - i]];
-      store(row, load(row) + total[i]);
+      store(row, load(row) + rows[i]);
     }
   }
 }
@@ -385,25 +260,28 @@ EXTRAGS_INLINE PixelGradients pixel_gradients(const View* view, const ImageGradi
 
 template <bool kAbsolute>
 static void block_backward(const View* view, const ImageGradients* in, const TileFrame& t, int block,
-                           const Record* locals, const uint32_t* entries, uint32_t kept,
-                           Vec transmittance, Vec last, TileWork* work) {
+                           const Record* locals, const uint32_t* entries, const uint16_t* hits, uint32_t kept,
+                           Vec transmittance, TileWork* work) {
   const int x0 = t.x0 + 4 * (block % kSide), y0 = t.y0 + 4 * (block / kSide);
   Vec lane_x, lane_y;
   block_lanes(&lane_x, &lane_y);
   const Vec px = lane_x + Vec(x0 + 0.5f), py = lane_y + Vec(y0 + 0.5f);
   const PixelGradients v = pixel_gradients(view, in, x0, y0, transmittance);
-  {
-    // Column `pixel` of the basis, built for all pixels at once and turned round
-    const Vec x = lane_x + Vec(x0 + 0.5f - t.x0 - t.centre_x);
-    const Vec y = lane_y + Vec(y0 + 0.5f - t.y0 - t.centre_y);
-    alignas(64) float rows[256];
-    const Vec columns[16] = {Vec(1.f), v.red, x,     v.green,  y,     v.blue,   x * x, v.depth,
-                             x * y,    Vec(0.f), y * y, Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
-    for (int k = 0; k < 16; ++k) store(rows + 16 * k, columns[k]);
-    transpose16(rows, work->basis[0]);
+  for (int i = 0; i < 4; ++i) {
+    const float x = static_cast<float>(x0 + i - t.x0) + 0.5f - t.centre_x;
+    work->column_x[i][0] = x;
+    work->column_x[i][1] = x * x;
   }
-  const Vec threshold(kLog2AlphaMin), alpha_max(kAlphaMax), one(1.f);
-  Vec behind = v.behind, place(static_cast<float>(kept) - 1.f);
+  const Vec y = lane_y + Vec(y0 + 0.5f - t.y0 - t.centre_y);
+  const Vec gradients[4] = {v.red, v.green, v.blue, v.depth};
+  for (int channel = 0; channel < 4; ++channel) {
+    store(work->column_gradients[0][channel], splat_in_quads<0>(gradients[channel]));
+    store(work->column_gradients[1][channel], splat_in_quads<1>(gradients[channel]));
+    store(work->column_gradients[2][channel], splat_in_quads<2>(gradients[channel]));
+    store(work->column_gradients[3][channel], splat_in_quads<3>(gradients[channel]));
+  }
+  const Vec alpha_max(kAlphaMax), one(1.f);
+  Vec behind = v.behind;
   for (int left = static_cast<int>(kept); left > 0;) {
     const int count = left < kEntriesAhead ? left : kEntriesAhead;
     for (int i = 0; i < count; ++i) {
@@ -414,8 +292,7 @@ static void block_backward(const View* view, const ImageGradients* in, const Til
       const Record& r = locals[local];
       const Vec dx = Vec(r.x) - px, dy = Vec(r.y) - py;
       const Vec power = exponent(r, dx, dy);
-      const Mask hit = ge(power, threshold) & gt(last, place);
-      place = place - one;
+      const Mask hit = from_bits(hits[k]);
       const Vec raw = exp2(power), alpha = keep(hit, min(raw, alpha_max));
       transmittance = transmittance * (one / (one - alpha));
       // `behind` is the gradient-weighted value of all that lies behind, per unit of transmittance.
@@ -426,54 +303,51 @@ static void block_backward(const View* view, const ImageGradients* in, const Til
       const Vec weight = transmittance * alpha;
       // minus d loss / d (half the squared Mahalanobis distance); none where alpha was clipped
       const Vec g = keep(ge(alpha_max, raw), weight * difference);
-      store_pairs(work->pairs[i], g, weight);
+      store(work->g[i], g);
+      store(work->weight[i], weight);
       if constexpr (kAbsolute) {
         const Vec scale(-1.f / kLog2E), two(2.f);
         float* row = work->sums[local];
         const Vec du = scale * fma(two * Vec(r.xx), dx, Vec(r.xy) * dy);
         const Vec dv = scale * fma(two * Vec(r.yy), dy, Vec(r.xy) * dx);
-        row[12] += sum(abs(g * du));
-        row[14] += sum(abs(g * dv));
+        row[kSumAbsU] += sum(abs(g * du));
+        row[kSumAbsV] += sum(abs(g * dv));
       }
     }
-    reduce_entries(work, entries + left - 1, count);
+    reduce_entries(work, y, entries + left - 1, count);
     left -= count;
   }
 }
 
-// Turns sums about the tile's centre into moments about each Gaussian's mean, and files them by pair.
+// Turns sums about the tile's centre into moments about each Gaussian's mean, and files them by pair: whole cache
+// lines in no order, written past the caches.
 static void file_pair_rows(View* view, const TileFrame& t, const float (*sums)[16]) {
   const Record* locals = static_cast<const Record*>(view->locals.data) + t.first_pair;
   float* out = static_cast<float*>(view->pair_rows.data);
-  alignas(64) float columns[256], rows[256], x[16], y[16];
-  const float centre_x = t.x0 + t.centre_x, centre_y = t.y0 + t.centre_y;
+  alignas(64) float columns[256], rows[256];
   for (int first = 0; first < t.count; first += 16) {
     const int count = t.count - first < 16 ? t.count - first : 16;
-    for (int i = 0; i < 16; ++i) {
-      store(rows + 16 * i, i < count ? load(sums[first + i]) : Vec(0.f));
-      x[i] = i < count ? locals[first + i].x - centre_x : 0;
-      y[i] = i < count ? locals[first + i].y - centre_y : 0;
-      if (i < count) __builtin_prefetch(out + 16 * static_cast<size_t>(locals[first + i].pair), 1);
-    }
-    transpose16(rows, columns);
-    const Vec mx = load(x), my = load(y);
+    transpose16(sums[first], columns);
+    const Vec mx = load(columns + 16 * kSumMeanX), my = load(columns + 16 * kSumMeanY);
     // The sums hold minus the gradient.
-    const Vec s0 = negated(load(columns)), sx = negated(load(columns + 32)), sy = negated(load(columns + 64));
-    const Vec sxx = negated(load(columns + 96)), sxy = negated(load(columns + 128));
-    const Vec syy = negated(load(columns + 160));
+    const Vec s0 = negated(load(columns + 16 * kSum));
+    const Vec sx = negated(load(columns + 16 * kSumX)), sy = negated(load(columns + 16 * kSumY));
+    const Vec sxx = negated(load(columns + 16 * kSumXX)), sxy = negated(load(columns + 16 * kSumXY));
+    const Vec syy = negated(load(columns + 16 * kSumYY));
     const Vec dx = fma(mx, s0, negated(sx)), dy = fma(my, s0, negated(sy));
     const Vec moments[16] = {
         s0, dx, dy,
         fma(mx, dx, fnma(mx, sx, sxx)), fma(mx, dy, fnma(my, sx, sxy)), fma(my, dy, fnma(my, sy, syy)),
-        load(columns + 16), load(columns + 48), load(columns + 80), load(columns + 112),
-        load(columns + 192), load(columns + 224),
+        load(columns + 16 * kSumRed), load(columns + 16 * kSumGreen), load(columns + 16 * kSumBlue),
+        load(columns + 16 * kSumDepth), load(columns + 16 * kSumAbsU), load(columns + 16 * kSumAbsV),
         Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
     for (int k = 0; k < 16; ++k) store(columns + 16 * k, moments[k]);
     transpose16(columns, rows);
     for (int i = 0; i < count; ++i) {
-      store(out + 16 * static_cast<size_t>(locals[first + i].pair), load(rows + 16 * i));
+      stream(out + 16 * static_cast<size_t>(locals[first + i].pair), load(rows + 16 * i));
     }
   }
+  finish_streams();
 }
 
 static void backward_tile(View* view, const ImageGradients* in, bool absolute, int tile, int slot) {
@@ -482,24 +356,31 @@ static void backward_tile(View* view, const ImageGradients* in, bool absolute, i
   const uint32_t* starts = static_cast<const uint32_t*>(view->block_starts.data) + static_cast<size_t>(tile) * (kBlocks + 1);
   const uint32_t* kept = static_cast<const uint32_t*>(view->block_kept.data) + static_cast<size_t>(tile) * kBlocks;
   const float* finals = static_cast<const float*>(view->finals.data) + static_cast<size_t>(tile) * kBlocks * 16;
-  const float* lasts = static_cast<const float*>(view->lasts.data) + static_cast<size_t>(tile) * kBlocks * 16;
   const Record* locals = static_cast<const Record*>(view->locals.data) + t.first_pair;
-  const uint32_t* entries = static_cast<const uint32_t*>(static_cast<Buffer*>(view->tile_entries.data)[tile].data);
-  reserve(&view->scratch[slot], sizeof(float) * 16 * t.count);
+  uint32_t* entries = static_cast<uint32_t*>(static_cast<Buffer*>(view->tile_entries.data)[tile].data);
+  const uint16_t* hits = entry_hits(entries, starts[kBlocks]);
+  // Whole groups of sixteen, as they are filed
+  const int padded = (t.count + 15) / 16 * 16;
+  reserve(&view->scratch[slot], sizeof(float) * 16 * padded);
   alignas(64) TileWork work;
   work.sums = static_cast<float(*)[16]>(view->scratch[slot].data);
-  memset(work.sums, 0, sizeof(float) * 16 * t.count);
+  for (int i = 0; i < padded; ++i) {
+    store(work.sums[i], Vec(0.f));
+    if (i >= t.count) continue;
+    work.sums[i][kSumMeanX] = locals[i].x - (t.x0 + t.centre_x);
+    work.sums[i][kSumMeanY] = locals[i].y - (t.y0 + t.centre_y);
+  }
   for (int by = 0; by < t.blocks_y; ++by) {
     for (int bx = 0; bx < t.blocks_x; ++bx) {
       const int block = by * kSide + bx;
       if (kept[block] == 0) continue;
-      const Vec transmittance = load(finals + 16 * block), last = load(lasts + 16 * block);
+      const Vec transmittance = load(finals + 16 * block);
       if (absolute) {
-        block_backward<true>(view, in, t, block, locals, entries + starts[block], kept[block],
-                             transmittance, last, &work);
+        block_backward<true>(view, in, t, block, locals, entries + starts[block], hits + starts[block],
+                             kept[block], transmittance, &work);
       } else {
-        block_backward<false>(view, in, t, block, locals, entries + starts[block], kept[block],
-                              transmittance, last, &work);
+        block_backward<false>(view, in, t, block, locals, entries + starts[block], hits + starts[block],
+                              kept[block], transmittance, &work);
       }
     }
   }

@@ -133,6 +133,9 @@ EXTRAGS_INLINE void shade_backward(const Scene* scene, const SceneGradients* out
   }
   alignas(64) float back[256];
   float* target = out->sh + stride * first;
+  // Past the caches, where rows are whole lines: they are the most of what is written, and next read by Adam, after
+  // all others.
+  const bool streamed = kDegree == 3 && stride == 48 && !out->add && reinterpret_cast<uintptr_t>(target) % 64 == 0;
   for (int start = 0; start < kFloats; start += 16) {
     const int width = kFloats - start < 16 ? kFloats - start : 16;
     if (width < 16) memset(t + 16 * (start + width), 0, sizeof(float) * 16 * (16 - width));
@@ -142,7 +145,11 @@ EXTRAGS_INLINE void shade_backward(const Scene* scene, const SceneGradients* out
       Vec value = load(back + 16 * i);
       if (out->add) value = value + load_first(row, width);
       if (width == 16) {
-        store(row, value);
+        if (streamed) {
+          stream(row, value);
+        } else {
+          store(row, value);
+        }
       } else {
         store_first(row, value, width);
       }

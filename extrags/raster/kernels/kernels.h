@@ -77,7 +77,7 @@ struct alignas(64) Record {
   // slope dy +- sqrt(shape (half_height^2 - dy^2)); its rightmost point is at dy = right_dy.
   float half_height, slope, shape, right_dy;
   // Pairs of a Gaussian and a tile are numbered by Gaussian, then by row and column of the tile: that of tile
-  // (x, y) is pair + y tiles_across + x. In a tile's own copy `pair` is the number itself.
+  // (x, y) is the chunk's first + pair + y tiles_across + x. In a tile's own copy `pair` is the number itself.
   uint32_t pair, tiles_across;
 };
 static_assert(sizeof(Record) == 64, "one cache line per Gaussian");
@@ -105,9 +105,10 @@ struct View {
 
   Buffer records;      // Record [n]
   Buffer rects;        // TileRect [n]
+  Buffer depths;       // uint32 [n]: bits of the depth of a record
   Buffer pair_starts;  // uint32 [n + 1]: where the (Gaussian, tile) pairs of a Gaussian start
   Buffer counts;       // uint32 [chunks, tiles]
-  Buffer chunk_pairs;  // uint32 [chunks + 1]
+  Buffer chunk_pairs;  // uint32 [chunks + 1]: where the pairs of a chunk start
   Buffer tile_starts;  // uint32 [tiles + 1]: where the pairs of a tile start
   Buffer keys;         // DepthKey [pairs], per tile
   Buffer locals;       // Record [pairs], per tile, nearest first
@@ -115,12 +116,14 @@ struct View {
   Buffer block_kept;    // uint32 [tiles, blocks]: entries that some pixel composited
   Buffer finals;        // float [tiles, blocks, 16]: final transmittance
   Buffer lasts;         // float [tiles, blocks, 16]: how many kept entries a pixel went through
-  Buffer tile_entries;  // Buffer [tiles]: indices into the tile's locals, per block
+  Buffer tile_entries;  // Buffer [tiles]: indices into the tile's locals, per block, and `entry_hits`
   int tile_entries_count;
   Buffer pair_rows;  // float [pairs, 16], per Gaussian: gradients, or visibility
   Buffer partials;   // float [chunks, kPartials]: gradients of camera and light
   Buffer query;      // working memory of transmittance queries
   Buffer scratch[kMaxThreads];
+  bool check;   // whether the projection looks for NaN and infinities
+  bool finite;  // it found none
   double seconds[4];  // projection, tiles, tiles backward, projection backward of the last calls
 };
 

@@ -23,6 +23,7 @@ namespace EXTRAGS_ISA {
 #include "simd.h"
 
 #include "project.inl"
+#include "project_backward.inl"
 
 #include "composite.inl"
 #include "query.inl"
@@ -40,9 +41,38 @@ struct ViewContext {
   const SceneGradients* scene_gradients;
 };
 
+// Whether all values are finite: x - x is zero for finite x, else NaN, and a NaN stays in the sum.
+static bool all_finite(const float* values, int64_t count) {
+  Vec total[4] = {Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
+  int64_t i = 0;
+  for (; i + 64 <= count; i += 64) {
+    for (int k = 0; k < 4; ++k) {
+      const Vec x = load(values + i + 16 * k);
+      total[k] = total[k] + (x - x);
+    }
+  }
+  float poison = sum((total[0] + total[1]) + (total[2] + total[3]));
+  for (; i < count; ++i) poison += values[i] - values[i];
+  return poison == 0.f;
+}
+
+// A chunk's parameters, just before they are projected: they are read from memory once.
+static bool chunk_finite(const Scene& scene, int64_t begin, int64_t end) {
+  const int64_t count = end - begin, of_sh = 3 * static_cast<int64_t>(scene.coefficients);
+  return all_finite(scene.means + 3 * begin, 3 * count) && all_finite(scene.quats + 4 * begin, 4 * count) &&
+         all_finite(scene.scales + 3 * begin, 3 * count) && all_finite(scene.opacities + begin, count) &&
+         (scene.colors == nullptr || all_finite(scene.colors + 3 * begin, 3 * count)) &&
+         (scene.sh == nullptr || all_finite(scene.sh + of_sh * begin, of_sh * count));
+}
+
 template <bool kLens>
 static void project_task(void* data, int chunk, int) {
   const ViewContext& c = *static_cast<ViewContext*>(data);
+  const int begin = chunk * c.view->chunk, rest = c.scene->n - begin;
+  if (c.view->check && !chunk_finite(*c.scene, begin, begin + (rest < c.view->chunk ? rest : c.view->chunk))) {
+    __atomic_store_n(&c.view->finite, false, __ATOMIC_RELAXED);
+    return;
+  }
   if (c.scene->colors != nullptr) return project_chunk<0, true, kLens>(c.view, c.scene, c.images, chunk);
   switch (c.scene->degree) {
     case 0: return project_chunk<0, false, kLens>(c.view, c.scene, c.images, chunk);
@@ -52,33 +82,27 @@ static void project_task(void* data, int chunk, int) {
   }
 }
 
-// Lists the pairs of one chunk: per tile its Gaussians, per Gaussian where its pairs start.
+// Lists the pairs of one chunk: per tile its Gaussians, per Gaussian where its pairs start. Records are not
+// touched: at a cache line each they would be most of what is read.
 static void list_task(void* data, int chunk, int) {
   View* view = static_cast<ViewContext*>(data)->view;
   const int tiles = view->tiles_x * view->tiles_y;
   uint32_t* ends = static_cast<uint32_t*>(view->counts.data) + static_cast<size_t>(chunk) * tiles;
-  uint32_t pair = static_cast<uint32_t*>(view->chunk_pairs.data)[chunk];
+  const uint32_t first_pair = static_cast<uint32_t*>(view->chunk_pairs.data)[chunk];
   uint32_t* starts = static_cast<uint32_t*>(view->pair_starts.data);
   const TileRect* rects = static_cast<const TileRect*>(view->rects.data);
-  Record* records = static_cast<Record*>(view->records.data);
+  const uint32_t* depths = static_cast<const uint32_t*>(view->depths.data);
   DepthKey* keys = static_cast<DepthKey*>(view->keys.data);
   const int begin = chunk * view->chunk;
   const int end = begin + view->chunk < view->n ? begin + view->chunk : view->n;
   for (int id = begin; id < end; ++id) {
-    starts[id] = pair;
+    starts[id] += first_pair;
     const TileRect rect = rects[id];
     if (rect.x1 < rect.x0) continue;
-    DepthKey key;
-    key.id = id;
-    memcpy(&key.depth_bits, &records[id].depth, sizeof key.depth_bits);
+    const DepthKey key{depths[id], id};
     for (int ty = rect.y0; ty <= rect.y1; ++ty) {
       for (int tx = rect.x0; tx <= rect.x1; ++tx) keys[ends[ty * view->tiles_x + tx]++] = key;
     }
-    // Unsigned arithmetic wraps: only the number of a tile the Gaussian touches means anything.
-    const uint32_t across = rect.x1 - rect.x0 + 1u;
-    records[id].tiles_across = across;
-    records[id].pair = pair - rect.y0 * across - rect.x0;
-    pair += across * (rect.y1 - rect.y0 + 1u);
   }
 }
 
@@ -147,6 +171,7 @@ static void lay_out(View* view, int n) {
   const size_t count = static_cast<size_t>(n), blocks = kBlocks;
   reserve(&view->records, sizeof(Record) * (count + 1));
   reserve(&view->rects, sizeof(TileRect) * (count + 1));
+  reserve(&view->depths, sizeof(uint32_t) * (count + 1));
   reserve(&view->pair_starts, sizeof(uint32_t) * (count + 1));
   reserve(&view->counts, sizeof(uint32_t) * (view->chunks * tiles + 1));
   reserve(&view->chunk_pairs, sizeof(uint32_t) * (view->chunks + 1));
@@ -154,7 +179,6 @@ static void lay_out(View* view, int n) {
   reserve(&view->block_starts, sizeof(uint32_t) * tiles * (blocks + 1));
   reserve(&view->block_kept, sizeof(uint32_t) * tiles * blocks);
   reserve(&view->finals, sizeof(float) * tiles * blocks * 16);
-  reserve(&view->lasts, sizeof(float) * tiles * blocks * 16);
   if (view->tile_entries_count < static_cast<int>(tiles)) {
     Buffer fresh{nullptr, 0};
     reserve(&fresh, sizeof(Buffer) * tiles);
@@ -172,7 +196,9 @@ static void forward(View* view, const Scene* scene, const Images* images) {
   const double started = monotonic_seconds();
   lay_out(view, scene->n);
   ViewContext c{view, scene, images, nullptr, nullptr};
+  view->finite = true;
   parallel_for(view->chunks, view->camera.bent ? project_task<true> : project_task<false>, &c);
+  if (!view->finite) return;
 
   // Where each tile's pairs start, and in it those of each chunk
   const size_t tiles = static_cast<size_t>(view->tiles_x) * view->tiles_y;
@@ -256,21 +282,6 @@ static void backward(View* view, const Scene* scene, const ImageGradients* in, c
     }
     out->viewmat[4 * i + 3] = finite_float(v_translation);
   }
-}
-
-// Whether all values are finite: x - x is zero for finite x, else NaN, and a NaN stays in the sum.
-static bool all_finite(const float* values, int64_t count) {
-  Vec total[4] = {Vec(0.f), Vec(0.f), Vec(0.f), Vec(0.f)};
-  int64_t i = 0;
-  for (; i + 64 <= count; i += 64) {
-    for (int k = 0; k < 4; ++k) {
-      const Vec x = load(values + i + 16 * k);
-      total[k] = total[k] + (x - x);
-    }
-  }
-  float poison = sum((total[0] + total[1]) + (total[2] + total[3]));
-  for (; i < count; ++i) poison += values[i] - values[i];
-  return poison == 0.f;
 }
 
 constexpr int64_t kFiniteValues = 1 << 18;  // a task, at least

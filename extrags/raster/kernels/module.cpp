@@ -21,20 +21,12 @@
 #include <variant>
 #include <vector>
 
+#include "arrays.h"
 #include "kernels.h"
 #include "march.h"
 
-namespace nb = nanobind;
-using namespace extrags;
 
 namespace {
-
-using In = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
-using Out = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
-using Counts = nb::ndarray<const int32_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-using Indices = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
-using Flags = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // The tables this processor can run, the fastest first.
 std::vector<const KernelTable*> usable_tables() {
@@ -75,9 +67,9 @@ const KernelTable*& active() {
 
 struct ViewDeleter {
   void operator()(View* view) const {
-    Buffer* all[] = {&view->records, &view->rects, &view->pair_starts, &view->counts, &view->chunk_pairs,
+    Buffer* all[] = {&view->records, &view->rects, &view->depths, &view->pair_starts, &view->counts, &view->chunk_pairs,
                      &view->tile_starts, &view->keys, &view->locals, &view->block_starts, &view->block_kept,
-                     &view->finals, &view->lasts, &view->pair_rows, &view->partials, &view->query};
+                     &view->finals, &view->pair_rows, &view->partials, &view->query};
     for (Buffer* buffer : all) release(buffer);
     for (int tile = 0; tile < view->tile_entries_count; ++tile) {
       release(static_cast<Buffer*>(view->tile_entries.data) + tile);
@@ -127,150 +119,8 @@ struct Frame {
   }
 };
 
-template <class Array>
-auto* data_or_null(const std::optional<Array>& array) {
-  return array ? array->data() : nullptr;
-}
-
-void expect(bool ok, const char* what) {
-  if (!ok) throw std::invalid_argument(std::string(what) + " has an unexpected size");
-}
-
-// The structs Python hands over. Their arrays live as long as they do, so that one made once serves every step;
-// shapes are checked where a struct is made, sizes that two structs must share where they meet.
-
-struct GaussianArrays {
-  In means, quats, scales, opacities;
-  std::optional<In> sh, colors;
-
-  void check() const {
-    const size_t n = count();
-    expect(n < (size_t{1} << 28) && means.size() == 3 * n, "means");
-    expect(quats.size() == 4 * n, "quats");
-    expect(scales.size() == 3 * n, "scales");
-    expect(opacities.size() == n, "opacities");
-    expect(sh.has_value() != colors.has_value(), "sh or colors");
-    expect(!sh || (sh->ndim() == 3 && sh->size() == 3 * n * sh->shape(1)), "sh");
-    expect(!colors || colors->size() == 3 * n, "colors");
-  }
-
-  size_t count() const { return means.shape(0); }
-
-  Scene scene(int degree) const {
-    const int coefficients = sh ? static_cast<int>(sh->shape(1)) : 0;
-    expect(!sh || (degree + 1) * (degree + 1) <= coefficients, "sh");
-    return Scene{static_cast<int>(count()), means.data(), quats.data(), scales.data(), opacities.data(),
-                 data_or_null(sh), coefficients, degree, data_or_null(colors)};
-  }
-};
-
-// Copied from the arrays when it is made.
-struct CameraSettings {
-  Camera camera{};
-  int width, height;
-  float near;
-  float background[3]{};
-  bool lit;
-  CameraLight light{};
-
-  CameraSettings(const In& viewmat, const In& K, int width, int height, float near,
-                 const std::optional<In>& background, const std::optional<In>& light,
-                 const std::optional<In>& lens)
-      : width(width), height(height), near(near), lit(light.has_value()) {
-    expect(viewmat.size() == 16, "viewmat");
-    expect(K.size() == 9, "K");
-    expect(!background || background->size() == 3, "background");
-    expect(!light || light->size() == 12, "light");
-    expect(!lens || lens->size() * sizeof(float) == sizeof(RadialLens), "lens");
-    const float* v = viewmat.data();
-    for (int i = 0; i < 3; ++i) {
-      for (int j = 0; j < 3; ++j) camera.rotation[3 * i + j] = v[4 * i + j];
-      camera.translation[i] = v[4 * i + 3];
-    }
-    const float* k = K.data();
-    camera.fx = k[0];
-    camera.fy = k[4];
-    camera.cx = k[2];
-    camera.cy = k[5];
-    camera.bent = lens.has_value();
-    if (lens) std::memcpy(&camera.lens, lens->data(), sizeof camera.lens);
-    if (background) std::copy_n(background->data(), 3, this->background);
-    if (light) std::memcpy(&this->light, light->data(), sizeof this->light);
-  }
-
-  void apply(View* view) const {
-    view->width = width;
-    view->height = height;
-    view->near = near;
-    view->camera = camera;
-    std::copy_n(background, 3, view->background);
-    view->lit = lit;
-    if (lit) view->light = light;
-  }
-};
-
-struct ImageArrays {
-  Out rgb, alpha, depth, means2d, radius;
-  std::optional<Out> median_depth, visibility_max, visibility_sum;
-
-  void check(size_t pixels, size_t n) const {
-    expect(rgb.size() == 3 * pixels, "rgb");
-    expect(alpha.size() == pixels && depth.size() == pixels, "alpha or depth");
-    expect(!median_depth || median_depth->size() == pixels, "median_depth");
-    expect(means2d.size() == 2 * n && radius.size() == n, "means2d or radius");
-    expect(visibility_max.has_value() == visibility_sum.has_value(), "visibility");
-    expect(!visibility_max || (visibility_max->size() == n && visibility_sum->size() == n), "visibility");
-  }
-
-  Images pointers() const {
-    return Images{rgb.data(), alpha.data(), depth.data(), data_or_null(median_depth), means2d.data(),
-                  radius.data(), data_or_null(visibility_max), data_or_null(visibility_sum)};
-  }
-};
-
-struct ImageGradientArrays {
-  std::optional<In> rgb, alpha, depth, depth_image;
-
-  void check(size_t pixels) const {
-    expect(!rgb || rgb->size() == 3 * pixels, "gradient of rgb");
-    expect(!alpha || alpha->size() == pixels, "gradient of alpha");
-    expect(!depth || (depth->size() == pixels && depth_image && depth_image->size() == pixels),
-           "gradient of depth");
-  }
-
-  ImageGradients pointers() const {
-    return ImageGradients{data_or_null(rgb), data_or_null(alpha), data_or_null(depth),
-                          data_or_null(depth_image)};
-  }
-};
-
-struct GaussianGradientArrays {
-  std::optional<Out> means, quats, scales, opacities, sh, colors, means2d, absolute2d;
-
-  void check(const GaussianArrays& of) const {
-    const size_t n = of.count();
-    expect(!means || means->size() == 3 * n, "gradient of means");
-    expect(!quats || quats->size() == 4 * n, "gradient of quats");
-    expect(!scales || scales->size() == 3 * n, "gradient of scales");
-    expect(!opacities || opacities->size() == n, "gradient of opacities");
-    expect(!sh || (of.sh && sh->size() == of.sh->size()), "gradient of sh");
-    expect(!colors || colors->size() == 3 * n, "gradient of colors");
-    expect(!means2d || means2d->size() == 2 * n, "gradient of means2d");
-    expect(!absolute2d || absolute2d->size() == 2 * n, "absolute gradient of means2d");
-  }
-};
-
-struct CameraGradientArrays {
-  std::optional<Out> viewmat, light;
-
-  void check(bool lit) const {
-    expect(!viewmat || viewmat->size() == 16, "gradient of viewmat");
-    expect(!light || (lit && light->size() == 12), "gradient of light");
-  }
-};
-
 std::unique_ptr<Frame> render(const GaussianArrays& gaussians, const CameraSettings& camera,
-                              const ImageArrays& images, int degree) {
+                              const ImageArrays& images, int degree, bool check) {
   const Scene scene = gaussians.scene(degree);
   images.check(static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height), gaussians.count());
   auto frame = std::make_unique<Frame>();
@@ -278,7 +128,9 @@ std::unique_ptr<Frame> render(const GaussianArrays& gaussians, const CameraSetti
   camera.apply(frame->view.get());
   const Images out = images.pointers();
   nb::gil_scoped_release release_gil;
+  frame->view->check = check;
   frame->kernels->forward(frame->view.get(), &scene, &out);
+  if (!frame->view->finite) return nullptr;
   return frame;
 }
 
@@ -535,7 +387,9 @@ NB_MODULE(_native, m) {
            "Of the projection, the tiles, the tiles backward and the projection backward.")
       .def("query", &frame_query, nb::arg("points"), nb::arg("transmittance").noconvert());
   m.def("render", &render, nb::arg("gaussians"), nb::arg("camera"), nb::arg("images"), nb::kw_only(),
-        nb::arg("degree"), "Render one camera; `degree` is that of the harmonics used.");
+        nb::arg("degree"), nb::arg("check") = false,
+        "Render one camera; `degree` is that of the harmonics used. With `check`, None where an array of the "
+        "Gaussians holds a NaN or an infinity.");
   m.def("l1_ssim", &l1_ssim, nb::arg("image"), nb::arg("target"), nb::arg("mask").none(),
         nb::arg("gradient").noconvert(), nb::arg("dssim_weight"), nb::arg("scale"),
         nb::arg("ssim_mask").none() = nb::none());

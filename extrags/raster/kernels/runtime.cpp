@@ -2,6 +2,9 @@
 
 #include <pthread.h>
 #include <sched.h>
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
 
 #include <atomic>
 #include <chrono>
@@ -19,11 +22,25 @@
 
 namespace extrags {
 
+void advise_huge_pages(void* data, size_t bytes) {
+#if defined(__linux__)
+  constexpr uintptr_t kHugePage = 2 << 20;
+  const uintptr_t begin = (reinterpret_cast<uintptr_t>(data) + kHugePage - 1) / kHugePage * kHugePage;
+  const uintptr_t end = (reinterpret_cast<uintptr_t>(data) + bytes) / kHugePage * kHugePage;
+  // Advice only: where the system does not take it, pages stay small.
+  if (end > begin) madvise(reinterpret_cast<void*>(begin), end - begin, MADV_HUGEPAGE);
+#else
+  (void)data;
+  (void)bytes;
+#endif
+}
+
 void reserve(Buffer* buffer, size_t bytes) {
   if (bytes <= buffer->capacity) return;
   const size_t wanted = (bytes + bytes / 4 + 4095) / 4096 * 4096;
   void* fresh = std::aligned_alloc(64, wanted);
   if (fresh == nullptr) throw std::bad_alloc();
+  advise_huge_pages(fresh, wanted);
   std::free(buffer->data);
   buffer->data = fresh;
   buffer->capacity = wanted;

@@ -126,6 +126,19 @@ def test_nonfinite_parameters_are_named(name: str) -> None:
         direct.run(_target(), sh_degree=0)
 
 
+def test_a_nonfinite_gaussian_out_of_sight_is_named() -> None:
+    # The check goes with the projection, which leaves Gaussians behind the camera early.
+    parameters = _parameters()
+    parameters["means"][5, 2] = -3
+    parameters["sh"][5, 3, 1] = float("inf")
+    direct = DirectStep()
+    direct.bind(parameters)
+    with pytest.raises(NonFiniteError, match=r"sh\[5, 3, 1\] is inf \(1 such"):
+        direct.run(_target(), sh_degree=0)
+    parameters["sh"][5, 3, 1] = 0
+    assert np.isfinite(direct.run(_target(), sh_degree=0))
+
+
 def test_targets_are_checked(unchecked: None) -> None:
     rgb, eye = torch.zeros(4, 5, 3), np.eye(3)
     with pytest.raises(ShapeError, match="rgb has shape"):
