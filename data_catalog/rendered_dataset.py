@@ -1,4 +1,8 @@
-"""Procedural scenes as a dataset: `FAMILY/N@sparse` and `FAMILY/N@distanced`, for every N, without files."""
+"""Procedural scenes as a dataset: `FAMILY/N@SETTING`, for every N, without files.
+
+Every family has the settings `sparse` and `distanced`, and whatever else the field `setting` of its scenes'
+settings allows.
+"""
 
 from __future__ import annotations
 
@@ -18,6 +22,7 @@ from extrags.sequence import EndoscopicSequence
 __all__ = ["RenderedDataset", "Setting"]
 
 Setting = Literal["sparse", "distanced"]
+"""The settings of every family, which are the ones that are listed."""
 _LISTED_SCENES = 4
 
 C = TypeVar("C", bound=BaseModel)
@@ -38,7 +43,8 @@ class RenderedDataset(ABC, Generic[C]):
 
     def __init__(self, name: str, generator_version: int, config_type: type[C], description: str) -> None:
         self.name = name
-        self.spelling = ", ".join(f"{name}/N@{setting}" for setting in get_args(Setting))
+        self._settings: tuple[str, ...] = get_args(config_type.model_fields["setting"].annotation)
+        self.spelling = ", ".join(f"{name}/N@{setting}" for setting in self._settings)
         self._generator_version = generator_version
         self._config_type = config_type
         self._description = description
@@ -50,10 +56,15 @@ class RenderedDataset(ABC, Generic[C]):
 
     @abstractmethod
     def train_frames(self, config: C) -> int:
-        """Frames of the training recording."""
+        """Frames that train."""
+
+    def split_text(self, config: C, train: int) -> str:
+        """What trains and what evaluates, in words."""
+        evaluate = getattr(config, "test_frames", 0)
+        return f"{train} frames of recording B train, all {evaluate} of recording A evaluate"
 
     def entries(self) -> Iterator[Descriptor]:
-        """The first few scenes in each setting."""
+        """The first few scenes in each setting that all families have."""
         for scene in range(_LISTED_SCENES):
             yield from (self._described(scene, setting) for setting in get_args(Setting))
 
@@ -100,20 +111,19 @@ class RenderedDataset(ABC, Generic[C]):
             scene=scene, setting=setting, width=width, height=height, max_frames=config.max_frames
         )
 
-    def _scene_and_setting(self, name: str) -> tuple[int, Setting] | None:
+    def _scene_and_setting(self, name: str) -> tuple[int, str] | None:
         match = self._pattern.fullmatch(name)
         if match is None:
             return None
         setting = match["setting"] or "sparse"
-        for known in get_args(Setting):
-            if setting == known:
-                return int(match["scene"]), known
-        raise UnknownSequenceError(
-            f"{self.name} has no setting {setting!r}; known: {', '.join(get_args(Setting))}"
-        )
+        if setting not in self._settings:
+            raise UnknownSequenceError(
+                f"{self.name} has no setting {setting!r}; known: {', '.join(self._settings)}"
+            )
+        return int(match["scene"]), setting
 
-    def _described(self, scene: int, setting: Setting) -> Descriptor:
-        plain: Any = self._config_type()
+    def _described(self, scene: int, setting: str) -> Descriptor:
+        plain: Any = self._config_type(scene=scene, setting=setting)
         train = self.train_frames(plain)
         return Descriptor(
             name=f"{self.name}/{scene}@{setting}",
@@ -125,7 +135,7 @@ class RenderedDataset(ABC, Generic[C]):
             axes="OpenCV camera axes, camera-to-world",
             has_depth=True,
             has_poses=True,
-            split=f"{train} frames of recording B train, all {plain.test_frames} of recording A evaluate",
+            split=self.split_text(plain, train),
             licence="Apache-2.0 (generated)",
             format=self.name,
         )

@@ -98,6 +98,8 @@ def measure(
         "coverage_share": float(directions.mean()) / coverage.directions,
         "depth_unit_mm": depth_unit_mm,
         "training_views": float(len(cameras)),
+        "pixels": float(cameras.width * cameras.height),
+        "width": float(cameras.width),
         "probe_views": float(len(probes)),
     }
     _log.info(

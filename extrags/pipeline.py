@@ -158,8 +158,10 @@ class Pipeline(ABC):
         # that all methods are compared under the same conditions.
         if planned is not None and not planned.run and not self.leave_out:
             return planned.reason
-        # Fine-tuning without `enhance` among the stages is a control on real views alone.
-        if stage == "finetune" and "enhance" not in self.leave_out and "enhance" in self.skipped:
+        # A method that restores views and is left without any by another left-out stage has nothing to show;
+        # without `enhance` among the stages, fine-tuning is a control on real views alone.
+        lost = "enhance" not in self.leave_out and "enhance" in self.skipped
+        if stage == "finetune" and lost and self.leave_out:
             return "there are no virtual views"
         if stage in NEEDS and NEEDS[stage] in self.skipped:
             return f"it needs the stage {NEEDS[stage]}, which was skipped"

@@ -32,6 +32,8 @@ __all__ = [
     "fitted",
     "packaged_model",
     "probe_seconds",
+    "stage_seconds",
+    "stage_tasks",
 ]
 
 STAGE_TASKS: dict[str, tuple[str, ...]] = {
@@ -230,6 +232,19 @@ class CostModel:
     def from_json(found: Mapping[str, Any]) -> CostModel:
         """A model from the JSON of `to_json`."""
         return CostModel(found["time"], found["memory"], float(found["probe_s"]))
+
+
+def stage_tasks(stage: str, config: PipelineConfig) -> tuple[str, ...]:
+    """The tasks of a stage that are modelled and that these settings run."""
+    left_out = set() if config.finetune.judge.enabled else {"finetune-judge"}
+    return tuple(task for task in STAGE_TASKS[stage] if task not in left_out)
+
+
+def stage_seconds(model: CostModel, stage: str, work: Workload) -> float:
+    """Processor time of a stage on the reference machine, each task once; unknown tasks count nothing."""
+    return sum(
+        model.predict(task, work).seconds for task in stage_tasks(stage, work.config) if task in model.time
+    )
 
 
 def fitted(history: Sequence[tuple[Workload, TaskCost]], probe_s: float) -> CostModel:

@@ -11,6 +11,7 @@ from pydantic import Field
 
 from extrags.config import PipelineConfig, StageConfig
 from extrags.errors import ConfigError
+from extrags.run_costs import Workload, packaged_model, stage_seconds
 from extrags.store.storable import Storable
 
 __all__ = ["Decision", "ScenePlan", "decide"]
@@ -21,10 +22,17 @@ class Decision(StageConfig):
 
     stage: str = Field(description="name of the stage")
     run: bool = Field(description="whether it runs")
-    budget: dict[str, int] = Field(default_factory=dict, description="settings of the stage to use instead")
+    budget: dict[str, bool | int] = Field(
+        default_factory=dict, description="settings of the stage to use instead"
+    )
     reason: str = Field(description="why, in words")
     value: float = Field(description="the number the decision rests on")
     threshold: float = Field(description="what it was compared with")
+    saves_s: float | None = Field(
+        None,
+        description="predicted saving against the settings without a plan, in seconds of processor time on "
+        "the machine that `extrags.run_costs` rests on; None where the size of the frames is not known",
+    )
 
 
 class ScenePlan(StageConfig, Storable):
@@ -69,7 +77,9 @@ def decide(measurements: Mapping[str, float], config: PipelineConfig) -> ScenePl
     """Decide which of the later stages run, and scale their budgets.
 
     The share of lacking pixels is compared with `assess.min_hole_share`. Above it the number of trajectories
-    grows in proportion, up to the whole budget at `assess.full_budget_share`.
+    grows in proportion, up to the whole budget at `assess.full_budget_share`. Below it nothing is explored
+    and no virtual view restored; the scene is fine-tuned on its real views, without a judge: there is no
+    guess for it to judge.
 
     Args:
         measurements: from `measure`.
@@ -79,7 +89,27 @@ def decide(measurements: Mapping[str, float], config: PipelineConfig) -> ScenePl
         The plan, one decision per stage: surface, freespace, explore, enhance, finetune.
     """
     decisions = _decisions(measurements["lacking_share"], config)
-    return ScenePlan(measurements=dict(measurements), decisions=decisions)
+    plan = ScenePlan(measurements=dict(measurements), decisions=decisions)
+    return plan if "pixels" not in measurements else _with_savings(plan, config)
+
+
+def _with_savings(plan: ScenePlan, config: PipelineConfig) -> ScenePlan:
+    """The plan with what each decision saves."""
+    found = plan.measurements
+    frames = found["training_views"]
+    model = packaged_model()
+
+    def seconds(stage: str, settings: PipelineConfig) -> float:
+        work = Workload(found["pixels"], frames, frames, 0, settings, width=found["width"])
+        return stage_seconds(model, stage, work)
+
+    planned = plan.applied_to(config)
+    lines = []
+    for line in plan.decisions:
+        left = seconds(line.stage, planned) if line.run else 0.0
+        saved = round(seconds(line.stage, config) - left, 1)
+        lines.append(line.model_copy(update={"saves_s": saved}))
+    return plan.model_copy(update={"decisions": tuple(lines)})
 
 
 def _decisions(lacking: float, config: PipelineConfig) -> tuple[Decision, ...]:
@@ -107,24 +137,28 @@ def _decisions(lacking: float, config: PipelineConfig) -> tuple[Decision, ...]:
     if trajectories < wanted:
         spent += f", not {wanted}: enhance.max_views={config.enhance.max_views} allows no more"
 
-    def line(stage: str, reason: str, **budget: int) -> Decision:
+    def line(stage: str, reason: str, *, runs: bool = run, **budget: bool | int) -> Decision:
         return Decision(
             stage=stage,
-            run=run,
-            budget=budget if run else {},
+            run=runs,
+            budget=budget,
             reason=reason,
             value=lacking,
             threshold=settings.min_hole_share,
         )
 
     if not run:
-        return (
+        left = (
             line("surface", f"only exploration needs it, and {why}"),
             line("freespace", f"only exploration needs it, and {why}"),
             line("explore", why),
             line("enhance", f"there will be no virtual views: {why}"),
-            line("finetune", f"there will be no virtual views: {why}"),
         )
+        if config.finetune.keep_scene:
+            none = "the scene's own Gaussians stay as they are, and there will be no virtual views"
+            return (*left, line("finetune", f"{none}: {why}"))
+        unjudged = line("finetune", f"on real views alone, which need no judge: {why}", runs=True)
+        return (*left, unjudged.model_copy(update={"budget": {"judge.enabled": False}}))
     return (
         line("surface", f"exploration needs it: {why}"),
         line("freespace", f"exploration needs it: {why}"),

@@ -76,12 +76,13 @@ def print_plan(outcome: SequenceOutcome) -> None:
     out = console()
     plan = outcome.plan or {"decisions": [], "measurements": {}}
     table = Table(box=None, pad_edge=False, header_style="bold", title=f"plan for {outcome.name}")
-    for column in ("stage", "runs", "budget", "because"):
-        table.add_column(column)
+    for column in ("stage", "runs", "budget", "saves s", "because"):
+        table.add_column(column, justify="right" if column == "saves s" else "left")
     for line in plan["decisions"]:
         budget = ", ".join(f"{name} {value}" for name, value in line["budget"].items())
         runs = "[green]yes[/]" if line["run"] else "no"
-        table.add_row(line["stage"], runs, budget, escape(line["reason"]))
+        saves = "-" if line.get("saves_s") is None else f"{line['saves_s']:.1f}"
+        table.add_row(line["stage"], runs, budget, saves, escape(line["reason"]))
     out.print(table)
     figures = ", ".join(f"{name} {value:.4g}" for name, value in plan["measurements"].items())
     out.print(f"[dim]measured: {figures}[/]")

@@ -16,13 +16,23 @@ from extrags.run_costs import (
     Workload,
     packaged_model,
     probe_seconds,
+    stage_tasks,
 )
 from extrags.scene_plan import ScenePlan
 from extrags.store import Manifest, Store
 from flows.outcome import SequenceOutcome
 from flows.workloads import frames_work, task_repeats
 
-__all__ = ["RunPrediction", "StageCost", "planned_work", "predict_run", "recorded_costs"]
+__all__ = [
+    "Pace",
+    "RunPrediction",
+    "StageCost",
+    "pace_here",
+    "planned_work",
+    "predict_run",
+    "recorded_costs",
+    "unplanned_work",
+]
 
 Record = tuple[Workload, TaskCost]
 ENOUGH_SECONDS = 10.0
@@ -91,6 +101,41 @@ class RunPrediction:
         }
 
 
+@dataclass(frozen=True)
+class Pace:
+    """How much longer tasks take here than on the reference machine, by task.
+
+    Args:
+        source: `history` of a store, or a `probe`.
+        records: so many records the history has.
+        processor: factors of processor time.
+        elapsed: factors of elapsed time; empty where nothing is known of it.
+    """
+
+    source: str
+    records: int
+    processor: dict[str, float]
+    elapsed: dict[str, float]
+
+
+def pace_here(store: Store, fallback: PipelineConfig, model: CostModel) -> Pace:
+    """The pace of this machine: by the records of a store, else by a probe.
+
+    Args:
+        store: with artefacts that were made on this machine.
+        fallback: settings that manifests do not hold.
+        model: of the reference machine.
+
+    Raises:
+        StoreError: when the store cannot be read.
+    """
+    elapsed, processor = recorded_costs(store, fallback)
+    if sum(cost.seconds for _, cost in processor) >= ENOUGH_SECONDS:
+        return Pace("history", len(processor), model.pace(processor), model.pace(elapsed))
+    factor = probe_seconds() / model.probe_s
+    return Pace("probe", len(processor), dict.fromkeys(model.time, factor), {})
+
+
 def predict_run(
     store: Store,
     work: Workload,
@@ -98,6 +143,7 @@ def predict_run(
     *,
     measured_scenes: int = 1,
     model: CostModel | None = None,
+    pace: Pace | None = None,
 ) -> RunPrediction:
     """What a run will cost on this machine, when nothing of it is in the store.
 
@@ -107,19 +153,13 @@ def predict_run(
         stages: that will run.
         measured_scenes: scenes that are evaluated: 2 where the coarse and a fine-tuned one are.
         model: of the reference machine; the packaged one by default.
+        pace: of this machine; `pace_here` by default.
 
     Raises:
         StoreError: when the store cannot be read.
     """
     model = model or packaged_model()
-    elapsed, processor = recorded_costs(store, work.config)
-    told = sum(cost.seconds for _, cost in processor)
-    if told >= ENOUGH_SECONDS:
-        source, pace = "history", model.pace(processor)
-        wall_pace = model.pace(elapsed)
-    else:
-        source, wall_pace = "probe", {}
-        pace = dict.fromkeys(model.time, probe_seconds() / model.probe_s)
+    pace = pace or pace_here(store, work.config, model)
     found: list[StageCost] = []
     unknown: list[str] = []
     restored = int("enhance" in stages and work.config.evaluate.restored != "none")
@@ -131,19 +171,20 @@ def predict_run(
             unknown.append(stage)
             continue
         repeats = task_repeats(stage, measured_scenes, restored)
-        costs = [model.predict(task, work) for task in repeats if task in model.time]
+        run = [task for task in stage_tasks(stage, work.config) if task in repeats]
+        costs = [model.predict(task, work) for task in run if task in model.time]
         peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
         found.append(
             StageCost(
                 stage,
-                sum(repeats[cost.task] * cost.seconds * pace[cost.task] for cost in costs),
-                sum(repeats[cost.task] * cost.seconds * wall_pace[cost.task] for cost in costs)
-                if wall_pace
+                sum(repeats[cost.task] * cost.seconds * pace.processor[cost.task] for cost in costs),
+                sum(repeats[cost.task] * cost.seconds * pace.elapsed[cost.task] for cost in costs)
+                if pace.elapsed
                 else None,
                 max(peaks, default=None),
             )
         )
-    return RunPrediction(found, source, len(processor), unknown)
+    return RunPrediction(found, pace.source, pace.records, unknown)
 
 
 def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig) -> tuple[Workload, set[str]]:
@@ -166,6 +207,17 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
         skipped |= {line.stage for line in decided.decisions if not line.run}
     work = frames_work(store.manifest(outcome.refs["ingest"]), config)
     return work, {str(stage) for stage in STAGES if stage not in skipped}
+
+
+def unplanned_work(
+    store: Store, outcome: SequenceOutcome, config: PipelineConfig
+) -> tuple[Workload, set[str]]:
+    """As `planned_work`, of a run without a plan: all stages with the whole of their budgets.
+
+    Raises:
+        StoreError: when the sequence's manifest cannot be read.
+    """
+    return planned_work(store, replace(outcome, plan=None), config)
 
 
 def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record], list[Record]]:

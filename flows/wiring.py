@@ -312,6 +312,9 @@ class SequenceRun(Pipeline):
                 self._report_progress(row, "running", accepted, self.config.explore.trajectories)
             collected = {**inputs, "search": search, "state": self.refs["waves"]}
             self.refs["explore"] = self._run_task(row, Call(explore, collected))
+            accepted = int(self._manifest("explore").counts["trajectories"] or 0)
+            if accepted < self.config.explore.trajectories:
+                row.reason += f"; {accepted} of them were accepted, since no other added enough"
 
     def enhance(self) -> None:
         """The restorer, and the virtual views it restores in batches."""
@@ -368,7 +371,9 @@ class SequenceRun(Pipeline):
             }
             self.refs["judgement"] = self._run_task(row, Call(judge, inputs))
             judgement = self.store.load(Judgement, self.refs["judgement"])
-            row.reason = judgement.reason
+            planned = self.planned("finetune")
+            if planned is None or "judge.enabled" not in planned.budget:
+                row.reason = judgement.reason
             if judgement.amount is None:
                 return
             inputs = {

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from extrags.config import AssessConfig, CoverageConfig, PipelineConfig
 from extrags.store import Ref, Slot
 from tasks.stage import stage
@@ -12,6 +14,16 @@ MEASUREMENTS = "measurements.json"
 
 _OF_PLAN = ("force", "full_budget_share", "min_hole_share")
 """Settings of the assessment that only the plan reads."""
+
+_OF_SAVINGS = (
+    ("coarse", "densify.max_gaussians"),
+    ("enhance", "folds"),
+    ("enhance", "fold_iterations"),
+    ("enhance", "max_width"),
+    ("finetune", "judge.enabled"),
+    ("finetune", "judge.iterations_share"),
+)
+"""Settings that what a stage costs depends on."""
 
 
 def measuring_settings(config: AssessConfig) -> AssessConfig:
@@ -27,11 +39,20 @@ def planning_settings(config: PipelineConfig) -> PipelineConfig:
         "explore.length": config.explore.length,
         "enhance.max_views": config.enhance.max_views,
         "finetune.iterations": config.finetune.iterations,
+        "finetune.keep_scene": config.finetune.keep_scene,
+        **{f"{group}.{name}": _setting(config, group, name) for group, name in _OF_SAVINGS},
     }
     return PipelineConfig().with_overrides(read)
 
 
-@stage("assess", version=2)
+def _setting(config: PipelineConfig, group: str, name: str) -> object:
+    found: Any = config
+    for part in (group, *name.split(".")):
+        found = getattr(found, part)
+    return found
+
+
+@stage("assess", version=3)
 def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig, coverage: CoverageConfig) -> None:
     """Measure the scene; writes `measurements.json`.
 
@@ -46,7 +67,7 @@ def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig, coverage
     slot.counts["lacking_share"] = found["lacking_share"]
 
 
-@stage("plan", version=3)
+@stage("plan", version=4)
 def plan(slot: Slot, measured: Ref, config: PipelineConfig) -> None:
     """Derive the plan from the measurements and the budgets of the run; writes `plan.json`."""
     from extrags.scene_plan import decide

@@ -42,6 +42,7 @@ _OF_EMBEDDED = frozenset(
         "fold_iterations",
         "folds",
         "judge",
+        "judge_pairs",
         "learning_rate",
         "max_width",
         "precision",
@@ -116,7 +117,7 @@ def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=10, ignore=("given",))
+@stage("enhance-train", version=11, ignore=("given",))
 def train(
     slot: Slot,
     scene: Ref,

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from data_catalog.rendered_dataset import Setting
 
-__all__ = ["GENERATOR_VERSION", "PhantomConfig", "Setting", "stream"]
+__all__ = ["GENERATOR_VERSION", "PhantomConfig", "PhantomSetting", "Setting", "stream"]
 
+PhantomSetting = Literal["sparse", "distanced", "covered", "pocket"]
+"""`sparse` and `distanced`: two recordings (`data_catalog.phantom.trajectories`). `covered` and `pocket`: one
+that looks everywhere, or everywhere but into a pocket (`data_catalog.phantom.thorough`)."""
 
 GENERATOR_VERSION = 1
 """Raised by hand whenever the same settings give other pixels; part of every cache key."""
@@ -19,13 +24,13 @@ _STREAMS = ("shape", "vessels", "mucosa", "exposure", "noise", "trajectory", "va
 class PhantomConfig(BaseModel):
     """One scene of the phantom, recorded in one setting.
 
-    The same `scene` has the same anatomy and texture in both settings and at every resolution.
+    The same `scene` has the same anatomy and texture in all settings and at every resolution.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     scene: int = Field(0, ge=0, description="which colon; the seed of everything random")
-    setting: Setting = Field("sparse", description="how far the two recordings are apart")
+    setting: PhantomSetting = Field("sparse", description="what was recorded, and how it is split")
     width: int = Field(160, ge=16, le=4096, description="image width in pixels")
     height: int = Field(128, ge=16, le=4096, description="image height in pixels")
     field_of_view_deg: float = Field(96.0, gt=20, lt=150, description="horizontal field of view")

@@ -1,17 +1,18 @@
 """Rendering of the phantom into an `EndoscopicSequence` with exact ground truth.
 
-Axes are OpenCV's, lengths millimetres, depth is z-depth at pixel centres. Frames of recording B (training)
-come first, then those of recording A (evaluation). Only frames that are used are rendered.
+Axes are OpenCV's, lengths millimetres, depth is z-depth at pixel centres. Of two recordings the one that
+trains comes first; frames of one recording are in the order of time. Only frames that are used are rendered.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from data_catalog.phantom import thorough
 from data_catalog.phantom.appearance import Texture, bilinear, paint
 from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig, stream
 from data_catalog.phantom.geometry import Wall, build_wall
@@ -27,6 +28,8 @@ __all__ = ["Phantom", "record"]
 
 EVALUATES, TRAINS = 0, 1
 _SCENE_GAIN_TARGET = 0.14
+NOISE_PER_PASS = 10_000
+"""So many numbers of frames each pass of an examination has for its streams of noise."""
 
 
 class Phantom:
@@ -129,39 +132,48 @@ class Phantom:
         return sensor.develop(self.radiance(camera, self.config.supersample), exposure, rng), exposure
 
 
+@dataclass(frozen=True)
+class _Part:
+    """Frames of one recording in the order of time: letter, number, camera, and whether it trains."""
+
+    letters: tuple[str, ...]
+    recording: int
+    numbers: Int[np.ndarray, "n"]
+    cameras: Cameras
+    trains: Bool[np.ndarray, "n"]
+    noise: Int[np.ndarray, "n"]
+    """Numbers of their streams of noise."""
+
+
 def record(config: PhantomConfig, name: str) -> EndoscopicSequence:
-    """Render a scene's two recordings and their ground truth."""
+    """Render a scene's recordings and their ground truth."""
     phantom = Phantom(config)
     gain = phantom.scene_gain()
-    video = np.arange(0, config.video_frames, config.train_every)
-    evaluation = np.arange(config.test_frames)
-    video, evaluation = _thinned(video, evaluation, config.max_frames)
-    last = {"b": max(config.video_frames - 1, 1), "a": max(config.test_frames - 1, 1)}
-    parts = {"b": (TRAINS, video), "a": (EVALUATES, evaluation)}
+    parts = _two_recordings(phantom) if config.setting in ("sparse", "distanced") else _examination(phantom)
 
-    rgb, cameras, recording, names = [], [], [], []
+    rgb, recording, names = [], [], []
     sensors: dict[str, Any] = {}
     exposures: list[float] = []
-    for letter, (index, frames) in parts.items():
-        views = phantom.cameras(letter, frames / last[letter])
-        sensor = recording_sensor(config, index, gain)
-        sensors[letter] = sensor.as_json()
-        for k, frame in enumerate(frames):
-            image, exposure = phantom.photograph(views[k], sensor, index, int(frame))
+    total = sum(len(part.numbers) for part in parts)
+    for part in parts:
+        sensor = recording_sensor(config, part.recording, gain)
+        sensors |= dict.fromkeys(part.letters, sensor.as_json())
+        for k, (letter, number) in enumerate(zip(part.letters, part.numbers.tolist(), strict=True)):
+            image, exposure = phantom.photograph(part.cameras[k], sensor, part.recording, int(part.noise[k]))
             rgb.append(image)
             exposures.append(exposure)
-            recording.append(index)
-            names.append(f"{letter}_{int(frame):04d}")
-            emit(Progress("ingest", len(rgb), video.size + evaluation.size))
-        cameras.append(views)
+            recording.append(part.recording)
+            names.append(f"{letter}_{number:04d}")
+            emit(Progress("ingest", len(rgb), total))
+    cameras = [part.cameras for part in parts]
+    trains = np.concatenate([part.trains for part in parts])
     every = Cameras.concatenated(cameras)
     depth = np.stack([phantom.z_depth(every[k]) for k in range(len(every))])
     valid = np.isfinite(depth)
     depth = np.where(valid, depth, 0).astype(np.float32)
-    train = np.arange(len(video))
-    test = np.arange(len(video), len(every))
+    train, test = np.flatnonzero(trains), np.flatnonzero(~trains)
     observed = np.zeros(depth.shape, dtype=bool)
-    for k in range(len(video), len(every)):
+    for k in test.tolist():
         rays = pixel_rays(every[k])[0][valid[k]]
         points = every.centers[k] + rays * depth[k][valid[k]][:, None].astype(np.float64)
         observed[k][valid[k]] = phantom.rays.seen_by(points, every[train])
@@ -189,6 +201,56 @@ def record(config: PhantomConfig, name: str) -> EndoscopicSequence:
         observed=observed,
         truth=truth,
     )
+
+
+def _two_recordings(phantom: Phantom) -> list[_Part]:
+    """Recording B, which trains, and A, which evaluates."""
+    config = phantom.config
+    video, evaluation = _thinned(
+        np.arange(0, config.video_frames, config.train_every),
+        np.arange(config.test_frames),
+        config.max_frames,
+    )
+    last = {"b": max(config.video_frames - 1, 1), "a": max(config.test_frames - 1, 1)}
+    return [
+        _Part(
+            (letter,) * len(numbers),
+            index,
+            numbers,
+            phantom.cameras(letter, numbers / last[letter]),
+            np.full(len(numbers), index == TRAINS),
+            numbers,
+        )
+        for letter, index, numbers in (("b", TRAINS, video), ("a", EVALUATES, evaluation))
+    ]
+
+
+def _examination(phantom: Phantom) -> list[_Part]:
+    """One recording of several passes, its frames that train and those between them."""
+    config = phantom.config
+    plan = thorough.examination(config)
+    poses = thorough.poses(config, phantom.wall, phantom.rays, plan)
+    K = phantom.intrinsics(config.width, config.height)
+    cameras = Cameras(np.repeat(K[None], len(poses), 0), poses, config.width, config.height)
+    kept = plan.trains.copy()
+    if config.setting == "pocket":
+        # At one small size: which frames train does not depend on that of the images.
+        small = cameras.resized(40, 32)
+        depth = np.stack([phantom.z_depth(small[k]) for k in range(len(small))])
+        kept &= ~thorough.sees_pocket(phantom.wall, small, depth)
+    frames = np.sort(
+        np.concatenate(_thinned(np.flatnonzero(kept), np.flatnonzero(~plan.trains), config.max_frames))
+    )
+    return [
+        _Part(
+            tuple(thorough.PASSES[index][0] for index in plan.passed[frames].tolist()),
+            TRAINS,
+            plan.number[frames],
+            cameras[frames],
+            plan.trains[frames],
+            NOISE_PER_PASS * plan.passed[frames] + plan.number[frames],
+        )
+    ]
 
 
 def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

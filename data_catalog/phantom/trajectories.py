@@ -26,12 +26,21 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from data_catalog.phantom.config import PhantomConfig, Setting, stream
+from data_catalog.phantom.config import PhantomConfig, PhantomSetting, stream
 from data_catalog.phantom.geometry import Wall
 from data_catalog.ray_casting import RayCaster
 from extrags.cameras import compose, look_at, rotation_about
+from extrags.errors import ConfigError
 
-__all__ = ["MIN_CLEARANCE_MM", "PathStyle", "camera_path", "path_style"]
+__all__ = [
+    "DISTANCED",
+    "MIN_CLEARANCE_MM",
+    "TRAINING",
+    "PathStyle",
+    "camera_path",
+    "path_style",
+    "styled_path",
+]
 
 MIN_CLEARANCE_MM = 5.5
 """The lens keeps this distance from the wall; checked against the wall's triangles."""
@@ -55,7 +64,7 @@ class PathStyle:
     roll_deg: float
 
 
-_TRAINING = PathStyle(
+TRAINING = PathStyle(
     start_mm=12.0,
     end_mm=88.0,
     side_rad=0.0,
@@ -77,7 +86,7 @@ _SPARSE = PathStyle(
     turn_swing_deg=7.0,
     roll_deg=15.0,
 )
-_DISTANCED = PathStyle(
+DISTANCED = PathStyle(
     start_mm=10.0,
     end_mm=90.0,
     side_rad=float(np.pi),
@@ -88,13 +97,20 @@ _DISTANCED = PathStyle(
     turn_swing_deg=12.0,
     roll_deg=30.0,
 )
+_EVALUATION: dict[str, PathStyle] = {"sparse": _SPARSE, "distanced": DISTANCED}
 
 
-def path_style(recording: str, setting: Setting) -> PathStyle:
-    """The style of recording `a` (evaluates) or `b` (trains, the same in both settings)."""
+def path_style(recording: str, setting: PhantomSetting) -> PathStyle:
+    """The style of recording `a` (evaluates) or `b` (trains, the same in both settings).
+
+    Raises:
+        ConfigError: for recording `a` in a setting that has one recording only.
+    """
     if recording == "b":
-        return _TRAINING
-    return _SPARSE if setting == "sparse" else _DISTANCED
+        return TRAINING
+    if setting not in _EVALUATION:
+        raise ConfigError(f"the setting {setting} has no recording {recording}")
+    return _EVALUATION[setting]
 
 
 def camera_path(
@@ -113,11 +129,34 @@ def camera_path(
         `world_from_camera`, [N, 4, 4].
     """
     style = path_style(recording, config.setting)
+    # Of the random stream: 0 for `a` in the setting sparse, 1 for `b`, 2 for `a` in distanced.
+    index = 1 if recording == "b" else 2 * list(_EVALUATION).index(config.setting)
+    return styled_path(config, wall, rays, style, index, share)
+
+
+def styled_path(
+    config: PhantomConfig,
+    wall: Wall,
+    rays: RayCaster,
+    style: PathStyle,
+    index: int,
+    share: Float[np.ndarray, "n"],
+) -> Float[np.ndarray, "n 4 4"]:
+    """Poses of a path of any style at shares of its duration.
+
+    Args:
+        config: the scene.
+        wall: its anatomy.
+        rays: the wall as a target, for the clearance.
+        style: of the path.
+        index: of its random stream.
+        share: 0 at the start, 1 at the end, [N].
+
+    Returns:
+        `world_from_camera`, [N, 4, 4].
+    """
     # The reference direction belongs to the scene, the sway to the recording.
     reference = stream(config.scene, "trajectory").uniform(0, 2 * np.pi)
-    index = {"a": 0, "b": 1}[recording] + 2 * ("sparse", "distanced").index(config.setting) * (
-        recording == "a"
-    )
     phases = stream(config.scene, "trajectory", index).uniform(0, 2 * np.pi, 10)
 
     dense = np.linspace(0, 1, _DENSE)

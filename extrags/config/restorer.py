@@ -158,6 +158,12 @@ class EnhanceConfig(StageConfig):
         description="compare the embedded restorer with blending and filling on leave-out pairs of the "
         "scene, and use the latter where the former is worse",
     )
+    judge_pairs: int = Field(
+        48,
+        ge=4,
+        description="leave-out pairs the restorers are compared on, at most, spread over the recording; they "
+        "take longer than the reconstructions they come from, and more of them hardly tell more",
+    )
     batch: int = Field(4, ge=1, description="crops per step")
     crop: int = Field(96, ge=32, description="crop size in pixels, a multiple of 8")
     channels: tuple[int, int, int] = Field(

@@ -116,10 +116,11 @@ class AssessConfig(StageConfig):
     probe_turn_deg: float = Field(35.0, ge=0, description="turn of a probe")
     hole_alpha: float = Field(HOLE_ALPHA, gt=0, lt=1, description="a pixel below this alpha is a hole")
     min_hole_share: float = Field(
-        0.002,
+        0.05,
         ge=0,
         le=1,
-        description="explore only when holes and poorly seen pixels exceed this share",
+        description="explore, restore and judge only when holes and poorly seen pixels exceed this share; a "
+        "scene that lacks less is fine-tuned on its real views alone",
     )
     min_directions: int = Field(
         2, ge=1, description="a Gaussian seen from fewer direction bins counts as poorly seen"

@@ -62,6 +62,7 @@ def plan_rows(inputs: ReportInputs) -> dict[str, Any] | None:
                 "value": _figure(line["value"]),
                 "threshold": _figure(line["threshold"]),
                 "budget": [f"{key} = {value}" for key, value in line["budget"].items()],
+                "saves": "" if line.get("saves_s") is None else f"{line['saves_s']:.1f} s",
                 "reason": line["reason"],
             }
             for line in inputs.plan["decisions"]

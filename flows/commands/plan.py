@@ -11,6 +11,7 @@ from flows.commands.options import Parser, add_json, add_method, add_runner
 from flows.commands.run import execute
 
 if TYPE_CHECKING:
+    from extrags.run_costs import Workload
     from flows.run_costs import RunPrediction
 
 __all__ = ["add_arguments", "plan", "print_prediction"]
@@ -66,38 +67,61 @@ def plan(given: argparse.Namespace) -> int:
     (outcome,) = execute([given.sequence], given, until="assess").sequences
     if outcome.status == "failed":
         raise outcome.error or ExtragsError(f"{outcome.name} failed")
+    from extrags.run_costs import packaged_model
     from flows.console import print_plan
-    from flows.run_costs import planned_work, predict_run
+    from flows.run_costs import pace_here, planned_work, predict_run, unplanned_work
 
-    store = Store(store_root(given))
-    work, stages = planned_work(store, outcome, run_config(given))
-    scenes = 2 if "finetune" in stages else 1
-    predicted = predict_run(store, work, stages, measured_scenes=scenes)
+    store, config = Store(store_root(given)), run_config(given)
+    pace = pace_here(store, config, packaged_model())
+
+    def cost(work: Workload, stages: set[str]) -> RunPrediction:
+        scenes = 2 if "finetune" in stages else 1
+        return predict_run(store, work, stages, measured_scenes=scenes, pace=pace)
+
+    predicted = cost(*planned_work(store, outcome, config))
+    whole = cost(*unplanned_work(store, outcome, config))
     if given.json != "-":
         print_plan(outcome)
-        print_prediction(predicted)
+        print_prediction(predicted, whole)
     write_json(
-        {"sequence": outcome.name, **(outcome.plan or {}), "predicted": predicted.to_json()}, given.json
+        {
+            "sequence": outcome.name,
+            **(outcome.plan or {}),
+            "predicted": predicted.to_json(),
+            "without_plan": whole.to_json(),
+        },
+        given.json,
     )
     return 0
 
 
-def print_prediction(predicted: RunPrediction) -> None:
-    """What a run will cost, stage by stage and in all."""
+def print_prediction(predicted: RunPrediction, whole: RunPrediction | None = None) -> None:
+    """What a run will cost, stage by stage and in all.
+
+    Args:
+        predicted: of the run.
+        whole: of one that is not planned, of which the savings are taken; None shows none.
+    """
     from rich.table import Table
 
     from flows.terminal import console
 
     table = Table(box=None, pad_edge=False, header_style="bold", title="predicted cost of a whole run")
     table.add_column("stage")
-    for name in ("processor s", "elapsed s", "peak MiB"):
+    names = ["processor s", "elapsed s", "peak MiB"]
+    for name in names if whole is None else [*names, "without the plan: processor s"]:
         table.add_column(name, justify="right")
-    rows = [(item.stage, item.processor_seconds, item.seconds, item.peak_mib) for item in predicted.stages]
-    for stage, *costs in [
-        *rows,
-        ("total", predicted.processor_seconds, predicted.seconds, predicted.peak_mib),
-    ]:
-        texts = (("-" if cost is None else f"{cost:.0f}" if cost >= 10 else f"{cost:.1f}") for cost in costs)
+    planned = {item.stage: item for item in predicted.stages}
+    costs: list[tuple[str, list[float | None]]] = []
+    for item in predicted.stages if whole is None else whole.stages:
+        own = planned.get(item.stage)
+        row = [0.0, None, None] if own is None else [own.processor_seconds, own.seconds, own.peak_mib]
+        costs.append((item.stage, [*row, item.processor_seconds]))
+    total = [predicted.processor_seconds, predicted.seconds, predicted.peak_mib]
+    costs.append(("total", [*total, 0.0 if whole is None else whole.processor_seconds]))
+    for stage, row in costs:
+        shown = row[:-1] if whole is None else row
+        texts = (("-" if cost is None else f"{cost:.0f}" if cost >= 10 else f"{cost:.1f}") for cost in shown)
         table.add_row(stage, *texts)
     out = console()
     out.print(table)

@@ -10,11 +10,13 @@ from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.geometry import build_wall
 from data_catalog.phantom.imaging import recording_sensor
 from data_catalog.phantom.recording import Phantom, record
-from data_catalog.phantom.trajectories import MIN_CLEARANCE_MM, camera_path
+from data_catalog.phantom.thorough import PASSES, sees_pocket
+from data_catalog.phantom.trajectories import MIN_CLEARANCE_MM, camera_path, path_style, styled_path
 from data_catalog.ray_casting import RayCaster
 from data_catalog.visibility import observed_from_depth
 from extrags.cameras import Cameras, invert_poses, pixel_rays
 from extrags.config import IngestConfig
+from extrags.errors import ConfigError
 from extrags.sequence import EndoscopicSequence
 
 
@@ -152,6 +154,71 @@ class TestRecordings:
         product = invert_poses(poses) @ poses
         np.testing.assert_allclose(product, np.broadcast_to(np.eye(4), poses.shape), atol=1e-12)
         np.testing.assert_allclose(np.linalg.det(poses[:, :3, :3]), 1, atol=1e-12)
+
+
+def thorough(setting: str, **settings: int) -> EndoscopicSequence:
+    config = {"scene": 11, "setting": setting, "width": 40, "height": 32, **settings}
+    return record(PhantomConfig.model_validate(config), "x")
+
+
+@pytest.fixture(scope="module")
+def covered() -> EndoscopicSequence:
+    return thorough("covered")
+
+
+@pytest.fixture(scope="module")
+def pocket() -> EndoscopicSequence:
+    return thorough("pocket")
+
+
+class TestThoroughExamination:
+    def test_held_out_frames_lie_between_those_that_train(self, covered: EndoscopicSequence) -> None:
+        assert (len(covered.train), len(covered.test)) == (120, 28)
+        assert set(covered.recording) == {1}
+        # Exposures of held-out frames are those of their neighbours in time: the order matters.
+        assert sorted(covered.frame_names) == list(covered.frame_names)
+        for index in covered.test.tolist():
+            before, after = covered.frame_names[index - 1], covered.frame_names[index + 1]
+            assert {index - 1, index + 1} <= set(covered.train.tolist())
+            assert before[0] == covered.frame_names[index][0] == after[0]
+        assert {name[0] for name in covered.frame_names} == set("bcdefg")
+
+    def test_covered_leaves_hardly_anything_unseen(self, covered: EndoscopicSequence) -> None:
+        assert covered.truth["separation"]["unseen_share_mean"] < 0.002
+
+    def test_the_pocket_is_all_that_is_left_out(
+        self, covered: EndoscopicSequence, pocket: EndoscopicSequence
+    ) -> None:
+        assert 60 < len(pocket.train) < 110
+        names = np.array(covered.frame_names)
+        kept = np.isin(names, pocket.frame_names)
+        np.testing.assert_array_equal(covered.rgb[kept], pocket.rgb)
+        assert set(names[covered.test]) == {pocket.frame_names[index] for index in pocket.test}
+        wall = build_wall(PhantomConfig(scene=11))
+        assert covered.depth_mm is not None
+        sees = sees_pocket(wall, covered.cameras, covered.depth_mm)
+        # Those that were left out, and no other that trains.
+        np.testing.assert_array_equal(sees[covered.train], ~kept[covered.train])
+        assert pocket.truth["separation"]["unseen_share_mean"] > 0.02
+
+    def test_fewer_frames_of_all_passes(self) -> None:
+        few = thorough("covered", max_frames=12)
+        assert len(few) == 12
+        assert len(few.test) == 2
+        assert len({name[0] for name in few.frame_names}) >= 5
+
+    @pytest.mark.parametrize("scene", [0, 11])
+    def test_lens_keeps_clear_of_the_wall(self, scene) -> None:
+        config = PhantomConfig(scene=scene, setting="covered")
+        wall = build_wall(config)
+        rays = RayCaster(wall.vertices, wall.triangles)
+        for _, style, stream in PASSES:
+            path = styled_path(config, wall, rays, style, stream, np.linspace(0, 1, 100))
+            assert rays.clearance_mm(path[:, :3, 3]).min() > MIN_CLEARANCE_MM
+
+    def test_one_recording_has_no_other(self) -> None:
+        with pytest.raises(ConfigError, match="the setting covered has no recording a"):
+            path_style("a", "covered")
 
 
 class TestImages:

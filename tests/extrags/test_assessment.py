@@ -9,8 +9,9 @@ import torch
 
 from extrags.assessment import assess, probe_views
 from extrags.cameras import rotation_angle_deg
-from extrags.config import AssessConfig, EnhanceConfig, ExploreConfig, PipelineConfig
+from extrags.config import AssessConfig, EnhanceConfig, ExploreConfig, FinetuneConfig, PipelineConfig
 from extrags.errors import CaptureError, ConfigError
+from extrags.run_costs import STAGE_TASKS, Workload, packaged_model
 from extrags.scene import Scene
 from extrags.scene_plan import ScenePlan, decide
 
@@ -50,11 +51,37 @@ class TestAssess:
         assert plan.measurements["lacking_share"] <= 0.002
         assert [line.stage for line in plan.decisions] == list(STAGES)
         for line in plan.decisions:
-            assert not line.run
-            assert line.budget == {}
+            assert line.run == (line.stage == "finetune")
             assert line.value == plan.measurements["lacking_share"]
-            assert line.threshold == 0.002
-            assert "no more than 0.20 %" in line.reason
+            assert line.threshold == 0.05
+            assert "no more than 5.00 %" in line.reason
+            assert line.budget == ({"judge.enabled": False} if line.run else {})
+        assert "on real views alone" in plan.decision("finetune").reason
+        assert not plan.applied_to(config()).finetune.judge.enabled
+
+    def test_what_a_decision_saves_is_what_the_stage_would_cost(self):
+        plan, settings = ball_plan(), config()
+        sequence = make_ball().sequence
+        frames, pixels = len(sequence.train), sequence.width * sequence.height
+        assert (plan.measurements["pixels"], plan.measurements["width"]) == (pixels, sequence.width)
+        work = Workload(pixels, frames, frames, 0, settings, width=sequence.width)
+        model = packaged_model()
+        for line in plan.decisions:
+            tasks = ("finetune-judge",) if line.stage == "finetune" else STAGE_TASKS[line.stage]
+            whole = sum(model.predict(task, work).seconds for task in tasks)
+            assert line.saves_s == pytest.approx(whole, abs=0.051)
+            assert line.saves_s > 0
+        # With the whole of the budgets nothing is saved.
+        assert [line.saves_s for line in ball_plan(force=True).decisions] == [0, 0, 0, 0, 0]
+        # Without the size of frames nothing is known of it.
+        assert decide({"lacking_share": 0.0}, settings).decision("explore").saves_s is None
+
+    def test_a_scene_that_is_kept_is_not_fine_tuned_without_virtual_views(self):
+        settings = PipelineConfig(finetune=FinetuneConfig(keep_scene=True))
+        line = decide({"lacking_share": 0.0}, settings).decision("finetune")
+        assert not line.run
+        assert line.budget == {}
+        assert decide({"lacking_share": 1.0}, settings).decision("finetune").run
 
     def test_force_runs_all_the_same(self):
         plan = ball_plan(force=True)

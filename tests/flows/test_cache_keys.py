@@ -122,7 +122,10 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "enhance.pretrained_weights": (),  # By content, below.
     "enhance.keyframes": ("enhance-keyframes", "finetune-judge"),
     "enhance.max_views": ("plan", *RESTORE),
-    "enhance.max_width": ("enhance-train", *RESTORE, "finetune-judge"),
+    # What a decision saves depends on them.
+    "enhance.folds": ("plan", "enhance-train"),
+    "enhance.fold_iterations": ("plan", "enhance-train"),
+    "enhance.max_width": ("plan", "enhance-train", *RESTORE, "finetune-judge"),
     "enhance.clips_per_batch": ("enhance-restore",),
     "enhance.references": ("enhance-train", *RESTORE, "finetune-judge"),
     "enhance.reference": ("enhance-train", *RESTORE, "finetune-judge"),
@@ -133,7 +136,10 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "enhance.pretrained.*": (),
     "enhance.checkpoint.*": (),
     "enhance.*": ("enhance-train",),
+    "finetune.judge.enabled": ("plan", "finetune-judge"),
+    "finetune.judge.iterations_share": ("plan", "finetune-judge"),
     "finetune.judge.*": ("finetune-judge",),
+    "finetune.keep_scene": ("plan", "finetune-judge", "finetune"),
     "finetune.iterations": ("plan", "finetune-judge", "finetune"),
     "finetune.*": ("finetune-judge", "finetune"),
     "evaluate.restored": ("evaluate-restore",),

@@ -338,6 +338,8 @@ class TestFinished:
         said = capsys.readouterr().out
         assert "explore" in said
         assert "% of the pixels" in said
+        assert "saves s" in said
+        assert "without the plan" in " ".join(said.split())
 
     def test_plan_as_json(
         self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
@@ -347,6 +349,8 @@ class TestFinished:
         plan = json.loads(capsys.readouterr().out)
         assert plan["sequence"] == SEQUENCE
         assert {line["stage"] for line in plan["decisions"]} >= {"explore", "enhance", "finetune"}
+        assert all(line["saves_s"] is not None for line in plan["decisions"])
+        assert plan["without_plan"]["processor_seconds"] >= plan["predicted"]["processor_seconds"] > 0
 
     def test_report_is_built_again(
         self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]

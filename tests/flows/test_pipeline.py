@@ -131,9 +131,9 @@ class TestUcNerf:
 class TestRules:
     """Asked of both: why a stage is skipped does not depend on who runs it."""
 
-    def reasons(self, tmp_path: Path, left_out: dict[str, str]) -> dict[str, str]:
+    def reasons(self, tmp_path: Path, left_out: dict[str, str], **settings: object) -> dict[str, str]:
         """Reasons by stage, the same from a run in memory and from a cached one."""
-        config = tiny_config(enhance__backend="classical", coarse__iterations=20)
+        config = tiny_config(enhance__backend="classical", coarse__iterations=20, **settings)
         outcome = run_sequence(
             SEQUENCE, config, str(tmp_path), DirectRunner(str(tmp_path)), until="finetune", leave_out=left_out
         )
@@ -142,6 +142,7 @@ class TestRules:
         result = extrags.run_pipeline(sequence, config, until="finetune", leave_out=left_out)
         cached = {row.stage: row.reason for row in outcome.stages if row.state == "skipped"}
         assert cached == result.skipped
+        assert ("finetune" in outcome.refs) == (result.finetuning is not None)
         return cached
 
     def test_what_rests_on_a_left_out_stage_is_skipped_too(self, tmp_path: Path) -> None:
@@ -159,6 +160,10 @@ class TestRules:
         reasons = self.reasons(tmp_path, left_out)
         assert set(reasons) == {*GIVEN, "assess", *left_out}
         assert reasons["assess"] == NO_PLAN
+
+    def test_a_scene_that_lacks_nothing_is_fine_tuned_on_real_views(self, tmp_path: Path) -> None:
+        reasons = self.reasons(tmp_path, {}, assess__force=False, assess__min_hole_share=1.0)
+        assert set(reasons) == {*GIVEN, "surface", "freespace", "explore", "enhance"}
 
     def test_who_pays_for_the_assessment(self) -> None:
         """The plan skips stages of whole runs, and sets the budgets of those that explore."""

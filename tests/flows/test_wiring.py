@@ -107,15 +107,32 @@ def test_a_scene_that_lacks_nothing_skips_with_reasons(finished: tuple[str, Sequ
     config = tiny_config(assess__force=False, assess__min_hole_share=1.0)
     outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store))
     assert outcome.status == "ok"
-    skipped = ("surface", "freespace", "explore", "enhance", "finetune")
+    skipped = ("surface", "freespace", "explore", "enhance")
     for stage in skipped:
         row = outcome.row(stage)
         assert row is not None
         assert row.state == "skipped"
         assert "%" in row.reason
-    # Then the coarse scene is the final one.
-    assert outcome.metrics["final"] == outcome.metrics["coarse"] == first.metrics["coarse"]
+    # Then the scene is fine-tuned on its real views, and nothing judged.
+    row = outcome.row("finetune")
+    assert row is not None
+    assert row.state == "ran"
+    assert row.reason.startswith("on real views alone, which need no judge")
+    judged = Store(store).load_json("judgement.json", outcome.refs["judgement"])
+    assert (judged["amount"], judged["trials"]) == (1.0, [])
+    assert outcome.metrics["coarse"] == first.metrics["coarse"]
+    assert outcome.metrics["final"] != first.metrics["final"]
+    assert outcome.digests["finetune"] != first.digests["finetune"]
+    assert "restored" not in outcome.metrics
     assert outcome.report is not None
+
+
+def test_a_kept_scene_that_lacks_nothing_is_the_final_one(finished: tuple[str, SequenceOutcome]) -> None:
+    store, first = finished
+    config = tiny_config(assess__force=False, assess__min_hole_share=1.0, finetune__keep_scene=True)
+    outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="evaluate")
+    assert states(outcome)["finetune"] == "skipped"
+    assert outcome.metrics["final"] == outcome.metrics["coarse"] == first.metrics["coarse"]
 
 
 def test_control_on_real_views_alone(finished: tuple[str, SequenceOutcome]) -> None:

@@ -52,7 +52,8 @@ def scene_restorer(
         if not config.judge or len(sequence.train) < MIN_FRAMES:
             return untouched
         # Nothing is trained, so all leave-out pairs validate; synthetic ones would favour filling holes.
-        fresh = make_pairs(scene, sequence, config.model_copy(update={"synthetic_views": 0}), coarse)
+        leave_out = config.model_copy(update={"synthetic_views": 0})
+        fresh = make_pairs(scene, sequence, leave_out, coarse, most=config.judge_pairs)
         pairs = replace(fresh, validation=np.ones(len(fresh), dtype=bool))
         judged = better_of_both(untouched, pairs, transfer)
         # How far off it is differs more from scene to scene than where.

@@ -104,7 +104,12 @@ class Pairs:
 
 
 def make_pairs(
-    scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    config: EnhanceConfig,
+    coarse: CoarseConfig,
+    *,
+    most: int | None = None,
 ) -> Pairs:
     """All pairs of a scene.
 
@@ -113,13 +118,15 @@ def make_pairs(
         sequence: posed frames; only training frames are used.
         config: how many pairs.
         coarse: settings of the leave-out reconstructions.
+        most: about so many leave-out pairs at most, two of every frame that is taken; None takes all.
 
     Raises:
         CaptureError: with fewer than four training frames.
     """
     parts = []
+    frames = None if most is None else max(1, most // (2 * config.folds))
     for fold in range(config.folds):
-        parts.append(fold_pairs(scene, sequence, config, coarse, fold))
+        parts.append(fold_pairs(scene, sequence, config, coarse, fold, most_frames=frames))
         emit(Progress("enhance-pairs", fold + 1, config.folds + 1))
     if config.synthetic_views > 0:
         parts.append(synthetic_pairs(scene, sequence, config))
@@ -128,7 +135,13 @@ def make_pairs(
 
 
 def fold_pairs(
-    scene: Scene, sequence: EndoscopicSequence, config: EnhanceConfig, coarse: CoarseConfig, fold: int
+    scene: Scene,
+    sequence: EndoscopicSequence,
+    config: EnhanceConfig,
+    coarse: CoarseConfig,
+    fold: int,
+    *,
+    most_frames: int | None = None,
 ) -> Pairs:
     """Reconstruct without the frames of a fold, and render them, from the scene and from a perturbed copy.
 
@@ -138,6 +151,7 @@ def fold_pairs(
         config: folds, iterations, seed.
         coarse: settings of the reconstruction.
         fold: which fold, from 0.
+        most_frames: of the fold, at most so many are rendered, spread evenly; None renders all.
 
     Raises:
         CaptureError: with fewer than four training frames.
@@ -154,6 +168,8 @@ def fold_pairs(
         stage="enhance-pairs",
     )
     references = gather_references(partial, sequence, kept)
+    if most_frames is not None and len(left) > most_frames:
+        left = left[np.linspace(0, len(left) - 1, most_frames).round().astype(np.int64)]
     # In the partial scene the mean over the kept frames is one.
     gain = (log_exposures(scene, sequence, left) - log_exposures(scene, sequence, kept).mean()).exp()
     generator = np.random.default_rng([config.seed, 4, fold])

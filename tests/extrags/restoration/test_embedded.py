@@ -12,6 +12,7 @@ from extrags.errors import ConfigError, DivergedError, WeightsError
 from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import render_clips
+from extrags.restoration.diffusion import scene_restorer
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import cell_errors, error_over_expected
 from extrags.restoration.diffusion.network import build_network
@@ -274,6 +275,32 @@ class TestEmbedded:
         assert half == pytest.approx(ratio / 2, rel=1e-5)
         expected, true = cell_errors(plain, validation_pairs(tube_pairs), transfer)
         assert ratio == pytest.approx(true.mean() / expected.mean(), rel=1e-5)
+
+    @pytest.mark.parametrize(("most", "expected"), [(48, 20), (8, 8)])
+    def test_no_more_pairs_are_judged_than_tell_something(
+        self, tube: Tube, trained: EmbeddedEnhancer, tmp_path, monkeypatch, most: int, expected: int
+    ) -> None:
+        trained.save(tmp_path, half=True)
+        judged: list[Pairs] = []
+
+        def keep(enhancer: EmbeddedEnhancer, pairs: Pairs, _: object) -> EmbeddedEnhancer:
+            judged.append(pairs)
+            return enhancer
+
+        monkeypatch.setattr(scene_restorer, "better_of_both", keep)
+        settings = {
+            "train_iterations": 0,
+            "pretrained_weights": str(tmp_path),
+            "judge_pairs": most,
+            "folds": 2,
+        }
+        train_enhancer(tube.scene, tube.sequence, SMALL.model_copy(update=settings), CoarseConfig())
+        (pairs,) = judged
+        assert len(pairs) == expected
+        assert pairs.validation.all()
+        # From both folds, and from the scene as well as from its perturbed copy.
+        assert {*pairs.synthetic.tolist()} == {True, False}
+        assert len({*pairs.frame.tolist()}) == expected / 2
 
     def test_a_plain_regression_needs_no_noise(self, tube: Tube, tube_pairs: Pairs, clip: Clip) -> None:
         plain = train_on_scene(tube_pairs, tube.references.transfer, SMALL, deterministic=True)
