@@ -134,8 +134,9 @@ def needed_resources(
 ) -> dict[str, float]:
     """What a task takes of the resources that workers declare; nothing of those that none does.
 
-    `GPU`: 1 for a task whose device, or one in its settings, is `cuda`. `MEMORY`, in bytes: what such tasks took before,
-    and no more than the largest worker has, since a task that needs more would wait for ever.
+    `GPU`: 1 for a task whose device, or one in its settings, is `cuda`. `MEMORY`, in bytes: what such
+    tasks took before, and no more than the largest worker has, since a task that needs more would wait for
+    ever.
 
     Args:
         inputs: of the task.

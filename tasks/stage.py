@@ -47,7 +47,7 @@ NOT_IN_KEY = frozenset({"store", "label", "time_limit_s", "threads"})
 threads."""
 
 DEVICE = "device"
-"""Parameter of stages that may run on a GPU: cpu or cuda. Their results differ by rounding, so that it counts."""
+"""Parameter of stages that may run on a GPU: cpu or cuda. Their results differ by rounding: it counts."""
 
 _versions: dict[str, int] = {}
 
