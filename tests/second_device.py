@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor
@@ -91,10 +92,15 @@ class _FromNumbers(TorchFunctionMode):
         return func(*args, **kwargs)
 
 
+def _without_inference(mode: bool = True, *, of: Any = torch.inference_mode) -> Any:
+    """Tensors that wrap others have no inference mode."""
+    return torch.no_grad() if mode else of(False)
+
+
 @contextmanager
 def second_device() -> Iterator[torch.device]:
     """Within, `meta` is a device with values."""
-    with _FromNumbers(), _Factories():
+    with patch.object(torch, "inference_mode", _without_inference), _FromNumbers(), _Factories():
         yield DEVICE
 
 
