@@ -122,11 +122,13 @@ def settings_of(model: type[BaseModel]) -> dict[str, Setting]:
 
 
 def groups_of(model: type[BaseModel]) -> dict[str, str]:
-    """What each group of settings is for, by dotted name: the first line of its model's docstring."""
+    """What each group of settings is for, by dotted name: the first line of its model's docstring.
+
+    What is set for all of the model, and belongs to no group, has the empty name.
+    """
     return {
         prefix.removesuffix("."): (inner.__doc__ or "").strip().partition("\n")[0]
         for prefix, inner in _models(model)
-        if prefix
     }
 
 

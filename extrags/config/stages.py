@@ -261,12 +261,6 @@ class PipelineConfig(StageConfig):
     not_in_keys: ClassVar[frozenset[str]] = frozenset({"device"})
     """Stages count the device they ran on: `auto` would be another on another machine."""
 
-    device: Literal["auto", "cpu", "cuda"] = Field(
-        "auto",
-        description="where Gaussians are optimised, rendered and measured, and where stages whose own device "
-        "is auto run. auto: cuda where there is one, with gsplat and pinholes; cuda: refused where there is "
-        "none. Part of cache keys as what it comes to; `extrags devices` shows what runs where, and why",
-    )
     ingest: IngestConfig = IngestConfig()
     poses: PosesConfig = PosesConfig()
     depth: DepthConfig = DepthConfig()
@@ -281,13 +275,19 @@ class PipelineConfig(StageConfig):
     finetune: FinetuneConfig = FinetuneConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     report: ReportConfig = ReportConfig()
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto",
+        description="where Gaussians are optimised, rendered and measured, and where stages whose own device "
+        "is auto run. auto: cuda where there is one, with gsplat and pinholes; cuda: refused where there is "
+        "none. Part of cache keys as what it comes to; `extrags devices` shows what runs where, and why",
+    )
 
     def with_seed(self, seed: int) -> PipelineConfig:
         """The same settings with every stage's seed set."""
         seeded = {
             name: value.model_copy(update={"seed": seed})
             for name, value in self
-            if "seed" in type(value).model_fields
+            if isinstance(value, StageConfig) and "seed" in type(value).model_fields
         }
         return self.model_copy(update=seeded)
 

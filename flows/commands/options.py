@@ -294,11 +294,11 @@ def _explain(given: argparse.Namespace) -> int:
     profile = given.profile if "profile" in given else items(getattr(given, "profiles", [DEFAULT_PROFILE]))[0]
     tree = profile_config(profile).model_dump()
     about = groups_of(PipelineConfig)
-    shown = ""
+    shown: str | None = None
     for setting in chosen.values():
         if setting.group != shown:
             shown = setting.group
-            print(f"\n{shown}: {about[shown]}")
+            print(f"\n{shown}: {about[shown]}" if shown else f"\n{about[shown]}")
         default = tree
         for part in setting.name.split("."):
             default = default[part]
