@@ -8,7 +8,7 @@ a tensor that is not on the processor.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 from unittest.mock import patch
@@ -125,7 +125,7 @@ def _done(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     return return_and_correct_aliasing(func, args, kwargs, found) if on_device and there else found
 
 
-def _check(name: str, func: Any, args: Any, there: list[Tensor], here: list[Tensor]) -> None:
+def _check(name: str, func: Any, args: Any, there: Sequence[Tensor], here: Sequence[Tensor]) -> None:
     if any(tensor.device == DEVICE for tensor in here):
         raise MixedDevicesError(f"{name}: a tensor without values, made without a dispatched operation")
     if not there or not here or name in CARRIES:

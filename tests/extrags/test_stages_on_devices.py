@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,11 +18,13 @@ from extrags.config import (
     EnhanceConfig,
     ExploreConfig,
     FinetuneConfig,
+    LpipsNet,
     PipelineConfig,
     SurfaceConfig,
 )
 from extrags.config.stages import JudgeConfig
 from extrags.evaluation import evaluate_renders, render
+from extrags.exploration.coverage import training_coverage
 from extrags.finetuning_judge import judge_finetuning
 from extrags.metrics.lpips import Lpips
 from extrags.metrics.protocol import figures_per_view
@@ -67,7 +70,7 @@ def test_held_out_views(few: Tube, elsewhere: torch.device) -> None:
 @pytest.mark.usefixtures("without_kernels")
 def test_metrics(few: Tube, elsewhere: torch.device) -> None:
     """PSNR, SSIM, FLIP, LPIPS: all photometric metrics of the protocol."""
-    lpips = {"alex": Lpips("alex", random_weights("alex"))}
+    lpips: dict[LpipsNet, Lpips | str] = {"alex": Lpips("alex", random_weights("alex"))}
     renders = render(few.scene, few.sequence)
     found = [
         figures_per_view([renders], few.sequence, few.sequence.test, lpips, device=device)[0]
@@ -91,11 +94,10 @@ def test_assessment(few: Tube, elsewhere: torch.device, monkeypatch: pytest.Monk
     settings, coverage = AssessConfig(probe_views=2), ExploreConfig(render_width=24).coverage
     covered_on = []
 
-    def coverage_of(scene: Scene, *given: object, **more: object) -> np.ndarray:
+    def coverage_of(scene: Scene, *given: Any, **more: Any) -> np.ndarray:
         covered_on.append(scene.device.type)
         return training_coverage(scene, *given, **more)
 
-    training_coverage = assessment.training_coverage
     monkeypatch.setattr(assessment, "training_coverage", coverage_of)
     expected, found = (
         measure(few.scene.to(device), few.sequence, settings, coverage) for device in ("cpu", elsewhere)

@@ -150,7 +150,7 @@ def test_a_lens_is_refused_by_name() -> None:
 
 def test_a_processor_s_tensors_are_refused_by_name() -> None:
     scene = tube(5, 8, 8, sh_degree=0).to(torch.float32)
-    with pytest.raises(ConfigError, match="gsplat takes float32 CUDA tensors, got torch.float32 on cpu"):
+    with pytest.raises(ConfigError, match=r"gsplat takes float32 CUDA tensors, got torch\.float32 on cpu"):
         rasterize(
             scene.means, scene.quats, scene.scales, scene.opacities, scene.sh, scene.viewmats, scene.Ks, 8, 8,
             backend="gsplat",

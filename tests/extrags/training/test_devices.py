@@ -76,7 +76,7 @@ class TestCoarse:
         lit: bool,
         monkeypatch: pytest.MonkeyPatch,
     ) -> None:
-        changed = []
+        changed: list[bool] = []
         monkeypatch.setattr(DensityRound, "apply", watched(DensityRound.apply, changed))
         config = CoarseConfig.model_validate(
             {**COARSE, "light": {"enabled": lit}, "densify": densifying(strategy, gradient_threshold=1e-7)}
