@@ -1,7 +1,7 @@
 """What is put round gsplat: the light as a function of torch, and the outputs that it has not.
 
-gsplat's own kernels need a GPU; where there is none the reference stands in for them. It gets what gsplat would
-get, and nothing of the light but the colours.
+gsplat's own kernels need a GPU; where there is none the reference stands in for them. It gets what gsplat
+would get, and nothing of the light but the colours.
 """
 
 from __future__ import annotations
