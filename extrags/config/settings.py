@@ -139,7 +139,9 @@ def unknown_setting(name: str, known: Iterable[str]) -> ConfigError:
     if inside:
         return ConfigError(f"{name} is a group of settings; name one of {', '.join(inside)}")
     meant = did_you_mean(name, known)
-    groups = ", ".join(dict.fromkeys(other.partition(".")[0] for other in known))
+    # Groups first, then what is set for the whole.
+    grouped = sorted(known, key=lambda other: "." not in other)
+    groups = ", ".join(dict.fromkeys(other.partition(".")[0] for other in grouped))
     return ConfigError(f"no setting {name}{meant or f'; settings begin with {groups}'}")
 
 
