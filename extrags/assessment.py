@@ -59,7 +59,7 @@ def measure(
     bins. Budgets are not used here: `decide` turns the numbers into a plan.
 
     Args:
-        scene: the coarse reconstruction.
+        scene: the coarse reconstruction; probe views are rendered where it is.
         sequence: its frames.
         settings: the probe views, and the thresholds for lacking pixels.
         coverage: when a Gaussian counts as seen; the same rule as in the exploration.
@@ -76,11 +76,13 @@ def measure(
             f"{sequence.name}: nothing to assess with {len(scene.gaussians)} Gaussians "
             f"and {len(cameras)} training views"
         )
+    # Blending weights come from the native kernels, and the search tree is on the processor.
+    on_processor = scene.to("cpu")
     small = cameras.at_most_width(coverage.render_width)
     depth_unit_mm, training_holes = _training_view_measurements(scene, small, settings)
-    covered = training_coverage(scene, small, **coverage.options)
+    covered = training_coverage(on_processor, small, **coverage.options)
     directions = direction_counts(covered)
-    probes = probe_views(scene, small.as_pinholes(), depth_unit_mm, settings)
+    probes = probe_views(on_processor, small.as_pinholes(), depth_unit_mm, settings)
     holes, poor = _lacking_pixels(scene, probes, directions < settings.min_directions, settings)
     lacking = float((holes | poor).mean())
     seen = directions > 0
@@ -164,10 +166,10 @@ def _training_view_measurements(scene: Scene, cameras: Cameras, config: AssessCo
     with torch.no_grad():
         for start in range(0, len(cameras), PROBES_PER_BATCH):
             rendering = scene.render(cameras[start : start + PROBES_PER_BATCH], sh_degree=0)
-            field = torch.from_numpy(cameras[start : start + PROBES_PER_BATCH].field)
+            field = torch.from_numpy(cameras[start : start + PROBES_PER_BATCH].field).to(scene.device)
             surface = (rendering.alpha >= config.hole_alpha) & field
-            depths.append(rendering.depth[surface].numpy())
-            holes.append((field & ~surface)[field].numpy())
+            depths.append(rendering.depth[surface].cpu().numpy())
+            holes.append((field & ~surface)[field].cpu().numpy())
             emit(Progress("assess", min(start + PROBES_PER_BATCH, len(cameras)), len(cameras)))
     depth = np.concatenate(depths)
     if depth.size == 0:
@@ -185,6 +187,6 @@ def _lacking_pixels(
         for start in range(0, len(probes), PROBES_PER_BATCH):
             shares, alpha = scene.render_attributes(probes[start : start + PROBES_PER_BATCH], flag)
             hole = alpha < config.hole_alpha
-            holes.append(hole.numpy())
-            poor.append(((shares[..., 0] > 0.5 * alpha) & ~hole).numpy())
+            holes.append(hole.cpu().numpy())
+            poor.append(((shares[..., 0] > 0.5 * alpha) & ~hole).cpu().numpy())
     return np.concatenate(holes), np.concatenate(poor)

@@ -32,7 +32,7 @@ def render(
     at the exposure interpolated between these; frames of other recordings at the mean exposure.
 
     Args:
-        scene: the scene.
+        scene: the scene, rendered where it is.
         sequence: posed frames in the scene's world.
         frames: indices of the frames; None takes the held-out ones.
         train_on: which frames the scene was made from (`coarse.train_on`). The oracle's scene was made from
@@ -52,9 +52,9 @@ def render(
         for done, frame in enumerate(frames, start=1):
             exposure = None if gains is None else gains[done - 1 : done]
             rendering = scene.render(sequence.cameras[int(frame)], exposure=exposure)
-            rgb.append(rendering.rgb[0].numpy())
-            alpha.append(rendering.alpha[0].numpy())
-            depth.append(rendering.depth[0].numpy())
+            rgb.append(rendering.rgb[0].cpu().numpy())
+            alpha.append(rendering.alpha[0].cpu().numpy())
+            depth.append(rendering.depth[0].cpu().numpy())
             emit(Progress("render", done, len(frames)))
     return RenderedViews(np.stack(rgb), np.stack(alpha), np.stack(depth), len(scene.gaussians))
 
@@ -67,6 +67,7 @@ def evaluate_renders(
     true_surface: TrueSurface | None = None,
     lpips: LpipsByNet | None = None,
     per_view: list[dict[str, Any]] | None = None,
+    device: torch.device | str = "cpu",
 ) -> EvaluationResult:
     """Metrics of rendered held-out views, and of the surface where ground truth is known.
 
@@ -77,6 +78,7 @@ def evaluate_renders(
         true_surface: ground truth of the surface; None omits the surface metrics.
         lpips: LPIPS by backbone; None searches for the weights of the default backbones.
         per_view: as `extrags.metrics.protocol.evaluate_views` takes it.
+        device: where colours are compared.
 
     Raises:
         ShapeError: when renders and frames differ in number or size.
@@ -93,6 +95,7 @@ def evaluate_renders(
         if sequence.true_depth_mm is None
         else "no true surface given",
         per_view=per_view,
+        device=device,
     )
 
 

@@ -149,7 +149,7 @@ def judge_finetuning(
     the coarse scene; else nothing.
 
     Args:
-        scene: the coarse scene, trained on `sequence.train`.
+        scene: the coarse scene, trained on `sequence.train`; trials are optimised where it is.
         sequence: posed frames; only training frames are used.
         trajectories: virtual views of each trajectory, its real start first.
         enhancer: the scene's restorer; None where there are no virtual views.

@@ -85,6 +85,17 @@ class Gaussians:
         """A copy without gradient history."""
         return Gaussians(**{k: v.detach().clone() for k, v in self.parameters().items()})
 
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return self.means.device
+
+    def to(self, device: torch.device | str) -> Gaussians:
+        """The same on a device; these very Gaussians where they are there already."""
+        if self.device == torch.device(device):
+            return self
+        return Gaussians(**{k: v.to(device) for k, v in self.parameters().items()})
+
     def subset(self, index: Int[Tensor, "m"] | Bool[Tensor, "n"]) -> Gaussians:
         """The Gaussians of an index or a mask."""
         return Gaussians(**{k: v[index] for k, v in self.parameters().items()})
@@ -135,14 +146,14 @@ class Gaussians:
         )
 
     def save(self, path: Path) -> None:
-        """Write a zarr v3 group, one array per attribute."""
+        """Write a zarr v3 group, one array per attribute; from any device."""
         with new_group(path) as group:
             for name, value in self.parameters().items():
-                write_array(group, name, value.detach().numpy())
+                write_array(group, name, value.detach().cpu().numpy())
 
     @classmethod
     def load(cls, path: Path) -> Gaussians:
-        """Read what `save` wrote."""
+        """Read what `save` wrote, to the processor."""
         group = open_group(path)
         return cls(**{f.name: torch.from_numpy(read_array(group, f.name)) for f in fields(cls)})
 

@@ -102,7 +102,7 @@ class NearFieldLight:
     def exposure(self, frame: int | None) -> Float[Tensor, ""]:
         """Exposure gain of a training frame; None gives the mean exposure, which is 1."""
         if frame is None:
-            return torch.ones(())
+            return self.log_exposure.new_ones(())
         return (self.log_exposure[frame] - self.log_exposure.mean()).exp()
 
     def exposures(self) -> Float[Tensor, "f"]:
@@ -116,6 +116,8 @@ class NearFieldLight:
         recording: Int[np.ndarray, "n"] | None = None,
     ) -> Float[Tensor, "m"]:
         """Exposure gains of arbitrary frames, interpolated between training frames; no pixel is used.
+
+        On the processor, wherever the light is.
 
         Automatic exposure changes slowly. Between training frames of the same recording the log-exposure is
         interpolated linearly over the frame index; before the first and after the last it is constant.
@@ -131,7 +133,7 @@ class NearFieldLight:
             if recording is None
             else recording
         )
-        logs = self.exposures().detach().log().double().numpy()
+        logs = self.exposures().detach().log().cpu().double().numpy()
         result = np.zeros(len(frames))
         for which in np.unique(owner[train]):
             known, wanted = owner[train] == which, owner[frames] == which
@@ -201,7 +203,7 @@ class NearFieldLight:
         return self.invert_response(rgb) / self.gain(points, normals).clamp_min(min_gain)[:, None]
 
     def _row(self, like: Tensor) -> Float[Tensor, "12"]:
-        return self.camera_light(torch.ones(1)).packed()[0].to(like)
+        return self.camera_light(self.log_exposure.new_ones(1)).packed()[0].to(like)
 
     def parameters(self) -> dict[str, Tensor]:
         """The learned tensors by name."""
@@ -220,16 +222,23 @@ class NearFieldLight:
         values = {k: v.detach().clone() for k, v in self.parameters().items()}
         return NearFieldLight(**values, reference_distance=self.reference_distance)
 
+    def to(self, device: torch.device | str) -> NearFieldLight:
+        """The same on a device; this very light where it is there already."""
+        if self.log_exposure.device == torch.device(device):
+            return self
+        values = {k: v.to(device) for k, v in self.parameters().items()}
+        return NearFieldLight(**values, reference_distance=self.reference_distance)
+
     def save(self, path: Path) -> None:
-        """Write a zarr v3 group."""
+        """Write a zarr v3 group; from any device."""
         with new_group(path) as group:
             for name, value in self.parameters().items():
-                write_array(group, name, value.detach().numpy())
+                write_array(group, name, value.detach().cpu().numpy())
             group.attrs["reference_distance"] = self.reference_distance
 
     @classmethod
     def load(cls, path: Path) -> NearFieldLight:
-        """Read what `save` wrote."""
+        """Read what `save` wrote, to the processor."""
         group = open_group(path)
         names = [name for name in cls.__dataclass_fields__ if name != "reference_distance"]
         values = {name: torch.from_numpy(read_array(group, name)) for name in names}

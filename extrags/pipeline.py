@@ -16,7 +16,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
@@ -109,7 +109,7 @@ class Pipeline(ABC):
     """
 
     def __init__(self, config: PipelineConfig, leave_out: Mapping[str, str] | None = None) -> None:
-        self.config = config
+        self.config = config = config.with_run_device()
         self.leave_out = dict(leave_out or {})
         self.plan: ScenePlan | None = None
         self.skipped: set[StageName] = set()
@@ -370,6 +370,8 @@ class InMemoryPipeline(Pipeline):
         self.true_surface = true_surface
         self._training = sequence
         """The frames that the reconstruction uses: from `coarse` on, the training frames alone."""
+        self._device = "cpu"
+        """Where Gaussians are optimised and rendered; results are kept on the processor."""
         self._enhancer: Enhancer | None = None
         """The scene's restorer, which the judge of the fine-tuning uses as well."""
 
@@ -399,7 +401,11 @@ class InMemoryPipeline(Pipeline):
         return 0 if self.result.exploration is None else self.result.exploration.n_virtual
 
     def ingest(self) -> None:
-        """The sequence was read by the caller."""
+        """The sequence was read by the caller; the device is looked at before anything is made."""
+        from extrags.placement import check_device, run_device
+
+        check_device(self.config)
+        self._device = run_device(self.config)
 
     def poses(self) -> None:
         """`extrags.poses.estimate_poses`; frames that cannot be registered are dropped."""
@@ -435,7 +441,8 @@ class InMemoryPipeline(Pipeline):
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
             frames = self._with_depth(self.result.sequence) if oracle else self._training
-            found = reconstruct(frames, self.config.coarse)
+            found = reconstruct(frames, self.config.coarse, device=self._device)
+            found = replace(found, scene=found.scene.to("cpu"))
             if found.refined is not None:
                 # The scene was optimised with the corrected poses: later stages need them.
                 refined = with_refined_poses(self.result.sequence, found.refined.world_from_camera)
@@ -448,7 +455,9 @@ class InMemoryPipeline(Pipeline):
         from extrags.assessment import assess
 
         with self._timed("assess"):
-            self.plan = self.result.plan = assess(self.result.coarse, self._training, self.config)
+            self.plan = self.result.plan = assess(
+                self.result.coarse.to(self._device), self._training, self.config
+            )
 
     def surface(self) -> None:
         """`extrags.surface.fuse_surface`."""
@@ -491,7 +500,7 @@ class InMemoryPipeline(Pipeline):
         exploration = _made(self.result.exploration, "explore")
         scene, frames, settings = self.result.coarse, self._training, self.config.enhance
         with self._timed("enhance"):
-            self._enhancer = train_enhancer(scene, frames, settings, self.config.coarse)
+            self._enhancer = train_enhancer(scene.to(self._device), frames, settings, self.config.coarse)
             self.result.pseudo_views = restore(
                 scene,
                 frames,
@@ -509,8 +518,9 @@ class InMemoryPipeline(Pipeline):
 
         exploration = self.result.exploration
         with self._timed("finetune"):
+            scene = self.result.coarse.to(self._device)
             judgement = self.result.judgement = judge_finetuning(
-                self.result.coarse,
+                scene,
                 self._training,
                 () if exploration is None else exploration.trajectories,
                 self._enhancer,
@@ -520,13 +530,14 @@ class InMemoryPipeline(Pipeline):
                 measure=self._perceptual_difference(),
             )
             if judgement.amount is not None:
-                self.result.finetuning = finetune(
-                    self.result.coarse,
+                found = finetune(
+                    scene,
                     self._training,
                     self.result.pseudo_views if judgement.amount > 0 else None,
                     judgement.applied_to(self.config.finetune),
                     self.config.coarse,
                 )
+                self.result.finetuning = replace(found, scene=found.scene.to("cpu"))
 
     def evaluate(self) -> None:
         """`extrags.evaluation` of the coarse and the final scene."""
@@ -551,7 +562,9 @@ class InMemoryPipeline(Pipeline):
                 if self.result.finetuning is not None:
                     scenes["final"] = self.result.finetuning.scene
                 for which, scene in scenes.items():
-                    self.result.renders[which] = render(scene, sequence, train_on=self.config.coarse.train_on)
+                    self.result.renders[which] = render(
+                        scene.to(self._device), sequence, train_on=self.config.coarse.train_on
+                    )
                     if self.true_surface is not None:
                         meshes[which] = scene_surface(scene, sequence)
             restored = self._restored_renders()
@@ -560,7 +573,9 @@ class InMemoryPipeline(Pipeline):
                 # The surface is the scene's.
                 meshes["restored"] = meshes.get("final", meshes.get("coarse"))
             renders = self.result.renders
-            found = figures_per_view(list(renders.values()), sequence, sequence.test, lpips)
+            found = figures_per_view(
+                list(renders.values()), sequence, sequence.test, lpips, device=self._device
+            )
             for which, per_view in zip(renders, found, strict=True):
                 self.result.evaluations[which] = evaluate_renders(
                     renders[which],

@@ -44,6 +44,17 @@ class Scene(Storable):
         """
         return NEAR if self.light is None else NEAR * min(1.0, self.light.reference_distance)
 
+    @property
+    def device(self) -> torch.device:
+        """Where the scene is, and where it is rendered."""
+        return self.gaussians.device
+
+    def to(self, device: torch.device | str) -> Scene:
+        """The same scene on a device; this very one where it is there already."""
+        if self.device == torch.device(device):
+            return self
+        return Scene(self.gaussians.to(device), None if self.light is None else self.light.to(device))
+
     def render(
         self,
         cameras: Cameras,
@@ -53,11 +64,11 @@ class Scene(Storable):
         viewmats: Float[Tensor, "c 4 4"] | None = None,
         **options: Any,
     ) -> Rendering:
-        """Render all cameras.
+        """Render all cameras, on the scene's device.
 
         Args:
             cameras: the views.
-            exposure: gain per camera; None is the mean exposure of the training frames.
+            exposure: gain per camera, on any device; None is the mean exposure of the training frames.
             sh_degree: use spherical harmonics up to this degree only.
             viewmats: world-to-camera matrices that replace those of the cameras; differentiable.
             options: further arguments of `extrags.raster.rasterize` (visibility, query_points, ...).
@@ -88,8 +99,8 @@ class Scene(Storable):
             The attributes summed with the blending weights, and alpha, the sum of the weights.
         """
         parts = []
-        alpha = torch.zeros(len(cameras), cameras.height, cameras.width)
-        for part in attributes.split(3, dim=1):
+        alpha = torch.zeros(len(cameras), cameras.height, cameras.width, device=self.device)
+        for part in attributes.to(self.device).split(3, dim=1):
             colors = functional.pad(part, (0, 3 - part.shape[1]))
             rendering = self._rasterized(cameras, None, colors=colors)
             parts.append(rendering.rgb[..., : part.shape[1]])
@@ -111,8 +122,8 @@ class Scene(Storable):
             gaussians.scales.exp(),
             gaussians.opacities.sigmoid(),
             sh,
-            torch.from_numpy(cameras.viewmats.astype(np.float32)) if viewmats is None else viewmats,
-            torch.from_numpy(cameras.K.astype(np.float32)),
+            self._array(cameras.viewmats) if viewmats is None else viewmats,
+            self._array(cameras.K),
             cameras.width,
             cameras.height,
             lens=cameras.lens,
@@ -120,12 +131,16 @@ class Scene(Storable):
         )
 
     def _camera_light(self, count: int, exposure: Float[Tensor, "c"] | None) -> CameraLight | None:
+        gain = torch.ones(count, device=self.device) if exposure is None else exposure.to(self.device)
         if self.light is not None:
-            return self.light.camera_light(torch.ones(count) if exposure is None else exposure)
+            return self.light.camera_light(gain)
         if exposure is None:
             return None
-        zero, one = torch.zeros(()), torch.ones(())
-        return CameraLight(exposure[:, None].expand(-1, 3), one, zero, zero, zero, torch.zeros(3), zero, 1.0)
+        zero, one = gain.new_zeros(()), gain.new_ones(())
+        return CameraLight(gain[:, None].expand(-1, 3), one, zero, zero, zero, gain.new_zeros(3), zero, 1.0)
+
+    def _array(self, values: Float[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
+        return torch.from_numpy(values.astype(np.float32)).to(self.device)
 
     def detached(self) -> Scene:
         """A copy without gradient history."""

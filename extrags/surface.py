@@ -115,6 +115,8 @@ def rendered_depth(
     Returns:
         The cameras at the size rendered, wide pinholes in place of a lens, and their depth.
     """
+    # The median depth comes from the native kernels, and Open3D fuses it there.
+    scene = scene.to("cpu")
     cameras = cameras.as_pinholes(WIDE_FIELD_DEG).at_most_width(config.max_width)
     batches = []
     with torch.no_grad():

@@ -35,6 +35,7 @@ VERBS = {
     "data": "what sequences there are, and whether a source is right",
     "cache": "what is in the store",
     "reconcile": "set runs that a power loss left Running to Crashed",
+    "devices": "what a run would do on the processor and what on a GPU, and why",
     "weights": "which weights of networks are on this machine, and their download",
     "evaluate": "measure renders made elsewhere, or show the figures of a finished run",
     "benchmark": "compare methods over sequences and seeds",
@@ -53,6 +54,7 @@ EXAMPLES = """examples:
   extrags run 'phantom/[0-3]@sparse' --methods 3dgs,extrags --seeds 0,1 --only failed
   extrags run --help-settings coarse.light
   extrags status 'phantom/*'
+  extrags devices --device cuda
   extrags plan phantom/0@sparse
   extrags evaluate phantom/0@sparse --renders my_renders/ --json -
   extrags benchmark phantom/0@sparse phantom/1@sparse --methods 3dgs,coarse --seeds 0,1,2

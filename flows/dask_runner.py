@@ -27,6 +27,7 @@ from prefect.settings import PREFECT_API_URL
 from prefect_dask import DaskTaskRunner
 from pydantic import BaseModel
 
+from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
 
 __all__ = ["ClusterTaskRunner", "needed_resources"]
@@ -133,8 +134,9 @@ def needed_resources(
 ) -> dict[str, float]:
     """What a task takes of the resources that workers declare; nothing of those that none does.
 
-    `GPU`: 1 for a task whose settings have a device `cuda`. `MEMORY`, in bytes: what such tasks took before,
-    and no more than the largest worker has, since a task that needs more would wait for ever.
+    `GPU`: 1 for a task whose device, or one in its settings, is `cuda`. `MEMORY`, in bytes: what such
+    tasks took before, and no more than the largest worker has, since a task that needs more would wait for
+    ever.
 
     Args:
         inputs: of the task.
@@ -142,7 +144,7 @@ def needed_resources(
         declared: see `ClusterTaskRunner.resources`.
     """
     needed = {}
-    if "GPU" in declared and any(_on_gpu(value) for value in inputs.values()):
+    if "GPU" in declared and _asks_for_gpu(inputs):
         needed["GPU"] = 1.0
     before = peak_mib() if "MEMORY" in declared else None
     if before is not None:
@@ -150,8 +152,13 @@ def needed_resources(
     return needed
 
 
+def _asks_for_gpu(inputs: Mapping[str, Any]) -> bool:
+    return inputs.get("device") == "cuda" or any(_on_gpu(value) for value in inputs.values())
+
+
 def _on_gpu(value: Any) -> bool:
-    if not isinstance(value, BaseModel):
+    # The settings of a whole run are a page's: they are shown, and nothing is computed by them.
+    if not isinstance(value, BaseModel) or isinstance(value, PipelineConfig):
         return False
     fields = [getattr(value, name) for name in type(value).model_fields]
     return getattr(value, "device", None) == "cuda" or any(map(_on_gpu, fields))

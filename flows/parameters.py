@@ -59,8 +59,11 @@ def _names(further: tuple[str, ...] = ()) -> JsonSchemaValue:
     stages.
     """
     by_stage: dict[str, list[str]] = {}
+    alone_names = list(further)
     for name in _values():
-        by_stage.setdefault(name.partition(".")[0], []).append(name)
+        stage, dot, _ = name.partition(".")
+        # What is set for the whole run has no stage.
+        by_stage.setdefault(stage, []).append(name) if dot else alone_names.append(name)
     stages = "|".join(map(re.escape, by_stage))
     rules: list[JsonSchemaValue] = []
     for stage, names in by_stage.items():
@@ -73,7 +76,7 @@ def _names(further: tuple[str, ...] = ()) -> JsonSchemaValue:
         others = {"pattern": f"^{begins}([^{''.join(letters)}]|$)"}
         rules.append({"if": others, "then": {"enum": names}})
     known = rf"^({stages})\."
-    alone = f"|^({'|'.join(map(re.escape, further))})$" if further else ""
+    alone = f"|^({'|'.join(map(re.escape, alone_names))})$" if alone_names else ""
     return {"allOf": [{"pattern": f"{known}{alone}"}, *rules]}
 
 

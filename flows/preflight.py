@@ -26,6 +26,11 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         ConfigError: when settings do not fit each other, the model or the machine.
         ExtragsError: when the code a checkpoint needs does not start.
     """
+    config = config.with_run_device()
+    if STAGES.index(until) >= STAGES.index("coarse"):
+        from extrags.placement import check_device
+
+        check_device(config)
     if STAGES.index(until) >= STAGES.index("depth") and config.depth.enabled and "depth" not in leave_out:
         from extrags.devices import chosen_device
         from tasks.weights import depth_completion_digest, depth_monocular_digest

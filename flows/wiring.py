@@ -121,7 +121,7 @@ class SequenceRun(Pipeline):
         self.store = Store(store)
         self.runner = runner
         self.profile = profile
-        self._given = config
+        self._given = self.config
         self._record: RunRecord | None = None
         self._before: dict[str, StageRow] = {}
         """Rows of the attempts that met a damaged artefact."""
@@ -253,7 +253,7 @@ class SequenceRun(Pipeline):
             oracle = self.config.coarse.train_on == "all"
             frames = self._with_depth(self.refs["sequence"]) if oracle else self.refs["training"]
             self.refs["coarse"] = self._run_task(
-                row, Call(coarse, {"sequence": frames, "config": self.config.coarse})
+                row, Call(coarse, {"sequence": frames, "config": self.config.coarse, **self._on_device()})
             )
             counts = self._manifest("coarse").counts
             said = [HELD_OUT_TRAINED_ON] if oracle else []
@@ -274,7 +274,12 @@ class SequenceRun(Pipeline):
         with self._stage("assess") as row:
             coverage = self.config.explore.coverage
             settings = measuring_settings(self.config.assess)
-            inputs = {**self._scene_inputs(), "config": settings, "coverage": coverage}
+            inputs = {
+                **self._scene_inputs(),
+                **self._on_device(),
+                "config": settings,
+                "coverage": coverage,
+            }
             self.refs["assess"] = self._run_task(row, Call(assess, inputs))
             # The decisions depend on the measurements and all budgets. They take no time, and do not affect
             # whether the stage counts as cached.
@@ -326,6 +331,8 @@ class SequenceRun(Pipeline):
                 "coarse": self.config.coarse,
                 "model_digest": restorer_digest(given),
                 "given": given,
+                # Of the backends here the embedded one alone reconstructs anything.
+                **(self._on_device() if given.backend == "embedded" else {}),
             }
             self.refs["restorer"] = self._run_task(row, Call(train, inputs))
             weights, *_ = self._weights()
@@ -368,6 +375,7 @@ class SequenceRun(Pipeline):
                 "weights_digest": weights.digest,
                 "weights": weights,
                 "clips_per_batch": self.config.enhance.clips_per_batch,
+                **self._on_device(),
             }
             self.refs["judgement"] = self._run_task(row, Call(judge, inputs))
             judgement = self.store.load(Judgement, self.refs["judgement"])
@@ -381,6 +389,7 @@ class SequenceRun(Pipeline):
                 "pseudo_views": self.refs.get("enhance") if judgement.amount > 0 else None,
                 "config": finetuning_settings(judgement.applied_to(settings)),
                 "coarse": coarse,
+                **self._on_device(),
             }
             self.refs["finetune"] = self._run_task(row, Call(finetune, inputs))
 
@@ -394,7 +403,11 @@ class SequenceRun(Pipeline):
             if self.config.uc_nerf.enabled:
                 calls = [Call(render_uc_nerf, {"scene": ref, "sequence": sequence}) for ref in scenes]
             else:
-                shown = {"sequence": sequence, "train_on": self.config.coarse.train_on}
+                shown = {
+                    "sequence": sequence,
+                    "train_on": self.config.coarse.train_on,
+                    **self._on_device(),
+                }
                 calls = [Call(render, {"scene": ref, **shown}) for ref in scenes]
             renders = self._run_tasks(row, calls)
             restored = self._restored_renders(row, renders[-1])
@@ -403,6 +416,7 @@ class SequenceRun(Pipeline):
                 "lpips_digests": {item.net: item.digest for item in weights},
                 "weights": weights,
                 "added": added_metrics(),
+                **self._on_device(),
             }
             measured = renders + ([] if restored is None else [restored])
             figures = self._figures(row, measured, {"sequence": sequence, **settings})
@@ -469,6 +483,12 @@ class SequenceRun(Pipeline):
 
     def _scene_inputs(self) -> dict[str, Any]:
         return {"scene": self.refs["coarse"], "sequence": self.refs["training"]}
+
+    def _on_device(self) -> dict[str, str]:
+        """The run's device, as stages take it that optimise, render or measure."""
+        from extrags.placement import run_device
+
+        return {"device": run_device(self.config)}
 
     def _training_frames(self) -> Ref:
         """The training frames alone, with their estimated depth if the source has none."""

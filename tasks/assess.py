@@ -53,16 +53,26 @@ def _setting(config: PipelineConfig, group: str, name: str) -> object:
 
 
 @stage("assess", version=3)
-def assess(slot: Slot, scene: Ref, sequence: Ref, config: AssessConfig, coverage: CoverageConfig) -> None:
+def assess(
+    slot: Slot,
+    scene: Ref,
+    sequence: Ref,
+    config: AssessConfig,
+    coverage: CoverageConfig,
+    device: str = "cpu",
+) -> None:
     """Measure the scene; writes `measurements.json`.
 
-    The measurements do not depend on budgets, so changed budgets do not repeat them; `plan` decides.
+    The measurements do not depend on budgets, so changed budgets do not repeat them; `plan` decides. Probe
+    views are rendered on the `device`.
     """
     from extrags.assessment import measure
+    from extrags.devices import chosen_device
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
-    found = measure(slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence), config, coverage)
+    shown = slot.load(Scene, scene).to(chosen_device(device, "device"))
+    found = measure(shown, slot.load(EndoscopicSequence, sequence), config, coverage)
     slot.save_json(MEASUREMENTS, found, indent=1)
     slot.counts["lacking_share"] = found["lacking_share"]
 

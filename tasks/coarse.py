@@ -17,15 +17,16 @@ HISTORY = "history.json"
 
 
 @stage("coarse", version=8)
-def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
+def coarse(slot: Slot, sequence: Ref, config: CoarseConfig, device: str = "cpu") -> None:
     """Optimise the coarse scene; writes `scene/` and `history.json`.
 
     Where blurred and moved frames were looked for, also writes `frame_weights.json`; what was found is
     said in the counts (`inconsistent_frames`).
 
     If poses were refined (`refined_poses` in the counts), also writes `refined_poses/`: the poses of the
-    training frames that the scene was optimised with.
+    training frames that the scene was optimised with. It is optimised on the `device`.
     """
+    from extrags.devices import chosen_device
     from extrags.sequence import EndoscopicSequence
     from extrags.training import reconstruct
     from extrags.training.starting import starts_at_random
@@ -34,7 +35,7 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig) -> None:
     if config.train_on == "all":
         slot.counts["held_out_frames_trained_on"] = len(frames.test)
     with keep_last_finite_scene(slot):
-        result = reconstruct(frames, config)
+        result = reconstruct(frames, config, device=chosen_device(device, "device"))
     slot.save(result.scene)
     slot.save_json(HISTORY, result.history)
     slot.counts["n_gaussians"] = len(result.scene.gaussians)

@@ -126,6 +126,7 @@ def train(
     coarse: CoarseConfig,
     model_digest: str | None,
     given: EnhanceConfig | None = None,
+    device: str = "cpu",
 ) -> None:
     """Train the scene's restorer on its own pairs, or prepare a pretrained one; writes `restorer/`.
 
@@ -137,7 +138,9 @@ def train(
         coarse: settings of leave-out reconstructions.
         model_digest: content of weights and captions.
         given: the settings of the run, which say where these lie and how captions are asked for.
+        device: of leave-out reconstructions, for a backend that makes some.
     """
+    from extrags.devices import chosen_device
     from extrags.restoration.backends import train_enhancer
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
@@ -156,7 +159,8 @@ def train(
             "meanwhile, or this worker sees other files; run again"
         )
     frames = slot.load(EndoscopicSequence, sequence)
-    train_enhancer(slot.load(Scene, scene), frames, config, coarse).save(slot.path / RESTORER)
+    shown = slot.load(Scene, scene).to(chosen_device(device, "device"))
+    train_enhancer(shown, frames, config, coarse).save(slot.path / RESTORER)
 
 
 @stage("enhance-keyframes", version=2)

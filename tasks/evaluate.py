@@ -21,18 +21,22 @@ VIEWS_FILE = "views.json"
 
 
 @stage("evaluate-render", version=4)
-def render(slot: Slot, scene: Ref, sequence: Ref, train_on: Literal["train", "all"]) -> None:
+def render(
+    slot: Slot, scene: Ref, sequence: Ref, train_on: Literal["train", "all"], device: str = "cpu"
+) -> None:
     """Render the held-out views at the exposure defined by the protocol, and extract the scene's surface.
 
     Writes `renders/`, and `mesh/` if the sequence has a true surface. `train_on` as in `coarse.train_on`.
+    Views are rendered on the `device`, the surface on the processor.
     """
     from extrags import evaluation
+    from extrags.devices import chosen_device
     from extrags.metrics.surface import scene_surface
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
     shown, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
-    views = evaluation.render(shown, frames, train_on=train_on)
+    views = evaluation.render(shown.to(chosen_device(device, "device")), frames, train_on=train_on)
     slot.save(views)
     slot.counts.update(views=len(views), n_gaussians=views.n_gaussians)
     # Without true depth there is no true surface either, so the mesh is not needed.
@@ -103,20 +107,23 @@ def measure_views(
     lpips_digests: dict[LpipsNet, str | None],
     weights: list[Weights],
     added: list[str],
+    device: str = "cpu",
 ) -> None:
     """Figures of each held-out view, of several stacks of renders at once; writes `views.json`.
 
     LPIPS then looks at each frame once for all stacks. `lpips_digests` names the backbones of LPIPS with the
     digests of their weights, None for missing ones. `added` names the metrics that a program has registered
-    beside the protocol's (`extrags.metrics.registry.added_metrics`).
+    beside the protocol's (`extrags.metrics.registry.added_metrics`). Colour is compared on the `device`.
     """
+    from extrags.devices import chosen_device
     from extrags.metrics.protocol import RenderedViews, figures_per_view
     from extrags.sequence import EndoscopicSequence
 
     _check_added(added)
     frames = slot.load(EndoscopicSequence, sequence)
     stacks = [slot.load(RenderedViews, ref) for ref in renders]
-    found = figures_per_view(stacks, frames, frames.test, lpips_by_net(weights))
+    place = chosen_device(device, "device")
+    found = figures_per_view(stacks, frames, frames.test, lpips_by_net(weights), device=place)
     by_digest = {ref.digest: views for ref, views in zip(renders, found, strict=True)}
     slot.save_json(VIEWS_FILE, by_digest, indent=1)
     slot.counts.update(stacks=len(by_digest), views=len(frames.test))
@@ -132,6 +139,7 @@ def measure(
     weights: list[Weights],
     added: list[str],
     views: Ref | None = None,
+    device: str = "cpu",
 ) -> None:
     """Metrics of rendered views and of the surface; writes `metrics.json`.
 
@@ -139,6 +147,7 @@ def measure(
     other arguments are those of `measure_views`.
     """
     from data_catalog.true_surface import true_surface
+    from extrags.devices import chosen_device
     from extrags.evaluation import evaluate_renders
     from extrags.metrics.comparison import figure_of
     from extrags.metrics.protocol import RenderedViews
@@ -155,6 +164,8 @@ def measure(
         true_surface=None if frames.true_depth_mm is None else true_surface(frames),
         lpips=lpips_by_net(weights),
         per_view=None if views is None else slot.load_json(VIEWS_FILE, views)[renders.digest],
+        # Where the views were measured before, there is nothing to compute on it.
+        device="cpu" if views is not None else chosen_device(device, "device"),
     )
     slot.save_json(METRICS_FILE, result.to_json(), indent=1)
     for figure in figures("counts"):

@@ -32,11 +32,14 @@ def judge(
     weights_digest: str | None,
     weights: Weights,
     clips_per_batch: int | None = None,
+    device: str = "cpu",
 ) -> None:
     """Decide how much of the fine-tuning to keep; writes `judgement.json`.
 
-    Without exploration there are no virtual views, and real views alone are judged.
+    Without exploration there are no virtual views, and real views alone are judged. Trials are optimised on
+    the `device`.
     """
+    from extrags.devices import chosen_device
     from extrags.exploration import Exploration
     from extrags.finetuning_judge import judge_finetuning
     from extrags.restoration.backends import load_enhancer
@@ -46,7 +49,7 @@ def judge(
     if clips_per_batch is not None:
         enhance = enhance.model_copy(update={"clips_per_batch": clips_per_batch})
     judgement = judge_finetuning(
-        slot.load(Scene, scene),
+        slot.load(Scene, scene).to(chosen_device(device, "device")),
         slot.load(EndoscopicSequence, sequence),
         () if explore is None else slot.load(Exploration, explore).trajectories,
         None if restorer is None else load_enhancer(slot.open(restorer) / RESTORER),
@@ -67,18 +70,21 @@ def finetune(
     pseudo_views: Ref | None,
     config: FinetuneConfig,
     coarse: CoarseConfig,
+    device: str = "cpu",
 ) -> None:
-    """Fine-tune the coarse scene; writes `scene/` and `history.json`.
+    """Fine-tune the coarse scene on the `device`; writes `scene/` and `history.json`.
 
     Without pseudo-views it trains on the real views alone: the control of a comparison of methods.
     """
     from extrags import training
+    from extrags.devices import chosen_device
     from extrags.pseudo_views import PseudoViews
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
     views = None if pseudo_views is None else slot.load(PseudoViews, pseudo_views)
     start, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
+    start = start.to(chosen_device(device, "device"))
     with keep_last_finite_scene(slot):
         result = training.finetune(start, frames, views, config, coarse)
     slot.save(result.scene)

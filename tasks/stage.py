@@ -46,6 +46,9 @@ NOT_IN_KEY = frozenset({"store", "label", "time_limit_s", "threads"})
 """Parameters of every stage that do not affect the content of its artefact: store, display name, limit,
 threads."""
 
+DEVICE = "device"
+"""Parameter of stages that may run on a GPU: cpu or cuda. Their results differ by rounding: it counts."""
+
 _versions: dict[str, int] = {}
 
 
@@ -72,6 +75,9 @@ class StageKey(CachePolicy):
         """
         left_out = NOT_IN_KEY.union(self.ignore)
         counted = {name: value for name, value in (inputs or {}).items() if name not in left_out}
+        # The processor is what all was made on before there was a choice: its keys stay.
+        if counted.get(DEVICE) == "cpu":
+            del counted[DEVICE]
         return f"{self.name}-v{self.version}-{digest_of(counted)}"
 
 

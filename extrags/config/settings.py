@@ -122,11 +122,13 @@ def settings_of(model: type[BaseModel]) -> dict[str, Setting]:
 
 
 def groups_of(model: type[BaseModel]) -> dict[str, str]:
-    """What each group of settings is for, by dotted name: the first line of its model's docstring."""
+    """What each group of settings is for, by dotted name: the first line of its model's docstring.
+
+    What is set for all of the model, and belongs to no group, has the empty name.
+    """
     return {
         prefix.removesuffix("."): (inner.__doc__ or "").strip().partition("\n")[0]
         for prefix, inner in _models(model)
-        if prefix
     }
 
 
@@ -137,7 +139,9 @@ def unknown_setting(name: str, known: Iterable[str]) -> ConfigError:
     if inside:
         return ConfigError(f"{name} is a group of settings; name one of {', '.join(inside)}")
     meant = did_you_mean(name, known)
-    groups = ", ".join(dict.fromkeys(other.partition(".")[0] for other in known))
+    # Groups first, then what is set for the whole.
+    grouped = sorted(known, key=lambda other: "." not in other)
+    groups = ", ".join(dict.fromkeys(other.partition(".")[0] for other in grouped))
     return ConfigError(f"no setting {name}{meant or f'; settings begin with {groups}'}")
 
 

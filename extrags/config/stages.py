@@ -8,7 +8,7 @@ iterations, never in seconds: a result must not depend on how busy the machine w
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
@@ -259,6 +259,9 @@ class ReportConfig(StageConfig):
 class PipelineConfig(StageConfig):
     """All stages of one run."""
 
+    not_in_keys: ClassVar[frozenset[str]] = frozenset({"device"})
+    """Stages count the device they ran on: `auto` would be another on another machine."""
+
     ingest: IngestConfig = IngestConfig()
     poses: PosesConfig = PosesConfig()
     depth: DepthConfig = DepthConfig()
@@ -273,15 +276,41 @@ class PipelineConfig(StageConfig):
     finetune: FinetuneConfig = FinetuneConfig()
     evaluate: EvaluateConfig = EvaluateConfig()
     report: ReportConfig = ReportConfig()
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto",
+        description="where Gaussians are optimised, rendered and measured, and where stages whose own device "
+        "is auto run. auto: cuda where there is one, with gsplat and pinholes; cuda: refused where there is "
+        "none. Part of cache keys as what it comes to; `extrags devices` shows what runs where, and why",
+    )
 
     def with_seed(self, seed: int) -> PipelineConfig:
         """The same settings with every stage's seed set."""
         seeded = {
             name: value.model_copy(update={"seed": seed})
             for name, value in self
-            if "seed" in type(value).model_fields
+            if isinstance(value, StageConfig) and "seed" in type(value).model_fields
         }
         return self.model_copy(update=seeded)
+
+    def with_run_device(self) -> PipelineConfig:
+        """The same settings where stages whose own device is `auto` have the run's."""
+        if self.device == "auto":
+            return self
+        device = {"device": self.device}
+        changed: dict[str, Any] = {}
+        if self.depth.device == "auto":
+            changed["depth"] = self.depth.model_copy(update=device)
+        parts = {
+            name: part.model_copy(update=device)
+            for name, part in (
+                ("pretrained", self.enhance.pretrained),
+                ("checkpoint", self.enhance.checkpoint),
+            )
+            if part.device == "auto"
+        }
+        if parts:
+            changed["enhance"] = self.enhance.model_copy(update=parts)
+        return self.model_copy(update=changed)
 
     def check_imported(self) -> None:
         """Refuse settings that an imported scene, or a radiance field, makes meaningless.

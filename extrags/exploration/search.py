@@ -246,7 +246,7 @@ def prepare_search(
     """Collect the inputs that all branches share.
 
     Args:
-        scene: the reconstructed scene.
+        scene: the reconstructed scene; it is searched on the processor.
         cameras: the training views; not looked at where `measured` is given.
         freespace: where cameras may go.
         config: settings.
@@ -255,7 +255,8 @@ def prepare_search(
     Raises:
         CaptureError: when there is no training view, or none sees a surface.
     """
-    scene = scene.detached()
+    # What a view sees is told by blending weights, which the native kernels give and gsplat does not.
+    scene = scene.detached().to("cpu")
     frontier = frontier_of(scene, freespace, config)
     if measured is None:
         measured = measure_scene(scene, cameras, freespace, config, frontier)

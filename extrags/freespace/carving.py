@@ -64,6 +64,8 @@ def carve(
     Source: [ExtraGS, section "Scene Initialization and Feasible Region Estimation"], see docs/references.md.
     """
     config = FreespaceConfig() if config is None else config
+    # Transmittance at points comes from the native kernels, and the grid is on the processor.
+    scene = scene.to("cpu")
     size = config.grid_size
     origin_mm, axes, voxel_mm, extent_voxels = _bounding_volume(mesh, cameras, config)
     # The grid is a cube with the longest side of the bounding volume; along the other axes the volume ends

@@ -154,6 +154,7 @@ def evaluate_views(
     surface: SurfaceResult | None = None,
     surface_reason: str = "no surface was given",
     per_view: list[dict[str, Any]] | None = None,
+    device: torch.device | str = "cpu",
 ) -> EvaluationResult:
     """Compare rendered views with the frames they show, by the protocol of this module.
 
@@ -167,6 +168,7 @@ def evaluate_views(
         surface: figures of the scene's surface, from `extrags.metrics.surface`.
         surface_reason: said in `reasons` when `surface` is None.
         per_view: of these renders, where `figures_per_view` has measured them with others; None measures.
+        device: where photometric metrics are computed, where they are.
 
     Returns:
         Metrics per view and their means.
@@ -176,7 +178,7 @@ def evaluate_views(
         NonFiniteError: for NaN or infinity in the renders; names the frame.
     """
     if per_view is None:
-        (per_view,) = figures_per_view([renders], sequence, frames, lpips)
+        (per_view,) = figures_per_view([renders], sequence, frames, lpips, device=device)
     metrics = _mean_tree([{k: v for k, v in view.items() if k not in ("frame", "name")} for view in per_view])
     metrics["n_gaussians"] = renders.n_gaussians
     metrics["surface"] = _NO_SURFACE if surface is None else surface.to_json()
@@ -196,6 +198,8 @@ def figures_per_view(
     sequence: EndoscopicSequence,
     frames: Int[np.ndarray, "v"],
     lpips: LpipsByNet | None,
+    *,
+    device: torch.device | str = "cpu",
 ) -> list[list[dict[str, Any]]]:
     """`EvaluationResult.per_view` of several stacks of renders of the same frames.
 
@@ -207,6 +211,7 @@ def figures_per_view(
         sequence: as there.
         frames: as there.
         lpips: as there.
+        device: where photometric metrics are computed; LPIPS is moved there.
 
     Raises:
         ShapeError: when renders and frames do not fit each other, or there are none.
@@ -217,11 +222,13 @@ def figures_per_view(
     for net, network in ({} if lpips is None else lpips).items():
         if isinstance(network, str):
             logger.warning("%s: LPIPS with %s is not measured: %s", sequence.name, net, network)
+    if lpips is not None:
+        lpips = {net: found if isinstance(found, str) else found.to(device) for net, found in lpips.items()}
     at_once = max(1, _PIXELS_AT_ONCE // (sequence.height * sequence.width))
     done = itertools.count(1)
 
     def evaluated(start: int) -> list[list[dict[str, Any]]]:
-        found = _evaluate_chunk(stacks, sequence, frames, slice(start, start + at_once), lpips)
+        found = _evaluate_chunk(stacks, sequence, frames, slice(start, start + at_once), lpips, device)
         emit(Progress("evaluate", min(next(done) * at_once, len(frames)), len(frames)))
         return found
 
@@ -251,32 +258,35 @@ def _evaluate_chunk(
     frames: np.ndarray,
     part: slice,
     lpips: LpipsByNet | None,
+    device: torch.device | str,
 ) -> list[list[dict[str, Any]]]:
     chosen = frames[part]
-    target = torch.from_numpy(sequence.rgb[chosen].astype(np.float32) / 255)
+    target = torch.from_numpy(sequence.rgb[chosen].astype(np.float32) / 255).to(device)
     valid = torch.from_numpy(np.ascontiguousarray(sequence.mask[chosen]))
     parts, shares = _parts_of(sequence, chosen)
-    inside = valid[..., None].to(target.dtype)
-    renders = [_in_8_bits(stack.rgb[part]) for stack in stacks]
+    # Depth is compared on the processor, colour on the device.
+    regions = {name: region.to(device) for name, region in {"valid": valid, **parts}.items()}
+    counted = regions["valid"]
+    inside = counted[..., None].to(target.dtype)
+    renders = [_in_8_bits(stack.rgb[part]).to(device) for stack in stacks]
 
-    regions = {"valid": valid, **parts}
     masked = target * inside
     known = TargetActivations(masked)
     plain = [_photometric(render * inside, masked, regions, lpips, known) for render in renders]
     aligned = [
-        _photometric(align_exposure(render, target, valid) * inside, masked, regions, lpips, known)
+        _photometric(align_exposure(render, target, counted) * inside, masked, regions, lpips, known)
         for render in renders
     ]
     if bool(valid.all()):
         whole = [found["valid"] for found in plain]
     else:
-        everything = {"whole": torch.ones_like(valid)}
+        everything = {"whole": torch.ones_like(counted)}
         known = TargetActivations(target)
         whole = [_photometric(render, target, everything, lpips, known)["whole"] for render in renders]
 
     found = []
     for index, (stack, render) in enumerate(zip(stacks, renders, strict=True)):
-        gains = exposure_gain(render, target, valid)[:, 0].tolist()
+        gains = exposure_gain(render, target, counted)[:, 0].tolist()
         depth = np.where(stack.alpha[part] >= SURFACE_ALPHA, stack.depth_mm[part], 0)
         found.append(
             [

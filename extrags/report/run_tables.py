@@ -124,7 +124,7 @@ def setting_groups(config: PipelineConfig | None) -> list[dict[str, Any]]:
     defaults = PipelineConfig()
     groups = []
     for stage in type(config).model_fields:
-        values, usual = flat_settings(getattr(config, stage)), flat_settings(getattr(defaults, stage))
+        values, usual = (_group(whole, stage) for whole in (config, defaults))
         groups.append(
             {
                 "stage": stage,
@@ -139,6 +139,12 @@ def setting_groups(config: PipelineConfig | None) -> list[dict[str, Any]]:
             }
         )
     return groups
+
+
+def _group(config: PipelineConfig, name: str) -> dict[str, Any]:
+    """Settings of a stage; one that is set for the whole run is a group of its own."""
+    found = getattr(config, name)
+    return flat_settings(found) if isinstance(found, BaseModel) else {name: found}
 
 
 def flat_settings(model: BaseModel, prefix: str = "") -> dict[str, Any]:

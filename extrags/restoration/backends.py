@@ -121,7 +121,7 @@ def train_enhancer(
     """The restorer of a scene: trained on the scene's own pairs, or prepared from a pretrained model.
 
     Args:
-        scene: the coarse scene, trained on `sequence.train`.
+        scene: the coarse scene, trained on `sequence.train`; leave-out reconstructions run where it is.
         sequence: posed frames; only training frames are used.
         config: backend and budgets.
         coarse: settings of the leave-out reconstructions.

@@ -97,6 +97,7 @@ def restored_batches(
     Raises:
         ShapeError: when a batch has no view at all.
     """
+    scene = scene.to("cpu")
     sequence, trajectories = at_working_size(sequence, trajectories, config)
     references = gather_references(scene, sequence, sequence.train)
     keyframes = restore_keyframes(scene, sequence, trajectories, enhancer, config, references=references)

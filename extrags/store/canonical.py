@@ -33,7 +33,8 @@ class Ref(BaseModel):
 def canonical(value: Any) -> Any:
     """Canonical JSON form of a value, independent of process, platform and insertion order.
 
-    Floats are represented exactly (`float.hex`), pydantic models by their fields, refs by their digest alone.
+    Floats are represented exactly (`float.hex`), pydantic models by their fields (but for those in
+    their `not_in_keys`), refs by their digest alone.
     Tuples and lists are equivalent; `1`, `1.0` and `True` are distinct.
 
     Args:
@@ -63,8 +64,11 @@ def _canonical(value: Any, where: str) -> Any:
     if isinstance(value, Ref):
         return {"$ref": value.digest}
     if isinstance(value, BaseModel):
+        left_out: frozenset[str] = getattr(type(value), "not_in_keys", frozenset())
         return {
-            name: _canonical(getattr(value, name), f"{where}.{name}") for name in type(value).model_fields
+            name: _canonical(getattr(value, name), f"{where}.{name}")
+            for name in type(value).model_fields
+            if name not in left_out
         }
     if isinstance(value, list | tuple):
         return [_canonical(item, f"{where}[{index}]") for index, item in enumerate(value)]

@@ -134,13 +134,22 @@ class DefaultStrategy(DensityStrategy):
         extent: length scale of the scene in world units.
         iterations: of the whole optimisation.
         n_gaussians: size of the set at the start.
-        seed: of the samples that place split children.
+        seed: of the samples that place split children. They are drawn on the processor whatever the device:
+            the draws are the same.
+        device: of the Gaussians.
 
     Source: Kerbl et al., 3D Gaussian Splatting, section 5; Ye et al., AbsGS, 2024 (absolute gradients).
     """
 
     def __init__(
-        self, config: DensifyConfig, extent: float, iterations: int, n_gaussians: int, *, seed: int
+        self,
+        config: DensifyConfig,
+        extent: float,
+        iterations: int,
+        n_gaussians: int,
+        *,
+        seed: int,
+        device: torch.device | str = "cpu",
     ) -> None:
         self.needs_absgrad = config.absgrad
         self._config = config
@@ -148,7 +157,9 @@ class DefaultStrategy(DensityStrategy):
         self._window = Window.of(config, iterations)
         self._refine_2d_until = config.refine_scale2d_stop_share * iterations
         self._generator = torch.Generator().manual_seed(seed)
-        self._gradient, self._count, self._radius = torch.zeros(3, n_gaussians).unbind()
+        self._device = torch.device(device)
+        statistics = torch.zeros(3, n_gaussians, device=self._device)
+        self._gradient, self._count, self._radius = statistics.unbind()
 
     def step(self, adam: SelectiveAdam, rendering: Rendering, iteration: int) -> None:
         """See `DensityStrategy.step`."""
@@ -172,10 +183,10 @@ class DefaultStrategy(DensityStrategy):
             return
         height, width = rendering.alpha.shape[1:]
         # The loss of a batch is a mean over its cameras.
-        scale = torch.tensor([width / 2, height / 2]) * len(gradient)
+        scale = gradient.new_tensor([width / 2, height / 2]) * len(gradient)
         for camera, visible in enumerate(rendering.visible):
             norm = (gradient[camera] * scale).norm(dim=-1)
-            self._gradient += torch.where(visible, norm, torch.zeros(()))
+            self._gradient += torch.where(visible, norm, norm.new_zeros(()))
             self._count += visible
             share = rendering.radius_px[camera] / max(width, height)
             self._radius = torch.maximum(self._radius, share)
@@ -213,7 +224,7 @@ class DefaultStrategy(DensityStrategy):
         parents = _chosen(parameters, chosen)
         scales = parents["scales"].exp()
         twice = {name: value.repeat(2, *[1] * (value.ndim - 1)) for name, value in parents.items()}
-        noise = torch.randn(2 * len(scales), 3, generator=self._generator)
+        noise = torch.randn(2 * len(scales), 3, generator=self._generator).to(scales.device)
         offset = torch.einsum("nij,nj->ni", rotation_matrices(twice["quats"]), noise * scales.repeat(2, 1))
         twice["means"] = twice["means"] + offset
         # The thin axes of needles and pancakes may have no size left in float32, and zero has no logarithm.
@@ -223,7 +234,8 @@ class DefaultStrategy(DensityStrategy):
 
     def reset_statistics(self, n_gaussians: int) -> None:
         """Start collecting anew."""
-        self._gradient, self._count, self._radius = torch.zeros(3, n_gaussians).unbind()
+        statistics = torch.zeros(3, n_gaussians, device=self._device)
+        self._gradient, self._count, self._radius = statistics.unbind()
 
     @torch.no_grad()
     def reset_opacities(self, adam: SelectiveAdam) -> None:
@@ -241,7 +253,7 @@ class DefaultStrategy(DensityStrategy):
             return torch.zeros_like(grows)
         if int(grows.sum()) > room:
             # The strongest first, so that the cap does not depend on the order in memory.
-            strength = torch.where(grows, mean_gradient, torch.zeros(()))
+            strength = torch.where(grows, mean_gradient, mean_gradient.new_zeros(()))
             strongest = torch.argsort(strength, descending=True, stable=True)[:room]
             return torch.zeros_like(grows).index_fill_(0, strongest, True)
         return grows
@@ -250,7 +262,7 @@ class DefaultStrategy(DensityStrategy):
         room = max(0, self._config.max_gaussians - len(wide) - growing)
         if int(wide.sum()) <= room:
             return wide
-        size = torch.where(wide, self._radius, torch.zeros(()))
+        size = torch.where(wide, self._radius, self._radius.new_zeros(()))
         widest = torch.argsort(size, descending=True, stable=True)[:room]
         return torch.zeros_like(wide).index_fill_(0, widest, True)
 

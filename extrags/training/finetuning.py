@@ -95,7 +95,7 @@ def finetune(
     learned, without densification; where there are none, the scene is returned as it was given.
 
     Args:
-        scene: the coarse scene.
+        scene: the coarse scene; the optimisation runs where it is, and so does the result.
         sequence: posed frames; only training frames are used.
         pseudo_views: restored virtual views with confidences, or None.
         config: budgets and shares; None takes the defaults.
@@ -117,7 +117,7 @@ def finetune(
     if pseudo_views is not None and config.seed_holes:
         room = max_gaussians - len(scene.gaussians)
         new_gaussians = hole_gaussians(
-            scene,
+            scene.to("cpu"),
             sequence,
             pseudo_views,
             room,
@@ -125,7 +125,8 @@ def finetune(
             max_distance=MAX_GUESS_DISTANCE * depth,
         )
         if new_gaussians is not None:
-            start = Scene(Gaussians.concatenated(scene.gaussians, new_gaussians), scene.light)
+            filled = Gaussians.concatenated(scene.gaussians, new_gaussians.to(scene.device))
+            start = Scene(filled, scene.light)
     if config.keep_scene and len(start.gaussians) == len(scene.gaussians):
         return TrainingResult(scene.detached(), [])
     if coarse.inconsistent_frames == "weight":
@@ -133,6 +134,7 @@ def finetune(
     else:
         real = real_views(sequence, frames)
     virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)
+    real, virtual = ([view.to(scene.device) for view in views] for views in (real, virtual))
     generator = np.random.default_rng(config.seed)
     next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
     pattern = virtual_steps(config, any_virtual=bool(virtual))
@@ -239,7 +241,7 @@ def hole_gaussians(
     * far from all known surface.
 
     Args:
-        scene: the coarse scene.
+        scene: the coarse scene, on the processor, where the search trees are.
         sequence: posed frames; training frames carve.
         pseudo_views: restored virtual views.
         room: at most so many new Gaussians.

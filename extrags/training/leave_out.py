@@ -70,7 +70,7 @@ def partial_scene(
     that the coarse scene does not have.
 
     Args:
-        scene: the coarse scene, trained on `sequence.train`.
+        scene: the coarse scene, trained on `sequence.train`; the reconstruction runs where it is.
         sequence: posed frames.
         coarse: settings the scene was reconstructed with.
         kept: training frames to use.
@@ -96,11 +96,12 @@ def partial_scene(
         seed=brief.seed,
         thickness=brief.thickness,
     )
-    views = real_views(sequence, kept)
+    views = [view.to(scene.device) for view in real_views(sequence, kept)]
     order = epochs(len(views), np.random.default_rng(brief.seed))
     schedule = coarse_schedule(brief, scene_extent(sequence, kept), median_depth(sequence, kept), stage)
     footprint = smallest_footprint(coarse, sequence.cameras[kept])
-    return optimise(Scene(start, light), lambda _: views[next(order)], schedule, footprint=footprint).scene
+    begin = Scene(start.to(scene.device), light)
+    return optimise(begin, lambda _: views[next(order)], schedule, footprint=footprint).scene
 
 
 def log_exposures(

@@ -35,7 +35,7 @@ def normal_loss(
     Source: Bonilla et al., Gaussian Pancakes, MICCAI 2024 (see docs/references.md).
     """
     shortest = log_scales.detach().argmin(dim=1)
-    axes = rotation_matrices(quats)[torch.arange(len(quats)), :, shortest]
+    axes = rotation_matrices(quats)[torch.arange(len(quats), device=quats.device), :, shortest]
     return (1 - (axes * normals.detach()).sum(dim=1).abs()).mean()
 
 
@@ -95,7 +95,8 @@ class NormalTerm:
         known = self._assigned
         if known is not None and known[0] is means and 0 <= iteration - known[1] < NEAREST_EVERY:
             return known[2]
-        _, nearest = self._points.query(means.detach().numpy())
-        normals = self._normals[torch.from_numpy(nearest)].to(means.dtype)
+        # The tree is on the processor: positions come there whenever nearest points are looked up again.
+        _, nearest = self._points.query(means.detach().cpu().numpy())
+        normals = self._normals[torch.from_numpy(nearest)].to(means)
         self._assigned = means, iteration, normals
         return normals

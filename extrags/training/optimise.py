@@ -61,8 +61,8 @@ def optimise(
     """Fit a scene to views, one per iteration.
 
     Args:
-        scene: where to start.
-        draw: gives the view of an iteration.
+        scene: where to start; the optimisation runs where it is, and so does the result.
+        draw: gives the view of an iteration, its images on the scene's device.
         schedule: rates, weights and budgets.
         make_step: which implementation of a step; default: the fastest that can take the scene.
         poses: corrects the poses of real views during the optimisation.
@@ -74,7 +74,12 @@ def optimise(
     step = make_step(scene, schedule)
     adam = step.adam
     density = density_strategy(
-        schedule.densify, schedule.extent, schedule.iterations, len(adam.steps), seed=schedule.seed
+        schedule.densify,
+        schedule.extent,
+        schedule.iterations,
+        len(adam.steps),
+        seed=schedule.seed,
+        device=scene.device,
     )
     history: list[dict[str, float]] = []
     last_good = scene.detached()

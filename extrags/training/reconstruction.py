@@ -6,6 +6,7 @@ import logging
 from dataclasses import replace
 
 import numpy as np
+import torch
 from jaxtyping import Int
 
 from extrags.cameras import Cameras
@@ -37,6 +38,7 @@ def reconstruct(
     *,
     frames: Int[np.ndarray, "m"] | None = None,
     stage: str = "coarse",
+    device: torch.device | str = "cpu",
 ) -> TrainingResult:
     """Optimise Gaussians (and the near-field light) on training frames.
 
@@ -46,6 +48,7 @@ def reconstruct(
         frames: which frames to use; default: those of `config.train_on`, the split's training frames or,
             for the oracle, all.
         stage: named in progress events.
+        device: where it is optimised, and where the scene will be.
 
     Raises:
         CaptureError: with fewer than one frame, nothing to start from, or a unit of length too large for a
@@ -89,6 +92,8 @@ def reconstruct(
     views, weights = weighted_views(sequence, chosen, config)
     for statement in () if weights is None else weights.statements:
         logger.warning("%s: %s", sequence.name, statement)
+    # Once, not in every iteration.
+    views = [view.to(device) for view in views]
     order = epochs(len(views), np.random.default_rng(config.seed))
     schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
     if config.normal_weight > 0:
@@ -98,7 +103,7 @@ def reconstruct(
         settings = config.pose_refinement
         poses = PoseRefinement(sequence.cameras[chosen], settings, depth, config.iterations)
     result = optimise(
-        Scene(gaussians, light),
+        Scene(gaussians, light).to(device),
         lambda _: views[next(order)],
         schedule,
         poses=poses,

@@ -52,9 +52,9 @@ def compute_relocation(
     count = copies.clamp(1, MAX_COPIES)
     old = opacities.double()
     new = -torch.expm1(torch.log1p(-old) / count)
-    k = torch.arange(1, MAX_COPIES + 1)
-    table = torch.tensor(
-        [[math.comb(n, j) for j in k.tolist()] for n in range(MAX_COPIES + 1)], dtype=torch.float64
+    k = torch.arange(1, MAX_COPIES + 1, device=old.device)
+    table = old.new_tensor(
+        [[math.comb(n, j) for j in range(1, MAX_COPIES + 1)] for n in range(MAX_COPIES + 1)]
     )
     signed = table[count] * (1 - 2 * ((k - 1) % 2)) / k.double().sqrt()
     total = (signed * new[:, None] ** k).sum(1)
@@ -113,7 +113,7 @@ class MCMCStrategy(DensityStrategy):
             new_gaussians=_none(parameters),
             rewritten=torch.cat([rows, dead]),
             values={name: torch.cat([value, value[place]]) for name, value in values.items()},
-            restarted=torch.ones(len(rows) + len(dead), dtype=torch.bool),
+            restarted=torch.ones(len(rows) + len(dead), dtype=torch.bool, device=rows.device),
         )
 
     def grow(self, parameters: dict[str, Tensor]) -> DensityRound:
@@ -133,7 +133,7 @@ class MCMCStrategy(DensityStrategy):
             new_gaussians={name: value[place] for name, value in values.items()},
             rewritten=rows,
             values=values,
-            restarted=torch.zeros(len(rows), dtype=torch.bool),
+            restarted=torch.zeros(len(rows), dtype=torch.bool, device=rows.device),
         )
 
     @torch.no_grad()
@@ -142,12 +142,15 @@ class MCMCStrategy(DensityStrategy):
         transparency = 1 - parameters["opacities"].sigmoid()
         share = torch.sigmoid(SHAKEN_STEEPNESS * (transparency - SHAKEN_TRANSPARENCY))
         axes = rotation_matrices(parameters["quats"]) * parameters["scales"].exp()[:, None, :]
-        noise = torch.randn(parameters["means"].shape, generator=self._generator) * share[:, None]
+        noise = torch.randn(parameters["means"].shape, generator=self._generator).to(share.device)
+        noise = noise * share[:, None]
         shaped = torch.einsum("nij,nkj,nk->ni", axes, axes, noise)
         parameters["means"] += shaped * (means_learning_rate * self._config.noise / self._extent**2)
 
     def _sampled(self, weights: Tensor, n: int) -> Tensor:
-        return torch.multinomial(weights, n, replacement=True, generator=self._generator)
+        # Once a round. On the processor whatever the device: the draws are the same.
+        found = torch.multinomial(weights.cpu(), n, replacement=True, generator=self._generator)
+        return found.to(weights.device)
 
     def _shared_out(self, parameters: dict[str, Tensor], source: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The sampled rows, in order, and their parameters after copies were placed at the same position."""
@@ -168,4 +171,5 @@ def _none(parameters: dict[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _unchanged(parameters: dict[str, Tensor]) -> DensityRound:
-    return DensityRound(torch.ones(len(parameters["means"]), dtype=torch.bool), _none(parameters))
+    means = parameters["means"]
+    return DensityRound(torch.ones(len(means), dtype=torch.bool, device=means.device), _none(parameters))

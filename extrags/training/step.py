@@ -107,7 +107,9 @@ class AutogradStep:
         exposure = None
         if scene.light is not None:
             exposure = scene.light.exposure(view.frame)[None]
-        pose = None if viewmat is None else torch.from_numpy(viewmat.astype(np.float32)).requires_grad_()
+        pose = None
+        if viewmat is not None:
+            pose = torch.from_numpy(viewmat.astype(np.float32)).to(scene.device).requires_grad_()
         rendering = scene.render(
             view.camera,
             exposure=exposure,
@@ -138,7 +140,7 @@ class AutogradStep:
         for penalty in _penalties(schedule, self.adam.parameters, density, iteration):
             loss = loss + penalty
         loss.backward()
-        gradient = None if pose is None or pose.grad is None else pose.grad.numpy()
+        gradient = None if pose is None or pose.grad is None else pose.grad.cpu().numpy()
         return Observation(float(loss.detach()), rendering, rendering.visible[0], gradient)
 
     def update(self, observation: Observation, iteration: int) -> None:

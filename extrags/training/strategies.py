@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import torch
+
 from extrags.config import DensifyConfig
 from extrags.training.density import DefaultStrategy, DensityStrategy
 from extrags.training.relocation import MCMCStrategy
@@ -10,7 +12,13 @@ __all__ = ["density_strategy"]
 
 
 def density_strategy(
-    config: DensifyConfig, extent: float, iterations: int, n_gaussians: int, *, seed: int
+    config: DensifyConfig,
+    extent: float,
+    iterations: int,
+    n_gaussians: int,
+    *,
+    seed: int,
+    device: torch.device | str = "cpu",
 ) -> DensityStrategy:
     """The strategy of a configuration; one that does nothing where densification is off.
 
@@ -20,9 +28,10 @@ def density_strategy(
         iterations: of the whole optimisation.
         n_gaussians: size of the set at the start.
         seed: of everything a strategy draws.
+        device: of the Gaussians.
     """
     if not config.enabled:
         return DensityStrategy()
     if config.strategy == "mcmc":
         return MCMCStrategy(config, extent, iterations, seed=seed)
-    return DefaultStrategy(config, extent, iterations, n_gaussians, seed=seed)
+    return DefaultStrategy(config, extent, iterations, n_gaussians, seed=seed, device=device)

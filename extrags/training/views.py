@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,6 +43,15 @@ class View:
     ssim_weight: Float[Tensor, "h w"] | None = None
     normalisation: float | None = None
     depth_confidence: Float[Tensor, "h w"] | None = None
+
+    def to(self, device: torch.device | str) -> View:
+        """The same view with its images on a device; this very one where they are there already."""
+        if self.rgb.device == torch.device(device):
+            return self
+        images: dict[str, Any] = {
+            name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)
+        }
+        return replace(self, **images)
 
 
 CONFIDENT_ERROR = 0.15

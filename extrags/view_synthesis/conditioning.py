@@ -169,6 +169,8 @@ def observe_views(
         reference: which of them comes first, as `warp_references`.
         exposure: gain of each view; None is 1.
     """
+    # Blending weights and median depth come from the native kernels.
+    scene = scene.to("cpu")
 
     def observe(view: int) -> Observation:
         gain = None if exposure is None else exposure[[view]]

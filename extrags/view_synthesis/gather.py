@@ -47,6 +47,8 @@ def gather_references(
     """
     if sequence.lens is not None:
         raise ShapeError(f"{sequence.name}: references are pinholes; take `EndoscopicSequence.as_pinhole`")
+    # What a frame saw is told by blending weights, which the native kernels give and gsplat does not.
+    scene = scene.to("cpu")
     frames = np.asarray(frames, dtype=np.int64)
     if len(frames) == 0:
         raise CaptureError(f"{sequence.name}: no real views to refer to")

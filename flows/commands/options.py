@@ -194,6 +194,9 @@ def add_settings(parser: Parser, group: str = "") -> None:
         help="override one setting; the same as --NAME VALUE, with a value in JSON or YAML; repeatable",
     )
     for name in known:
+        if f"--{name}" in parser._option_string_actions:
+            # The verb has one of its own by that name: the setting is `--set`'s alone.
+            continue
         parser.add_argument(
             f"--{name}", dest="settings", action=_Assign, default=argparse.SUPPRESS, help=argparse.SUPPRESS
         )
@@ -270,9 +273,9 @@ def _listing(known: dict[str, Setting]) -> str:
     lines = ["settings (--GROUP.NAME VALUE; --help-settings [GROUP] explains them):"]
     for group, names in groups.items():
         lines += textwrap.wrap(
-            " ".join(names),
+            " ".join(names) if group else " --".join(names),
             _columns(),
-            initial_indent=f"  --{group}.*: ",
+            initial_indent=f"  --{group}.*: " if group else "  --",
             subsequent_indent=" " * 8,
             break_on_hyphens=False,
         )
@@ -291,11 +294,11 @@ def _explain(given: argparse.Namespace) -> int:
     profile = given.profile if "profile" in given else items(getattr(given, "profiles", [DEFAULT_PROFILE]))[0]
     tree = profile_config(profile).model_dump()
     about = groups_of(PipelineConfig)
-    shown = ""
+    shown: str | None = None
     for setting in chosen.values():
         if setting.group != shown:
             shown = setting.group
-            print(f"\n{shown}: {about[shown]}")
+            print(f"\n{shown}: {about[shown]}" if shown else f"\n{about[shown]}")
         default = tree
         for part in setting.name.split("."):
             default = default[part]

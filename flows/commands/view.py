@@ -33,6 +33,13 @@ def add_arguments(parser: Parser) -> None:
         metavar="SEQUENCE|FILE",
         help="a sequence whose run with these settings is in the store, or a 3DGS PLY or SPZ",
     )
+    # Of the picture; the run's own is `--set device=...`.
+    parser.add_argument(
+        "--device",
+        choices=("auto", "cpu", "cuda"),
+        default="auto",
+        help="auto: CUDA where there is a device and gsplat, else the processor (default: auto)",
+    )
     add_method(parser)
     parser.add_argument(
         "--scene", choices=("final", "coarse"), help="which scene of the run (default: final)"
@@ -53,12 +60,6 @@ def add_arguments(parser: Parser) -> None:
         metavar="ADDRESS",
         help="where to listen; anything but the default lets others look who can reach it, without a "
         "password (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--device",
-        choices=("auto", "cpu", "cuda"),
-        default="auto",
-        help="auto: CUDA where there is a device and gsplat, else the processor (default: auto)",
     )
 
 

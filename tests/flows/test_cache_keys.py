@@ -92,7 +92,20 @@ EXPLORE = ("explore-start", "explore-branch", "explore")
 RESTORE = ("enhance-keyframes", "enhance-restore")
 ALL_AFTER_COARSE = ("depth", "uc-nerf", "coarse", "uc-nerf-render", "assess")
 
+ON_DEVICE = (
+    "coarse",
+    "assess",
+    "enhance-train",
+    "finetune-judge",
+    "finetune",
+    "evaluate-render",
+    "evaluate-views",
+    "evaluate",
+)
+"""Stages that optimise, render or measure where `device` says."""
+
 DIRECTLY: dict[str, tuple[str, ...]] = {
+    "device": ON_DEVICE,
     "ingest.calibration": (),  # By content, below.
     "ingest.*": ("ingest",),
     "poses.replace_given": (),  # Decides whether the stage runs; below.
@@ -157,6 +170,7 @@ OTHERS: dict[str, Any] = {
     "imported.scene": None,
     "enhance.pretrained_weights": None,
     "evaluate.lpips_weights": None,
+    "device": "cuda",
     "depth.device": "cuda",
     "enhance.precision": "bfloat16",
     "enhance.pretrained.device": "cuda",
@@ -172,6 +186,7 @@ BASE = PipelineConfig().with_overrides(
     {
         "ingest.width": 64,
         "ingest.height": 51,
+        "device": "cpu",
         "depth.device": "cpu",
         "enhance.keyframes": 2,
         "enhance.precision": "float32",

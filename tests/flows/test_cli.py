@@ -203,6 +203,9 @@ class TestSettings:
             main([verb, "--help"])
         listed = capsys.readouterr().out.partition("settings (")[2]
         for setting in settings_of(PipelineConfig).values():
+            if not setting.group:
+                assert f"  --{setting.name}\n" in listed
+                continue
             _, _, behind = listed.partition(f"  --{setting.group}.*: ")
             assert setting.name.rpartition(".")[2] in behind.partition("--")[0].split()
 

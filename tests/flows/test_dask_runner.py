@@ -18,7 +18,7 @@ import pytest
 from prefect.settings import PREFECT_API_URL, temporary_settings
 
 import flows.dask_runner
-from extrags.config import DepthConfig, profile_config
+from extrags.config import CoarseConfig, DepthConfig, profile_config
 from flows.dask_runner import ClusterTaskRunner, needed_resources
 from flows.settings import task_runner
 from tests.flows.tiny import SEQUENCE, TINY
@@ -153,6 +153,15 @@ class TestResources:
     def test_a_device_deep_in_the_settings_counts(self) -> None:
         enhance = profile_config("quick").with_overrides({"enhance.pretrained.device": "cuda"}).enhance
         assert needed_resources({"config": enhance}, lambda: None, {"GPU": 1.0}) == {"GPU": 1.0}
+
+    def test_a_task_is_told_its_device(self) -> None:
+        inputs = {"config": CoarseConfig(), "device": "cuda"}
+        assert needed_resources(inputs, lambda: None, {"GPU": 1.0}) == {"GPU": 1.0}
+        assert needed_resources({**inputs, "device": "cpu"}, lambda: None, {"GPU": 1.0}) == {}
+
+    def test_the_page_of_a_run_on_a_gpu_needs_none(self) -> None:
+        whole = profile_config("quick").with_overrides({"device": "cuda", "depth.device": "cuda"})
+        assert needed_resources({"config": whole}, lambda: None, {"GPU": 1.0}) == {}
 
     def test_workers_are_asked(self, server: str) -> None:
         with (

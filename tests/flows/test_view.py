@@ -24,7 +24,7 @@ from extrags.scene import Scene
 from extrags.splat_files import write_ply_scene
 from extrags.store import Store
 from extrags.view import SceneRenderer
-from flows.cli import main
+from flows.cli import main, parser
 from flows.commands import view as command
 from flows.outcome import SequenceOutcome
 from flows.view_server import ViewServer, check_installed
@@ -107,6 +107,10 @@ class TestRefused:
     def test_a_run_that_is_not_in_the_store(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["view", SEQUENCE, *SETTINGS, "--store", str(tmp_path / "store")]) == 1
         assert "run it first" in capsys.readouterr().err
+
+    def test_the_device_of_a_picture_is_not_that_of_the_run(self) -> None:
+        given = parser("view").parse_args(["view", "a.ply", "--device", "cpu", "--set", "device=cuda"])
+        assert (given.device, given.settings) == ("cpu", {"device": "cuda"})
 
     @pytest.mark.usefixtures("stand_in")
     def test_cuda_where_there_is_none(self, capsys: pytest.CaptureFixture[str]) -> None:

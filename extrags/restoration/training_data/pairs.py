@@ -114,7 +114,7 @@ def make_pairs(
     """All pairs of a scene.
 
     Args:
-        scene: the coarse scene, trained on `sequence.train`.
+        scene: the coarse scene, trained on `sequence.train`; leave-out reconstructions run where it is.
         sequence: posed frames; only training frames are used.
         config: how many pairs.
         coarse: settings of the leave-out reconstructions.
@@ -146,7 +146,8 @@ def fold_pairs(
     """Reconstruct without the frames of a fold, and render them, from the scene and from a perturbed copy.
 
     Args:
-        scene: the coarse scene; its light gives the exposure of the left-out frames.
+        scene: the coarse scene; its light gives the exposure of the left-out frames. The reconstruction runs
+            where it is.
         sequence: posed frames.
         config: folds, iterations, seed.
         coarse: settings of the reconstruction.
@@ -167,6 +168,8 @@ def fold_pairs(
         seed=config.seed + fold,
         stage="enhance-pairs",
     )
+    # The views of pairs need blending weights and median depth, which the native kernels give.
+    scene, partial = scene.to("cpu"), partial.to("cpu")
     references = gather_references(partial, sequence, kept)
     if most_frames is not None and len(left) > most_frames:
         left = left[np.linspace(0, len(left) - 1, most_frames).round().astype(np.int64)]
@@ -229,6 +232,7 @@ def synthetic_pairs(scene: Scene, sequence: EndoscopicSequence, config: EnhanceC
     Raises:
         CaptureError: with fewer than four training frames.
     """
+    scene = scene.to("cpu")
     train = np.asarray(sequence.train, dtype=np.int64)
     if len(train) < MIN_FRAMES:
         leave_out_folds(train, config.folds)
