@@ -14,6 +14,7 @@ from data_catalog.c3vd.dataset import C3vdDataset
 from data_catalog.caverns.dataset import CAVERNS
 from data_catalog.checks import check_sequence
 from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
+from data_catalog.detail import DetailSize, source_detail
 from data_catalog.folders import FolderDataset
 from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.specular import with_specular
@@ -21,7 +22,15 @@ from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["DATASETS", "describe", "list_sequences", "read", "resolve", "source_fingerprint"]
+__all__ = [
+    "DATASETS",
+    "describe",
+    "list_sequences",
+    "measured_detail",
+    "read",
+    "resolve",
+    "source_fingerprint",
+]
 
 DATASETS: tuple[Dataset, ...] = (
     FolderDataset(),
@@ -92,13 +101,32 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
             f"ingest.calibration is given, but {source.name} states its intrinsics itself; give one of the "
             "two"
         )
-    sequence = dataset.read(source, config)
+    detail = source_detail(dataset, source, config)
+    sequence = dataset.read(source, config if detail is None else detail.applied_to(config))
     check_sequence(sequence, file=source.path or source.name)
     if config.scale_mm_per_unit is not None:
         sequence = _scaled(sequence, config.scale_mm_per_unit)
     # After the checks, which hold poses against all depth there is; what was observed is known by now.
     shown = sequence.without_training_depth() if config.withhold_depth else sequence
     return with_specular(shown)
+
+
+def measured_detail(source: Source | str | Path, config: IngestConfig) -> DetailSize | None:
+    """The size that `read` shrinks the frames of a source to, where the settings ask for it.
+
+    Args:
+        source: what `resolve` returns, or takes.
+        config: the settings it will be read with.
+
+    Returns:
+        None unless `ingest.size` is detail and decides.
+
+    Raises:
+        SourceError: as `read` does.
+        ConfigError: as `read` does.
+    """
+    source = source if isinstance(source, Source) else resolve(source)
+    return source_detail(_dataset(source), source, config)
 
 
 def source_fingerprint(source: Source | str | Path, config: IngestConfig | None = None) -> dict[str, Any]:

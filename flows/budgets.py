@@ -62,7 +62,7 @@ def preset_budgets(name: str, config: PipelineConfig) -> list[Budget]:
     names, factors = PRESETS[name]
     made = []
     for factor in factors:
-        settings = {setting: max(1, round(_value(config, setting) * factor)) for setting in names}
+        settings = {setting: max(1, round(config.value(setting) * factor)) for setting in names}
         made.append(Budget(AS_PROFILE) if factor == 1 else _budget(settings))
     return made
 
@@ -139,13 +139,6 @@ def reaching(budget: Budget, left_out: Mapping[str, str]) -> dict[str, Any]:
 
 def _budget(settings: Mapping[str, Any]) -> Budget:
     return Budget(", ".join(f"{name}={value}" for name, value in settings.items()), dict(settings))
-
-
-def _value(config: PipelineConfig, name: str) -> float:
-    node: Any = config
-    for part in name.split("."):
-        node = getattr(node, part)
-    return float(node)
 
 
 def _parsed(text: str) -> Any:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import Any
 
 from data_catalog import Descriptor, describe
@@ -12,7 +13,15 @@ from extrags.pipeline import STAGES
 from extrags.run_costs import STAGE_TASKS, Workload
 from extrags.store import Manifest
 
-__all__ = ["catalogue_work", "frames_work", "known_work", "read_size", "task_repeats", "usual_work"]
+__all__ = [
+    "at_detail_size",
+    "catalogue_work",
+    "frames_work",
+    "known_work",
+    "read_size",
+    "task_repeats",
+    "usual_work",
+]
 
 USUAL_WIDTH = 340
 """About the width that sources are read at where no divisor is set, in pixels."""
@@ -42,6 +51,17 @@ def frames_work(ingested: Manifest, config: PipelineConfig) -> Workload:
         float(ingested.counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
     )
     return Workload(width * height, frames, train, test, config, width=width)
+
+
+def at_detail_size(work: Workload, counts: Mapping[str, Any]) -> Workload | None:
+    """The same run with frames of the size that keeps their detail; None where that is the size they have.
+
+    Args:
+        work: of a sequence that has been read.
+        counts: of the artefact of its `ingest`.
+    """
+    width, height = float(counts["detail_width"]), float(counts["detail_height"])
+    return None if width >= work.width else replace(work, pixels=width * height, width=width)
 
 
 def catalogue_work(

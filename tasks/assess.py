@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from extrags.config import AssessConfig, CoverageConfig, PipelineConfig
 from extrags.store import Ref, Slot
 from tasks.stage import stage
@@ -15,13 +13,22 @@ MEASUREMENTS = "measurements.json"
 _OF_PLAN = ("force", "full_budget_share", "min_hole_share")
 """Settings of the assessment that only the plan reads."""
 
+_OF_BUDGETS = (
+    "explore.trajectories",
+    "explore.length",
+    "enhance.max_views",
+    "finetune.iterations",
+    "finetune.keep_scene",
+)
+"""Settings that the decisions rest on."""
+
 _OF_SAVINGS = (
-    ("coarse", "densify.max_gaussians"),
-    ("enhance", "folds"),
-    ("enhance", "fold_iterations"),
-    ("enhance", "max_width"),
-    ("finetune", "judge.enabled"),
-    ("finetune", "judge.iterations_share"),
+    "coarse.densify.max_gaussians",
+    "enhance.folds",
+    "enhance.fold_iterations",
+    "enhance.max_width",
+    "finetune.judge.enabled",
+    "finetune.judge.iterations_share",
 )
 """Settings that what a stage costs depends on."""
 
@@ -33,23 +40,9 @@ def measuring_settings(config: AssessConfig) -> AssessConfig:
 
 def planning_settings(config: PipelineConfig) -> PipelineConfig:
     """The settings that `plan` reads, all others at their defaults: these are not part of the key."""
-    read = {
-        **{f"assess.{name}": getattr(config.assess, name) for name in _OF_PLAN},
-        "explore.trajectories": config.explore.trajectories,
-        "explore.length": config.explore.length,
-        "enhance.max_views": config.enhance.max_views,
-        "finetune.iterations": config.finetune.iterations,
-        "finetune.keep_scene": config.finetune.keep_scene,
-        **{f"{group}.{name}": _setting(config, group, name) for group, name in _OF_SAVINGS},
-    }
+    names = (*(f"assess.{name}" for name in _OF_PLAN), *_OF_BUDGETS, *_OF_SAVINGS)
+    read = {name: config.value(name) for name in names}
     return PipelineConfig().with_overrides(read)
-
-
-def _setting(config: PipelineConfig, group: str, name: str) -> object:
-    found: Any = config
-    for part in (group, *name.split(".")):
-        found = getattr(found, part)
-    return found
 
 
 @stage("assess", version=3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Any
 
 from data_catalog import Source
@@ -11,9 +12,11 @@ from tasks.stage import stage
 
 __all__ = ["ingest", "training_frames"]
 
+log = logging.getLogger(__name__)
+
 
 # The fingerprint covers the content of the files; their location is not part of the key.
-@stage("ingest", version=4, ignore=("source", "calibration"))
+@stage("ingest", version=5, ignore=("source", "calibration"))
 def ingest(
     slot: Slot,
     source: Source,
@@ -31,10 +34,16 @@ def ingest(
         calibration: path of the calibration file; None without.
     """
     from data_catalog import read
+    from data_catalog.catalog import measured_detail
+    from data_catalog.detail import detail_size
     from extrags.sequence import saturated_mask
 
-    sequence = read(source, config.model_copy(update={"calibration": calibration}))
+    config = config.model_copy(update={"calibration": calibration})
+    asked = measured_detail(source, config)
+    sequence = read(source, config if asked is None else asked.applied_to(config))
     slot.save(sequence)
+    detail = asked or detail_size(sequence, config.detail_psnr_db)
+    log.info("%s: frames hold %s", sequence.name, detail)
     inside = max(1, int(sequence.mask.sum()))
     slot.counts.update(
         frames=len(sequence),
@@ -46,6 +55,9 @@ def ingest(
         intrinsics=sequence.intrinsics,
         scale=sequence.scale_words if sequence.world_from_camera is not None else "",
         has_depth=int(sequence.training_depth_known),
+        detail_width=detail.reduced_width,
+        detail_height=detail.reduced_height,
+        detail=str(detail),
         masked_share=float(1 - sequence.mask.mean()),
         specular_share=0.0 if sequence.specular is None else float(sequence.specular.sum() / inside),
         saturated_share=float((saturated_mask(sequence.rgb) & sequence.mask).sum() / inside),

@@ -8,6 +8,7 @@ iterations, never in seconds: a result must not depend on how busy the machine w
 from __future__ import annotations
 
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, field_validator
@@ -49,12 +50,20 @@ class IngestConfig(StageConfig):
         le=16,
         description="divide the source's size by this; None: as ingest.size says; ignored when width is set",
     )
-    size: Literal["thumbnail", "source", "central"] = Field(
+    size: Literal["thumbnail", "source", "central", "detail"] = Field(
         "thumbnail",
         description="where neither width nor downscale is set. thumbnail: the source's usual divisor (sinus "
         "4, simcol3d 2, C3VD to a width of 225, others 1); source: as large as the source; central: as "
         "source, but where field_of_view_deg (of C3VD: 100) widens the pinhole of a distorted source, the "
-        "image grows with it, so that the source's central resolution is kept",
+        "image grows with it, so that the source's central resolution is kept; detail: the smallest size that "
+        "keeps the detail of the frames (detail_psnr_db), for footage that is larger than what it shows",
+    )
+    detail_psnr_db: float = Field(
+        45.0,
+        ge=20,
+        le=80,
+        description="what frames that are shrunk and enlarged again must keep, as the PSNR against "
+        "themselves; sets the size where size is detail, and is told of all sources",
     )
     holdout_every: int = Field(
         8, ge=2, description="hold out every n-th frame where the source defines no split"
@@ -367,6 +376,17 @@ class PipelineConfig(StageConfig):
                 "coarse.densify.max_gaussians": max(count, self.coarse.densify.max_gaussians),
             }
         )
+
+    def value(self, name: str) -> Any:
+        """The value of a setting by its dotted name.
+
+        Raises:
+            ConfigError: for an unknown name (with the nearest known one).
+        """
+        known = settings_of(PipelineConfig)
+        if name not in known:
+            raise unknown_setting(name, known)
+        return attrgetter(name)(self)
 
     def with_overrides(self, overrides: Mapping[str, Any]) -> PipelineConfig:
         """Apply `{"coarse.iterations": 500}`-like settings.

@@ -70,6 +70,7 @@ def plan(given: argparse.Namespace) -> int:
     from extrags.run_costs import packaged_model
     from flows.console import print_plan
     from flows.run_costs import pace_here, planned_work, predict_run, unplanned_work
+    from flows.workloads import at_detail_size
 
     store, config = Store(store_root(given)), run_config(given)
     pace = pace_here(store, config, packaged_model())
@@ -80,19 +81,50 @@ def plan(given: argparse.Namespace) -> int:
 
     predicted = cost(*planned_work(store, outcome, config))
     whole = cost(*unplanned_work(store, outcome, config))
+    counts = store.manifest(outcome.refs["ingest"]).counts
+    work, stages = planned_work(store, outcome, config)
+    smaller = at_detail_size(work, counts)
+    reduced = None if smaller is None else cost(smaller, stages)
     if given.json != "-":
         print_plan(outcome)
         print_prediction(predicted, whole)
+        if reduced is not None:
+            print_detail(str(counts["detail"]), predicted, reduced)
     write_json(
         {
             "sequence": outcome.name,
             **(outcome.plan or {}),
             "predicted": predicted.to_json(),
             "without_plan": whole.to_json(),
+            "detail": None
+            if reduced is None
+            else {
+                "width": counts["detail_width"],
+                "height": counts["detail_height"],
+                "predicted": reduced.to_json(),
+            },
         },
         given.json,
     )
     return 0
+
+
+def print_detail(found: str, predicted: RunPrediction, reduced: RunPrediction) -> None:
+    """What frames of the size that keeps their detail would save.
+
+    Args:
+        found: the size, in words.
+        predicted: of the run as it is.
+        reduced: of the same run with such frames.
+    """
+    from flows.terminal import console
+
+    seconds, smaller = predicted.processor_seconds, reduced.processor_seconds
+    console().print(
+        f"frames hold {found}: --ingest.size detail would take {smaller:.0f} s of processor time in place of "
+        f"{seconds:.0f}",
+        soft_wrap=True,
+    )
 
 
 def print_prediction(predicted: RunPrediction, whole: RunPrediction | None = None) -> None:

@@ -37,6 +37,15 @@ class TestConfig:
             with pytest.raises(ValidationError):
                 model.model_validate({"no_such_setting": 1})
 
+    def test_a_value_is_found_by_its_dotted_name(self) -> None:
+        config = PipelineConfig().with_overrides({"finetune.judge.iterations_share": 0.3, "device": "cpu"})
+        assert config.value("finetune.judge.iterations_share") == 0.3
+        assert config.value("device") == "cpu"
+        with pytest.raises(
+            ConfigError, match=r"no setting finetune\.judge\.iteration_share.*iterations_share"
+        ):
+            config.value("finetune.judge.iteration_share")
+
     def test_override_changes_one_value_only(self) -> None:
         config = PipelineConfig()
         changed = config.with_overrides({"explore.length": 5, "coarse.light.enabled": False})
