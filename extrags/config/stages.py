@@ -55,8 +55,8 @@ class IngestConfig(StageConfig):
         description="where neither width nor downscale is set. thumbnail: the source's usual divisor (sinus "
         "4, simcol3d 2, C3VD to a width of 225, others 1); source: as large as the source; central: as "
         "source, but where field_of_view_deg (of C3VD: 100) widens the pinhole of a distorted source, the "
-        "image grows with it, so that the source's central resolution is kept; detail: the smallest size that "
-        "keeps the detail of the frames (detail_psnr_db), for footage that is larger than what it shows",
+        "image grows with it, so that the source's central resolution is kept; detail: the smallest size "
+        "that keeps the detail of the frames (detail_psnr_db), for footage that is larger than what it shows",
     )
     detail_psnr_db: float = Field(
         45.0,

@@ -46,7 +46,8 @@ def test_frames_with_detail_down_to_the_pixel_keep_their_size() -> None:
     frames = np.stack([texture(WIDTH, HEIGHT, seed) for seed in range(FRAMES)])
     found = detail_size(sequence_of(frames), LIMIT_DB)
     assert (found.divisor, found.reduced_width, found.reduced_height) == (1, WIDTH, HEIGHT)
-    assert found.next_psnr_db is not None and found.next_psnr_db < LIMIT_DB
+    assert found.next_psnr_db is not None
+    assert found.next_psnr_db < LIMIT_DB
     assert "all 640 x 480" in str(found)
 
 
@@ -107,7 +108,8 @@ def folder(tmp_path: Path) -> Path:
 def test_a_source_is_read_at_the_size_of_its_detail(folder: Path) -> None:
     config = IngestConfig(size="detail", detail_psnr_db=LIMIT_DB)
     found = measured_detail(str(folder), config)
-    assert found is not None and found.divisor > 1
+    assert found is not None
+    assert found.divisor > 1
     sequence, whole = read(folder, config), read(folder, IngestConfig(size="source"))
     assert (sequence.width, sequence.height) == (found.reduced_width, found.reduced_height)
     assert len(sequence) == len(whole) == 12
