@@ -61,7 +61,9 @@ def at_detail_size(work: Workload, counts: Mapping[str, Any]) -> Workload | None
         counts: of the artefact of its `ingest`.
     """
     width, height = float(counts["detail_width"]), float(counts["detail_height"])
-    return None if width >= work.width else replace(work, pixels=width * height, width=width)
+    if work.width is None or width >= work.width:
+        return None
+    return replace(work, pixels=width * height, width=width)
 
 
 def catalogue_work(
