@@ -10,11 +10,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
-from extrags.restoration.diffusion.validation import validation_pairs
+from extrags.restoration.diffusion.validation import RestoredPairs, restored_pairs
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.uncertainty.calibration import SMALLEST_ERROR, Calibration, cell_means
 from extrags.restoration.uncertainty.error_model import ErrorModel, error_features
-from extrags.threads import in_threads
 from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["cell_errors", "error_over_expected", "with_calibration", "with_error_model"]
@@ -23,38 +22,30 @@ MIN_VALID_SHARE = 0.5
 """Cells with a smaller share of valid pixels are not counted."""
 
 
-def with_calibration(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> EmbeddedEnhancer:
-    """The restorer with the calibration curve of the validation pairs; unchanged where they are too few.
+def with_calibration(enhancer: EmbeddedEnhancer, restored: RestoredPairs) -> EmbeddedEnhancer:
+    """The restorer with the calibration curve of validation pairs; unchanged where they are too few.
 
     The error model stays: a few pairs of one scene determine a curve, but not six weights.
 
     Args:
         enhancer: trained.
-        pairs: all pairs.
-        transfer: how brightness changes with distance.
+        restored: what it makes of the validation pairs.
     """
-    chosen = validation_pairs(pairs)
-    if chosen is None:
-        return enhancer
-    calibration = Calibration.fitted(*cell_errors(enhancer, chosen, transfer))
+    calibration = Calibration.fitted(*cell_errors(restored))
     return replace(enhancer, calibration=calibration) if calibration.predicted else enhancer
 
 
-def error_over_expected(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> float | None:
-    """How many times larger its error on the validation pairs is than what the restorer expects of itself.
+def error_over_expected(enhancer: EmbeddedEnhancer, restored: RestoredPairs) -> float | None:
+    """How many times larger its error on validation pairs is than what the restorer expects of itself.
 
     About 1 in scenes like those that it was calibrated on; well above, the scene is not what it knows. None
-    without validation pairs or valid cells.
+    without valid cells.
 
     Args:
         enhancer: with the calibration of its weights, not of this scene.
-        pairs: all pairs.
-        transfer: how brightness changes with distance.
+        restored: what it makes of the validation pairs.
     """
-    chosen = validation_pairs(pairs)
-    if chosen is None:
-        return None
-    expected, true = cell_errors(enhancer, chosen, transfer)
+    expected, true = cell_errors(restored)
     if len(true) == 0:
         return None
     return float(true.mean() / max(float(enhancer.calibration.applied(expected).mean()), SMALLEST_ERROR))
@@ -86,31 +77,26 @@ def with_error_model(
             errors.append(mean[share > MIN_VALID_SHARE])
     fitted = replace(plain, error_model=ErrorModel.fitted(np.concatenate(features), np.concatenate(errors)))
     cells = [
-        cell_errors(replace(fitted, patches=patches), pairs, transfer) for pairs, transfer, patches in scenes
+        cell_errors(restored_pairs(replace(fitted, patches=patches), pairs, transfer))
+        for pairs, transfer, patches in scenes
     ]
     expected, true = (np.concatenate(part) for part in zip(*cells, strict=True))
     return replace(fitted, calibration=Calibration.fitted(expected, true))
 
 
-def cell_errors(
-    enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer
-) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+def cell_errors(restored: RestoredPairs) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
     """Expected (not calibrated) and true absolute errors of cells that are mostly valid.
 
     Args:
-        enhancer: trained.
-        pairs: with the truth.
-        transfer: how brightness changes with distance.
+        restored: pairs with the truth.
     """
-
-    def errors(view: int) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
-        noise = enhancer.noise(pairs.size, view, 0)
-        restored = enhancer.restored_layers(pairs.layers[view], transfer, noise, steps=enhancer.steps)
-        weight = pairs.weight[view : view + 1]
-        error = (restored.rgb - pairs.target[view : view + 1]).abs().mean(dim=1, keepdim=True)
-        predicted, share = cell_means(restored.error, weight)
+    pairs = restored.pairs
+    error = (restored.rgb - pairs.target).abs().mean(dim=1, keepdim=True)
+    expected, true = [], []
+    for view in range(len(pairs)):
+        one = slice(view, view + 1)
+        predicted, share = cell_means(restored.error[one], pairs.weight[one])
         counted = share > MIN_VALID_SHARE
-        return predicted[counted], cell_means(error, weight)[0][counted]
-
-    expected, true = zip(*in_threads(errors, range(len(pairs))), strict=True)
+        expected.append(predicted[counted])
+        true.append(cell_means(error[one], pairs.weight[one])[0][counted])
     return np.concatenate(expected), np.concatenate(true)

@@ -15,7 +15,7 @@ from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
 from extrags.restoration.diffusion.error_fit import error_over_expected, with_calibration
 from extrags.restoration.diffusion.patches import choose_patches
 from extrags.restoration.diffusion.scene_training import train_on_scene
-from extrags.restoration.diffusion.validation import validation_scores
+from extrags.restoration.diffusion.validation import restored_pairs, scores_of, validation_pairs
 from extrags.restoration.protocol import Enhancer
 from extrags.restoration.training_data.pairs import Pairs, make_pairs
 from extrags.scene import Scene
@@ -55,15 +55,16 @@ def scene_restorer(
         leave_out = config.model_copy(update={"synthetic_views": 0})
         fresh = make_pairs(scene, sequence, leave_out, coarse, most=config.judge_pairs)
         pairs = replace(fresh, validation=np.ones(len(fresh), dtype=bool))
-        judged = better_of_both(untouched, pairs, transfer)
         # How far off it is differs more from scene to scene than where.
-        return with_calibration(judged, pairs, transfer) if isinstance(judged, EmbeddedEnhancer) else judged
+        return better_of_both(untouched, pairs, transfer, calibrate=True)
     pairs = make_pairs(scene, sequence, config, coarse)
     trained = train_on_scene(pairs, transfer, config, start)
     return better_of_both(trained, pairs, transfer) if config.judge else trained
 
 
-def better_of_both(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer) -> Enhancer:
+def better_of_both(
+    enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer, *, calibrate: bool = False
+) -> Enhancer:
     """The restorer, or the classical one where that is clearly better on the scene's validation pairs.
 
     On scenes unlike its training data a network can do harm; the classical restorer then replaces it, and
@@ -73,12 +74,17 @@ def better_of_both(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTran
         enhancer: ready for the scene.
         pairs: those for validation were not trained on.
         transfer: how brightness changes with distance.
+        calibrate: fit the expected error of the restorer that is kept to these pairs.
     """
+    chosen = validation_pairs(pairs)
     # By their means: a drawn view has texture of its own, which costs PSNR wherever it is right.
-    scores = validation_scores(replace(enhancer, drawing=False), pairs, transfer, (enhancer.steps,))
-    restored, filled = scores[f"embedded_{enhancer.steps}"]["psnr"], scores["classical"]["psnr"]
+    means = restored_pairs(replace(enhancer, drawing=False), chosen or pairs, transfer)
+    scores = scores_of([means], transfer)
+    restored, filled = scores[means.name]["psnr"], scores["classical"]["psnr"]
     emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
-    ratio = error_over_expected(enhancer, pairs, transfer)
+    shown = restored_pairs(enhancer, means.pairs, transfer) if enhancer.drawing else means
+    # Without validation pairs nothing tells of errors: the restorer was trained on these.
+    ratio = None if chosen is None else error_over_expected(enhancer, shown)
     if ratio is not None:
         emit(MetricRecorded("enhance", "error_over_expected", ratio))
     judged = {
@@ -105,7 +111,8 @@ def better_of_both(enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTran
         logger.warning("%s; the scene is restored by blending and filling", reason)
         return ClassicalEnhancer(reason, judged)
     validation = {**enhancer.record.get("validation", {}), **scores}
-    return replace(enhancer, record={**enhancer.record, "validation": validation, "judged": judged})
+    kept = replace(enhancer, record={**enhancer.record, "validation": validation, "judged": judged})
+    return with_calibration(kept, shown) if calibrate and chosen is not None else kept
 
 
 def _scene_gamut(sequence: EndoscopicSequence) -> Gamut:

@@ -16,7 +16,7 @@ from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.error_fit import with_calibration
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE, build_network
 from extrags.restoration.diffusion.network_training import TrainingSettings, train_network
-from extrags.restoration.diffusion.validation import validation_pairs, validation_scores
+from extrags.restoration.diffusion.validation import restored_pairs, validation_pairs, validation_scores
 from extrags.restoration.training_data.augmentation import CropSampler
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.threads import one_torch_thread
@@ -78,7 +78,10 @@ def train_on_scene(
     steps = _best(trained.scores if kept else before, candidates)[0]
     record = {**base.record, **training.record(trained), "scene_training_kept": kept}
     enhancer = replace(trained.enhancer if kept else base, steps=steps, record=record)
-    return with_calibration(enhancer, pairs, transfer)
+    validating = validation_pairs(pairs)
+    if validating is None:
+        return enhancer
+    return with_calibration(enhancer, restored_pairs(enhancer, validating, transfer))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -9,13 +11,53 @@ from torch import Tensor
 
 from extrags.metrics.image import psnr_per_image, ssim_map
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.rectified_flow import Sampled
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.threads import in_threads
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import condition
 from extrags.view_synthesis.references import LightTransfer
 
-__all__ = ["validation_pairs", "validation_scores"]
+__all__ = ["RestoredPairs", "restored_pairs", "scores_of", "validation_pairs", "validation_scores"]
+
+
+@dataclass(frozen=True)
+class RestoredPairs:
+    """Pairs and what a restorer makes of them.
+
+    Args:
+        pairs: N of them, with the truth.
+        rgb: restored colours, [N, 3, H, W].
+        error: their expected error, not calibrated, [N, 1, H, W].
+        name: the restorer with its number of steps.
+    """
+
+    pairs: Pairs
+    rgb: Float[Tensor, "n 3 h w"]
+    error: Float[Tensor, "n 1 h w"]
+    name: str
+
+
+def restored_pairs(
+    enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer, steps: int | None = None
+) -> RestoredPairs:
+    """Restore pairs, each as a view of its own.
+
+    Args:
+        enhancer: trained.
+        pairs: all of these are restored.
+        transfer: how brightness changes with distance.
+        steps: of the sampler; None takes the restorer's.
+    """
+    steps = enhancer.steps if steps is None else steps
+
+    def restored(view: int) -> Sampled:
+        noise = enhancer.noise(pairs.size, view, 0)
+        return enhancer.restored_layers(pairs.layers[view], transfer, noise, steps=steps)
+
+    views = in_threads(restored, range(len(pairs)))
+    rgb, error = torch.cat([view.rgb for view in views]), torch.cat([view.error for view in views])
+    return RestoredPairs(pairs, rgb, error, f"embedded_{steps}")
 
 
 def validation_scores(
@@ -37,17 +79,22 @@ def validation_scores(
         `psnr_hole` where a validation pair has pixels of alpha below one half.
     """
     chosen = validation_pairs(pairs) or pairs
+    return scores_of([restored_pairs(enhancer, chosen, transfer, steps) for steps in candidates], transfer)
+
+
+def scores_of(restored: list[RestoredPairs], transfer: LightTransfer) -> dict[str, dict[str, float]]:
+    """As `validation_scores`, of pairs that have been restored.
+
+    Args:
+        restored: of the same pairs, at least one.
+        transfer: how brightness changes with distance.
+    """
+    pairs = restored[0].pairs
     with torch.no_grad():
-        conditioning = condition(chosen.layers, transfer)
-    images = {"none": chosen.layers.get("rendered").clamp(0, 1), "classical": conditioning.base}
-    for steps in candidates:
-
-        def restored(view: int, steps: int = steps) -> Tensor:
-            noise = enhancer.noise(chosen.size, view, 0)
-            return enhancer.restored_layers(chosen.layers[view], transfer, noise, steps=steps).rgb
-
-        images[f"embedded_{steps}"] = torch.cat(in_threads(restored, range(len(chosen))))
-    return {name: _score(image, chosen) for name, image in images.items()}
+        conditioning = condition(pairs.layers, transfer)
+    images = {"none": pairs.layers.get("rendered").clamp(0, 1), "classical": conditioning.base}
+    images |= {each.name: each.rgb for each in restored}
+    return {name: _score(image, pairs) for name, image in images.items()}
 
 
 def validation_pairs(pairs: Pairs) -> Pairs | None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from extrags.restoration.diffusion.network_training import (
 from extrags.restoration.diffusion.rectified_flow import Predicted, sample
 from extrags.restoration.diffusion.scene_restorer import better_of_both
 from extrags.restoration.diffusion.scene_training import train_on_scene
-from extrags.restoration.diffusion.validation import validation_pairs
+from extrags.restoration.diffusion.validation import restored_pairs, validation_pairs
 from extrags.restoration.protocol import Clip, Enhancer
 from extrags.restoration.training_data.augmentation import Batch
 from extrags.restoration.training_data.pairs import Pairs
@@ -270,11 +271,36 @@ class TestEmbedded:
         transfer = tube.references.transfer
         plain = replace(trained, calibration=Calibration((0.01, 1.0), (0.01, 1.0)))
         doubled = replace(trained, calibration=Calibration((0.01, 1.0), (0.02, 2.0)))
-        ratio, half = (error_over_expected(each, tube_pairs, transfer) for each in (plain, doubled))
+        chosen = validation_pairs(tube_pairs)
+        assert chosen is not None
+        restored = restored_pairs(plain, chosen, transfer)
+        ratio, half = (error_over_expected(each, restored) for each in (plain, doubled))
         assert ratio is not None
         assert half == pytest.approx(ratio / 2, rel=1e-5)
-        expected, true = cell_errors(plain, validation_pairs(tube_pairs), transfer)
+        expected, true = cell_errors(restored)
         assert ratio == pytest.approx(true.mean() / expected.mean(), rel=1e-5)
+
+    def test_pairs_are_restored_once_to_judge_and_to_calibrate(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, monkeypatch
+    ) -> None:
+        count = 0
+        once = EmbeddedEnhancer.restored_layers
+
+        def counted(self: EmbeddedEnhancer, *given: Any, **named: Any) -> Any:
+            nonlocal count
+            count += 1
+            return once(self, *given, **named)
+
+        monkeypatch.setattr(EmbeddedEnhancer, "restored_layers", counted)
+        transfer = tube.references.transfer
+        plain = replace(trained, calibration=Calibration())
+        kept = better_of_both(plain, tube_pairs, transfer, calibrate=True)
+        chosen = validation_pairs(tube_pairs)
+        assert chosen is not None
+        assert count == len(chosen)
+        assert isinstance(kept, EmbeddedEnhancer)
+        assert kept.calibration == Calibration.fitted(*cell_errors(restored_pairs(plain, chosen, transfer)))
+        assert better_of_both(plain, tube_pairs, transfer).calibration == plain.calibration
 
     @pytest.mark.parametrize(("most", "expected"), [(48, 20), (8, 8)])
     def test_no_more_pairs_are_judged_than_tell_something(
@@ -283,7 +309,8 @@ class TestEmbedded:
         trained.save(tmp_path, half=True)
         judged: list[Pairs] = []
 
-        def keep(enhancer: EmbeddedEnhancer, pairs: Pairs, _: object) -> EmbeddedEnhancer:
+        def keep(enhancer: EmbeddedEnhancer, pairs: Pairs, _: object, *, calibrate: bool) -> EmbeddedEnhancer:
+            assert calibrate
             judged.append(pairs)
             return enhancer
 
