@@ -59,7 +59,7 @@ class IngestConfig(StageConfig):
         "that keeps the detail of the frames (detail_psnr_db), for footage that is larger than what it shows",
     )
     detail_psnr_db: float = Field(
-        45.0,
+        48.0,
         ge=20,
         le=80,
         description="what frames that are shrunk and enlarged again must keep, as the PSNR against "
