@@ -234,6 +234,12 @@ class _Assign(argparse.Action):
     ) -> None:
         if option_string == "--set":
             changed = parsed_settings([values])
+            known = _settings()
+            # A word, such as `alex` or `none`, means what it means after the setting's own flag.
+            changed = {
+                name: known[name].parse(value) if isinstance(value, str) and name in known else value
+                for name, value in changed.items()
+            }
         else:
             name = SHORT_NAMES.get(str(option_string), str(option_string).removeprefix("--"))
             changed = {name: _settings()[name].parse(values)}
