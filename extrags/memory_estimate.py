@@ -26,7 +26,7 @@ SEQUENCE = 16
 DECODED = 60
 """Bytes per source pixel of the frame that is being read, with its resampling grid."""
 TRAINING_VIEW = 16
-"""Bytes per pixel of a training frame while Gaussians are optimised: weights, depth, what finds its median."""
+"""Bytes per pixel of a training frame while Gaussians are optimised: weights, depth and its median."""
 DEPTH_FRAME = 60
 """Bytes per pixel of a training frame while its depth is estimated."""
 STEP = 140

@@ -58,7 +58,6 @@ HOLE_STRIDE_PX = 2
 """Hole pixels are taken on a grid of this step; thinning would drop most of them anyway."""
 
 
-@one_torch_thread()
 def finetune(
     scene: Scene,
     sequence: EndoscopicSequence,
@@ -108,63 +107,65 @@ def finetune(
     Source: [ExtraGS, eq. 24] (training views) and [ExtraGS, eq. 25] (virtual views), see
     docs/references.md; their depth term is our own.
     """
-    config = FinetuneConfig() if config is None else config
-    coarse = CoarseConfig() if coarse is None else coarse
-    frames = sequence.train
-    depth = median_depth(sequence, frames)
-    start = scene
-    max_gaussians = round(config.growth * coarse.densify.max_gaussians)
-    if pseudo_views is not None and config.seed_holes:
-        room = max_gaussians - len(scene.gaussians)
-        new_gaussians = hole_gaussians(
-            scene.to("cpu"),
-            sequence,
-            pseudo_views,
-            room,
-            thickness=coarse.thickness,
-            max_distance=MAX_GUESS_DISTANCE * depth,
-        )
-        if new_gaussians is not None:
-            filled = Gaussians.concatenated(scene.gaussians, new_gaussians.to(scene.device))
-            start = Scene(filled, scene.light)
-    if config.keep_scene and len(start.gaussians) == len(scene.gaussians):
-        return TrainingResult(scene.detached(), [])
-    if coarse.inconsistent_frames == "weight":
-        real, _ = weighted_views(sequence, frames, coarse)
-    else:
-        real = real_views(sequence, frames)
-    virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)
-    # A caller that keeps none either has their floats out of memory while the scene is optimised.
-    del pseudo_views
-    real, virtual = ([view.to(scene.device) for view in views] for views in (real, virtual))
-    generator = np.random.default_rng(config.seed)
-    next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
-    pattern = virtual_steps(config, any_virtual=bool(virtual))
+    # Not as a decorator, which would hold the virtual views for its caller.
+    with one_torch_thread():
+        config = FinetuneConfig() if config is None else config
+        coarse = CoarseConfig() if coarse is None else coarse
+        frames = sequence.train
+        depth = median_depth(sequence, frames)
+        start = scene
+        max_gaussians = round(config.growth * coarse.densify.max_gaussians)
+        if pseudo_views is not None and config.seed_holes:
+            room = max_gaussians - len(scene.gaussians)
+            new_gaussians = hole_gaussians(
+                scene.to("cpu"),
+                sequence,
+                pseudo_views,
+                room,
+                thickness=coarse.thickness,
+                max_distance=MAX_GUESS_DISTANCE * depth,
+            )
+            if new_gaussians is not None:
+                filled = Gaussians.concatenated(scene.gaussians, new_gaussians.to(scene.device))
+                start = Scene(filled, scene.light)
+        if config.keep_scene and len(start.gaussians) == len(scene.gaussians):
+            return TrainingResult(scene.detached(), [])
+        if coarse.inconsistent_frames == "weight":
+            real, _ = weighted_views(sequence, frames, coarse)
+        else:
+            real = real_views(sequence, frames)
+        virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)
+        # A caller that keeps none either has their floats out of memory while the scene is optimised.
+        del pseudo_views
+        real, virtual = ([view.to(scene.device) for view in views] for views in (real, virtual))
+        generator = np.random.default_rng(config.seed)
+        next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
+        pattern = virtual_steps(config, any_virtual=bool(virtual))
 
-    def draw(iteration: int) -> View:
-        return virtual[next(next_virtual)] if pattern[iteration] else real[next(next_real)]
+        def draw(iteration: int) -> View:
+            return virtual[next(next_virtual)] if pattern[iteration] else real[next(next_real)]
 
-    densify = {"start_share": 0.0, "stop_share": config.densify_share, "max_gaussians": max_gaussians}
-    schedule = coarse_schedule(
-        _with_loss_weights(coarse, config),
-        scene_extent(sequence, frames),
-        depth,
-        stage,
-        iterations=config.iterations,
-        densify=coarse.densify.model_copy(update=densify),
-    )
-    schedule = replace(schedule, photometric_weight=config.photometric_weight)
-    if config.keep_scene:
-        fixed = len(scene.gaussians)
-        return optimise(
-            start,
-            draw,
-            filling_schedule(schedule.resumed(seed=config.seed)),
-            make_step=lambda scene, schedule: FillingStep(scene, schedule, fixed),
+        densify = {"start_share": 0.0, "stop_share": config.densify_share, "max_gaussians": max_gaussians}
+        schedule = coarse_schedule(
+            _with_loss_weights(coarse, config),
+            scene_extent(sequence, frames),
+            depth,
+            stage,
+            iterations=config.iterations,
+            densify=coarse.densify.model_copy(update=densify),
         )
-    # All harmonics are active from the first step: the scene is optimised already.
-    footprint = smallest_footprint(coarse, sequence.cameras[frames])
-    return optimise(start, draw, schedule.resumed(seed=config.seed), footprint=footprint)
+        schedule = replace(schedule, photometric_weight=config.photometric_weight)
+        if config.keep_scene:
+            fixed = len(scene.gaussians)
+            return optimise(
+                start,
+                draw,
+                filling_schedule(schedule.resumed(seed=config.seed)),
+                make_step=lambda scene, schedule: FillingStep(scene, schedule, fixed),
+            )
+        # All harmonics are active from the first step: the scene is optimised already.
+        footprint = smallest_footprint(coarse, sequence.cameras[frames])
+        return optimise(start, draw, schedule.resumed(seed=config.seed), footprint=footprint)
 
 
 def _with_loss_weights(coarse: CoarseConfig, config: FinetuneConfig) -> CoarseConfig:
