@@ -9,11 +9,12 @@ Axes are OpenCV's: x right, y down, z forward. Pixel centres lie at +0.5. Poses 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from extrags.errors import PoseError, ShapeError
 from extrags.radial_lens import VIRTUAL_FIELD_DEG, RadialLens
@@ -27,6 +28,7 @@ __all__ = [
     "look_at",
     "pixel_rays",
     "project_points",
+    "rays_of_pixels",
     "rotation_about",
     "rotation_angle_deg",
     "transform_points",
@@ -375,6 +377,23 @@ def pixel_rays(cameras: Cameras) -> Float[np.ndarray, "c h w 3"]:
         x, y = _undistorted(cameras, x, y)
     local = np.stack([x, y, np.ones_like(x)], axis=-1)
     return np.asarray(np.einsum("cij,chwj->chwi", cameras.world_from_camera[:, :3, :3], local))
+
+
+def rays_of_pixels(cameras: Cameras, pixels: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
+    """The rays of `pixel_rays` through some pixels alone, one camera in memory at a time.
+
+    Args:
+        cameras: C cameras of H x W pixels.
+        pixels: positions among all C * H * W, ascending.
+    """
+    size = cameras.width * cameras.height
+    bounds = np.searchsorted(pixels, size * np.arange(len(cameras) + 1))
+    parts = [
+        pixel_rays(cameras[view]).reshape(-1, 3)[pixels[first:last] - view * size]
+        for view, (first, last) in enumerate(itertools.pairwise(bounds.tolist()))
+        if last > first
+    ]
+    return np.concatenate(parts) if parts else np.zeros((0, 3))
 
 
 def _undistorted(

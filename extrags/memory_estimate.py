@@ -25,8 +25,10 @@ SEQUENCE = 16
 """Bytes per pixel of a frame: colours, masks and depth, and the copy that holds the training frames."""
 DECODED = 60
 """Bytes per source pixel of the frame that is being read, with its resampling grid."""
-TRAINING_VIEW = 60
-"""Bytes per pixel of a training frame while Gaussians are optimised: targets, weights, comparison."""
+TRAINING_VIEW = 16
+"""Bytes per pixel of a training frame while Gaussians are optimised: weights, depth and its median."""
+DEPTH_FRAME = 60
+"""Bytes per pixel of a training frame while its depth is estimated."""
 STEP = 140
 """Bytes per pixel of the image of one optimisation step: rendering, loss and their gradients."""
 GAUSSIAN = 2400
@@ -150,7 +152,7 @@ def estimate_memory(
     found: dict[StageName, float] = {
         "ingest": PROCESS + SEQUENCE * all_frames * pixels + DECODED * source,
         "poses": whole,
-        "depth": held + TRAINING_VIEW * train * pixels,
+        "depth": held + DEPTH_FRAME * train * pixels,
         "coarse": held + steps + gaussian * coarse_gaussians,
         "surface": held + 40 * train * small,
         "explore": held + 8 * train * small,

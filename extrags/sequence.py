@@ -197,7 +197,7 @@ class EndoscopicSequence(Storable):
     @cached_property
     def training_depth_known(self) -> bool:
         """Whether any training frame has depth: held-out frames may have some for the evaluation alone."""
-        return self.depth_mm is not None and bool((self.depth_mm[self.train] > 0).any())
+        return self.depth_mm is not None and any(bool((self.depth_mm[k] > 0).any()) for k in self.train)
 
     @cached_property
     def true_depth_mm(self) -> Float[np.ndarray, "f h w"] | None:
@@ -359,7 +359,8 @@ class EndoscopicSequence(Storable):
             return np.stack([cv2.resize(image, size, interpolation=interpolation) for image in stack])
 
         def share(stack: np.ndarray) -> np.ndarray:
-            return resized(stack.astype(np.float32), cv2.INTER_AREA)
+            # Not the whole stack at once: in floats it would be the largest array of all.
+            return np.concatenate([resized(i.astype(np.float32), cv2.INTER_AREA) for i in stack[:, None]])
 
         K = self.K.copy()
         K[:, 0] *= size[0] / self.width

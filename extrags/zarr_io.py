@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import struct
+import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -46,6 +47,9 @@ PACKED = ".zarr.zip"
 METADATA = "zarr.json"
 HELD_BYTES = 64 << 20
 """Of a stack, so much is encoded at once, by several threads, before it is written in order."""
+
+MAPPED_BYTES = 64 << 20
+"""Larger stacks are read into a file that is mapped, instead of memory that nothing can take back."""
 
 # zarr reads a chunk that is not there as fill values, so that a lost file would be black frames.
 EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
@@ -200,6 +204,10 @@ def has_array(group: zarr.Group, name: str) -> bool:
 def read_array(group: zarr.Group, name: str) -> Any:
     """Read a whole array, in native byte order (Open3D accepts no other).
 
+    A stack of more than `MAPPED_BYTES` is decoded into a nameless file in the folder of temporary files
+    (`TMPDIR`) and mapped: the system may drop its pages and read them again. Changing the array changes
+    neither that file nor the group. The file is gone with the array, and with the process however that ends.
+
     Args:
         group: from `open_group`.
         name: may be a path with slashes.
@@ -207,6 +215,7 @@ def read_array(group: zarr.Group, name: str) -> Any:
     Raises:
         DamagedArtefactError: when a chunk is missing, or cannot be decoded, or differs from its checksum;
             names its file.
+        OSError: when the folder of temporary files has no room.
     """
     try:
         array = group[name]
@@ -222,12 +231,35 @@ def read_array(group: zarr.Group, name: str) -> Any:
         for key, _ in _chunks(array):
             if key not in present:
                 raise _damaged(array, key, "this chunk is missing")
+    if array.ndim > 1 and array.nbytes > MAPPED_BYTES:
+        return _mapped(array)
+    return _decoded(array, slice(None) if array.ndim else ())
+
+
+def _decoded(array: zarr.Array[Any], part: slice | tuple[()]) -> np.ndarray:
+    """Part of an array along its first axis, in native byte order."""
     try:
-        stored = np.asarray(array[...])
+        stored = np.asarray(array[part])
     except UNREADABLE as error:
         # Codecs do not say of which chunk they speak.
         raise _damaged(array, _first_unreadable(array), str(error)) from error
     return stored.astype(stored.dtype.newbyteorder("="), copy=False)
+
+
+def _mapped(array: zarr.Array[Any]) -> np.ndarray:
+    """A whole stack in a nameless file, its pages private."""
+    # Bounded parts, so that what is decoded at once does not grow with the stack.
+    step = max(1, HELD_BYTES * array.shape[0] // array.nbytes)
+    dtype = array.dtype.newbyteorder("=")
+    # Linux gives such a file no name at all: nothing is left to be removed, whatever happens.
+    with tempfile.TemporaryFile(prefix="extrags-") as file:
+        for first in range(0, array.shape[0], step):
+            # Written, not assigned to a map: a full disk is then an error, where a map would end the process.
+            file.write(np.ascontiguousarray(_decoded(array, slice(first, first + step))).data)
+        file.flush()
+        # The map keeps the file open. Private, so that a reader may write as into any array.
+        mapped = np.memmap(file, dtype=dtype, mode="c", shape=array.shape)
+    return mapped.view(np.ndarray)
 
 
 def _place(group: zarr.Group | zarr.Array[Any]) -> Path:

@@ -82,11 +82,17 @@ def finetune(
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
 
-    views = None if pseudo_views is None else slot.load(PseudoViews, pseudo_views)
     start, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
     start = start.to(chosen_device(device, "device"))
     with keep_last_finite_scene(slot):
-        result = training.finetune(start, frames, views, config, coarse)
+        # No name holds the virtual views here: they are dropped as soon as they are compact.
+        result = training.finetune(
+            start,
+            frames,
+            None if pseudo_views is None else slot.load(PseudoViews, pseudo_views),
+            config,
+            coarse,
+        )
     slot.save(result.scene)
     slot.save_json(HISTORY, result.history)
     slot.counts["n_gaussians"] = len(result.scene.gaussians)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +11,7 @@ from pathlib import Path
 __all__ = ["PeakMemory", "peak_memory"]
 
 SAMPLE_SECONDS = 0.1
-MIB = 1 << 20
+KIB_PER_MIB = 1 << 10
 
 
 @dataclass
@@ -26,7 +25,9 @@ class PeakMemory:
 def peak_memory() -> Iterator[PeakMemory]:
     """Sample the resident set size ten times per second while the block runs.
 
-    The size is that of the whole process, including stages that run concurrently on other threads.
+    The size is that of the whole process, including stages that run concurrently on other threads. Pages of
+    mapped files do not count (those of libraries, and of stacks that `extrags.zarr_io.read_array` maps): the
+    system takes them back where memory is short. Those of a file system in memory (tmpfs) do count.
     """
     peak = PeakMemory(_resident_mib())
     if peak.mib is None:
@@ -49,8 +50,10 @@ def peak_memory() -> Iterator[PeakMemory]:
 
 
 def _resident_mib() -> float | None:
+    """What the process has in memory and nothing else can take back, in MiB: without pages of files."""
     try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     except OSError:
         return None
-    return pages * os.sysconf("SC_PAGE_SIZE") / MIB
+    held = [int(line.split()[1]) for line in lines if line.startswith(("RssAnon:", "RssShmem:"))]
+    return sum(held) / KIB_PER_MIB if held else None

@@ -66,8 +66,8 @@ class TestReached:
         assert ("extrags.restoration.pretrained.wan_vace", "WanVace") in found
 
     def test_a_leaf_rests_on_little(self) -> None:
-        # A sequence, its cameras and their lens, and zarr.
-        assert len(reached(stages()["training-frames"][0])) < 60
+        # A sequence, its cameras and their lens, and zarr with stacks that are mapped.
+        assert len(reached(stages()["training-frames"][0])) < 65
 
     @pytest.mark.parametrize("edit", ["# said otherwise", '"""Said otherwise."""'])
     def test_words_do_not_count_and_code_does(

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 
-from extrags.cameras import pixel_rays
+from extrags.cameras import rays_of_pixels
 from extrags.config import CoarseConfig, FinetuneConfig
 from extrags.gaussians import Gaussians
 from extrags.pseudo_views import PseudoViews
@@ -22,7 +22,7 @@ from extrags.training.frame_weights import weighted_views
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
 from extrags.training.starting import median_depth, surface_normals, thin_out
-from extrags.training.views import View, epochs, real_views
+from extrags.training.views import View, epochs, in_steps, real_views
 
 __all__ = ["finetune", "hole_gaussians", "virtual_steps", "virtual_views"]
 
@@ -58,7 +58,6 @@ HOLE_STRIDE_PX = 2
 """Hole pixels are taken on a grid of this step; thinning would drop most of them anyway."""
 
 
-@one_torch_thread()
 def finetune(
     scene: Scene,
     sequence: EndoscopicSequence,
@@ -108,61 +107,65 @@ def finetune(
     Source: [ExtraGS, eq. 24] (training views) and [ExtraGS, eq. 25] (virtual views), see
     docs/references.md; their depth term is our own.
     """
-    config = FinetuneConfig() if config is None else config
-    coarse = CoarseConfig() if coarse is None else coarse
-    frames = sequence.train
-    depth = median_depth(sequence, frames)
-    start = scene
-    max_gaussians = round(config.growth * coarse.densify.max_gaussians)
-    if pseudo_views is not None and config.seed_holes:
-        room = max_gaussians - len(scene.gaussians)
-        new_gaussians = hole_gaussians(
-            scene.to("cpu"),
-            sequence,
-            pseudo_views,
-            room,
-            thickness=coarse.thickness,
-            max_distance=MAX_GUESS_DISTANCE * depth,
-        )
-        if new_gaussians is not None:
-            filled = Gaussians.concatenated(scene.gaussians, new_gaussians.to(scene.device))
-            start = Scene(filled, scene.light)
-    if config.keep_scene and len(start.gaussians) == len(scene.gaussians):
-        return TrainingResult(scene.detached(), [])
-    if coarse.inconsistent_frames == "weight":
-        real, _ = weighted_views(sequence, frames, coarse)
-    else:
-        real = real_views(sequence, frames)
-    virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)
-    real, virtual = ([view.to(scene.device) for view in views] for views in (real, virtual))
-    generator = np.random.default_rng(config.seed)
-    next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
-    pattern = virtual_steps(config, any_virtual=bool(virtual))
+    # Not as a decorator, which would hold the virtual views for its caller.
+    with one_torch_thread():
+        config = FinetuneConfig() if config is None else config
+        coarse = CoarseConfig() if coarse is None else coarse
+        frames = sequence.train
+        depth = median_depth(sequence, frames)
+        start = scene
+        max_gaussians = round(config.growth * coarse.densify.max_gaussians)
+        if pseudo_views is not None and config.seed_holes:
+            room = max_gaussians - len(scene.gaussians)
+            new_gaussians = hole_gaussians(
+                scene.to("cpu"),
+                sequence,
+                pseudo_views,
+                room,
+                thickness=coarse.thickness,
+                max_distance=MAX_GUESS_DISTANCE * depth,
+            )
+            if new_gaussians is not None:
+                filled = Gaussians.concatenated(scene.gaussians, new_gaussians.to(scene.device))
+                start = Scene(filled, scene.light)
+        if config.keep_scene and len(start.gaussians) == len(scene.gaussians):
+            return TrainingResult(scene.detached(), [])
+        if coarse.inconsistent_frames == "weight":
+            real, _ = weighted_views(sequence, frames, coarse)
+        else:
+            real = real_views(sequence, frames)
+        virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)
+        # A caller that keeps none either has their floats out of memory while the scene is optimised.
+        del pseudo_views
+        real, virtual = ([view.to(scene.device) for view in views] for views in (real, virtual))
+        generator = np.random.default_rng(config.seed)
+        next_real, next_virtual = epochs(len(real), generator), epochs(max(1, len(virtual)), generator)
+        pattern = virtual_steps(config, any_virtual=bool(virtual))
 
-    def draw(iteration: int) -> View:
-        return virtual[next(next_virtual)] if pattern[iteration] else real[next(next_real)]
+        def draw(iteration: int) -> View:
+            return virtual[next(next_virtual)] if pattern[iteration] else real[next(next_real)]
 
-    densify = {"start_share": 0.0, "stop_share": config.densify_share, "max_gaussians": max_gaussians}
-    schedule = coarse_schedule(
-        _with_loss_weights(coarse, config),
-        scene_extent(sequence, frames),
-        depth,
-        stage,
-        iterations=config.iterations,
-        densify=coarse.densify.model_copy(update=densify),
-    )
-    schedule = replace(schedule, photometric_weight=config.photometric_weight)
-    if config.keep_scene:
-        fixed = len(scene.gaussians)
-        return optimise(
-            start,
-            draw,
-            filling_schedule(schedule.resumed(seed=config.seed)),
-            make_step=lambda scene, schedule: FillingStep(scene, schedule, fixed),
+        densify = {"start_share": 0.0, "stop_share": config.densify_share, "max_gaussians": max_gaussians}
+        schedule = coarse_schedule(
+            _with_loss_weights(coarse, config),
+            scene_extent(sequence, frames),
+            depth,
+            stage,
+            iterations=config.iterations,
+            densify=coarse.densify.model_copy(update=densify),
         )
-    # All harmonics are active from the first step: the scene is optimised already.
-    footprint = smallest_footprint(coarse, sequence.cameras[frames])
-    return optimise(start, draw, schedule.resumed(seed=config.seed), footprint=footprint)
+        schedule = replace(schedule, photometric_weight=config.photometric_weight)
+        if config.keep_scene:
+            fixed = len(scene.gaussians)
+            return optimise(
+                start,
+                draw,
+                filling_schedule(schedule.resumed(seed=config.seed)),
+                make_step=lambda scene, schedule: FillingStep(scene, schedule, fixed),
+            )
+        # All harmonics are active from the first step: the scene is optimised already.
+        footprint = smallest_footprint(coarse, sequence.cameras[frames])
+        return optimise(start, draw, schedule.resumed(seed=config.seed), footprint=footprint)
 
 
 def _with_loss_weights(coarse: CoarseConfig, config: FinetuneConfig) -> CoarseConfig:
@@ -193,24 +196,30 @@ def virtual_views(pseudo_views: PseudoViews, config: FinetuneConfig) -> list[Vie
     """
     views = []
     cameras = pseudo_views.cameras
-    confidence = np.maximum(pseudo_views.pixel_confidence, config.confidence_floor)
     # Virtual cameras have no mask: every pixel is valid.
     normalisation = None if config.loss == "weighted_mean" else float(cameras.height * cameras.width)
     ssim_weight = torch.ones(cameras.height, cameras.width) if config.loss == "paper" else None
     # Completed depth supervises only where the scene has no reliable surface.
-    depth = np.where(pseudo_views.uncertainty > UNKNOWN, pseudo_views.depth_mm, 0).astype(np.float32)
     weights = config.pseudo_weight * pseudo_views.image_confidence
     used = np.flatnonzero(weights > 0)
     if not config.image_confidence:
         weights = np.full_like(weights, weights[used].mean() if len(used) else 0)
     for index in used.tolist():
         target = pseudo_views.target[index] if config.keep_known else pseudo_views.restored[index]
+        confidence = in_steps(pseudo_views.pixel_confidence[index])
+        depth = None
+        if config.pseudo_depth:
+            unknown = pseudo_views.uncertainty[index] > UNKNOWN
+            depth = torch.from_numpy(np.where(unknown, pseudo_views.depth_mm[index], 0).astype(np.float32))
+        if confidence.dtype != torch.uint8:
+            confidence = confidence.clamp(min=config.confidence_floor)
         views.append(
             View(
                 camera=cameras[index],
-                rgb=torch.from_numpy(np.asarray(target, dtype=np.float32)),
-                weight=torch.from_numpy(confidence[index].astype(np.float32)),
-                depth_mm=torch.from_numpy(depth[index]) if config.pseudo_depth else None,
+                rgb=in_steps(target),
+                weight=confidence,
+                least_weight=config.confidence_floor,
+                depth_mm=depth,
                 frame=None,
                 loss_weight=float(weights[index]),
                 ssim_weight=ssim_weight,
@@ -259,9 +268,9 @@ def hole_gaussians(
         return None
     cameras = pseudo_views.cameras
     view = chosen // (cameras.width * cameras.height)
-    rays = pixel_rays(cameras).reshape(-1, 3)[chosen]
+    rays = rays_of_pixels(cameras, chosen)
     points = cameras.centers[view] + pseudo_views.depth_mm.reshape(-1)[chosen, None] * rays
-    rgb = np.asarray(pseudo_views.target, dtype=np.float64).reshape(-1, 3)[chosen]
+    rgb = pseudo_views.target.reshape(-1, 3)[chosen].astype(np.float64)
     if len(points) < MIN_POINTS:
         return None
     if scene.light is not None:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import binary_dilation
 from scipy.spatial import cKDTree
 
-from extrags.cameras import pixel_rays
+from extrags.cameras import rays_of_pixels
 from extrags.errors import CaptureError
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
@@ -54,7 +54,8 @@ def median_depth(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> 
     """
     depth = _known_depth(sequence, frames)
     if depth is not None:
-        return float(np.median(depth[(depth > 0) & sequence.mask[frames]]))
+        known = depth[(depth > 0) & _of_frames(sequence.mask, frames)]
+        return float(np.median(known, overwrite_input=True))
     if sequence.points is not None and len(sequence.points) >= MIN_POINTS_PER_VIEW:
         found = []
         chosen = np.linspace(0, len(frames) - 1, min(len(frames), MEASURED_FRAMES)).round().astype(np.int64)
@@ -133,21 +134,24 @@ def starting_gaussians(
             depth_from_points(sequence, frames)[frames]
             if known is None
             else np.where(_edges_of_estimate(sequence, frames), 0, known)
+            if sequence.depth_error is not None
+            else known
         )
-    valid = (depth > 0) & sequence.mask[frames]
+    valid = (depth > 0) & _of_frames(sequence.mask, frames)
     count = int(valid.sum())
     if count == 0:
         raise CaptureError(f"{sequence.name}: no valid depth in any training frame")
     # A point per pixel of all frames would be millions; a tenfold surplus is enough for thinning.
     generator = np.random.default_rng(seed)
-    chosen = np.flatnonzero(valid)
+    drawn = None
     if count > 10 * max_points:
-        chosen = np.sort(generator.choice(chosen, 10 * max_points, replace=False))
-    rays = pixel_rays(cameras).reshape(-1, 3)[chosen]
+        drawn = np.sort(generator.choice(count, 10 * max_points, replace=False))
+    chosen = _positions(valid, drawn)
+    rays = rays_of_pixels(cameras, chosen)
     z = depth.reshape(-1)[chosen].astype(np.float64)
     view = chosen // (sequence.width * sequence.height)
     points = cameras.centers[view] + z[:, None] * rays
-    rgb = sequence.rgb[frames].reshape(-1, 3)[chosen].astype(np.float64) / 255
+    rgb = _of_frames(sequence.rgb, frames).reshape(-1, 3)[chosen].astype(np.float64) / 255
     if light is not None:
         local = np.einsum("nji,nj->ni", cameras.world_from_camera[view, :3, :3], z[:, None] * rays)
         rgb = light.albedo(torch.from_numpy(rgb), torch.from_numpy(local)).detach().numpy()
@@ -250,14 +254,36 @@ def depth_from_points(
     return depth
 
 
+def _positions(valid: Bool[np.ndarray, "m h w"], ranks: Int[np.ndarray, "n"] | None) -> Int[np.ndarray, "n"]:
+    """Flat positions of true pixels, ascending, by their ranks among them; None: of all.
+
+    Frame by frame: positions of all pixels would be eight times as large as the masks.
+    """
+    if ranks is None:
+        return np.flatnonzero(valid)
+    bounds = np.concatenate([[0], np.cumsum([np.count_nonzero(frame) for frame in valid])])
+    edges = np.searchsorted(ranks, bounds)
+    parts = [
+        position * frame.size + np.flatnonzero(frame)[ranks[first:last] - bounds[position]]
+        for position, (frame, first, last) in enumerate(zip(valid, edges[:-1], edges[1:], strict=True))
+    ]
+    return np.concatenate(parts)
+
+
+def _of_frames(stack: np.ndarray, frames: Int[np.ndarray, "m"]) -> np.ndarray:
+    """Images of some frames; the stack itself, not a copy, where these are all of them in order."""
+    whole = len(frames) == len(stack) and np.array_equal(frames, np.arange(len(stack)))
+    return stack if whole else stack[frames]
+
+
 def _known_depth(
     sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]
 ) -> Float[np.ndarray, "m h w"] | None:
     """Depth of the frames; None where no valid pixel of them has any."""
     if sequence.depth_mm is None:
         return None
-    depth = sequence.depth_mm[frames]
-    return depth if bool(((depth > 0) & sequence.mask[frames]).any()) else None
+    known = any(bool(((sequence.depth_mm[k] > 0) & sequence.mask[k]).any()) for k in frames)
+    return _of_frames(sequence.depth_mm, frames) if known else None
 
 
 def _edges_of_estimate(

@@ -6,7 +6,6 @@ one after the other and reuses its arrays. Both give the same numbers up to roun
 
 from __future__ import annotations
 
-import weakref
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
@@ -119,9 +118,9 @@ class AutogradStep:
         )
         loss = schedule.photometric_weight * l1_ssim_loss(
             rendering.rgb[0],
-            view.rgb,
+            view.colours,
             dssim_weight=schedule.dssim_weight,
-            mask=view.weight,
+            mask=view.weights,
             ssim_mask=view.ssim_weight,
             normalisation=view.normalisation,
         )
@@ -158,8 +157,7 @@ class AutogradStep:
 class NativeStep:
     """The step as the native kernels do it: no graph, no new arrays while the number of Gaussians stays.
 
-    `direct` holds the last view's gradients, once there was one; `light_fit` the light, if the scene has one;
-    `targets` what the kernels need of each view that is still alive, by its identity.
+    `direct` holds the last view's gradients, once there was one; `light_fit` the light, if the scene has one.
 
     Args:
         scene: float32 on the CPU; it is copied.
@@ -176,7 +174,6 @@ class NativeStep:
         )
         self.direct: DirectStep | None = None
         self._bound: list[Tensor] = []
-        self.targets: dict[int, tuple[weakref.ref[View], Target]] = {}
 
     @property
     def light(self) -> NearFieldLight | None:
@@ -244,26 +241,19 @@ class NativeStep:
                 (split[name] if name in split else gradients[name]).add_(gradient)
 
     def _target(self, view: View) -> Target:
-        """What the kernels need of a view, kept as long as the view lives."""
-        key = id(view)
-        if key in self.targets:
-            return self.targets[key][1]
+        """What the kernels need of a view; made anew, so that one decoded view alone is in memory."""
         camera = view.camera
-        target = Target(
+        return Target(
             camera.viewmats[0].astype(np.float32),
             camera.K[0].astype(np.float32),
-            view.rgb,
+            view.colours,
             lens=camera.lens,
-            weight=view.weight,
+            weight=view.weights,
             ssim_weight=view.ssim_weight,
             normalisation=view.normalisation,
             depth=view.depth_mm if self._schedule.depth_weight > 0 else None,
             depth_confidence=view.depth_confidence,
         )
-        targets = self.targets
-        # An identity may be given again once its view is gone.
-        targets[key] = (weakref.ref(view, lambda _: targets.pop(key, None)), target)
-        return target
 
 
 def _penalties(

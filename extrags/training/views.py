@@ -1,4 +1,9 @@
-"""What one optimisation step is supervised with, and the order in which views are drawn."""
+"""What one optimisation step is supervised with, and the order in which views are drawn.
+
+Views stay in memory for a whole training, so they hold images as compactly as loses nothing: colours and
+weights that are steps of 1/255 as such, in 8 bits, and masks as truth values. A step decodes the one that it
+draws.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +13,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from extrags.cameras import Cameras
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
-__all__ = ["View", "depth_confidence", "epochs", "real_views"]
+__all__ = ["View", "depth_confidence", "epochs", "in_steps", "real_views"]
 
 
 @dataclass(frozen=True)
@@ -23,8 +28,9 @@ class View:
 
     Args:
         camera: a single camera.
-        rgb: the target in [0, 1], [H, W, 3].
-        weight: per-pixel weight of the colour terms; zero outside the mask, [H, W].
+        rgb: the target in [0, 1], or uint8 in steps of 1/255, [H, W, 3].
+        weight: per-pixel weight of the colour terms; zero outside the mask, [H, W]. Floats, uint8 in steps
+            of 1/255, or truth values.
         depth_mm: z-depth, 0 where it does not supervise, [H, W]; None without depth.
         frame: position among the training frames, for its exposure; None for a virtual view.
         loss_weight: weight of the whole view.
@@ -32,17 +38,33 @@ class View:
         normalisation: pixels that the weighted sums of the colour terms are divided by; None is the sum of
             `weight`, which makes them weighted means.
         depth_confidence: weight of the depth term per pixel, in [0, 1], [H, W]; None is one.
+        least_weight: what smaller weights of pixels are raised to where they are stored in steps.
     """
 
     camera: Cameras
-    rgb: Float[Tensor, "h w 3"]
-    weight: Float[Tensor, "h w"]
+    rgb: Float[Tensor, "h w 3"] | UInt8[Tensor, "h w 3"]
+    weight: Float[Tensor, "h w"] | UInt8[Tensor, "h w"] | Bool[Tensor, "h w"]
     depth_mm: Float[Tensor, "h w"] | None
     frame: int | None
     loss_weight: float = 1.0
     ssim_weight: Float[Tensor, "h w"] | None = None
     normalisation: float | None = None
     depth_confidence: Float[Tensor, "h w"] | None = None
+    least_weight: float = 0.0
+
+    @property
+    def colours(self) -> Float[Tensor, "h w 3"]:
+        """The target in [0, 1]; decoded anew whenever it is asked for."""
+        return _from_steps(self.rgb)
+
+    @property
+    def weights(self) -> Float[Tensor, "h w"]:
+        """Weight of the colour terms; decoded anew whenever it is asked for."""
+        if self.weight.dtype == torch.bool:
+            return self.weight.view(torch.uint8).to(torch.float32)  # Faster than from truth values.
+        if self.weight.dtype == torch.uint8:
+            return _from_steps(self.weight).clamp_(min=self.least_weight)
+        return self.weight
 
     def to(self, device: torch.device | str) -> View:
         """The same view with its images on a device; this very one where they are there already."""
@@ -52,6 +74,41 @@ class View:
             name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)
         }
         return replace(self, **images)
+
+
+def _from_steps(values: Tensor) -> Tensor:
+    """Steps of 1/255 in [0, 1]; others as they are.
+
+    The divisor is a tensor, since a GPU multiplies with the inverse of a plain number, which rounds
+    otherwise.
+    """
+    if values.dtype != torch.uint8:
+        return values
+    decoded = values.to(torch.float32)
+    return decoded.div_(torch.full((), 255.0, device=decoded.device))
+
+
+def in_steps(values: Float[np.ndarray, "*n"]) -> UInt8[Tensor, "*n"] | Float[Tensor, "*n"]:
+    """Values that are steps of 1/255 in [0, 1] in 8 bits, as stored images are; others as a float32 copy.
+
+    Args:
+        values: of any shape.
+
+    Returns:
+        What `View.colours` and `View.weights` decode to the same float32 values, bit by bit.
+    """
+    exact = np.array(values, dtype=np.float32)
+    # Not a number is no step.
+    with np.errstate(invalid="ignore"):
+        steps = np.rint(exact * np.float32(255)).clip(0, 255).astype(np.uint8)
+    stored = torch.from_numpy(steps)
+    found = torch.from_numpy(exact)
+    return stored if torch.equal(_from_steps(stored), found) else found
+
+
+def _shared(array: np.ndarray) -> Tensor:
+    """An array as a tensor in the same memory; a copy where that is read-only or has gaps."""
+    return torch.from_numpy(np.require(array, requirements=("C", "W")))
 
 
 CONFIDENT_ERROR = 0.15
@@ -68,7 +125,10 @@ def depth_confidence(expected_error: Float[np.ndarray, "*f h w"]) -> Float[np.nd
 
 
 def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> list[View]:
-    """The training frames as views; saturated pixels and specular highlights carry no weight."""
+    """The training frames as views; saturated pixels and specular highlights carry no weight.
+
+    Colours, and depth that is zero outside the mask already, share the memory of the sequence.
+    """
     cameras = sequence.cameras
     views = []
     for position, frame in enumerate(frames):
@@ -78,12 +138,12 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
         weight = sequence.supervised_mask(index) & ~saturated_mask(sequence.rgb[index])
         depth = None
         if sequence.depth_mm is not None:
-            depth = torch.from_numpy(np.where(mask, sequence.depth_mm[index], 0).astype(np.float32))
+            depth = _shared(_inside(sequence.depth_mm[index], mask))
         views.append(
             View(
                 camera=cameras[index],
-                rgb=torch.from_numpy(sequence.rgb[index].astype(np.float32) / 255),
-                weight=torch.from_numpy(weight.astype(np.float32)),
+                rgb=_shared(sequence.rgb[index]),
+                weight=torch.from_numpy(weight),
                 depth_mm=depth,
                 frame=position,
                 depth_confidence=None
@@ -92,6 +152,13 @@ def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> li
             )
         )
     return views
+
+
+def _inside(depth_mm: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Depth inside a mask, zero elsewhere, in float32; not copied where it is that already."""
+    if depth_mm.dtype == np.float32 and not depth_mm[~mask].any():
+        return depth_mm
+    return np.where(mask, depth_mm, 0).astype(np.float32)
 
 
 def epochs(count: int, generator: np.random.Generator) -> Iterator[int]:

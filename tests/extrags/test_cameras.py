@@ -12,12 +12,16 @@ from extrags.cameras import (
     look_at,
     pixel_rays,
     project_points,
+    rays_of_pixels,
     rotation_about,
     rotation_angle_deg,
     transform_points,
     unproject_pixels,
 )
 from extrags.errors import PoseError, ShapeError
+from extrags.radial_lens import RadialLens
+
+LENS = RadialLens((-0.209, 0.0397, 0.00787, -0.00334), float(np.radians(80)))
 
 
 def random_poses(count: int, seed: int = 0) -> np.ndarray:
@@ -183,3 +187,22 @@ class TestInterpolated:
         pose = look_at(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([0.0, -1.0, 0.0]))
         alone = Cameras(np.eye(3)[None], pose[None], 8, 6)
         assert alone.interpolated(5) is alone
+
+
+@pytest.mark.parametrize("lens", [None, LENS])
+@pytest.mark.parametrize("seed", range(3))
+def test_rays_of_some_pixels_have_the_bits_of_all(lens: RadialLens | None, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    poses = np.stack(
+        [
+            look_at(generator.normal(size=3), generator.normal(size=3) + 9, np.array([0.0, 1, 0]))
+            for _ in range(4)
+        ]
+    )
+    K = np.repeat(np.array([[[31.3, 0, 20.1], [0, 30.7, 14.9], [0, 0, 1]]]), 4, axis=0)
+    cameras = Cameras(K, poses, 41, 29, lens)
+    every = pixel_rays(cameras).reshape(-1, 3)
+    # The third camera has none, as frames without depth do.
+    at = np.flatnonzero((generator.random(len(every)) < 0.1) & (np.arange(len(every)) // (41 * 29) != 2))
+    assert np.array_equal(rays_of_pixels(cameras, at), every[at])
+    assert rays_of_pixels(cameras, at[:0]).shape == (0, 3)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import tempfile
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -87,6 +88,61 @@ class TestPacked:
         assert not group_exists(tmp_path / "a")
         with pytest.raises(SourceNotFoundError, match=r"a\.zarr\.zip"):
             open_group(tmp_path / "a")
+
+
+class TestMapped:
+    @pytest.fixture(autouse=True)
+    def scratch(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+        """Everything is large, and temporary files lie in a folder of their own."""
+        folder = tmp_path / "scratch"
+        folder.mkdir()
+        monkeypatch.setattr(zarr_io, "MAPPED_BYTES", 0)
+        # Two frames are decoded at once.
+        monkeypatch.setattr(zarr_io, "HELD_BYTES", 2 * FRAMES[0].nbytes)
+        monkeypatch.setattr(tempfile, "tempdir", str(folder))
+        return folder
+
+    @pytest.mark.parametrize("dtype", ["uint8", "bool", "float32", ">f4", "int64"])
+    def test_it_is_what_was_written(self, tmp_path: Path, dtype: str) -> None:
+        frames = FRAMES.astype(dtype)
+        write(tmp_path / "a", frames)
+        found = read(tmp_path / "a")
+        assert found.dtype == np.dtype(dtype).newbyteorder("=")
+        assert isinstance(found.base, np.memmap)
+        np.testing.assert_array_equal(found, frames)
+
+    def test_the_file_has_no_name_and_is_not_changed(self, tmp_path: Path, scratch: Path) -> None:
+        write(tmp_path / "a")
+        first = read(tmp_path / "a")
+        assert list(scratch.iterdir()) == []
+        first[:] = 0
+        assert not first.any()
+        np.testing.assert_array_equal(read(tmp_path / "a"), FRAMES)
+
+    def test_damage_is_named_and_leaves_nothing(self, tmp_path: Path, scratch: Path) -> None:
+        file = write(tmp_path / "a")
+        with zipfile.ZipFile(file) as pack:
+            chunk = pack.getinfo("rgb/c/4/0/0/0")
+        content = bytearray(file.read_bytes())
+        content[chunk.header_offset + 30 + len(chunk.filename) + 20] ^= 1
+        file.write_bytes(content)
+        with pytest.raises(DamagedArtefactError, match="rgb/c/4/0/0/0"):
+            read(tmp_path / "a")
+        assert list(scratch.iterdir()) == []
+
+    def test_a_full_disk_is_an_error(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        if not Path("/dev/full").exists():
+            pytest.skip("no /dev/full here")
+        write(tmp_path / "a")
+        monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb"))  # noqa: SIM115
+        with pytest.raises(OSError, match="No space left"):
+            read(tmp_path / "a")
+
+    def test_only_large_stacks_are_mapped(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(zarr_io, "MAPPED_BYTES", FRAMES.nbytes)
+        write(tmp_path / "a")
+        assert not isinstance(read(tmp_path / "a").base, np.memmap)
+        assert not isinstance(read(tmp_path / "a", "split/train").base, np.memmap)
 
 
 class TestDamage:

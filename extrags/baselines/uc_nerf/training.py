@@ -219,9 +219,9 @@ class _Training:
         found = field(rays, z, encoded, prior, scene.inverse_range, self.center, scene.scale)
 
         column, row = pixels.long().unbind(dim=1)
-        weight = view.weight[row, column]
+        weight = view.weights[row, column]
         assert found.rgb is not None
-        squares = (found.rgb[: len(pixels)] - view.rgb[row, column]).square().mean(dim=1)
+        squares = (found.rgb[: len(pixels)] - view.colours[row, column]).square().mean(dim=1)
         squared = (squares * weight).sum() / weight.sum().clamp_min(1)
 
         confidence = 1 - guide[2]
@@ -237,7 +237,7 @@ class _Training:
             + (confidence * (found.depth - 1 / guide[0]).abs() / scene.scale).mean()
         )
         loss = loss + config.smoothness_weight * edge_aware_smoothness(
-            prior.inverse * scene.scale, _resized(view.rgb, prior.inverse)
+            prior.inverse * scene.scale, _resized(view.colours, prior.inverse)
         )
         patches = self._patches(found, guide, confidence)
         return loss + config.gradient_weight * scale_invariant_gradient(*patches), squared
@@ -257,7 +257,7 @@ class _Training:
             ]
         height, width = prior.inverse.shape
         small = self.images[[frame]].resized(width, height)
-        weight = _resized(view.weight[..., None], prior.inverse)[0]
+        weight = _resized(view.weights[..., None], prior.inverse)[0]
         images = encoded.images.resized(width, height)
         return sum(levels, start=photometric_consistency(small, images, prior.inverse, weight))
 

@@ -257,7 +257,7 @@ class TestConfidences:
 
     def test_the_floor_may_be_zero(self, pseudo: PseudoViews) -> None:
         floors = [0.0, 0.1]
-        found = [virtual_views(pseudo, config_of("paper", confidence_floor=f))[0].weight for f in floors]
+        found = [virtual_views(pseudo, config_of("paper", confidence_floor=f))[0].weights for f in floors]
         assert [float(weight.min()) for weight in found] == pytest.approx(floors)
 
     def test_restored_depth_supervises_unknown_pixels_alone(self, pseudo: PseudoViews) -> None:
@@ -272,7 +272,7 @@ class TestConfidences:
     def test_targets(self, pseudo: PseudoViews) -> None:
         for keep_known, images in ((True, pseudo.target), (False, pseudo.restored)):
             view = virtual_views(pseudo, config_of("paper", keep_known=keep_known))[1]
-            assert np.array_equal(view.rgb.numpy(), images[2])
+            assert np.array_equal(view.colours.numpy(), images[2])
 
 
 class TestSteps:

@@ -7,6 +7,7 @@ import pytest
 
 from extrags.errors import CaptureError
 from extrags.sequence import EndoscopicSequence
+from extrags.training import starting
 from extrags.training.random_start import depth_range
 from extrags.training.starting import (
     depth_from_points,
@@ -29,6 +30,16 @@ class TestStartingGaussians:
         first, second = (starting_gaussians(tube_sequence, tube_sequence.train, 300) for _ in range(2))
         for name, value in first.parameters().items():
             np.testing.assert_array_equal(value.numpy(), second.parameters()[name].numpy())
+
+    def test_drawn_pixels_are_those_of_all_positions(self) -> None:
+        generator = np.random.default_rng(0)
+        valid = generator.random((5, 7, 9)) < 0.4
+        valid[2] = False
+        every = np.flatnonzero(valid)
+        drawn = np.sort(np.random.default_rng(1).choice(every, 30, replace=False))
+        ranks = np.sort(np.random.default_rng(1).choice(len(every), 30, replace=False))
+        assert np.array_equal(starting._positions(valid, ranks), drawn)
+        assert np.array_equal(starting._positions(valid, None), every)
 
     def test_uses_the_given_frames_only(self, tube_sequence: EndoscopicSequence) -> None:
         depth = tube_sequence.depth_mm
