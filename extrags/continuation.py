@@ -16,7 +16,7 @@ from extrags.store import canonical
 __all__ = ["Comparison", "compared_frames", "other_settings"]
 
 SAME_POSE = 1e-6
-"""Largest difference of two equal poses, in rotation entries, and in camera positions relative to the largest."""
+"""Largest difference between equal poses: of rotation entries, and of positions as a share of the largest."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,9 @@ def compared_frames(earlier: EndoscopicSequence, sequence: EndoscopicSequence) -
     if refusal:
         return _refused(refusal)
     if len(earlier) >= len(sequence):
-        return _refused(f"it has {len(earlier)} training frames, not fewer than the {len(sequence)} of this run")
+        return _refused(
+            f"it has {len(earlier)} training frames, not fewer than the {len(sequence)} of this run"
+        )
     places = defaultdict(list)
     for index, digest in enumerate(_digests(sequence)):
         places[digest].append(index)
@@ -104,7 +106,8 @@ def _other_kind(earlier: EndoscopicSequence, sequence: EndoscopicSequence) -> st
 
 def _digests(sequence: EndoscopicSequence) -> list[bytes]:
     return [
-        hashlib.blake2b(np.ascontiguousarray(image).tobytes(), digest_size=16).digest() for image in sequence.rgb
+        hashlib.blake2b(np.ascontiguousarray(image).tobytes(), digest_size=16).digest()
+        for image in sequence.rgb
     ]
 
 

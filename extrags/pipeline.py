@@ -440,8 +440,8 @@ class InMemoryPipeline(Pipeline):
                 return
             if self.config.continuation.scene == "nearest":
                 raise ConfigError(
-                    "continuation.scene=nearest looks for a scene in a store, and a run in memory has none; give "
-                    "extrags.training.reconstruct the earlier scene"
+                    "continuation.scene=nearest looks for a scene in a store, and a run in memory has none; "
+                    "give extrags.training.reconstruct the earlier scene"
                 )
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"

@@ -1,4 +1,4 @@
-"""A coarse scene that goes on from the nearest one in the store: the call that makes it, or why there is none."""
+"""A coarse scene that goes on from the nearest one in the store, or why it starts anew."""
 
 from __future__ import annotations
 
@@ -40,9 +40,7 @@ def coarse_call(
     anew = Call(coarse, {"sequence": frames, "config": config.coarse, "device": device})
 
     def iterations(earlier: Earlier) -> int:
-        return continued_iterations(
-            config.continuation, config.coarse.iterations, len(earlier.frames), total
-        )
+        return continued_iterations(config.continuation, config.coarse.iterations, len(earlier.frames), total)
 
     def continued(earlier: Earlier) -> Call:
         inputs = {

@@ -145,7 +145,7 @@ def nearest_scene(store: Store, label: str, frames: Ref, config: CoarseConfig) -
 
     refusals: dict[str, str] = {}
     candidates: list[tuple[int, Manifest, Ref]] = []
-    for manifest in [item for stage in STAGES for item in store.ls(stage)]:
+    for manifest in [item for kind in STAGES for item in store.ls(kind)]:
         if manifest.stage not in STAGES or _source(manifest.label) != _source(label):
             continue
         if manifest.inputs.get("sequence") == frames.digest:
@@ -203,7 +203,7 @@ def _settings(manifest: Manifest) -> CoarseConfig | None:
 
 
 def found_whole(store: Store, key: str) -> Ref | None:
-    """The artefact of a key; None where it is damaged, which who only looks for a start leaves where it is."""
+    """The artefact of a key; None where it is damaged: who only looks leaves it where it is."""
     try:
         return store.find(key)
     except DamagedArtefactError:

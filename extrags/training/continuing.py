@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass, replace
 
@@ -11,7 +12,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from extrags.config import CoarseConfig, ContinuationConfig
-from extrags.errors import ShapeError
+from extrags.errors import CaptureError, ShapeError
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
@@ -20,12 +21,21 @@ from extrags.thresholds import HOLE_ALPHA
 from extrags.training.schedule import Schedule
 from extrags.training.starting import starting_gaussians
 
-__all__ = ["EarlierScene", "continued_iterations", "continued_schedule", "continued_start", "unexplained_pixels"]
+__all__ = [
+    "EarlierScene",
+    "continued_iterations",
+    "continued_schedule",
+    "continued_start",
+    "unexplained_pixels",
+]
+
+_log = logging.getLogger(__name__)
 
 WRONG_DEPTH_SHARE = 0.1
 """A rendered depth that differs by more from the depth known there shows another surface."""
 
 ROOM_SHARE = 0.5
+"""When the earlier scene is full, so much of their even share of the Gaussians is free for new frames."""
 
 MIN_POINTS = 8
 """Fewer unexplained pixels have neither neighbours nor normals, and say little."""
@@ -95,7 +105,9 @@ def continued_start(
     points = math.ceil(share * config.max_points)
     limit = config.densify.max_gaussians
     kept = math.floor((1 - ROOM_SHARE * len(new) / len(chosen)) * limit)
-    scene = Scene(scene.gaussians.subset(_strongest(scene, sequence, chosen, min(kept, limit - points))), light)
+    scene = Scene(
+        scene.gaussians.subset(_strongest(scene, sequence, chosen, min(kept, limit - points))), light
+    )
     added = _added_gaussians(scene, sequence, new, where, points, config)
     return scene if added is None else Scene(Gaussians.concatenated(scene.gaussians, added), light)
 
@@ -108,15 +120,6 @@ def continued_schedule(schedule: Schedule, iterations: int) -> Schedule:
         iterations: how many there are.
     """
     return replace(schedule.resumed(seed=schedule.seed), iterations=iterations)
-
-
-NEW_FRAME_TURNS = 3
-
-
-def continued_turns(earlier: EarlierScene, chosen: Int[np.ndarray, "m"]) -> Int[np.ndarray, "t"]:
-    """Positions of the frames that an epoch draws: new ones several times, since they have been fitted least."""
-    new = np.flatnonzero(~np.isin(chosen, earlier.frames))
-    return np.concatenate([np.arange(len(chosen)), *[new] * (NEW_FRAME_TURNS - 1)])
 
 
 def unexplained_pixels(
@@ -204,13 +207,18 @@ def _added_gaussians(
         where = where & (sequence.depth_mm[new] > 0)
     if int(where.sum()) < MIN_POINTS or points < MIN_POINTS:
         return None
-    return starting_gaussians(
-        sequence,
-        new,
-        points,
-        light=scene.light,
-        sh_degree=config.sh_degree,
-        thickness=config.thickness,
-        seed=config.seed,
-        where=where,
-    )
+    try:
+        return starting_gaussians(
+            sequence,
+            new,
+            points,
+            light=scene.light,
+            sh_degree=config.sh_degree,
+            thickness=config.thickness,
+            seed=config.seed,
+            where=where,
+        )
+    except CaptureError as error:
+        # The other frames have shown where surface is; densification may still reach what these show.
+        _log.warning("%s: new frames add no starting points: %s", sequence.name, error)
+        return None

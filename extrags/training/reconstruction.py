@@ -15,7 +15,7 @@ from extrags.errors import CaptureError, ConfigError
 from extrags.illumination import NearFieldLight
 from extrags.scene import NEAR, Scene
 from extrags.sequence import EndoscopicSequence
-from extrags.training.continuing import EarlierScene, continued_schedule, continued_start, continued_turns
+from extrags.training.continuing import EarlierScene, continued_schedule, continued_start
 from extrags.training.footprint import SmallestFootprint
 from extrags.training.frame_weights import weighted_views
 from extrags.training.normal_term import NormalTerm
@@ -98,7 +98,7 @@ def reconstruct(
         start = Scene(gaussians, light)
     elif refines_poses(sequence, config):
         raise ConfigError(
-            f"{sequence.name}: poses are refined (coarse.refine_poses), and the earlier scene belongs to others"
+            f"{sequence.name}: poses are refined (coarse.refine_poses); the earlier scene belongs to others"
         )
     else:
         start = continued_start(earlier, sequence, chosen, config)
@@ -107,8 +107,7 @@ def reconstruct(
         logger.warning("%s: %s", sequence.name, statement)
     # Once, not in every iteration.
     views = [view.to(device) for view in views]
-    turns = np.arange(len(views)) if earlier is None else continued_turns(earlier, chosen)
-    order = epochs(len(turns), np.random.default_rng(config.seed))
+    order = epochs(len(views), np.random.default_rng(config.seed))
     schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
     if earlier is not None:
         schedule = continued_schedule(schedule, earlier.iterations)
@@ -120,7 +119,7 @@ def reconstruct(
         poses = PoseRefinement(sequence.cameras[chosen], settings, depth, config.iterations)
     result = optimise(
         start.to(device),
-        lambda _: views[turns[next(order)]],
+        lambda _: views[next(order)],
         schedule,
         poses=poses,
         footprint=smallest_footprint(config, sequence.cameras[chosen]),

@@ -1,4 +1,4 @@
-"""What it costs and gains to go on from a scene of fewer frames: `python tests/benchmarks/bench_continuing.py`.
+"""What going on from a scene of fewer frames gains: `python tests/benchmarks/bench_continuing.py`.
 
 A coarse scene is made from the first part of the training frames; then one of all of them, anew and from the
 first one, with several shares of the iterations. Figures are of held-out views, with processor seconds of one
@@ -72,7 +72,10 @@ def compared(
 
 
 def timed(
-    sequence: EndoscopicSequence, config: CoarseConfig, frames: np.ndarray, earlier: EarlierScene | None = None
+    sequence: EndoscopicSequence,
+    config: CoarseConfig,
+    frames: np.ndarray,
+    earlier: EarlierScene | None = None,
 ) -> tuple[Scene, float]:
     begun = time.process_time()
     scene = reconstruct(sequence, config, frames=frames, earlier=earlier).scene
