@@ -21,11 +21,11 @@ class ContinuationConfig(StageConfig):
         "the most of its training frames, and from no other frame; where there is none, it starts anew",
     )
     iterations_per_new_share: float = Field(
-        2.0,
+        1.5,
         gt=0,
         description="iterations of a continued scene, as a share of coarse.iterations, per share of new "
         "frames among its training frames; never more than coarse.iterations",
     )
     min_iterations_share: float = Field(
-        0.3, gt=0, le=1, description="lower bound of that share of coarse.iterations"
+        0.15, gt=0, le=1, description="lower bound of that share of coarse.iterations"
     )
