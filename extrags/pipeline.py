@@ -438,6 +438,11 @@ class InMemoryPipeline(Pipeline):
             if self.config.imported.scene is not None:
                 self.result.reconstruction = self._imported(self.config.imported.scene)
                 return
+            if self.config.continuation.scene == "nearest":
+                raise ConfigError(
+                    "continuation.scene=nearest looks for a scene in a store, and a run in memory has none; "
+                    "give extrags.training.reconstruct the earlier scene"
+                )
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
             frames = self._with_depth(self.result.sequence) if oracle else self._training

@@ -22,6 +22,7 @@ TASKS = {
     "training-frames": "coarse",
     "depth-frames": "coarse",
     "refined-frames": "coarse",
+    "continued-coarse": "coarse",
     "plan": "assess",
     "uc-nerf": "coarse",
     "uc-nerf-render": "evaluate",

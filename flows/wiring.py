@@ -16,6 +16,7 @@ from extrags.pipeline import HELD_OUT_TRAINED_ON, STAGES, Pipeline, StageName
 from extrags.redaction import without_credentials
 from extrags.store import Manifest, Ref, Store
 from extrags.store.runs import RunRecord, recorded_run
+from flows.continuation import coarse_call
 from flows.damage import again_after_damage
 from flows.imported import imported_call, of_imported_scene
 from flows.memory_limit import check_memory
@@ -252,11 +253,19 @@ class SequenceRun(Pipeline):
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
             frames = self._with_depth(self.refs["sequence"]) if oracle else self.refs["training"]
-            self.refs["coarse"] = self._run_task(
-                row, Call(coarse, {"sequence": frames, "config": self.config.coarse, **self._on_device()})
-            )
-            counts = self._manifest("coarse").counts
+            call = Call(coarse, {"sequence": frames, "config": self.config.coarse, **self._on_device()})
             said = [HELD_OUT_TRAINED_ON] if oracle else []
+            # The oracle's frames are other ones than those of any scene that may be gone on from.
+            if self.config.continuation.scene == "nearest" and not oracle:
+                refresh = getattr(self.runner, "refresh", False)
+                call, why_anew = coarse_call(
+                    self.config, self.store, self.outcome.name, frames, **self._on_device(), refresh=refresh
+                )
+                said += [why_anew] if why_anew else []
+            self.refs["coarse"] = self._run_task(row, call)
+            counts = self._manifest("coarse").counts
+            if counts.get("continued_from"):
+                said.append(str(counts["summary"]))
             if counts.get("refined_poses"):
                 # The scene was optimised with the corrected poses: later stages need them.
                 inputs = {"sequence": self.refs["sequence"], "coarse": self.refs["coarse"]}

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from extrags.config import CoarseConfig
 from extrags.store import Ref, Slot
 from tasks.divergence import keep_last_finite_scene
 from tasks.stage import stage
 
-__all__ = ["FRAME_WEIGHTS", "HISTORY", "coarse", "refined_frames"]
+if TYPE_CHECKING:
+    from extrags.sequence import EndoscopicSequence
+    from extrags.training import TrainingResult
+
+__all__ = ["FRAME_WEIGHTS", "HISTORY", "coarse", "refined_frames", "save_reconstruction"]
 
 FRAME_WEIGHTS = "frame_weights.json"
 """What was found of each training frame (`extrags.training.frame_weights.FrameWeights.to_json`)."""
@@ -29,13 +35,25 @@ def coarse(slot: Slot, sequence: Ref, config: CoarseConfig, device: str = "cpu")
     from extrags.devices import chosen_device
     from extrags.sequence import EndoscopicSequence
     from extrags.training import reconstruct
-    from extrags.training.starting import starts_at_random
 
     frames = slot.load(EndoscopicSequence, sequence)
     if config.train_on == "all":
         slot.counts["held_out_frames_trained_on"] = len(frames.test)
     with keep_last_finite_scene(slot):
         result = reconstruct(frames, config, device=chosen_device(device, "device"))
+    save_reconstruction(slot, frames, result)
+
+
+def save_reconstruction(slot: Slot, frames: EndoscopicSequence, result: TrainingResult) -> None:
+    """Write a coarse scene and what was found while it was made; fills the counts.
+
+    Args:
+        slot: to write into.
+        frames: what it was made from.
+        result: of the reconstruction.
+    """
+    from extrags.training.starting import starts_at_random
+
     slot.save(result.scene)
     slot.save_json(HISTORY, result.history)
     slot.counts["n_gaussians"] = len(result.scene.gaussians)

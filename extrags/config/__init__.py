@@ -6,6 +6,7 @@ Every public name of the modules below is here: a new model is listed in its own
 from extrags.config.base import *  # noqa: F403
 from extrags.config.baselines import *  # noqa: F403
 from extrags.config.coarse import *  # noqa: F403
+from extrags.config.continuation import *  # noqa: F403
 from extrags.config.depth import *  # noqa: F403
 from extrags.config.exploration import *  # noqa: F403
 from extrags.config.imported import *  # noqa: F403

@@ -16,6 +16,7 @@ from pydantic import Field, ValidationError, field_validator
 from extrags.config.base import StageConfig
 from extrags.config.baselines import UcNerfConfig
 from extrags.config.coarse import CoarseConfig
+from extrags.config.continuation import ContinuationConfig
 from extrags.config.depth import DepthConfig
 from extrags.config.exploration import ExploreConfig, FreespaceConfig, SurfaceConfig
 from extrags.config.imported import ImportedConfig
@@ -275,6 +276,7 @@ class PipelineConfig(StageConfig):
     poses: PosesConfig = PosesConfig()
     depth: DepthConfig = DepthConfig()
     coarse: CoarseConfig = CoarseConfig()
+    continuation: ContinuationConfig = ContinuationConfig()
     imported: ImportedConfig = ImportedConfig()
     uc_nerf: UcNerfConfig = UcNerfConfig()
     assess: AssessConfig = AssessConfig()
@@ -331,6 +333,7 @@ class PipelineConfig(StageConfig):
             "uc_nerf.enabled": self.uc_nerf.enabled,
             "coarse.train_on=all": self.coarse.train_on == "all",
             "coarse.refine_poses": self.coarse.refine_poses is True,
+            "continuation.scene=nearest": self.continuation.scene == "nearest",
             "poses.replace_given": self.poses.replace_given,
         }
         if self.uc_nerf.enabled and self.ingest.lens == "native":

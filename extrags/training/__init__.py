@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from extrags.training.continuing import EarlierScene as EarlierScene
 from extrags.training.finetuning import finetune as finetune
 from extrags.training.optimise import TrainingResult as TrainingResult
 from extrags.training.reconstruction import reconstruct as reconstruct

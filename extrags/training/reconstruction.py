@@ -11,10 +11,11 @@ from jaxtyping import Int
 
 from extrags.cameras import Cameras
 from extrags.config import CoarseConfig, DensifyConfig
-from extrags.errors import CaptureError
+from extrags.errors import CaptureError, ConfigError
 from extrags.illumination import NearFieldLight
 from extrags.scene import NEAR, Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.training.continuing import EarlierScene, continued_schedule, continued_start
 from extrags.training.footprint import SmallestFootprint
 from extrags.training.frame_weights import weighted_views
 from extrags.training.normal_term import NormalTerm
@@ -39,6 +40,7 @@ def reconstruct(
     frames: Int[np.ndarray, "m"] | None = None,
     stage: str = "coarse",
     device: torch.device | str = "cpu",
+    earlier: EarlierScene | None = None,
 ) -> TrainingResult:
     """Optimise Gaussians (and the near-field light) on training frames.
 
@@ -49,10 +51,13 @@ def reconstruct(
             for the oracle, all.
         stage: named in progress events.
         device: where it is optimised, and where the scene will be.
+        earlier: a scene of some of the frames to go on from, for the iterations it names; None starts anew.
 
     Raises:
         CaptureError: with fewer than one frame, nothing to start from, or a unit of length too large for a
             scene without light.
+        ConfigError: where poses are refined and there is an earlier scene, which belongs to other poses.
+        ShapeError: for an earlier scene that does not fit (`extrags.training.continuing.continued_start`).
         DivergedError: when the optimisation does not stay finite.
 
     Returns:
@@ -72,23 +77,31 @@ def reconstruct(
     if len(chosen) == 0:
         raise CaptureError(f"{sequence.name}: no training frames")
     depth = median_depth(sequence, chosen)
-    light = None
+    light: NearFieldLight | None = None
     if not config.light.enabled and depth < SHALLOWEST:
         raise CaptureError(
             f"{sequence.name}: the typical depth is {depth:.3g} units, too small without light, as "
             f"nothing nearer than {NEAR:g} is rendered; scale poses and depth up, or enable coarse.light"
         )
-    if config.light.enabled:
-        light = NearFieldLight.initial(len(chosen), depth, config.light)
-    gaussians = starting_gaussians(
-        sequence,
-        chosen,
-        config.max_points,
-        light=light,
-        sh_degree=config.sh_degree,
-        thickness=config.thickness,
-        seed=config.seed,
-    )
+    if earlier is None:
+        if config.light.enabled:
+            light = NearFieldLight.initial(len(chosen), depth, config.light)
+        gaussians = starting_gaussians(
+            sequence,
+            chosen,
+            config.max_points,
+            light=light,
+            sh_degree=config.sh_degree,
+            thickness=config.thickness,
+            seed=config.seed,
+        )
+        start = Scene(gaussians, light)
+    elif refines_poses(sequence, config):
+        raise ConfigError(
+            f"{sequence.name}: poses are refined (coarse.refine_poses); the earlier scene belongs to others"
+        )
+    else:
+        start = continued_start(earlier, sequence, chosen, config)
     views, weights = weighted_views(sequence, chosen, config)
     for statement in () if weights is None else weights.statements:
         logger.warning("%s: %s", sequence.name, statement)
@@ -96,14 +109,16 @@ def reconstruct(
     views = [view.to(device) for view in views]
     order = epochs(len(views), np.random.default_rng(config.seed))
     schedule = coarse_schedule(config, scene_extent(sequence, chosen), depth, stage)
+    if earlier is not None:
+        schedule = continued_schedule(schedule, earlier.iterations)
     if config.normal_weight > 0:
-        schedule = replace(schedule, normals=NormalTerm.at(gaussians.means.numpy(), config))
+        schedule = replace(schedule, normals=NormalTerm.at(start.gaussians.means.numpy(), config))
     poses = None
     if refines_poses(sequence, config):
         settings = config.pose_refinement
         poses = PoseRefinement(sequence.cameras[chosen], settings, depth, config.iterations)
     result = optimise(
-        Scene(gaussians, light).to(device),
+        start.to(device),
         lambda _: views[next(order)],
         schedule,
         poses=poses,

@@ -92,6 +92,7 @@ def starting_gaussians(
     sh_degree: int = 0,
     thickness: float = 1.0,
     seed: int = 0,
+    where: Bool[np.ndarray, "m h w"] | None = None,
 ) -> Gaussians:
     """Gaussians from back-projected depth, from sparse points without depth, or at random without either.
 
@@ -110,10 +111,11 @@ def starting_gaussians(
         sh_degree: degree of the (zero) higher harmonics.
         thickness: along the surface's normal, as a share of the radius; 1 makes round Gaussians.
         seed: chooses among equivalent pixels, and random points.
+        where: pixels of the frames that may start Gaussians; None: all valid ones.
 
     Raises:
         CaptureError: when neither depth nor points are known and all cameras stand in one place; when no
-            frame sees any of the points; when masks leave no pixel.
+            frame sees any of the points; when masks, or `where`, leave no pixel.
     """
     cameras = sequence.cameras[frames]
     at_random = starts_at_random(sequence, frames)
@@ -138,6 +140,8 @@ def starting_gaussians(
             else known
         )
     valid = (depth > 0) & _of_frames(sequence.mask, frames)
+    if where is not None:
+        valid &= where
     count = int(valid.sum())
     if count == 0:
         raise CaptureError(f"{sequence.name}: no valid depth in any training frame")

@@ -115,6 +115,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "depth.*": ("depth",),
     "coarse.train_on": (),  # Allowed for the oracle alone; below.
     "coarse.*": ("coarse",),
+    "continuation.*": (),  # Nothing is gone on from here; `test_continuation`.
     "imported.*": (),  # Without a scene nothing is imported; below.
     "uc_nerf.enabled": ALL_AFTER_COARSE,
     "uc_nerf.*": (),  # Reads nothing here; below.
@@ -167,6 +168,7 @@ OTHERS: dict[str, Any] = {
     "depth.completion": None,
     "depth.monocular": None,
     "coarse.train_on": None,
+    "continuation.scene": None,
     "imported.scene": None,
     "enhance.pretrained_weights": None,
     "evaluate.lpips_weights": None,
