@@ -31,10 +31,11 @@ from extrags.exploration import Exploration, explore
 from extrags.freespace import FreeSpace, carve
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
+from extrags.in_memory_pipeline import Result, run_pipeline
 from extrags.metrics.image import means_in_regions
 from extrags.metrics.protocol import EvaluationResult, RenderedViews
 from extrags.metrics.registry import Metric, register_metric
-from extrags.pipeline import STAGES, Result, run_pipeline
+from extrags.pipeline import STAGES
 from extrags.poses import estimate_poses, with_estimated_poses
 from extrags.pseudo_views import PseudoViews
 from extrags.raster import Rendering, rasterize

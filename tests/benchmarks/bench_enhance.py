@@ -38,11 +38,11 @@ from extrags.cameras import Cameras, pixel_rays
 from extrags.config import PipelineConfig
 from extrags.data_directories import data_roots
 from extrags.evaluation import render
+from extrags.in_memory_pipeline import InMemoryPipeline
 from extrags.metrics.image import mean_of_known, psnr
 from extrags.metrics.lpips import LpipsByNet
 from extrags.metrics.protocol import evaluate_views
 from extrags.metrics.registry import figures, metric_named
-from extrags.pipeline import InMemoryPipeline
 from extrags.raster import set_num_threads
 from extrags.raster.bench import machine
 from extrags.restoration.backends import load_enhancer

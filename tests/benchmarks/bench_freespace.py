@@ -196,7 +196,7 @@ def withheld(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Reconstructed without measured depth; clearance knows the depth's uncertainty."""
     from extrags.config import PROFILES
     from extrags.depth.training_depth import with_training_depth
-    from extrags.pipeline import run_pipeline
+    from extrags.in_memory_pipeline import run_pipeline
 
     rows = []
     for name in options.sequences:

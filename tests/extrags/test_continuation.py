@@ -9,7 +9,7 @@ import pytest
 from extrags.config import CoarseConfig, DensifyConfig, LightConfig, PipelineConfig
 from extrags.continuation import compared_frames, other_settings
 from extrags.errors import ConfigError
-from extrags.pipeline import run_pipeline
+from extrags.in_memory_pipeline import run_pipeline
 from extrags.sequence import EndoscopicSequence, Split
 from tests.extrags.training.textured_plane import changed, textured_plane
 

@@ -10,7 +10,7 @@ import pytest
 from data_catalog import read
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError
-from extrags.pipeline import run_pipeline
+from extrags.in_memory_pipeline import run_pipeline
 from tests.extrags.object_capture import write_object_capture
 from tests.flows.tiny import tiny_config
 

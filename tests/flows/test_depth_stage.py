@@ -14,7 +14,7 @@ import extrags
 from data_catalog.true_surface import true_surface
 from extrags.depth.estimate import DepthEstimate
 from extrags.errors import ConfigError, WeightsError
-from extrags.pipeline import InMemoryPipeline
+from extrags.in_memory_pipeline import InMemoryPipeline
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.store import Store

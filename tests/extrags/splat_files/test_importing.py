@@ -12,7 +12,7 @@ import torch
 from extrags.config import ImportedConfig, PipelineConfig
 from extrags.errors import ConfigError, PoseError, SourceError
 from extrags.gaussians import Gaussians
-from extrags.pipeline import run_pipeline
+from extrags.in_memory_pipeline import run_pipeline
 from extrags.scene import Scene
 from extrags.splat_files import bake_recorded_light, import_scene, write_ply_scene, write_spz
 from tests.extrags.lit_tube import Tube
