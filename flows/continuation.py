@@ -6,7 +6,6 @@ import logging
 
 from extrags.config import PipelineConfig
 from extrags.store import Ref, Store
-from extrags.training.continuing import continued_iterations
 from flows.runners import Call
 from tasks.coarse import coarse
 from tasks.continuation import Earlier, continued_coarse, found_whole, made_before, nearest_scene
@@ -36,6 +35,9 @@ def coarse_call(
     Returns:
         The call, and why it starts anew; empty where it goes on from an earlier scene.
     """
+    # Not above: it loads torch, which what only looks into a store does not need.
+    from extrags.training.continuing import continued_iterations
+
     total = int(store.manifest(frames).counts["frames"] or 0)
     anew = Call(coarse, {"sequence": frames, "config": config.coarse, "device": device})
 

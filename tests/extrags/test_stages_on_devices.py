@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from extrags import assessment, pipeline, placement
+from extrags import assessment, in_memory_pipeline, placement
 from extrags.assessment import measure
 from extrags.config import (
     AssessConfig,
@@ -161,7 +161,7 @@ def test_a_pipeline_in_memory(few: Tube, elsewhere: torch.device, monkeypatch: p
         {"finetune.judge.enabled": False, "evaluate.restored": "none"}
     )
     with kernel_threads(1):
-        result = pipeline.run_pipeline(
+        result = in_memory_pipeline.run_pipeline(
             few.sequence,
             config,
             leave_out=dict.fromkeys(("assess", "surface", "freespace", "explore", "enhance"), "not here"),
