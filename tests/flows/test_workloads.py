@@ -28,7 +28,7 @@ def test_frames_that_hold_all_their_detail_are_the_same_work() -> None:
 
 def test_a_plan_says_what_smaller_frames_would_take(capsys: pytest.CaptureFixture[str]) -> None:
     predicted, reduced = (
-        RunPrediction([StageCost("coarse", None, seconds, None)], "probe", 0) for seconds in (200.4, 79.6)
+        RunPrediction([StageCost("coarse", seconds, None, None)], "probe", 0) for seconds in (200.4, 79.6)
     )
     print_detail("no more detail than 450 x 360 px hold", predicted, reduced)
     said = capsys.readouterr().out
