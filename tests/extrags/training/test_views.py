@@ -4,6 +4,7 @@ import gc
 import inspect
 import weakref
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -165,9 +166,15 @@ class TestVirtualViews:
             return TrainingResult(start, [])
 
         monkeypatch.setattr(finetuning, "optimise", optimised)
-        # The checks of shapes, which tests alone have, hold the arguments.
+        # A decorator would hold them: there is none but the checks of shapes, which tests alone have.
+        assert wrappers(finetune) == wrappers(finetuning.virtual_views)
         inspect.unwrap(finetune)(scene, sequence, stored(), FinetuneConfig(iterations=1))
         assert alive == [False]
+
+
+def wrappers(function: Any) -> int:
+    """How many decorators a function has."""
+    return 1 + wrappers(function.__wrapped__) if hasattr(function, "__wrapped__") else 0
 
 
 def test_views_decode_on_another_device(sequence: EndoscopicSequence) -> None:
