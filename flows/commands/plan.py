@@ -79,10 +79,10 @@ def plan(given: argparse.Namespace) -> int:
         scenes = 2 if "finetune" in stages else 1
         return predict_run(store, work, stages, measured_scenes=scenes, pace=pace)
 
-    predicted = cost(*planned_work(store, outcome, config))
+    work, stages = planned_work(store, outcome, config)
+    predicted = cost(work, stages)
     whole = cost(*unplanned_work(store, outcome, config))
     counts = store.manifest(outcome.refs["ingest"]).counts
-    work, stages = planned_work(store, outcome, config)
     smaller = at_detail_size(work, counts)
     reduced = None if smaller is None else cost(smaller, stages)
     if given.json != "-":
