@@ -1,4 +1,4 @@
-"""The matrix form of a separable filter is the convolution it stands for."""
+"""Both forms of a separable filter are the convolution they stand for."""
 
 from __future__ import annotations
 
@@ -6,19 +6,44 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from extrags.metrics.filters import BorderRule, filter_separable, gaussian_weights
+from extrags.metrics.filters import LARGEST_MATRIX_PX, BorderRule, filter_separable, gaussian_weights
 
 
+@pytest.mark.parametrize("size", [(14, 19), (14, LARGEST_MATRIX_PX + 19), (LARGEST_MATRIX_PX + 14, 19)])
 @pytest.mark.parametrize("border", ["reflect", "replicate"])
-def test_equals_padding_and_convolution(border: BorderRule) -> None:
+def test_equals_padding_and_convolution(border: BorderRule, size: tuple[int, int]) -> None:
     generator = torch.Generator().manual_seed(3)
-    maps = torch.rand(2, 14, 19, generator=generator, dtype=torch.float64)
+    maps = torch.rand(2, *size, generator=generator, dtype=torch.float64)
     along_x = tuple(torch.randn(7, generator=generator, dtype=torch.float64).tolist())
     along_y = tuple(torch.randn(5, generator=generator, dtype=torch.float64).tolist())
     padded = F.pad(maps[:, None], (3, 3, 2, 2), mode=border)
     kernel = torch.outer(*(torch.tensor(weights, dtype=torch.float64) for weights in (along_y, along_x)))
     expected = F.conv2d(padded, kernel[None, None])[:, 0]
     torch.testing.assert_close(filter_separable(maps, along_x, along_y, border), expected, atol=1e-12, rtol=0)
+
+
+def test_large_maps_of_single_precision_differ_by_its_rounding() -> None:
+    maps = torch.rand(2, 3, 40, LARGEST_MATRIX_PX + 1, generator=torch.Generator().manual_seed(4))
+    window = gaussian_weights(1.5, 5)
+    found = filter_separable(maps, window, window)
+    assert found.dtype == torch.float32
+    exact = filter_separable(maps.double(), window, window)
+    # Two sums of eleven terms, the weights rounded too.
+    torch.testing.assert_close(found.double(), exact, atol=24 * 2**-24, rtol=0)
+
+
+def test_large_maps_have_gradients_and_may_be_views() -> None:
+    generator = torch.Generator().manual_seed(5)
+    maps = torch.rand(40, 2, LARGEST_MATRIX_PX + 1, generator=generator, dtype=torch.float64).transpose(0, 1)
+    window = gaussian_weights(1.5, 5)
+    without = filter_separable(maps, window, window)
+    maps.requires_grad_()
+    found = filter_separable(maps, window, window)
+    torch.testing.assert_close(found.detach(), without, atol=1e-12, rtol=0)
+    found.sum().backward()
+    # Weights sum to one, and mirrored borders give back what they take but for the border pixel itself.
+    assert maps.grad is not None
+    torch.testing.assert_close(maps.grad[:, 12:-12, 12:-12], torch.ones_like(maps)[:, 12:-12, 12:-12])
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 5])
