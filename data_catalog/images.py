@@ -61,9 +61,25 @@ def read_colour(file: Path, *, frame: object = None) -> UInt8[np.ndarray, "h w 3
 
     Raises:
         SourceNotFoundError: there is no such file.
-        SourceError: the file is truncated or no image.
+        SourceError: the file is truncated, no image, or has floating-point or 32-bit values, of which nothing
+            says what is white.
     """
-    return np.array(_opened(file, frame, "rgb", mode="RGB"), dtype=np.uint8)
+    from PIL import Image
+
+    with _image_errors(file, frame, "rgb"), Image.open(file) as image:
+        image.load()
+        mode = image.mode
+        # Pillow would clip 16-bit grey at 255: all white.
+        grey = (np.asarray(image) >> 8).astype(np.uint8) if mode.startswith("I;16") else None
+        found = None if mode in ("I", "F") or grey is not None else np.array(image.convert("RGB"), np.uint8)
+    if grey is not None:
+        return np.repeat(grey[..., None], 3, axis=2)
+    if found is None:
+        kind = "floating-point" if mode == "F" else "32-bit"
+        raise SourceError(
+            f"{kind} values; expected colours or grey of 8 or 16 bits", file=file, frame=frame, field="rgb"
+        )
+    return found
 
 
 def image_size(file: Path, *, frame: object = None) -> tuple[int, int]:

@@ -96,7 +96,7 @@ class _ContentMask:
 
 READER = FolderReader(
     name="frames",
-    version=4,
+    version=5,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,

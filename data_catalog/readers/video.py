@@ -56,10 +56,12 @@ class VideoFile:
         self._file = named or file
         with _opened(self._stream, self._file) as (container, stream):
             self._frames_per_s = float(stream.average_rate or stream.guessed_rate or 0)
-            duration_s = container.duration / 1e6 if container.duration else 0.0
+            self._start_s = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
+            # Of some containers the time before the first frame is part of the duration. Of the others this
+            # expects too few frames, which only makes the check for a truncated file more lenient.
+            duration_s = max(0.0, container.duration / 1e6 - self._start_s) if container.duration else 0.0
             # Where the container does not count its frames, what a steady rate would give.
             self._announced = stream.frames or round(duration_s * self._frames_per_s)
-            self._start_s = float(stream.start_time * stream.time_base) if stream.start_time else 0.0
             aspect = float(stream.sample_aspect_ratio or 1)
             turned_deg = next((frame.rotation for frame in _decoded(container, stream)), 0)
         # Counterclockwise, as numpy turns.

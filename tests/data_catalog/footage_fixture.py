@@ -39,6 +39,22 @@ def write_flagged(file: Path, woven: np.ndarray) -> Path:
     return file
 
 
+def write_late(file: Path, frames: np.ndarray, start_s: float) -> Path:
+    """Matroska or WebM whose first frame is not at time 0, as cuts and recordings with sound have it."""
+    import av
+
+    with av.open(str(file), "w") as container:
+        stream = container.add_stream("libvpx" if file.suffix == ".webm" else "mjpeg", rate=25)
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = "yuv420p" if file.suffix == ".webm" else "yuvj420p"
+        for number, image in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(image)
+            frame.pts = number + round(25 * start_s)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    return file
+
+
 def write_ten_bit(file: Path, frames: np.ndarray, *, pixel_aspect: str = "1:1") -> Path:
     """YUV4MPEG2 with 10 bits a channel and halved chroma, limited range."""
     height, width = frames.shape[1:3]

@@ -24,6 +24,7 @@ from tests.data_catalog.footage_fixture import (
     retimed,
     turned,
     write_flagged,
+    write_late,
     write_ten_bit,
     write_video,
 )
@@ -335,6 +336,22 @@ class TestRefused:
         file = write_video(tmp_path / "still.avi", np.repeat(moving_scene(1, *SIZE), 12, axis=0))
         with pytest.raises(SourceError, match=r"still\.avi, field motion: the picture moves by 0\.0%"):
             read(file)
+
+    @pytest.mark.parametrize("start_s", [0.0, 0.4, 100.0])
+    @pytest.mark.parametrize("name", ["late.mkv", "late.webm"])
+    def test_a_whole_video_that_starts_late_is_not(self, tmp_path, name, start_s) -> None:
+        """The duration in its header includes the time before the first frame."""
+        file = VideoFile(write_late(tmp_path / name, moving_scene(20, 64, 48), start_s))
+        frames = list(file.frames(TimeSpan()))
+        assert file.announced == len(frames) == 20
+        assert [frame.time_s for frame in frames] == pytest.approx(np.arange(20) / 25, abs=2e-3)
+
+    @pytest.mark.parametrize("start_s", [0.0, 100.0])
+    def test_a_truncated_one_that_starts_late(self, tmp_path, start_s) -> None:
+        whole = write_late(tmp_path / "late.mkv", moving_scene(60, 64, 48), start_s)
+        whole.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+        with pytest.raises(SourceError, match=r"late\.mkv.*(truncated|cannot be opened)"):
+            list(VideoFile(whole).frames(TimeSpan()))
 
     @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
     def test_a_truncated_file(self, video, tmp_path, share) -> None:

@@ -1,0 +1,50 @@
+"""Single images: what kinds of pixels become colours."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from data_catalog.images import read_colour, read_mask
+from extrags.errors import SourceError
+
+GREY = np.random.default_rng(0).integers(0, 2**16, (20, 30), dtype=np.uint16)
+
+
+def written(file: Path, pixels: np.ndarray) -> Path:
+    assert cv2.imwrite(str(file), pixels)
+    return file
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.tif"])
+class TestSixteenBits:
+    def test_grey_is_the_high_byte(self, tmp_path: Path, name: str) -> None:
+        found = read_colour(written(tmp_path / name, GREY))
+        assert found.dtype == np.uint8
+        np.testing.assert_array_equal(found, np.repeat((GREY >> 8)[..., None], 3, axis=2))
+
+    def test_a_mask_is_white_where_it_is_not_black(self, tmp_path: Path, name: str) -> None:
+        """Of labels in 16 bits, 255 is white as well."""
+        labels = np.where(GREY > 2**15, np.uint16(255), np.uint16(0))
+        np.testing.assert_array_equal(read_mask(written(tmp_path / name, labels)), labels > 0)
+
+
+def test_colours_of_sixteen_bits_are_the_high_byte(tmp_path: Path) -> None:
+    colours = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], axis=-1)
+    found = read_colour(written(tmp_path / "a.png", colours[..., ::-1]))
+    np.testing.assert_array_equal(found, (colours >> 8).astype(np.uint8))
+
+
+def test_alpha_is_dropped(tmp_path: Path) -> None:
+    colours = np.random.default_rng(1).integers(0, 256, (20, 30, 4), dtype=np.uint8)
+    found = read_colour(written(tmp_path / "a.png", colours))
+    np.testing.assert_array_equal(found, colours[..., 2::-1])
+
+
+def test_floating_point_has_no_white(tmp_path: Path) -> None:
+    file = written(tmp_path / "a.tif", GREY.astype(np.float32))
+    with pytest.raises(SourceError, match=r"a\.tif, frame 7, field rgb: floating-point values; expected"):
+        read_colour(file, frame=7)
