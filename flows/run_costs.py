@@ -199,6 +199,8 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
         StoreError: when the sequence's manifest cannot be read.
     """
     skipped = {row.stage for row in outcome.stages if row.state == "skipped"}
+    # Its row says that it ran: the scene was read, and nothing was trained.
+    skipped |= set() if config.imported.scene is None else {"coarse"}
     if outcome.plan is not None:
         decided = ScenePlan.model_validate(
             {name: outcome.plan[name] for name in ScenePlan.model_fields if name in outcome.plan}

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import logging
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 from data_catalog.catalog import resolve, source_fingerprint
 from extrags.config import PipelineConfig
-from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
 from extrags.metrics.registry import added_metrics
-from extrags.pipeline import HELD_OUT_TRAINED_ON, STAGES, Pipeline, StageName
-from extrags.redaction import without_credentials
-from extrags.store import Manifest, Ref, Store
-from extrags.store.runs import RunRecord, recorded_run
+from extrags.pipeline import HELD_OUT_TRAINED_ON, StageName
+from extrags.store import Ref
+from flows.cached_stages import CachedStages
 from flows.continuation import coarse_call
-from flows.damage import again_after_damage
 from flows.imported import imported_call, of_imported_scene
 from flows.memory_limit import check_memory
-from flows.outcome import Part, SequenceOutcome, StageRow
-from flows.runners import Call, NotInStoreError, Runner, StoreRunner
+from flows.outcome import SequenceOutcome, StageRow
+from flows.runners import Call, Runner, StoreRunner
 from tasks.assess import assess, measuring_settings, plan, planning_settings
 from tasks.coarse import coarse, refined_frames
 from tasks.depth import depth, depth_frames, triangulation_settings
@@ -44,7 +38,6 @@ from tasks.finetune import finetune, finetuning_settings, judge
 from tasks.freespace import freespace
 from tasks.ingest import ingest, training_frames
 from tasks.poses import estimating_settings, poses
-from tasks.progress import StageProgress, notify
 from tasks.report import PAGE, REPORT_PARTS, report
 from tasks.stage import stage_key
 from tasks.surface import surface
@@ -58,12 +51,6 @@ from tasks.weights import (
 )
 
 __all__ = ["SequenceRun", "run_sequence"]
-
-log = logging.getLogger(__name__)
-
-
-class _StoppedError(Exception):
-    """A stage failed; its row is written already."""
 
 
 def run_sequence(
@@ -103,74 +90,11 @@ def run_sequence(
     return run.run(until)
 
 
-class SequenceRun(Pipeline):
-    """The stages of one sequence as cached tasks; the arguments are those of `run_sequence`."""
+class SequenceRun(CachedStages):
+    """The stages of one sequence as cached tasks: the inputs of each, and what it makes.
 
-    def __init__(
-        self,
-        name: str,
-        config: PipelineConfig,
-        store: str,
-        runner: Runner,
-        profile: str = "",
-        *,
-        leave_out: Mapping[str, str] | None = None,
-    ) -> None:
-        super().__init__(config, leave_out)
-        self.check_frames: Callable[[Mapping[str, Any]], object] = dict  # Of the counts of `ingest`.
-        self.outcome = SequenceOutcome(name)
-        self.store = Store(store)
-        self.runner = runner
-        self.profile = profile
-        self._given = self.config
-        self._record: RunRecord | None = None
-        self._before: dict[str, StageRow] = {}
-        """Rows of the attempts that met a damaged artefact."""
-
-    @property
-    def refs(self) -> dict[Part, Ref]:
-        """What has been made so far."""
-        return self.outcome.refs
-
-    def run(self, until: StageName = "report") -> SequenceOutcome:
-        """All stages up to one; see `run_sequence`."""
-        begun = time.monotonic()
-        try:
-            if isinstance(self.runner, StoreRunner):
-                self._attempt(until)  # Who only looks moves nothing.
-            else:
-                with recorded_run(self.store, self.outcome.name) as self._record:
-                    again_after_damage(self.store, lambda: self._attempt(until))
-        except (_StoppedError, ArtefactGoneError, DamagedArtefactError) as error:
-            if not isinstance(error, _StoppedError):
-                last = self.outcome.stages[-1]
-                last.state, last.reason, self.outcome.error = "failed", str(error), error
-            self.outcome.status = "failed"
-            done = {row.stage for row in self.outcome.stages}
-            failed = self.outcome.stages[-1].stage
-            for stage in STAGES[: STAGES.index(until) + 1]:
-                if stage not in done:
-                    self.skip(stage, f"{failed} failed")
-        self.outcome.seconds = time.monotonic() - begun
-        return self.outcome
-
-    def _attempt(self, until: StageName) -> None:
-        """All stages from the beginning; raises what `again_after_damage` can mend."""
-        self._before |= {row.stage: row for row in self.outcome.stages}
-        self.outcome = SequenceOutcome(self.outcome.name)
-        self.config, self.plan = self._given, None
-        try:
-            self.run_stages(until)
-        except _StoppedError:
-            if isinstance(self.outcome.error, ArtefactGoneError | DamagedArtefactError):
-                raise self.outcome.error from None
-            raise
-
-    def skip(self, stage: StageName, reason: str) -> None:
-        """Add a row to the outcome and report the progress."""
-        row = StageRow(stage, "skipped", reason=reason)
-        self.outcome.stages.append(row)
-        self._report_progress(row, "skipped")
+    The arguments are those of `run_sequence`.
+    """
 
     def has_poses(self) -> bool:
         """Whether the source has camera poses."""
@@ -328,7 +252,9 @@ class SequenceRun(Pipeline):
             self.refs["explore"] = self._run_task(row, Call(explore, collected))
             accepted = int(self._manifest("explore").counts["trajectories"] or 0)
             if accepted < self.config.explore.trajectories:
-                row.reason += f"; {accepted} of them were accepted, since no other added enough"
+                wanted = self.config.explore.trajectories
+                told = f"{accepted} of {wanted} trajectories were accepted, since no other added enough"
+                row.reason = "; ".join(filter(None, (row.reason, told)))
 
     def enhance(self) -> None:
         """The restorer, and the virtual views it restores in batches."""
@@ -511,81 +437,3 @@ class SequenceRun(Pipeline):
 
     def _weights(self) -> list[Weights]:
         return lpips_weights(self.config.evaluate)
-
-    def _run_uncounted(self, call: Call) -> Ref:
-        """Run a task that is not counted in the row of its stage."""
-        (result,) = self.runner.run([call], self.outcome.name)
-        self._note([result.ref])
-        manifest = self.store.manifest(result.ref)
-        self.outcome.stages[-1].made[manifest.key] = manifest.bytes
-        return result.ref
-
-    def _note(self, refs: list[Ref]) -> None:
-        """Retention keeps what a run has used."""
-        if self._record is not None:
-            self._record.add(ref.uri.rsplit("/", 1)[-1] for ref in refs)
-
-    def _run_task(self, row: StageRow, call: Call) -> Ref:
-        return self._run_tasks(row, [call])[0]
-
-    def _run_tasks(self, row: StageRow, calls: list[Call]) -> list[Ref]:
-        results = self.runner.run(calls, self.outcome.name)
-        self._note([result.ref for result in results])
-        for result in results:
-            manifest = self.store.manifest(result.ref)
-            peak = manifest.counts.get("peak_mib")
-            if isinstance(peak, float):
-                row.peak_mib = max(row.peak_mib or 0.0, peak)
-            processor = manifest.counts.get("processor_s")
-            if not isinstance(processor, int | float):
-                row.processor_seconds = None
-            elif row.tasks == 0:
-                row.processor_seconds = float(processor)
-            elif row.processor_seconds is not None:
-                row.processor_seconds = round(row.processor_seconds + processor, 3)
-            row.made_seconds += manifest.seconds
-            row.made[manifest.key] = manifest.bytes
-            row.tasks += 1
-            if result.state == "ran":
-                row.spent_seconds += manifest.seconds
-                row.state = "ran"
-        return [result.ref for result in results]
-
-    def _manifest(self, part: Part) -> Manifest:
-        return self.store.manifest(self.refs[part])
-
-    @contextmanager
-    def _stage(self, stage: StageName) -> Iterator[StageRow]:
-        """One row of the outcome: timed, announced, and marked when the block raises."""
-        row = self.outcome.row(stage)
-        if row is None:
-            planned = self.planned(stage)
-            row = StageRow(stage, "cached", reason="" if planned is None else planned.reason)
-            before = self._before.get(stage)
-            if before is not None:
-                row.seconds = before.seconds
-                row.state = "ran" if before.state == "ran" else "cached"
-            self.outcome.stages.append(row)
-        self._report_progress(row, "running")
-        begun = time.monotonic()
-        try:
-            yield row
-        except NotInStoreError:
-            raise
-        except Exception as error:
-            row.state = "failed"
-            told = str(error) if isinstance(error, ExtragsError) else f"{type(error).__name__}: {error}"
-            row.reason = without_credentials(told)
-            self.outcome.error = error
-            raise _StoppedError from error
-        except BaseException:
-            row.state = "interrupted"
-            raise
-        finally:
-            row.seconds += time.monotonic() - begun
-            self._report_progress(row, row.state)
-
-    def _report_progress(self, row: StageRow, state: str, done: int = 0, total: int = 0) -> None:
-        reason = row.reason if state in ("skipped", "failed") else ""
-        made = {} if state == "running" else {str(part): ref for part, ref in self.refs.items()}
-        notify(StageProgress(self.outcome.name, row.stage, state, done, total, reason, row.seconds, made))

@@ -16,6 +16,7 @@ from extrags.store import Manifest
 __all__ = [
     "at_detail_size",
     "catalogue_work",
+    "detail_flags",
     "frames_work",
     "known_work",
     "read_size",
@@ -23,8 +24,10 @@ __all__ = [
     "usual_work",
 ]
 
-USUAL_WIDTH = 340
-"""About the width that sources are read at where no divisor is set, in pixels."""
+THUMBNAIL_DIVISORS = {"simcol3d": 2, "sinus": 4}
+"""Of formats whose thumbnails are divided alike; others but C3VD are read as they are."""
+SINUS_BOX = (1048, 972)
+"""Width and height in pixels of what the sinus frames show: their black border is cut off."""
 
 
 def known_work(name: str, config: PipelineConfig) -> Workload | None:
@@ -56,14 +59,33 @@ def frames_work(ingested: Manifest, config: PipelineConfig) -> Workload:
 def at_detail_size(work: Workload, counts: Mapping[str, Any]) -> Workload | None:
     """The same run with frames of the size that keeps their detail; None where that is the size they have.
 
+    None as well where settings divide the size of the source (`ingest.downscale`), which is then not known.
+
     Args:
         work: of a sequence that has been read.
         counts: of the artefact of its `ingest`.
     """
     width, height = float(counts["detail_width"]), float(counts["detail_height"])
-    if work.width is None or width >= work.width:
+    if work.width is None or width >= work.width or work.config.ingest.downscale is not None:
         return None
     return replace(work, pixels=width * height, width=width)
+
+
+def detail_flags(config: PipelineConfig, counts: Mapping[str, Any]) -> str:
+    """What asks for frames of that size, on the command line.
+
+    Frames of the source's size can be measured again, whatever they are; those of any other size were
+    measured as they are, and the size is named.
+
+    Args:
+        config: settings that they were read with.
+        counts: of the artefact of `ingest`.
+    """
+    given = config.ingest
+    if given.size == "source" and given.width is None:
+        return "--ingest.size detail"
+    height = "" if given.height is None else f" --ingest.height {counts['detail_height']}"
+    return f"--ingest.width {counts['detail_width']}{height}"
 
 
 def catalogue_work(
@@ -92,15 +114,24 @@ def catalogue_work(
 
 
 def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:
-    """About the width and height that a sequence of the catalogue is read at, in pixels."""
+    """About the width and height that a sequence of the catalogue is read at, in pixels.
+
+    Raises:
+        ConfigError: for a size that cannot be rendered.
+    """
+    from data_catalog.c3vd.pinhole import USUAL_WIDTH
+    from data_catalog.rendered_size import rendered_size
+
     ingest = config.ingest
-    if ingest.width and ingest.height and about.format in ("phantom", "caverns"):
-        return ingest.width, ingest.height
     if about.format in ("phantom", "caverns"):
-        return about.width, about.height
-    usual = max(1, round(about.width / USUAL_WIDTH)) if ingest.size == "thumbnail" else 1
-    divisor = ingest.downscale or usual
-    return about.width / divisor, about.height / divisor
+        return rendered_size(ingest, about.width, about.height)
+    width, height = SINUS_BOX if about.format == "sinus" else (about.width, about.height)
+    if ingest.width is not None:
+        return ingest.width, ingest.height or ingest.width * height / width
+    usual = max(1, round(width / USUAL_WIDTH)) if about.format == "c3vd" else 1
+    usual = THUMBNAIL_DIVISORS.get(about.format, usual)
+    divisor = ingest.downscale or (usual if ingest.size == "thumbnail" else 1)
+    return width / divisor, height / divisor
 
 
 def task_repeats(stage: str, measured_scenes: int, restored: int) -> dict[str, int]:

@@ -70,7 +70,7 @@ def plan(given: argparse.Namespace) -> int:
     from extrags.run_costs import packaged_model
     from flows.console import print_plan
     from flows.run_costs import pace_here, planned_work, predict_run, unplanned_work
-    from flows.workloads import at_detail_size
+    from flows.workloads import at_detail_size, detail_flags
 
     store, config = Store(store_root(given)), run_config(given)
     pace = pace_here(store, config, packaged_model())
@@ -89,7 +89,7 @@ def plan(given: argparse.Namespace) -> int:
         print_plan(outcome)
         print_prediction(predicted, whole)
         if reduced is not None:
-            print_detail(str(counts["detail"]), predicted, reduced)
+            print_detail(str(counts["detail"]), detail_flags(config, counts), predicted, reduced)
     write_json(
         {
             "sequence": outcome.name,
@@ -109,11 +109,12 @@ def plan(given: argparse.Namespace) -> int:
     return 0
 
 
-def print_detail(found: str, predicted: RunPrediction, reduced: RunPrediction) -> None:
+def print_detail(found: str, flags: str, predicted: RunPrediction, reduced: RunPrediction) -> None:
     """What frames of the size that keeps their detail would save.
 
     Args:
         found: the size, in words.
+        flags: what asks for it.
         predicted: of the run as it is.
         reduced: of the same run with such frames.
     """
@@ -121,7 +122,7 @@ def print_detail(found: str, predicted: RunPrediction, reduced: RunPrediction) -
 
     seconds, smaller = predicted.processor_seconds, reduced.processor_seconds
     console().print(
-        f"frames hold {found}: --ingest.size detail would take {smaller:.0f} s of processor time in place of "
+        f"frames hold {found}: {flags} would take {smaller:.0f} s of processor time in place of "
         f"{seconds:.0f}",
         soft_wrap=True,
     )

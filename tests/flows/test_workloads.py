@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
-from extrags.config import PipelineConfig
+from data_catalog import describe
+from extrags.config import IngestConfig, PipelineConfig
 from extrags.run_costs import Workload, packaged_model, stage_seconds
 from flows.commands.plan import print_detail
 from flows.run_costs import RunPrediction, StageCost
-from flows.workloads import at_detail_size
+from flows.workloads import at_detail_size, detail_flags, read_size
 
 
 def test_frames_of_the_size_that_keeps_their_detail_cost_less() -> None:
@@ -26,11 +29,54 @@ def test_frames_that_hold_all_their_detail_are_the_same_work() -> None:
     assert at_detail_size(whole, {"detail_width": 675, "detail_height": 540}) is None
 
 
+@pytest.mark.parametrize(
+    ("settings", "flags"),
+    [
+        ({"size": "source"}, "--ingest.size detail"),
+        ({"size": "thumbnail"}, "--ingest.width 180"),
+        ({"size": "source", "width": 225}, "--ingest.width 180"),
+        ({"width": 225, "height": 180}, "--ingest.width 180 --ingest.height 144"),
+    ],
+)
+def test_what_asks_for_frames_of_that_size(settings: dict[str, Any], flags: str) -> None:
+    """`size=detail` measures the source, and gives way to a width."""
+    config = PipelineConfig(ingest=IngestConfig(**settings))
+    assert detail_flags(config, {"detail_width": 180, "detail_height": 144}) == flags
+
+
+def test_frames_that_are_divided_have_no_such_flag() -> None:
+    config = PipelineConfig(ingest=IngestConfig(downscale=2))
+    work = Workload(225 * 180, 40, 20, 20, config, width=225)
+    assert at_detail_size(work, {"detail_width": 180, "detail_height": 144}) is None
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "size"),
+    [
+        ("phantom/0@sparse", {}, (160, 128)),
+        ("phantom/0@sparse", {"width": 64}, (64, 51)),
+        ("caverns/0@sparse", {"downscale": 4}, (40, 32)),
+        ("simcol3d/s1", {}, (237, 237)),
+        ("simcol3d/s1", {"size": "source"}, (475, 475)),
+        ("simcol3d/s1", {"width": 100}, (100, 100)),
+        ("sinus/hopkins", {}, (262, 243)),
+        ("sinus/hopkins", {"width": 64}, (64, 59)),
+        ("c3vdv2_sim/c9_transverse1_t3@sparse", {}, (225, 180)),
+        ("c3vdv2_sim/c9_transverse1_t3@sparse", {"size": "source", "downscale": 2}, (337, 270)),
+    ],
+)
+def test_the_size_that_a_sequence_will_be_read_at(
+    name: str, settings: dict[str, Any], size: tuple[int, int]
+) -> None:
+    found = read_size(describe(name), PipelineConfig(ingest=IngestConfig(**settings)))
+    assert found == pytest.approx(size, abs=1)
+
+
 def test_a_plan_says_what_smaller_frames_would_take(capsys: pytest.CaptureFixture[str]) -> None:
     predicted, reduced = (
         RunPrediction([StageCost("coarse", seconds, None, None)], "probe", 0) for seconds in (200.4, 79.6)
     )
-    print_detail("no more detail than 450 x 360 px hold", predicted, reduced)
+    print_detail("no more detail than 450 x 360 px hold", "--ingest.size detail", predicted, reduced)
     said = capsys.readouterr().out
     assert "frames hold no more detail than 450 x 360 px hold: --ingest.size detail" in said
     assert "80 s of processor time in place of 200" in said

@@ -1,0 +1,185 @@
+"""What is the same for every stage of a run with a store: tasks run, accounted, announced, and resumed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from extrags.config import PipelineConfig
+from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
+from extrags.pipeline import STAGES, Pipeline, StageName
+from extrags.redaction import without_credentials
+from extrags.store import Manifest, Ref, Store
+from extrags.store.runs import RunRecord, recorded_run
+from flows.damage import again_after_damage
+from flows.outcome import Part, SequenceOutcome, StageRow
+from flows.runners import Call, NotInStoreError, Runner, StoreRunner
+from tasks.progress import StageProgress, notify
+
+__all__ = ["CachedStages"]
+
+
+class _StoppedError(Exception):
+    """A stage failed; its row is written already."""
+
+
+class CachedStages(Pipeline):
+    """A run whose stages compute cached tasks; what each computes from what is a subclass's.
+
+    A subclass implements a stage within `with self._stage(...) as row`, has its tasks run by `_run_task`, and
+    keeps what they made in `refs`.
+
+    Args:
+        name: of the sequence.
+        config: settings of all stages.
+        store: root of the store.
+        runner: how artefacts are made.
+        profile: name of the profile the settings come from, for the report.
+        leave_out: see `extrags.pipeline.Pipeline`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        config: PipelineConfig,
+        store: str,
+        runner: Runner,
+        profile: str = "",
+        *,
+        leave_out: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(config, leave_out)
+        self.check_frames: Callable[[Mapping[str, Any]], object] = dict  # Of the counts of `ingest`.
+        self.outcome = SequenceOutcome(name)
+        self.store = Store(store)
+        self.runner = runner
+        self.profile = profile
+        self._given = self.config
+        self._record: RunRecord | None = None
+        self._before: dict[str, StageRow] = {}
+        """Rows of the attempts that met a damaged artefact."""
+
+    @property
+    def refs(self) -> dict[Part, Ref]:
+        """What has been made so far."""
+        return self.outcome.refs
+
+    def run(self, until: StageName = "report") -> SequenceOutcome:
+        """All stages up to one; see `run_sequence`."""
+        begun = time.monotonic()
+        try:
+            if isinstance(self.runner, StoreRunner):
+                self._attempt(until)  # Who only looks moves nothing.
+            else:
+                with recorded_run(self.store, self.outcome.name) as self._record:
+                    again_after_damage(self.store, lambda: self._attempt(until))
+        except (_StoppedError, ArtefactGoneError, DamagedArtefactError) as error:
+            if not isinstance(error, _StoppedError):
+                last = self.outcome.stages[-1]
+                last.state, last.reason, self.outcome.error = "failed", str(error), error
+            self.outcome.status = "failed"
+            done = {row.stage for row in self.outcome.stages}
+            failed = self.outcome.stages[-1].stage
+            for stage in STAGES[: STAGES.index(until) + 1]:
+                if stage not in done:
+                    self.skip(stage, f"{failed} failed")
+        self.outcome.seconds = time.monotonic() - begun
+        return self.outcome
+
+    def _attempt(self, until: StageName) -> None:
+        """All stages from the beginning; raises what `again_after_damage` can mend."""
+        self._before |= {row.stage: row for row in self.outcome.stages}
+        self.outcome = SequenceOutcome(self.outcome.name)
+        self.config, self.plan = self._given, None
+        try:
+            self.run_stages(until)
+        except _StoppedError:
+            if isinstance(self.outcome.error, ArtefactGoneError | DamagedArtefactError):
+                raise self.outcome.error from None
+            raise
+
+    def skip(self, stage: StageName, reason: str) -> None:
+        """Add a row to the outcome and report the progress."""
+        row = StageRow(stage, "skipped", reason=reason)
+        self.outcome.stages.append(row)
+        self._report_progress(row, "skipped")
+
+    def _run_uncounted(self, call: Call) -> Ref:
+        """Run a task that is not counted in the row of its stage."""
+        (result,) = self.runner.run([call], self.outcome.name)
+        self._note([result.ref])
+        manifest = self.store.manifest(result.ref)
+        self.outcome.stages[-1].made[manifest.key] = manifest.bytes
+        return result.ref
+
+    def _note(self, refs: list[Ref]) -> None:
+        """Retention keeps what a run has used."""
+        if self._record is not None:
+            self._record.add(ref.uri.rsplit("/", 1)[-1] for ref in refs)
+
+    def _run_task(self, row: StageRow, call: Call) -> Ref:
+        return self._run_tasks(row, [call])[0]
+
+    def _run_tasks(self, row: StageRow, calls: list[Call]) -> list[Ref]:
+        results = self.runner.run(calls, self.outcome.name)
+        self._note([result.ref for result in results])
+        for result in results:
+            manifest = self.store.manifest(result.ref)
+            peak = manifest.counts.get("peak_mib")
+            if isinstance(peak, float):
+                row.peak_mib = max(row.peak_mib or 0.0, peak)
+            processor = manifest.counts.get("processor_s")
+            if not isinstance(processor, int | float):
+                row.processor_seconds = None
+            elif row.tasks == 0:
+                row.processor_seconds = float(processor)
+            elif row.processor_seconds is not None:
+                row.processor_seconds = round(row.processor_seconds + processor, 3)
+            row.made_seconds += manifest.seconds
+            row.made[manifest.key] = manifest.bytes
+            row.tasks += 1
+            if result.state == "ran":
+                row.spent_seconds += manifest.seconds
+                row.state = "ran"
+        return [result.ref for result in results]
+
+    def _manifest(self, part: Part) -> Manifest:
+        return self.store.manifest(self.refs[part])
+
+    @contextmanager
+    def _stage(self, stage: StageName) -> Iterator[StageRow]:
+        """One row of the outcome: timed, announced, and marked when the block raises."""
+        row = self.outcome.row(stage)
+        if row is None:
+            planned = self.planned(stage)
+            row = StageRow(stage, "cached", reason="" if planned is None else planned.reason)
+            before = self._before.get(stage)
+            if before is not None:
+                row.seconds = before.seconds
+                row.state = "ran" if before.state == "ran" else "cached"
+            self.outcome.stages.append(row)
+        self._report_progress(row, "running")
+        begun = time.monotonic()
+        try:
+            yield row
+        except NotInStoreError:
+            raise
+        except Exception as error:
+            row.state = "failed"
+            told = str(error) if isinstance(error, ExtragsError) else f"{type(error).__name__}: {error}"
+            row.reason = without_credentials(told)
+            self.outcome.error = error
+            raise _StoppedError from error
+        except BaseException:
+            row.state = "interrupted"
+            raise
+        finally:
+            row.seconds += time.monotonic() - begun
+            self._report_progress(row, row.state)
+
+    def _report_progress(self, row: StageRow, state: str, done: int = 0, total: int = 0) -> None:
+        reason = row.reason if state in ("skipped", "failed") else ""
+        made = {} if state == "running" else {str(part): ref for part, ref in self.refs.items()}
+        notify(StageProgress(self.outcome.name, row.stage, state, done, total, reason, row.seconds, made))
