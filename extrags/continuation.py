@@ -15,6 +15,8 @@ from extrags.store import canonical
 
 __all__ = ["Comparison", "compared_frames", "other_settings"]
 
+MASKED_SHARE = 0.01
+"""Share of a frame's pixels that may be masked since: masks that are found from all frames shift a little."""
 SAME_POSE = 1e-6
 """Largest difference between equal poses: of rotation entries, and of positions as a share of the largest."""
 
@@ -38,7 +40,8 @@ def compared_frames(earlier: EndoscopicSequence, sequence: EndoscopicSequence) -
     The earlier ones must be a proper subset: then no held-out frame of the new sequence has been trained on,
     and a scene is never its own start. Frames are the same where colours, poses and intrinsics are; their
     names do not count. Depth that was measured must be the same as well, so that none that is withheld now
-    has been trained with; depth that was estimated from the training frames may differ.
+    has been trained with; depth that was estimated from the training frames may differ. Nothing would remove
+    Gaussians from pixels that have been masked since, so masks must not have grown.
 
     Args:
         earlier: the posed training frames of the earlier scene.
@@ -62,6 +65,8 @@ def compared_frames(earlier: EndoscopicSequence, sequence: EndoscopicSequence) -
         same = [place for place in places[digest] if _same_camera(earlier, index, sequence, place)]
         if not same:
             return _refused(f"its frame {name} had another pose or other intrinsics")
+        if _masked_since(earlier, index, sequence, same[0]):
+            return _refused(f"pixels of its frame {name} that it was trained on are masked now")
         if not _same_depth(earlier, index, sequence, same[0]):
             return _refused(f"its frame {name} had another depth")
         found.append(same[0])
@@ -119,6 +124,12 @@ def _same_camera(earlier: EndoscopicSequence, one: int, sequence: EndoscopicSequ
         and bool(np.abs(mine[:3, 3] - theirs[:3, 3]).max() <= SAME_POSE * length)
         and bool(np.allclose(sequence.K[other], earlier.K[one], rtol=SAME_POSE, atol=0))
     )
+
+
+def _masked_since(earlier: EndoscopicSequence, one: int, sequence: EndoscopicSequence, other: int) -> bool:
+    """Whether pixels that supervised the earlier scene do not supervise the new one."""
+    lost = earlier.supervised_mask(one) & ~sequence.supervised_mask(other)
+    return float(lost.mean()) > MASKED_SHARE
 
 
 def _same_depth(earlier: EndoscopicSequence, one: int, sequence: EndoscopicSequence, other: int) -> bool:

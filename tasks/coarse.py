@@ -13,7 +13,17 @@ if TYPE_CHECKING:
     from extrags.sequence import EndoscopicSequence
     from extrags.training import TrainingResult
 
-__all__ = ["FRAME_WEIGHTS", "HISTORY", "coarse", "refined_frames", "save_reconstruction"]
+__all__ = [
+    "COARSE_VERSION",
+    "FRAME_WEIGHTS",
+    "HISTORY",
+    "coarse",
+    "refined_frames",
+    "save_reconstruction",
+]
+
+COARSE_VERSION = 8
+"""Of the reconstruction, wherever it begins: scenes that go on from an earlier one follow it."""
 
 FRAME_WEIGHTS = "frame_weights.json"
 """What was found of each training frame (`extrags.training.frame_weights.FrameWeights.to_json`)."""
@@ -22,7 +32,7 @@ HISTORY = "history.json"
 """Training curve: a list of `{iteration, loss, psnr, n_gaussians}`."""
 
 
-@stage("coarse", version=8)
+@stage("coarse", version=COARSE_VERSION)
 def coarse(slot: Slot, sequence: Ref, config: CoarseConfig, device: str = "cpu") -> None:
     """Optimise the coarse scene; writes `scene/` and `history.json`.
 

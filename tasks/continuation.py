@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from extrags.config import CoarseConfig
 from extrags.errors import ConfigError, DamagedArtefactError
 from extrags.store import Manifest, Ref, Slot, Store
-from tasks.coarse import coarse, save_reconstruction
+from tasks.coarse import COARSE_VERSION, coarse, save_reconstruction
 from tasks.divergence import keep_last_finite_scene
 from tasks.stage import stage
 
 __all__ = ["Earlier", "Search", "continued_coarse", "found_whole", "made_before", "nearest_scene"]
 
+CONTINUED_VERSION = 1
+"""Raised for what differs in continuing alone: another reconstruction is another version of it anyway."""
 STAGES = ("coarse", "continued-coarse")
 """Stages whose scenes can be gone on from."""
 
@@ -48,13 +50,13 @@ class Search:
     def told(self) -> str:
         """Why there is none, in a line: the first refusals."""
         if not self.refusals:
-            return "the store has no other coarse scene of it"
+            return "the store has no other coarse scene of that name"
         first = [f"{key}: {why}" for key, why in list(self.refusals.items())[:3]]
         more = len(self.refusals) - len(first)
         return "; ".join([*first, *([f"and {more} more"] if more > 0 else [])])
 
 
-@stage("continued-coarse", version=1)
+@stage("continued-coarse", version=100 * COARSE_VERSION + CONTINUED_VERSION)
 def continued_coarse(
     slot: Slot,
     sequence: Ref,

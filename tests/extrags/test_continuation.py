@@ -82,6 +82,15 @@ class TestComparedFrames:
         assert refusal in found.refusal
         assert len(found.frames) == 0
 
+    @pytest.mark.parametrize(("share", "refused"), [(0.005, False), (0.02, True)])
+    def test_pixels_that_are_masked_now(self, share: float, refused: bool) -> None:
+        """Nothing would remove what they have made; masks that are found from all frames shift a little."""
+        mask = PLANE.mask.copy()
+        mask[2].reshape(-1)[: round(share * mask[2].size)] = False
+        found = compared_frames(first(6), replace(PLANE, mask=mask))
+        assert ("002.png that it was trained on are masked now" in found.refusal) == refused
+        assert not compared_frames(replace(first(6), mask=mask[:6]), PLANE).refusal
+
     def test_depth_that_was_trained_with_and_is_withheld_now(self) -> None:
         found = compared_frames(first(6), PLANE.without_training_depth())
         assert "had measured depth, those of this run have no depth" in found.refusal

@@ -178,7 +178,7 @@ def test_another_folder_is_another_source(folder: Path, store: str, tmp_path: Pa
     run(folder, store)
     elsewhere = folder.rename(tmp_path / "elsewhere")
     grow(elsewhere, 8)
-    assert "the store has no other coarse scene of it" in coarse_row(run(elsewhere, store)).reason
+    assert "the store has no other coarse scene of that name" in coarse_row(run(elsewhere, store)).reason
 
 
 def test_what_it_went_on_from_is_kept(folder: Path, store: str) -> None:
