@@ -25,6 +25,7 @@ from extrags.cameras import Cameras, rotation_about
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
+from extrags.frame_stacks import FrameStack, stacked
 from extrags.lens import Lens
 from extrags.radial_lens import RadialLens
 from extrags.sequence import EndoscopicSequence, Split
@@ -162,18 +163,18 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     kept = [source.frames[index] for index in spread(len(source.frames), config.max_frames)]
     split = _split(kept, source, config)
     world_from_camera = _poses(kept, source)
-    pixels = _Pixels(source, config)
+    pixels = _Pixels(source, config, len(kept))
     for index, frame in enumerate(kept, start=source.looked_at + 1):
         pixels.read(frame)
         emit(Progress("ingest", index, source.looked_at + len(kept)))
     K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
-    rgb, mask = np.stack(pixels.colours), pixels.masks(kept)
+    rgb, mask = pixels.colours.array, pixels.masks(kept)
     if source.intrinsics == "guessed":
         K = fitted_to_picture(K, mask)
     lens = pixels.lens(kept, source.pose_file)
     if world_from_camera is not None:
         world_from_camera = _rolled(world_from_camera, [pixels.samplings[f.lens].roll_rad for f in kept])
-    depth_mm = np.stack(pixels.depths) if pixels.depths else None
+    depth_mm = pixels.depths.array if len(pixels.depths) else None
     observed = None
     if world_from_camera is not None:
         cameras = Cameras(K, world_from_camera, rgb.shape[2], rgb.shape[1], lens)
@@ -205,12 +206,12 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
 class _Pixels:
     """Images, masks and depth of the frames that are kept, brought to the sequence's pinhole."""
 
-    def __init__(self, source: SourceFrames, config: IngestConfig) -> None:
+    def __init__(self, source: SourceFrames, config: IngestConfig, count: int) -> None:
         self.source = source
         self.config = config
         self.samplings: dict[CameraModel, Sampling] = {}
-        self.colours: list[UInt8[np.ndarray, "h w 3"]] = []
-        self.depths: list[Float[np.ndarray, "h w"]] = []
+        self.colours = FrameStack(count)
+        self.depths = FrameStack(count)
         # Many frames share one file: it is read again only when another one, or another lens, comes.
         self._last_mask: tuple[Path | None, CameraModel, Bool[np.ndarray, "h w"]] | None = None
         self._masks: list[Bool[np.ndarray, "h w"] | None] = []
@@ -221,9 +222,10 @@ class _Pixels:
         image = source.read_colour(frame)
         _check_size(image, frame, frame.file, "rgb", source.intrinsics_file)
         sampling = self._sampling(frame)
-        self.colours.append(sampling.colour(image, file=frame.file, frame=frame.label))
+        sampled = sampling.colour(image, file=frame.file, frame=frame.label)
+        self.colours.append(sampled)
         if frame.mask_file is None and source.masks is not None:
-            source.masks.see(frame, image, self.colours[-1])
+            source.masks.see(frame, image, sampled)
             self._masks.append(None)
         else:
             self._masks.append(self._mask(frame, sampling))
@@ -260,12 +262,11 @@ class _Pixels:
                 recording: finder.mask(frame, self.samplings[frame.lens])
                 for recording, frame in one_of_each.items()
             }
-        return np.stack(
-            [
-                found[frame.recording] if mask is None else mask
-                for frame, mask in zip(frames, self._masks, strict=True)
-            ]
+        masks = (
+            found[frame.recording] if mask is None else mask
+            for frame, mask in zip(frames, self._masks, strict=True)
         )
+        return stacked(masks, len(frames))
 
     def _sampling(self, frame: PosedFrame) -> Sampling:
         lens = frame.lens
@@ -323,11 +324,14 @@ def _rolled(poses: Float[np.ndarray, "f 4 4"], rolls_rad: Sequence[float]) -> Fl
 
 
 def _frame_names(frames: Sequence[PosedFrame]) -> tuple[str, ...]:
-    """Names without an image's suffix; the folder stays where names would otherwise meet."""
+    """Names without an image's suffix; folder, then suffix stay where names would otherwise meet."""
     named = [Path(frame.name) for frame in frames]
     bare = [name.with_suffix("") if name.suffix.lower() in COLOUR_SUFFIXES else name for name in named]
     short = tuple(name.name for name in bare)
-    return short if len(set(short)) == len(short) else tuple(name.as_posix() for name in bare)
+    if len(set(short)) == len(short):
+        return short
+    long = tuple(name.as_posix() for name in bare)
+    return long if len(set(long)) == len(long) else tuple(name.as_posix() for name in named)
 
 
 def _check_size(

@@ -25,6 +25,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from extrags.frame_stacks import stacked
 from extrags.sequence import EndoscopicSequence
 from extrags.thresholds import SATURATED
 
@@ -79,7 +80,8 @@ def specular_masks(
     rgb: UInt8[np.ndarray, "f h w 3"], mask: Bool[np.ndarray, "f h w"]
 ) -> Bool[np.ndarray, "f h w"]:
     """`specular_mask` of each frame."""
-    return np.stack([specular_mask(image, inside) for image, inside in zip(rgb, mask, strict=True)])
+    found = (specular_mask(image, inside) for image, inside in zip(rgb, mask, strict=True))
+    return stacked(found, len(rgb))
 
 
 def with_specular(sequence: EndoscopicSequence) -> EndoscopicSequence:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import Cameras, pixel_rays
+from extrags.frame_stacks import empty_stack
 from extrags.sequence import Split
 
 __all__ = ["observed_by_depth", "observed_from_depth"]
@@ -37,14 +38,20 @@ def observed_from_depth(
     Returns:
         True where observed, [F, H, W]; false in training frames and where depth is unknown.
     """
-    observed = np.zeros(depth_mm.shape, dtype=bool)
+    observed = empty_stack(depth_mm.shape, bool)
     for index in test:
         known = depth_mm[index] > 0
         rays = pixel_rays(cameras[int(index)])[0][known]
         points = cameras.centers[index] + rays * depth_mm[index][known][:, None].astype(np.float64)
         seen = np.zeros(len(points), dtype=bool)
-        for other in train:
-            seen |= _in_front(points, cameras[int(other)], depth_mm[other], tolerance_share, tolerance_mm)
+        # The nearest frames see most; only what they leave is looked for in the others.
+        nearest = np.argsort(np.linalg.norm(cameras.centers[train] - cameras.centers[index], axis=1))
+        for other in np.asarray(train)[nearest]:
+            left = np.flatnonzero(~seen)
+            if not left.size:
+                break
+            depth = depth_mm[other]
+            seen[left] = _in_front(points[left], cameras[int(other)], depth, tolerance_share, tolerance_mm)
         observed[index][known] = seen
     return observed
 

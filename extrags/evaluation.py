@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Int
 
 from extrags.events import Progress, emit
+from extrags.frame_stacks import FrameStack
 from extrags.metrics.lpips import LpipsByNet, available_lpips
 from extrags.metrics.protocol import EvaluationResult, RenderedViews, evaluate_views
 from extrags.metrics.surface import TrueSurface, evaluate_surface, scene_surface
@@ -47,7 +48,8 @@ def render(
     if scene.light is not None:
         trained = sequence.train if train_on == "train" else np.arange(len(sequence))
         gains = scene.light.interpolated_exposures(frames, trained, sequence.recording)
-    rgb, alpha, depth = [], [], []
+    # Held-out views may be hundreds, of full size.
+    rgb, alpha, depth = (FrameStack(len(frames)) for _ in range(3))
     with torch.no_grad():
         for done, frame in enumerate(frames, start=1):
             exposure = None if gains is None else gains[done - 1 : done]
@@ -56,7 +58,7 @@ def render(
             alpha.append(rendering.alpha[0].cpu().numpy())
             depth.append(rendering.depth[0].cpu().numpy())
             emit(Progress("render", done, len(frames)))
-    return RenderedViews(np.stack(rgb), np.stack(alpha), np.stack(depth), len(scene.gaussians))
+    return RenderedViews(rgb.array, alpha.array, depth.array, len(scene.gaussians))
 
 
 def evaluate_renders(

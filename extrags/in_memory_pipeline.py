@@ -125,6 +125,12 @@ class InMemoryPipeline(Pipeline):
         true_surface: TrueSurface | None = None,
     ) -> None:
         super().__init__(config, leave_out)
+        # The oracle's frames are those of no other scene: it starts anew anyway.
+        if config.continuation.scene == "nearest" and config.coarse.train_on != "all":
+            raise ConfigError(
+                "continuation.scene=nearest looks for a scene in a store, and a run in memory has none; "
+                "give extrags.training.reconstruct the earlier scene"
+            )
         self.result = Result(sequence)
         self.true_surface = true_surface
         self._training = sequence
@@ -197,11 +203,6 @@ class InMemoryPipeline(Pipeline):
             if self.config.imported.scene is not None:
                 self.result.reconstruction = self._imported(self.config.imported.scene)
                 return
-            if self.config.continuation.scene == "nearest":
-                raise ConfigError(
-                    "continuation.scene=nearest looks for a scene in a store, and a run in memory has none; "
-                    "give extrags.training.reconstruct the earlier scene"
-                )
             # The oracle alone is shown held-out frames, and no later stage sees what it made.
             oracle = self.config.coarse.train_on == "all"
             frames = self._with_depth(self.result.sequence) if oracle else self._training

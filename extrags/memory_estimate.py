@@ -33,8 +33,8 @@ STEP = 140
 """Bytes per pixel of the image of one optimisation step: rendering, loss and their gradients."""
 GAUSSIAN = 2400
 """Bytes of a Gaussian with all harmonics while it is optimised: parameters, gradients, moments, tiles."""
-PAIR = 650
-"""Bytes per pixel of a training frame while the restorer is prepared: layers of its leave-out pairs."""
+PAIR = 325
+"""Bytes per pixel of a leave-out pair while the restorer is prepared: its layers."""
 REFERENCE = 30
 """Bytes per pixel of a training frame that is carried into virtual views."""
 CLIP = 360
@@ -159,7 +159,7 @@ def estimate_memory(
         "enhance": held
         + max(
             # The judge of the restorer runs the network beside the pairs.
-            PAIR * train * working + network,
+            PAIR * _pairs(config, train) * working + references + network,
             references + CLIP * batch_views * working + network,
             PSEUDO_VIEW * views * working,
         ),
@@ -172,6 +172,16 @@ def estimate_memory(
     }
     wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in leave_out]
     return MemoryEstimate({stage: round(found[stage]) for stage in wanted if stage in found})
+
+
+def _pairs(config: PipelineConfig, training_frames: int) -> int:
+    """How many pairs the restorer is prepared with: two of every training frame, and synthetic ones."""
+    given = config.enhance
+    if given.backend != "embedded":
+        return 0
+    if given.train_iterations > 0 or given.pretrained_weights == "none":
+        return 2 * training_frames + given.synthetic_views
+    return min(2 * training_frames, given.judge_pairs) if given.judge else 0
 
 
 def fitting_settings(
@@ -225,5 +235,8 @@ def fitting_settings(
                 for earlier in list(changed):
                     fewer = {other: kept for other, kept in changed.items() if other != earlier}
                     changed = fewer if fits(fewer) else changed
+                if "ingest.width" in changed and config.ingest.height is not None:
+                    # A height that was given belongs to the width that was given with it.
+                    changed["ingest.height"] = round(size.height * changed["ingest.width"] / size.width)
                 return changed
     return None

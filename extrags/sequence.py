@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
+from extrags.frame_stacks import frames_of, stacked
 from extrags.lens import Undistortion
 from extrags.radial_lens import VIRTUAL_FIELD_DEG, RadialLens
 from extrags.store.storable import Storable
@@ -312,15 +313,19 @@ class EndoscopicSequence(Storable):
         plan = [plans[index] for index in which.reshape(-1)]
 
         def depths(stack: np.ndarray | None) -> np.ndarray | None:
-            return None if stack is None else np.stack([p.depth(d) for p, d in zip(plan, stack, strict=True)])
+            if stack is None:
+                return None
+            return stacked((p.depth(d) for p, d in zip(plan, stack, strict=True)), len(plan))
 
         def masks(stack: np.ndarray | None) -> np.ndarray | None:
-            return None if stack is None else np.stack([p.mask(m) for p, m in zip(plan, stack, strict=True)])
+            if stack is None:
+                return None
+            return stacked((p.mask(m) for p, m in zip(plan, stack, strict=True)), len(plan))
 
         specular = None if self.specular is None else masks(~self.specular)
         return replace(
             self,
-            rgb=np.stack([p.colour(image) for p, image in zip(plan, self.rgb, strict=True)]),
+            rgb=stacked((p.colour(image) for p, image in zip(plan, self.rgb, strict=True)), len(plan)),
             K=np.stack([p.K for p in plan]),
             mask=cast("np.ndarray", masks(self.mask)),
             depth_mm=depths(self.depth_mm),
@@ -356,11 +361,11 @@ class EndoscopicSequence(Storable):
         import cv2
 
         def resized(stack: np.ndarray, interpolation: int) -> np.ndarray:
-            return np.stack([cv2.resize(image, size, interpolation=interpolation) for image in stack])
+            return stacked((cv2.resize(i, size, interpolation=interpolation) for i in stack), len(stack))
 
-        def share(stack: np.ndarray) -> np.ndarray:
-            # Not the whole stack at once: in floats it would be the largest array of all.
-            return np.concatenate([resized(i.astype(np.float32), cv2.INTER_AREA) for i in stack[:, None]])
+        def where_share(stack: np.ndarray, above: float) -> np.ndarray:
+            shares = (cv2.resize(i.astype(np.float32), size, interpolation=cv2.INTER_AREA) for i in stack)
+            return stacked((share > above for share in shares), len(stack))
 
         K = self.K.copy()
         K[:, 0] *= size[0] / self.width
@@ -371,11 +376,11 @@ class EndoscopicSequence(Storable):
             self,
             rgb=resized(self.rgb, cv2.INTER_AREA),
             K=K,
-            mask=share(self.mask) > ALL_OF_AREA,
+            mask=where_share(self.mask, ALL_OF_AREA),
             depth_mm=None if depth is None else resized(depth, cv2.INTER_NEAREST),
             withheld_depth_mm=None if withheld is None else resized(withheld, cv2.INTER_NEAREST),
-            observed=None if observed is None else share(observed) > ALL_OF_AREA,
-            specular=None if specular is None else share(specular) > 0,
+            observed=None if observed is None else where_share(observed, ALL_OF_AREA),
+            specular=None if specular is None else where_share(specular, 0.0),
             focal_std_px=None if self.focal_std_px is None else self.focal_std_px * size[0] / self.width,
             depth_error=None if self.depth_error is None else resized(self.depth_error, cv2.INTER_NEAREST),
         )
@@ -389,15 +394,15 @@ class EndoscopicSequence(Storable):
         train = self.train
 
         def of_train(stack: Any) -> Any:
-            return None if stack is None else stack[train]
+            return None if stack is None else frames_of(stack, train)
 
         recording = of_train(self.recording)
         return replace(
             self,
             name=self.name.split("@")[0],
-            rgb=self.rgb[train],
+            rgb=of_train(self.rgb),
             K=self.K[train],
-            mask=self.mask[train],
+            mask=of_train(self.mask),
             split=Split("training", np.arange(len(train)), np.arange(0), self.split.version),
             world_from_camera=of_train(self.world_from_camera),
             depth_mm=of_train(self.depth_mm) if self.training_depth_known else None,

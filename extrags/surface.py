@@ -15,6 +15,7 @@ from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
+from extrags.frame_stacks import FrameStack
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
 from extrags.store.storable import Storable
@@ -118,14 +119,15 @@ def rendered_depth(
     # The median depth comes from the native kernels, and Open3D fuses it there.
     scene = scene.to("cpu")
     cameras = cameras.as_pinholes(WIDE_FIELD_DEG).at_most_width(config.max_width)
-    batches = []
+    found = FrameStack(len(cameras))
     with torch.no_grad():
         for start in range(0, len(cameras), VIEWS_PER_BATCH):
             batch = scene.render(cameras[start : start + VIEWS_PER_BATCH], median_depth=True)
             depth = cast("torch.Tensor", batch.median_depth)
-            batches.append(torch.where(batch.alpha >= config.min_alpha, depth, 0.0).numpy())
+            for view in torch.where(batch.alpha >= config.min_alpha, depth, 0.0).numpy():
+                found.append(view.astype(np.float32, copy=False))
             emit(Progress("surface", min(start + VIEWS_PER_BATCH, len(cameras)), len(cameras)))
-    return cameras, np.concatenate(batches).astype(np.float32)
+    return cameras, found.array
 
 
 def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: SurfaceConfig) -> Mesh:

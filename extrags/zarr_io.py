@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 import struct
-import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,6 +28,7 @@ from zarr.core.array_spec import ArrayConfigParams
 from zarr.errors import NodeNotFoundError
 from zarr.storage import LocalStore, MemoryStore, ZipStore
 
+from extrags import frame_stacks
 from extrags.errors import DamagedArtefactError, SourceNotFoundError
 
 __all__ = [
@@ -47,9 +47,6 @@ PACKED = ".zarr.zip"
 METADATA = "zarr.json"
 HELD_BYTES = 64 << 20
 """Of a stack, so much is encoded at once, by several threads, before it is written in order."""
-
-MAPPED_BYTES = 64 << 20
-"""Larger stacks are read into a file that is mapped, instead of memory that nothing can take back."""
 
 # zarr reads a chunk that is not there as fill values, so that a lost file would be black frames.
 EVERY_CHUNK: ArrayConfigParams = {"write_empty_chunks": True}
@@ -204,9 +201,8 @@ def has_array(group: zarr.Group, name: str) -> bool:
 def read_array(group: zarr.Group, name: str) -> Any:
     """Read a whole array, in native byte order (Open3D accepts no other).
 
-    A stack of more than `MAPPED_BYTES` is decoded into a nameless file in the folder of temporary files
-    (`TMPDIR`) and mapped: the system may drop its pages and read them again. Changing the array changes
-    neither that file nor the group. The file is gone with the array, and with the process however that ends.
+    A large stack is decoded into a mapped file of its own (`extrags.frame_stacks`): the system may drop its
+    pages and read them again. Changing the array does not change the group.
 
     Args:
         group: from `open_group`.
@@ -231,8 +227,8 @@ def read_array(group: zarr.Group, name: str) -> Any:
         for key, _ in _chunks(array):
             if key not in present:
                 raise _damaged(array, key, "this chunk is missing")
-    if array.ndim > 1 and array.nbytes > MAPPED_BYTES:
-        return _mapped(array)
+    if array.ndim > 1 and array.nbytes > frame_stacks.MAPPED_BYTES:
+        return _stack(array)
     return _decoded(array, slice(None) if array.ndim else ())
 
 
@@ -246,20 +242,15 @@ def _decoded(array: zarr.Array[Any], part: slice | tuple[()]) -> np.ndarray:
     return stored.astype(stored.dtype.newbyteorder("="), copy=False)
 
 
-def _mapped(array: zarr.Array[Any]) -> np.ndarray:
-    """A whole stack in a nameless file, its pages private."""
+def _stack(array: zarr.Array[Any]) -> np.ndarray:
+    """A whole stack; a large one is decoded part by part into a mapped file."""
+    stack = frame_stacks.empty_stack(array.shape, array.dtype.newbyteorder("="))
     # Bounded parts, so that what is decoded at once does not grow with the stack.
-    step = max(1, HELD_BYTES * array.shape[0] // array.nbytes)
-    dtype = array.dtype.newbyteorder("=")
-    # Linux gives such a file no name at all: nothing is left to be removed, whatever happens.
-    with tempfile.TemporaryFile(prefix="extrags-") as file:
-        for first in range(0, array.shape[0], step):
-            # Written, not assigned to a map: a full disk is then an error, where a map would end the process.
-            file.write(np.ascontiguousarray(_decoded(array, slice(first, first + step))).data)
-        file.flush()
-        # The map keeps the file open. Private, so that a reader may write as into any array.
-        mapped = np.memmap(file, dtype=dtype, mode="c", shape=array.shape)
-    return mapped.view(np.ndarray)
+    step = max(1, HELD_BYTES * array.shape[0] // max(1, array.nbytes))
+    for first in range(0, array.shape[0], step):
+        part = slice(first, first + step)
+        stack[part] = _decoded(array, part)
+    return stack
 
 
 def _place(group: zarr.Group | zarr.Array[Any]) -> Path:

@@ -14,6 +14,8 @@ from tasks.weights import Weights, lpips_by_net
 
 __all__ = ["METRICS_FILE", "measure", "measure_views", "render", "restore", "restoring_settings"]
 
+METRICS_VERSION = 10 * PROTOCOL_VERSION + 1
+"""Of the protocol, and how it is computed: the last digits of the figures are another's."""
 METRICS_FILE = "metrics.json"
 """`EvaluationResult.to_json()`, per-view figures included."""
 VIEWS_FILE = "views.json"
@@ -53,7 +55,7 @@ def restoring_settings(config: EnhanceConfig) -> EnhanceConfig:
     return EnhanceConfig(references=config.references, max_width=config.max_width, seed=config.seed)
 
 
-@stage("evaluate-restore", version=2)
+@stage("evaluate-restore", version=3)
 def restore(
     slot: Slot,
     renders: Ref,
@@ -99,7 +101,7 @@ def restore(
 
 
 # Metrics are separate stages, so that a new version of the protocol does not repeat the rendering.
-@stage("evaluate-views", version=PROTOCOL_VERSION, ignore=("weights",))
+@stage("evaluate-views", version=METRICS_VERSION, ignore=("weights",))
 def measure_views(
     slot: Slot,
     renders: list[Ref],
@@ -130,7 +132,7 @@ def measure_views(
 
 
 # What the views have been measured to be follows from the renders: whether it was at hand is not in the key.
-@stage("evaluate", version=PROTOCOL_VERSION, ignore=("weights", "views"))
+@stage("evaluate", version=METRICS_VERSION, ignore=("weights", "views"))
 def measure(
     slot: Slot,
     renders: Ref,

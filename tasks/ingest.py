@@ -45,6 +45,9 @@ def ingest(
     detail = asked or detail_size(sequence, config.detail_psnr_db)
     log.info("%s: frames hold %s", sequence.name, detail)
     inside = max(1, int(sequence.mask.sum()))
+    # Frame by frame: what is made of all of them at once would be as large as they are.
+    frames = zip(sequence.rgb, sequence.mask, strict=True)
+    saturated = float(sum(int((saturated_mask(image) & mask).sum()) for image, mask in frames))
     slot.counts.update(
         frames=len(sequence),
         train=len(sequence.train),
@@ -60,7 +63,7 @@ def ingest(
         detail=str(detail),
         masked_share=float(1 - sequence.mask.mean()),
         specular_share=0.0 if sequence.specular is None else float(sequence.specular.sum() / inside),
-        saturated_share=float((saturated_mask(sequence.rgb) & sequence.mask).sum() / inside),
+        saturated_share=saturated / inside,
     )
 
 

@@ -220,10 +220,13 @@ def stages() -> dict[str, tuple[Symbol, int]]:
 def _constant(module: str, node: ast.expr) -> int:
     if isinstance(node, ast.Constant):
         return int(node.value)  # type: ignore[arg-type]
+    if isinstance(node, ast.BinOp):
+        left, right = _constant(module, node.left), _constant(module, node.right)
+        return left * right if isinstance(node.op, ast.Mult) else left + right
     found = resolved(module, ast.unparse(node))
     assert found is not None, f"{module}: {ast.unparse(node)} is no constant of this project"
     (assigned,) = parsed(found[0]).definitions[found[1]]
-    return int(ast.literal_eval(assigned.value))  # type: ignore[attr-defined]
+    return _constant(found[0], assigned.value)  # type: ignore[attr-defined]
 
 
 def inventory() -> dict[str, Any]:

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Int
 from data_catalog.ray_casting import RayCaster
 from extrags.cameras import Cameras, compose, pixel_rays
 from extrags.errors import SourceError, SourceNotFoundError
+from extrags.frame_stacks import empty_stack
 
 __all__ = ["Alignment", "CoverageMesh", "Surface", "align", "read_coverage_mesh"]
 
@@ -200,7 +201,7 @@ class Surface:
         Returns:
             False in training frames, and where a pixel's ray meets no surface.
         """
-        observed = np.zeros(mask.shape, dtype=bool)
+        observed = empty_stack(mask.shape, bool)
         for index in test:
             depth, _ = self.z_depth(cameras[int(index)])
             met = np.isfinite(depth)

@@ -94,7 +94,7 @@ class RenderedViews(Storable):
         """Write a zarr v3 group, one view per chunk."""
         with new_group(path) as group:
             for name in ("rgb", "alpha", "depth_mm"):
-                write_frames(group, name, getattr(self, name).astype(np.float32))
+                write_frames(group, name, getattr(self, name).astype(np.float32, copy=False))
             group.attrs["n_gaussians"] = self.n_gaussians
 
     @classmethod
@@ -244,7 +244,7 @@ def _check(renders: RenderedViews, sequence: EndoscopicSequence, frames: np.ndar
     if renders.rgb.shape != expected:
         raise ShapeError(f"{sequence.name}: renders have shape {renders.rgb.shape}, expected {expected}")
     for name, stack in (("rgb", renders.rgb), ("alpha", renders.alpha), ("depth", renders.depth_mm)):
-        finite = np.isfinite(stack).reshape(len(frames), -1).all(1)
+        finite = np.array([np.isfinite(view).all() for view in stack])
         if not finite.all():
             worst = sequence.frame_name(int(frames[int(np.argmin(finite))]))
             raise NonFiniteError(

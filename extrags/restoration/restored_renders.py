@@ -25,11 +25,12 @@ from extrags.cameras import Cameras
 from extrags.config import EnhanceConfig
 from extrags.errors import ShapeError
 from extrags.events import Progress, emit
+from extrags.frame_stacks import FrameStack, stacked
 from extrags.lens import Undistortion, distortion_of_pinhole
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.metrics.protocol import RenderedViews
 from extrags.radial_lens import WIDE_FIELD_DEG
-from extrags.restoration.benchmark.evaluation import held_out_clips
+from extrags.restoration.benchmark.evaluation import iterate_held_out_clips
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import FEATHER_RADIUS_PX, FEATHER_SIGMA_PX
 from extrags.restoration.protocol import Clip, Enhancer
@@ -93,19 +94,20 @@ def restored_renders(
     texture = SurfaceTexture.of_references(references, seed=config.seed) if textured else None
     if textured and texture is None:
         logger.warning("no frame shows the surface closely enough: restored views stay without texture")
-    clips = held_out_clips(coarse, references, small, sequence.test, count=config.references)
+    clips = iterate_held_out_clips(coarse, references, small, sequence.test, count=config.references)
     keeps_known = isinstance(enhancer, ClassicalEnhancer)
-    restored, done = [], 0
+    restored, done = FrameStack(len(renders)), 0
     for clip in clips:
         part = slice(done, done + len(clip))
         cameras = sequence.cameras[sequence.test[part]]
         rendered = torch.from_numpy(renders.rgb[part]).permute(0, 3, 1, 2).clamp(0, 1)
         solid = torch.from_numpy(renders.alpha[part])[:, None].clamp(0, 1)
         mixed = _mixed(clip, cameras, rendered, solid, enhancer, texture, keeps_known=keeps_known)
-        restored.append(mixed.permute(0, 2, 3, 1).numpy())
+        for view in mixed.permute(0, 2, 3, 1).numpy():
+            restored.append(view)
         done += len(clip)
         emit(Progress("restore renders", done, len(renders)))
-    return replace(renders, rgb=np.concatenate(restored))
+    return replace(renders, rgb=restored.array)
 
 
 def _through_pinholes(
@@ -130,7 +132,8 @@ def _through_pinholes(
     ]
 
     def flattened(images: np.ndarray) -> np.ndarray:
-        return np.stack([plan.image(image) for plan, image in zip(plans, images, strict=True)])
+        found = (plan.image(image) for plan, image in zip(plans, images, strict=True))
+        return stacked(found, len(plans))
 
     flat = RenderedViews(
         flattened(renders.rgb), flattened(renders.alpha), flattened(renders.depth_mm), renders.n_gaussians
@@ -144,12 +147,12 @@ def _through_pinholes(
         config,
         textured=textured,
     )
-    changed = []
+    changed = FrameStack(len(plans))
     for index, plan in enumerate(plans):
         back = distortion_of_pinhole(sequence.K[sequence.test[index]], lens, plan.K, width, height)
         change = np.where(plan.valid[..., None], restored.rgb[index] - flat.rgb[index], 0)
-        changed.append(renders.rgb[index] + back.image(change))
-    return replace(renders, rgb=np.stack(changed).astype(np.float32))
+        changed.append((renders.rgb[index] + back.image(change)).astype(np.float32))
+    return replace(renders, rgb=changed.array)
 
 
 def _mixed(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import re
+import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -35,7 +36,10 @@ def refused_write(error: BaseException, stage: str, store: str, place: Path) -> 
     if number is None:
         return None
     path = file or _newest(place)
-    return StoreError(f"stage {stage}: {path} cannot be written: {os.strerror(number)} (store {store})")
+    where = f"store {store}"
+    if file == tempfile.gettempdir():
+        where = "the folder of temporary files, where large stacks of frames are held; TMPDIR names another"
+    return StoreError(f"stage {stage}: {path} cannot be written: {os.strerror(number)} ({where})")
 
 
 def _refusals(error: BaseException | None, place: Path) -> Iterator[tuple[int, str | None]]:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import errno
+import os
+import tempfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from extrags import frame_stacks
 from extrags.errors import DamagedArtefactError, StoreError
 from extrags.store import Ref, Store
 
@@ -64,6 +68,31 @@ def test_a_refused_write_names_stage_file_and_store(tmp_path: Path, error: Excep
     ):
         write()
     assert list((tmp_path / "scratch").iterdir()) == []
+
+
+def test_a_full_folder_of_temporary_files_is_not_blamed_on_the_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scratch = tmp_path / "scratch of the system"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    monkeypatch.setattr(frame_stacks, "MAPPED_BYTES", 0)
+
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
+
+    def write() -> None:
+        with Store(tmp_path / "store").slot(stage="toy", version=1, key="toy-v1-a") as slot:
+            (slot.path / "half").write_text("x")
+            frame_stacks.empty_stack((2, 3), np.uint8)
+
+    with pytest.raises(
+        StoreError, match=rf"stage toy: {scratch} cannot be written: No space.*TMPDIR"
+    ) as said:
+        write()
+    assert "(store" not in str(said.value)
 
 
 def test_what_may_not_be_read_elsewhere_is_no_matter_of_the_store(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import random
 import tempfile
 import zipfile
@@ -14,7 +16,7 @@ import zarr
 from zarr.codecs import BloscCodec
 from zarr.storage import ZipStore
 
-from extrags import zarr_io
+from extrags import frame_stacks, zarr_io
 from extrags.errors import DamagedArtefactError, SourceNotFoundError
 from extrags.zarr_io import group_exists, new_group, open_group, read_array, write_array, write_frames
 
@@ -96,7 +98,7 @@ class TestMapped:
         """Everything is large, and temporary files lie in a folder of their own."""
         folder = tmp_path / "scratch"
         folder.mkdir()
-        monkeypatch.setattr(zarr_io, "MAPPED_BYTES", 0)
+        monkeypatch.setattr(frame_stacks, "MAPPED_BYTES", 0)
         # Two frames are decoded at once.
         monkeypatch.setattr(zarr_io, "HELD_BYTES", 2 * FRAMES[0].nbytes)
         monkeypatch.setattr(tempfile, "tempdir", str(folder))
@@ -131,15 +133,17 @@ class TestMapped:
         assert list(scratch.iterdir()) == []
 
     def test_a_full_disk_is_an_error(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        if not Path("/dev/full").exists():
-            pytest.skip("no /dev/full here")
         write(tmp_path / "a")
-        monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb"))  # noqa: SIM115
+
+        def full(*_: int) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+        monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
         with pytest.raises(OSError, match="No space left"):
             read(tmp_path / "a")
 
     def test_only_large_stacks_are_mapped(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(zarr_io, "MAPPED_BYTES", FRAMES.nbytes)
+        monkeypatch.setattr(frame_stacks, "MAPPED_BYTES", FRAMES.nbytes)
         write(tmp_path / "a")
         assert not isinstance(read(tmp_path / "a").base, np.memmap)
         assert not isinstance(read(tmp_path / "a", "split/train").base, np.memmap)

@@ -8,7 +8,7 @@ same clips. Figures inside a region are means over the views in which the region
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -48,6 +48,7 @@ __all__ = [
     "RestorerBenchmark",
     "TrueViews",
     "held_out_clips",
+    "iterate_held_out_clips",
     "restore_views",
 ]
 
@@ -123,6 +124,24 @@ def held_out_clips(
         CaptureError: without any frame.
         ConfigError: for clips without a view.
     """
+    return list(iterate_held_out_clips(scene, references, sequence, frames, count=count, length=length))
+
+
+def iterate_held_out_clips(
+    scene: Scene,
+    references: ReferenceViews,
+    sequence: EndoscopicSequence,
+    frames: Int[np.ndarray, "v"],
+    *,
+    count: int,
+    length: int = CLIP_VIEWS,
+) -> Iterator[Clip]:
+    """`held_out_clips` one at a time: the layers of hundreds of views would fill the memory.
+
+    Raises:
+        CaptureError: without any frame; when the first clip is asked for, as the other.
+        ConfigError: for clips without a view.
+    """
     frames = np.asarray(frames, dtype=np.int64)
     if len(frames) == 0:
         raise CaptureError(f"{sequence.name}: no held-out frames to evaluate a restorer on")
@@ -132,20 +151,21 @@ def held_out_clips(
     gains = torch.ones(len(frames))
     if scene.light is not None:
         gains = scene.light.interpolated_exposures(frames, sequence.train, sequence.recording)
-    clips: list[Clip] = []
+    made = 0
     borders = np.flatnonzero(np.diff(recording[frames])) + 1
     for run in np.split(np.arange(len(frames)), borders):
         for part in np.array_split(run, -(-len(run) // length)):
             gain = gains[torch.from_numpy(part)]
-            clips += render_clips(
+            clips = render_clips(
                 scene,
                 references,
                 [sequence.cameras[frames[part]]],
                 count=count,
-                first_index=len(clips),
+                first_index=made,
                 exposure=[gain if bool((gain != 1).any()) else None],
             )
-    return clips
+            made += len(clips)
+            yield from clips
 
 
 @dataclass(frozen=True)
