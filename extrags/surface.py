@@ -156,11 +156,13 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         raise CaptureError(
             f"none of the {len(cameras)} views sees a surface; the reconstruction is empty there"
         )
-    voxel_mm = float(np.quantile(valid, 0.95)) * config.voxel_share
-    far_mm = float(np.quantile(valid, config.depth_quantile))
+    # `valid` is a copy, which may be reordered: another one would be as large as all depth.
+    voxel_mm = float(np.quantile(valid, 0.95, overwrite_input=True)) * config.voxel_share
+    far_mm = float(np.quantile(valid, config.depth_quantile, overwrite_input=True))
     if not (valid < far_mm).any():
         # A wall that faces the camera has one depth, which is to be fused and not cut off.
         far_mm = float(np.nextafter(np.float32(far_mm), np.float32(np.inf)))
+    del valid
 
     import open3d as o3d
     import open3d.core as o3c

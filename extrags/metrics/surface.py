@@ -25,6 +25,7 @@ from jaxtyping import Bool, Float, Int
 from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ConfigError
+from extrags.frame_stacks import stacked
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -169,8 +170,15 @@ def surface_from_depth(sequence: EndoscopicSequence) -> TrueSurface | None:
     true_depth_mm = sequence.true_depth_mm
     if true_depth_mm is None:
         return None
-    depth = np.where(sequence.mask[frames], true_depth_mm[frames], 0).astype(np.float32)
-    depth[~np.isfinite(depth)] = 0
+    # Frame by frame: of hundreds of full size, arrays of all at once would be the largest of the run.
+    known = (sequence.mask[frame] & np.isfinite(true_depth_mm[frame]) for frame in frames)
+    depth = stacked(
+        (
+            np.where(there, true_depth_mm[frame], 0).astype(np.float32)
+            for frame, there in zip(frames, known, strict=True)
+        ),
+        len(frames),
+    )
     try:
         return TrueSurface(_fused(sequence.cameras[frames], depth), "depth")
     except CaptureError:
@@ -325,8 +333,9 @@ def _fused(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"]) -> Mesh:
     known = depth_mm[depth_mm > 0]
     if known.size:
         # Cut here and not in the fusion, which cannot do with a view that has nothing near.
-        far = np.quantile(known, PROTOCOL_FUSION.depth_quantile)
-        depth_mm = np.where(depth_mm > far, np.float32(0), depth_mm)
+        far = np.quantile(known, PROTOCOL_FUSION.depth_quantile, overwrite_input=True)
+        del known
+        depth_mm = stacked((np.where(view > far, np.float32(0), view) for view in depth_mm), len(depth_mm))
     return fuse_depth(cameras, depth_mm, PROTOCOL_FUSION.model_copy(update={"depth_quantile": 1.0}))
 
 
