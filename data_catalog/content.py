@@ -10,9 +10,9 @@ import logging
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
-__all__ = ["Circle", "content_circle", "content_mask", "overlay_mask", "view_mask"]
+__all__ = ["Circle", "content_circle", "content_mask", "looked_at", "overlay_mask", "view_mask"]
 
 logger = logging.getLogger(__name__)
 
@@ -156,6 +156,11 @@ def overlay_mask(
     return np.asarray(found & inside)
 
 
+def looked_at(frames: int) -> Int[np.ndarray, "n"]:
+    """The frames that the mask of so many is found from."""
+    return np.round(np.linspace(0, frames - 1, min(frames, _MAX_FRAMES))).astype(np.int64)
+
+
 def content_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
     """True where frames show tissue: inside the round picture, or the dark frame, and not under text.
 
@@ -168,7 +173,7 @@ def content_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
 
     height, width = rgb.shape[1:3]
     if len(rgb) > _MAX_FRAMES:
-        rgb = rgb[np.round(np.linspace(0, len(rgb) - 1, _MAX_FRAMES)).astype(int)]
+        rgb = rgb[looked_at(len(rgb))]
     small = rgb
     if width > _LARGEST_WIDTH:
         size = (_LARGEST_WIDTH, round(_LARGEST_WIDTH * height / width))

@@ -32,6 +32,8 @@ __all__ = [
     "spread",
 ]
 
+BITS_PER_SAMPLE = 258
+"""Tag of TIFF."""
 COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _MASK_THRESHOLD = 127
 # Neighbouring depths that differ by more than this share lie on different surfaces.
@@ -57,25 +59,26 @@ def colour_files(folder: Path) -> list[Path]:
 
 
 def read_colour(file: Path, *, frame: object = None) -> UInt8[np.ndarray, "h w 3"]:
-    """Read an image as 8-bit RGB; of 16-bit files the high byte, alpha is dropped.
+    """Read an image as 8-bit RGB; of files with more bits the high ones, alpha is dropped.
 
     Raises:
         SourceNotFoundError: there is no such file.
-        SourceError: the file is truncated, no image, or has floating-point or 32-bit values, of which nothing
-            says what is white.
+        SourceError: the file is truncated, no image, or has floating-point, signed or 32-bit values, of
+            which nothing says what is white.
     """
     from PIL import Image
 
     with _image_errors(file, frame, "rgb"), Image.open(file) as image:
         image.load()
         mode = image.mode
-        # Pillow would clip 16-bit grey at 255: all white.
-        grey = (np.asarray(image) >> 8).astype(np.uint8) if mode.startswith("I;16") else None
+        # Pillow would clip 16-bit grey at 255: all white. A TIFF tells how many bits of these it uses.
+        bits = int(getattr(image, "tag_v2", {}).get(BITS_PER_SAMPLE, (16,))[0])
+        grey = (np.asarray(image) >> (bits - 8)).astype(np.uint8) if mode.startswith("I;16") else None
         found = None if mode in ("I", "F") or grey is not None else np.array(image.convert("RGB"), np.uint8)
     if grey is not None:
         return np.repeat(grey[..., None], 3, axis=2)
     if found is None:
-        kind = "floating-point" if mode == "F" else "32-bit"
+        kind = "floating-point" if mode == "F" else "signed or 32-bit"
         raise SourceError(
             f"{kind} values; expected colours or grey of 8 or 16 bits", file=file, frame=frame, field="rgb"
         )

@@ -7,6 +7,7 @@ however that ends: on Linux it never has a name.
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import tempfile
@@ -92,14 +93,16 @@ class FrameStack:
         """Take in the next frame; it is copied.
 
         Raises:
-            ValueError: when its shape differs from the first one's, or there is no room for it.
+            ValueError: when its shape or dtype differs from the first one's, or there is no room for it.
         """
         if self._array is None:
             self._array = empty_stack((self._count, *frame.shape), frame.dtype)
-        if frame.shape != self._array.shape[1:] or self._filled == self._count:
+        if self._filled == self._count:
+            raise ValueError(f"a further frame after {self._count}, for which there is room")
+        if frame.shape != self._array.shape[1:] or frame.dtype != self._array.dtype:
             raise ValueError(
-                f"frame {self._filled} of {self._count} has shape {frame.shape}, the first one "
-                f"{self._array.shape[1:]}"
+                f"frame {self._filled} of {self._count} is {frame.shape} of {frame.dtype}, the first one "
+                f"{self._array.shape[1:]} of {self._array.dtype}"
             )
         self._array[self._filled] = frame
         self._filled += 1
@@ -119,8 +122,14 @@ class FrameStack:
 def _reserve(file: int, size: int) -> None:
     """Room for a file, now: when a page of a map finds the disk full, the process ends without an error."""
     if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(file, 0, size)
-        return
-    blank = bytes(1 << 20)
-    for start in range(0, size, len(blank)):
-        os.pwrite(file, blank[: size - start], start)
+        try:
+            os.posix_fallocate(file, 0, size)
+        except OSError as error:
+            # Some file systems reserve nothing, and not every C library writes in their place.
+            if error.errno not in (errno.EOPNOTSUPP, errno.EINVAL):
+                raise
+        else:
+            return
+    blank, written = bytes(1 << 20), 0
+    while written < size:
+        written += os.pwrite(file, blank[: size - written], written)

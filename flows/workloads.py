@@ -59,14 +59,12 @@ def frames_work(ingested: Manifest, config: PipelineConfig) -> Workload:
 def at_detail_size(work: Workload, counts: Mapping[str, Any]) -> Workload | None:
     """The same run with frames of the size that keeps their detail; None where that is the size they have.
 
-    None as well where settings divide the size of the source (`ingest.downscale`), which is then not known.
-
     Args:
         work: of a sequence that has been read.
         counts: of the artefact of its `ingest`.
     """
     width, height = float(counts["detail_width"]), float(counts["detail_height"])
-    if work.width is None or width >= work.width or work.config.ingest.downscale is not None:
+    if work.width is None or width >= work.width:
         return None
     return replace(work, pixels=width * height, width=width)
 
@@ -74,15 +72,15 @@ def at_detail_size(work: Workload, counts: Mapping[str, Any]) -> Workload | None
 def detail_flags(config: PipelineConfig, counts: Mapping[str, Any]) -> str:
     """What asks for frames of that size, on the command line.
 
-    Frames of the source's size can be measured again, whatever they are; those of any other size were
-    measured as they are, and the size is named.
+    Frames that are at least of the source's size can be measured again, whatever they are; smaller ones were
+    measured as they are, and the size is named, beside which a divisor does not count.
 
     Args:
         config: settings that they were read with.
         counts: of the artefact of `ingest`.
     """
     given = config.ingest
-    if given.size == "source" and given.width is None:
+    if given.size != "thumbnail" and given.width is None and given.downscale is None:
         return "--ingest.size detail"
     height = "" if given.height is None else f" --ingest.height {counts['detail_height']}"
     return f"--ingest.width {counts['detail_width']}{height}"

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.checks import check_intrinsics
-from data_catalog.content import content_mask
+from data_catalog.content import content_mask, looked_at
 from data_catalog.folder_reader import FolderReader
 from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
 from data_catalog.images import colour_files, image_size
@@ -91,7 +91,9 @@ class _ContentMask:
     def mask(self, frame: PosedFrame, sampling: Sampling) -> Bool[np.ndarray, "h2 w2"]:
         """The picture inside its dark frame, less burnt-in text."""
         seen = sampling.mask(np.ones((frame.lens.height, frame.lens.width), dtype=bool), file=frame.file)
-        return np.asarray(content_mask(np.stack(self._seen)) & seen)
+        return np.asarray(
+            content_mask(np.stack([self._seen[index] for index in looked_at(len(self._seen))])) & seen
+        )
 
 
 READER = FolderReader(

@@ -15,10 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-__all__ = ["BorderRule", "filter_separable", "gaussian_weights"]
+__all__ = ["BorderRule", "filter_figures", "filter_separable", "gaussian_weights"]
 
 BorderRule = Literal["reflect", "replicate"]
 
+CV_DTYPES = (torch.float32, torch.float64)
 LARGEST_MATRIX_PX = 384
 """Larger maps are filtered by OpenCV: two products with matrices of their size take 7 to 12 times as long."""
 
@@ -42,8 +43,6 @@ def filter_separable(
         Filtered maps of the same size.
     """
     height, width = maps.shape[-2:]
-    if max(height, width) > LARGEST_MATRIX_PX and not maps.requires_grad and maps.device.type == "cpu":
-        return _filtered_directly(maps, weights_x, weights_y, border)
     across = _filter_matrix(width, weights_x, border).to(maps)
     down = _filter_matrix(height, weights_y, border).to(maps)
     return down @ (maps @ across.T)
@@ -57,14 +56,28 @@ def gaussian_weights(sigma_px: float, radius_px: int) -> tuple[float, ...]:
     return tuple(get_gaussian_kernel1d(2 * radius_px + 1, sigma_px, dtype=torch.float64)[0].tolist())
 
 
-def _filtered_directly(
+def filter_figures(
     maps: Float[Tensor, "*b h w"],
     weights_x: tuple[float, ...],
     weights_y: tuple[float, ...],
-    border: BorderRule,
+    border: BorderRule = "reflect",
 ) -> Float[Tensor, "*b h w"]:
-    """The same by OpenCV, whose work grows with the pixels alone; it knows no gradients."""
+    """`filter_separable` for figures: large maps go through OpenCV, where that can be.
+
+    Its work grows with the pixels alone, and its last bits are others; it knows no gradients and no half
+    precision. What stages compute keeps to one way, whatever the size.
+
+    Args:
+        maps: images, filtered along their last two axes.
+        weights_x: odd number of weights along rows.
+        weights_y: odd number of weights along columns.
+        border: as there.
+    """
     import cv2
+
+    large = max(maps.shape[-2:]) > LARGEST_MATRIX_PX
+    if not large or maps.requires_grad or maps.device.type != "cpu" or maps.dtype not in CV_DTYPES:
+        return filter_separable(maps, weights_x, weights_y, border)
 
     rule = cv2.BORDER_REPLICATE if border == "replicate" else cv2.BORDER_REFLECT_101
     along_x, along_y = (np.asarray(weights) for weights in (weights_x, weights_y))

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.errors import ConfigError, ShapeError
-from extrags.metrics.filters import filter_separable, gaussian_weights
+from extrags.metrics.filters import filter_figures, gaussian_weights
 from extrags.metrics.image import mean_of_known, means_in_regions, means_per_image
 
 __all__ = ["PIXELS_PER_DEGREE", "flip", "flip_in_regions", "flip_map"]
@@ -130,7 +130,7 @@ def _sensitivity_filtered(
             mass = sum(math.exp(-0.5 * (offset / sigma) ** 2) for offset in range(-radius, radius + 1))
             share = a * math.sqrt(math.pi / b) * mass**2
             weights = gaussian_weights(sigma, radius)
-            blurred = blurred + share * filter_separable(opponent[:, channel], weights, weights, "replicate")
+            blurred = blurred + share * filter_figures(opponent[:, channel], weights, weights, "replicate")
             total += share
         channels.append(blurred / total)
     return torch.stack(channels, dim=1)
@@ -152,8 +152,8 @@ def _feature_strengths(
     smooth, slope, bump = _feature_weights(pixels_per_degree)
 
     def strength(detector: tuple[float, ...]) -> Tensor:
-        along_x = filter_separable(achromatic, detector, smooth, "replicate")
-        along_y = filter_separable(achromatic, smooth, detector, "replicate")
+        along_x = filter_figures(achromatic, detector, smooth, "replicate")
+        along_y = filter_figures(achromatic, smooth, detector, "replicate")
         return torch.hypot(along_x, along_y)
 
     return strength(slope), strength(bump)

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.errors import ShapeError
-from extrags.metrics.filters import filter_separable, gaussian_weights
+from extrags.metrics.filters import filter_figures, filter_separable, gaussian_weights
 
 __all__ = [
     "MAX_PSNR_DB",
@@ -112,10 +112,17 @@ def ssim(
     return mean_of_known(means_per_image(ssim_map(render, target), mask))
 
 
-def ssim_map(render: Float[Tensor, "*b h w 3"], target: Float[Tensor, "*b h w 3"]) -> Float[Tensor, "*b h w"]:
+def ssim_map(
+    render: Float[Tensor, "*b h w 3"], target: Float[Tensor, "*b h w 3"], *, figures: bool = True
+) -> Float[Tensor, "*b h w"]:
     """SSIM of each pixel, mean of the three channels; borders are mirrored.
 
     Gaussian window 11 x 11 with sigma 1.5, K1 = 0.01, K2 = 0.03, data range 1, biased variances.
+
+    Args:
+        render: images in [0, 1].
+        target: images in [0, 1].
+        figures: for figures alone, so that large images may be filtered faster, with other last bits.
 
     Source: Wang et al., Image quality assessment: from error visibility to structural similarity,
     IEEE TIP 2004, equation 13.
@@ -129,9 +136,10 @@ def ssim_map(render: Float[Tensor, "*b h w 3"], target: Float[Tensor, "*b h w 3"
         raise ShapeError(f"SSIM needs images larger than {SSIM_WINDOW_PX // 2} px, found {width}x{height}")
     x = _channels_first(render)
     y = _channels_first(target)
+    filtered = filter_figures if figures else filter_separable
     moments = torch.cat([x, y, x * x, y * y, x * y])
     window = gaussian_weights(SSIM_SIGMA_PX, SSIM_WINDOW_PX // 2)
-    mean_x, mean_y, mean_xx, mean_yy, mean_xy = filter_separable(moments, window, window).chunk(5)
+    mean_x, mean_y, mean_xx, mean_yy, mean_xy = filtered(moments, window, window).chunk(5)
     square_x, square_y, product = mean_x.square(), mean_y.square(), mean_x * mean_y
     # Rounding can push a variance below zero on flat patches.
     variance_x = (mean_xx - square_x).clamp_min(0)

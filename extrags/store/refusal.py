@@ -37,7 +37,8 @@ def refused_write(error: BaseException, stage: str, store: str, place: Path) -> 
         return None
     path = file or _newest(place)
     where = f"store {store}"
-    if file == tempfile.gettempdir():
+    # What was found before: to look for it now would write to the full disk.
+    if file is not None and file == tempfile.tempdir:
         where = "the folder of temporary files, where large stacks of frames are held; TMPDIR names another"
     return StoreError(f"stage {stage}: {path} cannot be written: {os.strerror(number)} ({where})")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -48,3 +49,21 @@ def test_floating_point_has_no_white(tmp_path: Path) -> None:
     file = written(tmp_path / "a.tif", GREY.astype(np.float32))
     with pytest.raises(SourceError, match=r"a\.tif, frame 7, field rgb: floating-point values; expected"):
         read_colour(file, frame=7)
+
+
+def test_a_tiff_tells_how_many_of_sixteen_bits_it_uses(tmp_path: Path) -> None:
+    """Of 12 bits, packed, white is 4095."""
+    values = np.array([[0, 2048, 4095, 16]], dtype=np.uint16)
+    packed = b"".join(
+        bytes([int(a) >> 4, (int(a) & 15) << 4 | int(b) >> 8, int(b) & 255]) for a, b in values.reshape(-1, 2)
+    )
+    entries = [(256, 4, 4), (257, 4, 1), (258, 3, 12), (259, 3, 1), (262, 3, 1), (273, 4, 8), (277, 3, 1)]
+    entries += [(278, 4, 1), (279, 4, len(packed))]
+    directory = struct.pack("<H", len(entries))
+    for tag, kind, value in entries:
+        directory += struct.pack("<HHI", tag, kind, 1) + struct.pack(
+            "<HH" if kind == 3 else "<I", value, *[0] * (kind == 3)
+        )
+    file = tmp_path / "a.tif"
+    file.write_bytes(b"II*\0" + struct.pack("<I", 8 + len(packed)) + packed + directory + bytes(4))
+    np.testing.assert_array_equal(read_colour(file)[0, :, 0], [0, 128, 255, 1])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import tempfile
 from pathlib import Path
 
@@ -63,7 +65,11 @@ def test_frames_are_copied_when_they_are_taken_in() -> None:
 
 @pytest.mark.parametrize(
     ("shapes", "problem"),
-    [([(2, 2), (2, 3)], "frame 1 of 2"), ([(2, 2)] * 3, "frame 2 of 2"), ([(2, 2)], "1 of 2 frames")],
+    [
+        ([(2, 2), (2, 3)], "frame 1 of 2"),
+        ([(2, 2)] * 3, "further frame"),
+        ([(2, 2)], "1 of 2 frames"),
+    ],
 )
 def test_what_does_not_fit_is_refused(shapes: list[tuple[int, int]], problem: str) -> None:
     with pytest.raises(ValueError, match=problem):
@@ -78,3 +84,28 @@ def test_a_file_is_as_large_as_its_stack_where_room_cannot_be_reserved(
     found = empty_stack((3, 1000, 500), np.uint8)
     found[:] = 3
     assert int(found.sum()) == 3 * found.size
+
+
+def test_another_kind_of_numbers_is_refused() -> None:
+    """Where numpy would take the wider one, half of the frames would be rounded."""
+    with pytest.raises(ValueError, match="float64"):
+        stacked(iter([np.zeros((2, 2), np.uint8), np.full((2, 2), 0.7)]), 2)
+
+
+def test_a_file_system_that_reserves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_stacks, "MAPPED_BYTES", 0)
+
+    def refuse(*_given: object) -> None:
+        raise OSError(errno.EOPNOTSUPP, "not supported")
+
+    monkeypatch.setattr("os.posix_fallocate", refuse, raising=False)
+    true_write, sizes = os.pwrite, []
+
+    def short(file: int, data: bytes, offset: int) -> int:
+        sizes.append(true_write(file, data[:700_000], offset))
+        return sizes[-1]
+
+    monkeypatch.setattr("os.pwrite", short)
+    found = empty_stack((3, 1000, 500), np.uint8)
+    assert sum(sizes) == found.size
+    assert len(sizes) > 2

@@ -95,6 +95,24 @@ def test_a_full_folder_of_temporary_files_is_not_blamed_on_the_store(
     assert "(store" not in str(said.value)
 
 
+def test_where_even_temporary_files_have_no_room_the_store_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process that has not asked for that folder yet must not look for one on a full disk."""
+
+    def nowhere() -> str:
+        raise FileNotFoundError(errno.ENOENT, "No usable temporary directory found")
+
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "gettempdir", nowhere)
+    store = Store(tmp_path)
+    with (
+        pytest.raises(StoreError, match=r"^stage toy: .*cannot be written: No space"),
+        store.slot(stage="toy", version=1, key="toy-v1-a"),
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
 def test_what_may_not_be_read_elsewhere_is_no_matter_of_the_store(tmp_path: Path) -> None:
     def read() -> None:
         with Store(tmp_path / "store").slot(stage="toy", version=1, key="toy-v1-a"):

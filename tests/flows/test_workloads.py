@@ -33,6 +33,9 @@ def test_frames_that_hold_all_their_detail_are_the_same_work() -> None:
     ("settings", "flags"),
     [
         ({"size": "source"}, "--ingest.size detail"),
+        # Larger than the source in places, where no width could be asked for.
+        ({"size": "central"}, "--ingest.size detail"),
+        ({"size": "source", "downscale": 2}, "--ingest.width 180"),
         ({"size": "thumbnail"}, "--ingest.width 180"),
         ({"size": "source", "width": 225}, "--ingest.width 180"),
         ({"width": 225, "height": 180}, "--ingest.width 180 --ingest.height 144"),
@@ -42,12 +45,6 @@ def test_what_asks_for_frames_of_that_size(settings: dict[str, Any], flags: str)
     """`size=detail` measures the source, and gives way to a width."""
     config = PipelineConfig(ingest=IngestConfig(**settings))
     assert detail_flags(config, {"detail_width": 180, "detail_height": 144}) == flags
-
-
-def test_frames_that_are_divided_have_no_such_flag() -> None:
-    config = PipelineConfig(ingest=IngestConfig(downscale=2))
-    work = Workload(225 * 180, 40, 20, 20, config, width=225)
-    assert at_detail_size(work, {"detail_width": 180, "detail_height": 144}) is None
 
 
 @pytest.mark.parametrize(

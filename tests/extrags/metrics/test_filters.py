@@ -6,7 +6,13 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from extrags.metrics.filters import LARGEST_MATRIX_PX, BorderRule, filter_separable, gaussian_weights
+from extrags.metrics.filters import (
+    LARGEST_MATRIX_PX,
+    BorderRule,
+    filter_figures,
+    filter_separable,
+    gaussian_weights,
+)
 
 
 @pytest.mark.parametrize("size", [(14, 19), (14, LARGEST_MATRIX_PX + 19), (LARGEST_MATRIX_PX + 14, 19)])
@@ -19,13 +25,14 @@ def test_equals_padding_and_convolution(border: BorderRule, size: tuple[int, int
     padded = F.pad(maps[:, None], (3, 3, 2, 2), mode=border)
     kernel = torch.outer(*(torch.tensor(weights, dtype=torch.float64) for weights in (along_y, along_x)))
     expected = F.conv2d(padded, kernel[None, None])[:, 0]
-    torch.testing.assert_close(filter_separable(maps, along_x, along_y, border), expected, atol=1e-12, rtol=0)
+    for form in (filter_separable, filter_figures):
+        torch.testing.assert_close(form(maps, along_x, along_y, border), expected, atol=1e-12, rtol=0)
 
 
 def test_large_maps_of_single_precision_differ_by_its_rounding() -> None:
     maps = torch.rand(2, 3, 40, LARGEST_MATRIX_PX + 1, generator=torch.Generator().manual_seed(4))
     window = gaussian_weights(1.5, 5)
-    found = filter_separable(maps, window, window)
+    found = filter_figures(maps, window, window)
     assert found.dtype == torch.float32
     exact = filter_separable(maps.double(), window, window)
     # Two sums of eleven terms, the weights rounded too.
@@ -36,9 +43,9 @@ def test_large_maps_have_gradients_and_may_be_views() -> None:
     generator = torch.Generator().manual_seed(5)
     maps = torch.rand(40, 2, LARGEST_MATRIX_PX + 1, generator=generator, dtype=torch.float64).transpose(0, 1)
     window = gaussian_weights(1.5, 5)
-    without = filter_separable(maps, window, window)
+    without = filter_figures(maps, window, window)
     maps.requires_grad_()
-    found = filter_separable(maps, window, window)
+    found = filter_figures(maps, window, window)
     torch.testing.assert_close(found.detach(), without, atol=1e-12, rtol=0)
     found.sum().backward()
     # Weights sum to one, and mirrored borders give back what they take but for the border pixel itself.
@@ -51,3 +58,21 @@ def test_images_smaller_than_the_window_keep_their_mean_level(size: int) -> None
     window = gaussian_weights(2.0, 6)
     flat = torch.full((size, size), 0.7, dtype=torch.float64)
     torch.testing.assert_close(filter_separable(flat, window, window), flat, atol=1e-12, rtol=0)
+
+
+def test_what_stages_compute_is_one_way_whatever_the_size() -> None:
+    """Figures alone may have other last bits where images are large."""
+    maps = torch.rand(1, 40, LARGEST_MATRIX_PX + 1, generator=torch.Generator().manual_seed(6))
+    window = gaussian_weights(1.5, 5)
+    # Columns that lie apart from both borders see the same neighbours in a narrower map.
+    narrow = maps[..., :300]
+    whole = filter_separable(maps, window, window)
+    torch.testing.assert_close(whole[..., 20:280], filter_separable(narrow, window, window)[..., 20:280])
+    assert not torch.equal(whole, filter_figures(maps, window, window))
+    assert torch.equal(filter_separable(narrow, window, window), filter_figures(narrow, window, window))
+
+
+def test_half_precision_stays_with_the_matrices() -> None:
+    maps = torch.rand(1, 40, LARGEST_MATRIX_PX + 1, generator=torch.Generator().manual_seed(7)).bfloat16()
+    window = gaussian_weights(1.5, 5)
+    assert torch.equal(filter_figures(maps, window, window), filter_separable(maps, window, window))
