@@ -66,7 +66,7 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
     "enhance-train": ("one", "restored", "fold_iterations", "fold_iterations*restored"),
     "enhance": ("one", "views", "views*restored"),
     "finetune-judge": ("judge_iterations", "judge_iterations*pixels", "judge_iterations*gaussians"),
-    "finetune": ("tuning", "tuning*pixels", "tuning*gaussians"),
+    "finetune": ("tuning", "tuning*pixels", "tuning*restored", "tuning*gaussians"),
     "evaluate-render": ("test", "test*pixels"),
     "evaluate-restore": ("test*pixels", "test*restored"),
     "evaluate-views": ("test*pixels*stacks", "test*pixels*vgg*passes"),
@@ -75,7 +75,7 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
 }
 """Terms of the time of each task; others have a constant alone. Terms that records cannot tell apart (one
 number of iterations only) must not be there: the fit would give one of them the part of the other."""
-MEMORY_TERMS = ("one", "pixels", "frames*pixels", "gaussians")
+MEMORY_TERMS = ("one", "pixels", "frames*pixels", "restored", "gaussians")
 REWEIGHTED = 20
 """Rounds of reweighting; the fit has settled by then."""
 PRIOR_RECORDS = 2.0
