@@ -125,8 +125,9 @@ class InMemoryPipeline(Pipeline):
         true_surface: TrueSurface | None = None,
     ) -> None:
         super().__init__(config, leave_out)
-        # The oracle's frames are those of no other scene: it starts anew anyway.
-        if config.continuation.scene == "nearest" and config.coarse.train_on != "all":
+        # The oracle's frames are those of no other scene: it starts anew anyway. A radiance field has none.
+        begins_anew = config.coarse.train_on == "all" or config.uc_nerf.enabled
+        if config.continuation.scene == "nearest" and not begins_anew:
             raise ConfigError(
                 "continuation.scene=nearest looks for a scene in a store, and a run in memory has none; "
                 "give extrags.training.reconstruct the earlier scene"
@@ -366,7 +367,7 @@ class InMemoryPipeline(Pipeline):
             self._training,
             self._enhancer,
             self.config.enhance,
-            textured=self.config.evaluate.restored == "textured",
+            finish=self.config.evaluate.restored,
         )
 
     def report(self) -> None:

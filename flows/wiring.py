@@ -47,6 +47,7 @@ from tasks.weights import (
     depth_completion_digest,
     depth_monocular_digest,
     lpips_weights,
+    refiner_digest,
     restorer_digest,
 )
 
@@ -395,8 +396,9 @@ class SequenceRun(CachedStages):
             "sequence": self.refs["sequence"],
             "training": self.refs["training"],
             "restorer": self.refs["restorer"],
-            "config": renders_settings(self.config.enhance),
-            "textured": kind == "textured",
+            "config": renders_settings(self.config.enhance, kind),
+            "finish": kind,
+            "refiner": refiner_digest() if kind == "refined" else None,
         }
         return self._run_task(row, Call(restore_renders, inputs))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from extrags.config import EnhanceConfig, LpipsNet
+from extrags.config.stages import Finish
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.store import Ref, Slot
 from extrags.zarr_io import group_exists
@@ -50,12 +51,22 @@ def render(
     slot.counts["triangles"] = 0 if mesh is None else len(mesh.triangles)
 
 
-def restoring_settings(config: EnhanceConfig) -> EnhanceConfig:
-    """The settings that `restore` reads, all others at their defaults: the restorer stands for these."""
-    return EnhanceConfig(references=config.references, max_width=config.max_width, seed=config.seed)
+def restoring_settings(config: EnhanceConfig, finish: Finish) -> EnhanceConfig:
+    """The settings that `restore` reads, all others at their defaults: the restorer stands for these.
+
+    Args:
+        config: of the run.
+        finish: the refiner alone has a precision here, which is settled for this processor.
+    """
+    from extrags.restoration.diffusion.precision import chosen_precision
+
+    settings = EnhanceConfig(references=config.references, max_width=config.max_width, seed=config.seed)
+    if finish != "refined":
+        return settings
+    return settings.model_copy(update={"precision": chosen_precision(config)})
 
 
-@stage("evaluate-restore", version=3)
+@stage("evaluate-restore", version=4)
 def restore(
     slot: Slot,
     renders: Ref,
@@ -64,7 +75,8 @@ def restore(
     training: Ref,
     restorer: Ref,
     config: EnhanceConfig,
-    textured: bool,
+    finish: Finish,
+    refiner: str | None,
 ) -> None:
     """Restore rendered held-out views in the image; writes `renders/`, and the scene's `mesh/` again.
 
@@ -76,7 +88,8 @@ def restore(
         training: the training frames alone, with estimated depth where there is no other.
         restorer: of the scene.
         config: from `restoring_settings`.
-        textured: see `extrags.restoration.restored_renders.restored_renders`.
+        finish: see `extrags.restoration.restored_renders.restored_renders`.
+        refiner: digest of the refiner, where it is used; only part of the key.
     """
     from extrags.metrics.protocol import RenderedViews
     from extrags.restoration.backends import load_enhancer
@@ -92,7 +105,7 @@ def restore(
         slot.load(EndoscopicSequence, training),
         load_enhancer(slot.open(restorer) / RESTORER),
         config,
-        textured=textured,
+        finish=finish,
     )
     slot.save(views)
     slot.counts["views"] = len(views)

@@ -23,6 +23,7 @@ __all__ = [
     "depth_monocular_digest",
     "lpips_by_net",
     "lpips_weights",
+    "refiner_digest",
     "restorer_digest",
 ]
 
@@ -96,6 +97,13 @@ def restorer_digest(config: EnhanceConfig) -> str | None:
     from extrags.restoration import backends
 
     return backends.restorer_digest(config)
+
+
+def refiner_digest() -> str:
+    """Digest of the refiner of restored held-out views."""
+    from extrags.restoration.refinement.weights import refiner_digest as digest
+
+    return digest()
 
 
 def depth_completion_digest(config: DepthConfig) -> str | None:

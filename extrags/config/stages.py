@@ -224,6 +224,8 @@ class FinetuneConfig(StageConfig):
 
 LpipsNet = Literal["alex", "vgg", "squeeze"]
 """Backbones of LPIPS."""
+Finish = Literal["smooth", "textured", "refined"]
+"""What is done to the invented parts of restored views."""
 
 
 class EvaluateConfig(StageConfig):
@@ -240,12 +242,12 @@ class EvaluateConfig(StageConfig):
         description="npz file with LPIPS weights, or the folder that holds one for each backbone; None looks "
         "in the usual places",
     )
-    restored: Literal["none", "smooth", "textured"] = Field(
-        "textured",
+    restored: Literal["none", "smooth", "textured", "refined"] = Field(
+        "refined",
         description="held-out views of the final scene are also measured after restoration in the image. "
         "textured: what is invented gets texture of the scene's own frames, which looks right and costs some "
-        "PSNR; smooth: without it; none: not measured. Each held-out view takes the restorer once, which a "
-        "large pretrained model makes long",
+        "PSNR; refined: a network makes that texture and the shapes agree; smooth: without either; none: not "
+        "measured. Each held-out view takes the restorer once, which a large pretrained model makes long",
     )
 
     @field_validator("lpips_nets")

@@ -23,6 +23,7 @@ from torch.nn import functional
 
 from extrags.cameras import Cameras
 from extrags.config import EnhanceConfig
+from extrags.config.stages import Finish
 from extrags.errors import ShapeError
 from extrags.events import Progress, emit
 from extrags.frame_stacks import FrameStack, stacked
@@ -33,7 +34,10 @@ from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.restoration.benchmark.evaluation import iterate_held_out_clips
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import FEATHER_RADIUS_PX, FEATHER_SIGMA_PX
+from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.refinement.refiner import Refiner, textured_views
+from extrags.restoration.refinement.weights import bundled_refiner
 from extrags.restoration.surface_texture import SurfaceTexture, invented_share
 from extrags.restoration.training_data.augmentation import unconfirmed
 from extrags.scene import Scene
@@ -60,7 +64,7 @@ def restored_renders(
     enhancer: Enhancer,
     config: EnhanceConfig,
     *,
-    textured: bool = True,
+    finish: Finish = "refined",
 ) -> RenderedViews:
     """Restore rendered held-out views.
 
@@ -74,8 +78,9 @@ def restored_renders(
         sequence: posed frames in the scene's world, held-out ones included.
         training: its training frames, with the depth that the scene was made with.
         enhancer: the scene's restorer.
-        config: the number of references, the working width, and the seed.
-        textured: whether what is invented gets texture of the scene's own frames.
+        config: the number of references, the working width, the seed, and the refiner's precision.
+        finish: what is done to invented colours: `textured` lays texture of the scene's own frames onto them,
+            `refined` gives both to the refiner of the package.
 
     Returns:
         The same views with other colours; opacity and depth are those of the final scene.
@@ -83,16 +88,20 @@ def restored_renders(
     Raises:
         ShapeError: when there is not one render for each held-out frame.
         CaptureError: without any held-out frame.
+        WeightsError: when the refiner's weights are not there.
     """
     if len(renders) != len(sequence.test):
         raise ShapeError(f"{len(renders)} renders of {len(sequence.test)} held-out frames")
     if sequence.lens is not None:
-        return _through_pinholes(coarse, renders, sequence, training, enhancer, config, textured=textured)
+        return _through_pinholes(coarse, renders, sequence, training, enhancer, config, finish=finish)
     width = config.working_width(sequence.width)
     small, training = sequence.at_most_width(width), training.at_most_width(width)
     references = gather_references(coarse, training, training.train)
-    texture = SurfaceTexture.of_references(references, seed=config.seed) if textured else None
-    if textured and texture is None:
+    texture = None if finish == "smooth" else SurfaceTexture.of_references(references, seed=config.seed)
+    refiner = None
+    if finish == "refined":
+        refiner = bundled_refiner(half_precision=chosen_precision(config) == "bfloat16")
+    if finish != "smooth" and texture is None:
         logger.warning("no frame shows the surface closely enough: restored views stay without texture")
     clips = iterate_held_out_clips(coarse, references, small, sequence.test, count=config.references)
     keeps_known = isinstance(enhancer, ClassicalEnhancer)
@@ -102,7 +111,7 @@ def restored_renders(
         cameras = sequence.cameras[sequence.test[part]]
         rendered = torch.from_numpy(renders.rgb[part]).permute(0, 3, 1, 2).clamp(0, 1)
         solid = torch.from_numpy(renders.alpha[part])[:, None].clamp(0, 1)
-        mixed = _mixed(clip, cameras, rendered, solid, enhancer, texture, keeps_known=keeps_known)
+        mixed = _mixed(clip, cameras, rendered, solid, enhancer, texture, refiner, keeps_known=keeps_known)
         for view in mixed.permute(0, 2, 3, 1).numpy():
             restored.append(view)
         done += len(clip)
@@ -118,7 +127,7 @@ def _through_pinholes(
     enhancer: Enhancer,
     config: EnhanceConfig,
     *,
-    textured: bool,
+    finish: Finish,
 ) -> RenderedViews:
     """Views through a lens, restored as wide pinholes: what restoration changes there is carried back.
 
@@ -145,7 +154,7 @@ def _through_pinholes(
         training.as_pinhole(),
         enhancer,
         config,
-        textured=textured,
+        finish=finish,
     )
     changed = FrameStack(len(plans))
     for index, plan in enumerate(plans):
@@ -162,6 +171,7 @@ def _mixed(
     solid: Float[Tensor, "t 1 h w"],
     enhancer: Enhancer,
     texture: SurfaceTexture | None,
+    refiner: Refiner | None,
     *,
     keeps_known: bool,
 ) -> Float[Tensor, "t 3 h w"]:
@@ -187,8 +197,8 @@ def _mixed(
         share = torch.maximum(share, (1 - invented) * solid)
     mixed = (1 - share) * restored + share * rendered
     if texture is not None:
-        mixed = texture.applied(
-            mixed, cameras, _enlarged(depth, size)[:, 0], _enlarged(to_invent, size)[:, 0]
+        mixed = textured_views(
+            texture, refiner, mixed, cameras, _enlarged(depth, size), _enlarged(to_invent, size)
         )
     return mixed.clamp(0, 1)
 

@@ -27,7 +27,7 @@ from extrags.view_synthesis.filling import completed_depth
 from extrags.view_synthesis.references import ReferenceViews
 from extrags.view_synthesis.warp import depth_normals
 
-__all__ = ["SurfaceTexture", "invented_share"]
+__all__ = ["LaidTexture", "SurfaceTexture", "invented_share"]
 
 TILE_TEXELS = 32
 MARGIN_TEXELS = 8
@@ -61,6 +61,23 @@ UNCONFIRMED_FROM, UNCONFIRMED_TO = 0.2, 0.6
 """Texture sets in where a pixel is this much to be invented, and is complete from the second number on."""
 MIP_LEVELS = 4
 TILES_AT_ONCE = 64
+
+
+@dataclass(frozen=True)
+class LaidTexture:
+    """Texture that was laid onto the surface that V views show.
+
+    Args:
+        change: what it adds to their colours; zero where nothing is invented.
+        share: how much of each pixel counts as invented, 0 to 1.
+        facing: cosine between a pixel's ray and the normal of the surface, 0 to 1.
+        texels: width of a pixel on the surface, in texels.
+    """
+
+    change: Float[Tensor, "v 3 h w"]
+    share: Float[Tensor, "v 1 h w"]
+    facing: Float[Tensor, "v 1 h w"]
+    texels: Float[Tensor, "v 1 h w"]
 
 
 @dataclass(frozen=True)
@@ -121,18 +138,29 @@ class SurfaceTexture:
             depth_mm: z-depth without gaps.
             unconfirmed: share of each pixel that is invented.
         """
+        return (rgb + self.laid(rgb, cameras, depth_mm, unconfirmed).change).clamp(0, 1)
+
+    def laid(
+        self,
+        rgb: Float[Tensor, "v 3 h w"],
+        cameras: Cameras,
+        depth_mm: Float[Tensor, "v h w"],
+        unconfirmed: Float[Tensor, "v h w"],
+    ) -> LaidTexture:
+        """What `applied` adds to views, and how the surface lies that it is laid onto; arguments as there."""
         window = gaussian_weights(DETAIL_SIGMA, DETAIL_RADIUS)
         brightness = filter_separable(rgb, window, window) + DARKNESS
         share = invented_share(unconfirmed)
-        textured = [
-            rgb[view]
-            + STRENGTH
-            * share[view]
-            * self.detail(cameras[[view]], depth_mm[view], share[view] > 0)
-            * brightness[view]
-            for view in range(len(rgb))
-        ]
-        return torch.stack(textured).clamp(0, 1)
+        changes, facing, texels = [], [], []
+        for view in range(len(rgb)):
+            surface = _Surface.of_view(cameras[[view]], depth_mm[view], self.texel_mm)
+            detail = self._detail(surface, share[view] > 0)
+            changes.append(STRENGTH * share[view] * detail * brightness[view])
+            facing.append(surface.facing)
+            texels.append(surface.texels)
+        return LaidTexture(
+            torch.stack(changes), share[:, None], torch.stack(facing)[:, None], torch.stack(texels)[:, None]
+        )
 
     def detail(
         self, camera: Cameras, depth_mm: Float[Tensor, "h w"], wanted: Bool[Tensor, "h w"]
@@ -144,14 +172,11 @@ class SurfaceTexture:
             depth_mm: z-depth without gaps.
             wanted: where detail is wanted; it is zero elsewhere.
         """
-        rays = torch.from_numpy(pixel_rays(camera).astype(np.float32))[0]
-        window = gaussian_weights(DEPTH_SIGMA_PX, DEPTH_RADIUS_PX)
-        normals = depth_normals(rays, filter_separable(depth_mm[None, None], window, window)[0])
-        center = torch.from_numpy(camera.centers.astype(np.float32))[0]
-        points = (center + rays * depth_mm[..., None])[wanted]
-        texels = depth_mm[wanted] / float(camera.K[0, 0, 0]) / self.texel_mm
+        return self._detail(_Surface.of_view(camera, depth_mm, self.texel_mm), wanted)
+
+    def _detail(self, surface: _Surface, wanted: Bool[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
         detail = torch.zeros(*wanted.shape, 3)
-        detail[wanted] = self._at(points, normals[wanted], texels)
+        detail[wanted] = self._at(surface.points[wanted], surface.normals[wanted], surface.texels[wanted])
         return detail.permute(2, 0, 1)
 
     def _at(
@@ -248,6 +273,29 @@ def invented_share(unconfirmed: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         unconfirmed: share of each pixel that neither the rendering nor a real view confirms, in [0, 1].
     """
     return ((unconfirmed - UNCONFIRMED_FROM) / (UNCONFIRMED_TO - UNCONFIRMED_FROM)).clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """What a view shows of the surface: places, how they lie, and how many texels wide a pixel is there."""
+
+    points: Float[Tensor, "h w 3"]
+    normals: Float[Tensor, "h w 3"]
+    facing: Float[Tensor, "h w"]
+    texels: Float[Tensor, "h w"]
+
+    @classmethod
+    def of_view(cls, camera: Cameras, depth_mm: Float[Tensor, "h w"], texel_mm: float) -> _Surface:
+        rays = torch.from_numpy(pixel_rays(camera).astype(np.float32))[0]
+        window = gaussian_weights(DEPTH_SIGMA_PX, DEPTH_RADIUS_PX)
+        normals = depth_normals(rays, filter_separable(depth_mm[None, None], window, window)[0])
+        center = torch.from_numpy(camera.centers.astype(np.float32))[0]
+        return cls(
+            center + rays * depth_mm[..., None],
+            normals,
+            (functional.normalize(rays, dim=-1) * normals).sum(-1).abs(),
+            depth_mm / float(camera.K[0, 0, 0]) / texel_mm,
+        )
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import argparse
 import json
 import logging
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,12 +18,14 @@ from extrags.redaction import CredentialFilter, without_credentials
 
 if TYPE_CHECKING:
     from extrags.config import PipelineConfig
+    from extrags.config.base import StageConfig
     from extrags.pipeline import StageName
     from flows.limits import StageLimits
     from flows.wiring import SequenceRun
 
 __all__ = [
     "finished_run",
+    "further_settings",
     "items",
     "parsed_settings",
     "run_config",
@@ -204,3 +207,25 @@ def showing(given: argparse.Namespace) -> Literal["terminal", "log", "nothing"]:
     if given.quiet:
         return "nothing"
     return "terminal" if sys.stderr.isatty() else "log"
+
+
+def further_settings(texts: Sequence[str], model: type[StageConfig]) -> dict[str, Any]:
+    """Settings of a training given as NAME=VALUE.
+
+    Args:
+        texts: of the command line.
+        model: of the training's settings.
+
+    Raises:
+        ConfigError: for an unknown name, or a value that is none of its kind.
+    """
+    from extrags.config.settings import settings_of
+
+    known = settings_of(model)
+    found: dict[str, Any] = {}
+    for text in texts:
+        name, separator, value = text.partition("=")
+        if not separator or name not in known:
+            raise ConfigError(f"--set {text}: expected NAME=VALUE with one of {', '.join(sorted(known))}")
+        found[name] = known[name].parse(value)
+    return found

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
-from flows.commands.common import set_up_logging, showing
+from flows.commands.common import further_settings, set_up_logging, showing
 from flows.commands.options import Parser
 
 if TYPE_CHECKING:
@@ -100,8 +100,8 @@ class SceneSource:
 
 
 def scene_sources(given: argparse.Namespace, count: int) -> list[SceneSource]:
-    """The first scenes of the families asked for, which take turns."""
-    made = dict.fromkeys(SOURCES, 0)
+    """Scenes of the families asked for, which take turns, from a number on."""
+    made = dict.fromkeys(SOURCES, given.first_scene)
     sources = []
     for number in range(count):
         family = given.kinds[number % len(given.kinds)]
@@ -138,6 +138,14 @@ def add_arguments(parser: Parser) -> None:
         "(default: phantom cavities)",
     )
     parser.add_argument(
+        "--first-scene",
+        type=int,
+        default=0,
+        metavar="N",
+        help="number of the first scene of each family: a training that starts from weights, or refines what "
+        "they give, takes scenes that they have not seen (default: %(default)s)",
+    )
+    parser.add_argument(
         "--size-factor",
         type=int,
         default=1,
@@ -150,16 +158,20 @@ def add_arguments(parser: Parser) -> None:
         help="a third of the cavities wear tissue of real laparoscopy frames, which must be had",
     )
     parser.add_argument("--scenes-only", action="store_true", help="make the scenes, and train nothing")
-    parser.add_argument("--scenes", type=int, metavar="N", help="pretraining scenes (default: 86)")
     parser.add_argument(
-        "--validation-scenes", type=int, metavar="N", help="how many of them validate only (default: 6)"
+        "--scenes", type=int, metavar="N", help="pretraining scenes (default: 86; of a refiner 90)"
     )
-    parser.add_argument("--iterations", type=int, metavar="N", help="optimisation steps (default: 13500)")
+    parser.add_argument(
+        "--validation-scenes", type=int, metavar="N", help="how many of them validate only (default: 6; 8)"
+    )
+    parser.add_argument(
+        "--iterations", type=int, metavar="N", help="optimisation steps (default: 13500; 10000)"
+    )
     parser.add_argument("--batch", type=int, metavar="N", help="crops per step (default: 4)")
     parser.add_argument("--start", metavar="FOLDER", help="go on from these weights instead of from nothing")
-    parser.add_argument("--learning-rate", type=float, metavar="X", help="the peak (default: 8e-4)")
+    parser.add_argument("--learning-rate", type=float, metavar="X", help="the peak (default: 8e-4; 5e-4)")
     parser.add_argument(
-        "--perceptual-weight", type=float, metavar="X", help="of the perceptual distance (default: 0.15)"
+        "--perceptual-weight", type=float, metavar="X", help="of the perceptual distance (default: 0.15; 4)"
     )
     parser.add_argument(
         "--error-weight", type=float, metavar="X", help="of the expected error's likelihood (default: 0.02)"
@@ -183,6 +195,12 @@ def add_arguments(parser: Parser) -> None:
         help="train drawing as well: plausible views with texture, not their mean alone",
     )
     parser.add_argument(
+        "--refiner",
+        action="store_true",
+        help="train the refiner of restored views instead of a restorer; --start names the restorer whose "
+        "views it refines (default: bundled). It keeps no checkpoint",
+    )
+    parser.add_argument(
         "--set",
         action="append",
         default=[],
@@ -203,11 +221,51 @@ def pretrain(given: argparse.Namespace) -> int:
 
     from extrags.raster.bench import machine
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
-    from extrags.restoration.diffusion.pretraining import PretrainingConfig
     from extrags.restoration.diffusion.pretraining import pretrain as trained
+    from extrags.restoration.diffusion.weights import BUNDLED
+    from extrags.restoration.refinement.training import RefinerConfig
+    from flows.commands.pretrain_refiner import refiner_settings, start_of_refiner, trained_refiner
     from flows.progress_display import progress_display
     from flows.terminal import console
     from tasks.progress import reporting
+
+    config = refiner_settings(given) if given.refiner else _settings(given)
+    perceptual = isinstance(config, RefinerConfig) or config.perceptual
+    checked(given, config.scenes, config.validation_scenes, perceptual=perceptual)
+    start = None
+    if isinstance(config, RefinerConfig):
+        restorer = start_of_refiner(given.start or BUNDLED)
+    elif given.start is not None:
+        start = EmbeddedEnhancer.load(Path(given.start))
+    # As things are now: in some hours the working tree may be another.
+    about: dict[str, Any] = {"command": _command(given), "machine": machine()}
+    sources = scene_sources(given, config.scenes)
+    with progress_display(showing(given)), reporting("restorer", "pretrain"):
+        files = make_scenes(Path(given.scenes_folder), sources, given.workers)
+        if given.scenes_only:
+            console().print(f"{len(files)} scenes in {given.scenes_folder}")
+            return 0
+        if given.threads is not None:
+            torch.set_num_threads(given.threads)
+        if isinstance(config, RefinerConfig):
+            refiner = trained_refiner(files, config, restorer, about)
+            refiner.save(Path(given.out))
+            return _told(refiner.record, given.out)
+        checkpoint = Path(given.out) / CHECKPOINT
+        enhancer = trained(files, config, start, checkpoint=checkpoint)
+        replace(enhancer, record={**enhancer.record, **about}).save(Path(given.out), half=True)
+        if enhancer.record["iterations_made"] >= config.iterations:
+            checkpoint.unlink()
+    return _told(enhancer.record, given.out)
+
+
+def _settings(given: argparse.Namespace) -> PretrainingConfig:
+    """Settings of a restorer's training.
+
+    Raises:
+        ConfigError: for an unknown setting, or a value out of its range.
+    """
+    from extrags.restoration.diffusion.pretraining import PretrainingConfig
 
     values = {
         "scenes": given.scenes,
@@ -222,56 +280,33 @@ def pretrain(given: argparse.Namespace) -> int:
         "generative": given.generative,
         "seed": given.seed,
     }
-    known = {name: value for name, value in values.items() if value is not None} | _further(given.set)
+    known = {name: value for name, value in values.items() if value is not None} | further_settings(
+        given.set, PretrainingConfig
+    )
     try:
-        config = PretrainingConfig(**known)
+        return PretrainingConfig(**known)
     except ValueError as error:
         raise ConfigError(f"extrags pretrain: {error}") from error
-    start = None if given.start is None else EmbeddedEnhancer.load(Path(given.start))
-    checked(given, config)
-    # As things are now: in some hours the working tree may be another.
-    about: dict[str, Any] = {"command": _command(given), "machine": machine()}
-    sources = scene_sources(given, config.scenes)
-    with progress_display(showing(given)), reporting("restorer", "pretrain"):
-        files = make_scenes(Path(given.scenes_folder), sources, given.workers)
-        if given.scenes_only:
-            console().print(f"{len(files)} scenes in {given.scenes_folder}")
-            return 0
-        if given.threads is not None:
-            torch.set_num_threads(given.threads)
-        checkpoint = Path(given.out) / CHECKPOINT
-        enhancer = trained(files, config, start, checkpoint=checkpoint)
-        replace(enhancer, record={**enhancer.record, **about}).save(Path(given.out), half=True)
-        if enhancer.record["iterations_made"] >= config.iterations:
-            checkpoint.unlink()
+
+
+def _told(record: dict[str, Any], folder: str) -> int:
+    from flows.terminal import console
+
     out = console()
-    for method, scores in enhancer.record["validation_scores"].items():
+    for method, scores in record["validation_scores"].items():
         out.print(f"{method:12} " + "  ".join(f"{name} {value}" for name, value in scores.items()))
-    out.print(f"written to {given.out}")
+    out.print(f"written to {folder}")
     return 0
 
 
-def _further(texts: Sequence[str]) -> dict[str, Any]:
-    """Settings of the training given as NAME=VALUE.
-
-    Raises:
-        ConfigError: for an unknown name, or a value that is none of its kind.
-    """
-    from extrags.config.settings import settings_of
-    from extrags.restoration.diffusion.pretraining import PretrainingConfig
-
-    known = settings_of(PretrainingConfig)
-    found: dict[str, Any] = {}
-    for text in texts:
-        name, separator, value = text.partition("=")
-        if not separator or name not in known:
-            raise ConfigError(f"--set {text}: expected NAME=VALUE with one of {', '.join(sorted(known))}")
-        found[name] = known[name].parse(value)
-    return found
-
-
-def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
+def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, perceptual: bool) -> None:
     """Look at everything that would otherwise fail after hours.
+
+    Args:
+        given: the command line.
+        scenes: pretraining scenes in all.
+        validation_scenes: how many of them validate only.
+        perceptual: whether the perceptual distance is needed.
 
     Raises:
         ConfigError: for settings that do not fit each other, or a folder that cannot be written.
@@ -280,21 +315,19 @@ def checked(given: argparse.Namespace, config: PretrainingConfig) -> None:
     """
     from extrags.metrics.lpips_weights import find_weights
 
-    if config.validation_scenes >= config.scenes:
-        raise ConfigError(
-            f"{config.validation_scenes} of {config.scenes} scenes are for validation; none is left to train"
-        )
-    for name in ("workers", "threads", "size_factor"):
+    if validation_scenes >= scenes:
+        raise ConfigError(f"{validation_scenes} of {scenes} scenes are for validation; none is left to train")
+    for name, least in (("workers", 1), ("threads", 1), ("size_factor", 1), ("first_scene", 0)):
         value = getattr(given, name)
-        if value is not None and value < 1:
-            raise ConfigError(f"--{name.replace('_', '-')} {value}: expected 1 or more")
+        if value is not None and value < least:
+            raise ConfigError(f"--{name.replace('_', '-')} {value}: expected {least} or more")
     if given.out is None and not given.scenes_only:
         raise ConfigError("--out: where do the weights go? (--scenes-only makes scenes alone)")
     if given.real_textures:
         from data_catalog.cavities.real_textures import texture_files
 
         texture_files()
-    if config.perceptual and not given.scenes_only:
+    if perceptual and not given.scenes_only:
         find_weights(None, "squeeze")
     for folder in (given.out, given.scenes_folder):
         if folder is None:
@@ -376,11 +409,13 @@ def _command(given: argparse.Namespace) -> str:
         if value is not None:
             parts.append(f"--{name.replace('_', '-')} {value}")
     parts.append(f"--kinds {' '.join(given.kinds)}")
+    if given.first_scene:
+        parts.append(f"--first-scene {given.first_scene}")
     if given.size_factor != 1:
         parts.append(f"--size-factor {given.size_factor}")
     parts += [
         f"--{name.replace('_', '-')}"
-        for name in ("real_textures", "without_perceptual", "deterministic", "generative")
+        for name in ("real_textures", "without_perceptual", "deterministic", "generative", "refiner")
         if getattr(given, name)
     ]
     parts += [f"--set {text}" for text in given.set]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,10 @@ import pytest
 import torch
 
 from extrags.cameras import Cameras
+from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.refinement.refiner import Refiner
+from extrags.restoration.surface_texture import SurfaceTexture
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, ReferenceFrames
 from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
@@ -17,6 +21,7 @@ from extrags.view_synthesis.references import LightTransfer
 from flows.cli import main
 from flows.commands import pretrain as command
 from flows.commands.pretrain import SceneSource, make_scenes, scene_sources
+from tests.extrags.random_lpips import random_weights
 
 
 def small_scene(seed: int) -> PretrainingScene:
@@ -44,7 +49,9 @@ def small_scene(seed: int) -> PretrainingScene:
 
 
 def sources(kinds: tuple[str, ...] = ("phantom", "cavities"), count: int = 3) -> list[SceneSource]:
-    return scene_sources(Namespace(kinds=list(kinds), size_factor=1, real_textures=False), count)
+    return scene_sources(
+        Namespace(kinds=list(kinds), first_scene=0, size_factor=1, real_textures=False), count
+    )
 
 
 @pytest.fixture
@@ -174,3 +181,69 @@ def test_the_weights_of_the_package_say_where_they_come_from() -> None:
     scores = record["validation_scores"]
     assert scores["embedded_1"]["psnr"] > scores["classical"]["psnr"] + 1
     assert weights.stat().st_size < 8_000_000
+
+
+class TestRefiner:
+    @pytest.fixture(autouse=True)
+    def random_perception(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """LPIPS with random weights: those of SqueezeNet are not shipped."""
+        from extrags.metrics import lpips_weights
+
+        monkeypatch.setattr(Lpips, "load", lambda **_given: Lpips("alex", random_weights("alex")))
+        monkeypatch.setattr(lpips_weights, "find_weights", lambda *_given: ())
+
+    @pytest.fixture
+    def given(self, tmp_path: Path) -> list[str]:
+        folder = tmp_path / "pretraining"
+        generator = torch.Generator().manual_seed(0)
+        for index, source in enumerate(sources()):
+            tiles = torch.randn(16, 3, 32, 32, generator=generator) * 0.2
+            # One scene is seen too poorly to give texture.
+            texture = None if index == 1 else SurfaceTexture(tiles, 0.5)
+            replace(small_scene(index), texture=texture).save(folder / source.file_name, origin=source.origin)
+        common = ["--scenes-folder", str(folder), "--scenes", "3", "--validation-scenes", "1", "--batch", "1"]
+        return ["pretrain", "--refiner", *common, "--threads", "1", "--iterations", "2", "--set", "crop=64"]
+
+    def test_it_is_trained_on_restored_views_of_the_scenes(
+        self,
+        given: list[str],
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        caplog: pytest.LogCaptureFixture,
+    ) -> None:
+        out = tmp_path / "refiner"
+        assert main([*given, "--out", str(out)]) == 0
+        assert "textured" in capsys.readouterr().out
+        assert "cavities_00000.safetensors: left out" in caplog.text
+        record = Refiner.load(out).record
+        assert record["iterations_made"] == 2
+        assert "--refiner" in record["command"]
+        assert len(record["restorer"]) == 32
+        assert set(record["validation_scores"]) == {"smooth", "textured", "refined"}
+        kept = sorted((tmp_path / "pretraining" / "refinement").iterdir())
+        assert len(kept) == 2
+        before = [file.stat().st_mtime_ns for file in kept]
+        assert main([*given, "--out", str(tmp_path / "again")]) == 0
+        assert [file.stat().st_mtime_ns for file in kept] == before
+
+    def test_wrong_settings_are_named(
+        self, given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        out = ["--out", str(tmp_path / "refiner")]
+        assert main([*given, *out, "--set", "drawn_share=0.3"]) == 2
+        assert "adversarial_weight" in capsys.readouterr().err
+        assert main([*given, *out, "--learning-rate", "-1"]) == 2
+        assert "learning_rate" in capsys.readouterr().err
+        for start in ("none", str(tmp_path / "typo")):
+            assert main([*given, *out, "--start", start]) == 2
+            assert f"--start {start}" in capsys.readouterr().err
+        for option in ("--generative", "--deterministic", "--without-perceptual"):
+            assert main([*given, *out, option]) == 2
+            assert option in capsys.readouterr().err
+        assert main([*given, *out, "--first-scene", "-1"]) == 2
+        assert "--first-scene -1" in capsys.readouterr().err
+
+
+def test_scenes_can_begin_at_a_number() -> None:
+    given = Namespace(kinds=["phantom", "cavities"], first_scene=7, size_factor=1, real_textures=False)
+    assert [source.index for source in scene_sources(given, 4)] == [7, 7, 8, 8]

@@ -26,9 +26,11 @@ from extrags.restoration.benchmark.evaluation import (
 )
 from extrags.restoration.benchmark.variants import AsRendered, Textured, WithoutReferences
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.keyframes import Keyframes, following, make_keyframes
 from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.refinement.weights import bundled_refiner
 from extrags.restoration.training_data.pairs import make_pairs
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -42,6 +44,7 @@ __all__ = [
     "NO_KEYFRAMES",
     "NO_REFERENCES",
     "RECIPES",
+    "REFINED",
     "TEXTURED",
     "WITH_KEYFRAMES",
     "Method",
@@ -57,6 +60,8 @@ NO_REFERENCES = "/no-references"
 """Suffix of a method's name: the same restorer, not told what real views see."""
 TEXTURED = "/textured"
 """Suffix of a method's name: the same restorer, with texture laid onto what it invents."""
+REFINED = "/refined"
+"""Suffix of a method's name: the same with texture that a network makes agree with the shapes."""
 WITH_KEYFRAMES, NO_KEYFRAMES = "/keyframes", "/no-keyframes"
 """Suffixes of a method's name: the same restorer with keyframes, or every view restored alone; without
 either it is as the settings say."""
@@ -164,13 +169,14 @@ def check_methods(names: Iterable[str]) -> list[str]:
     if unknown or not chosen:
         raise ConfigError(
             f"unknown methods {', '.join(unknown) or '(none named)'}; expected {', '.join(known)}, "
-            f"each also with {NO_REFERENCES}, {TEXTURED}, {WITH_KEYFRAMES} or {NO_KEYFRAMES} behind it"
+            f"each also with {NO_REFERENCES}, {TEXTURED}, {REFINED}, {WITH_KEYFRAMES} or {NO_KEYFRAMES} "
+            "behind it"
         )
     return chosen
 
 
 def _plain(name: str) -> str:
-    for suffix in (NO_REFERENCES, TEXTURED, NO_KEYFRAMES, WITH_KEYFRAMES):
+    for suffix in (NO_REFERENCES, TEXTURED, REFINED, NO_KEYFRAMES, WITH_KEYFRAMES):
         if name.endswith(suffix):
             return name.removesuffix(suffix)
     return name
@@ -258,8 +264,11 @@ def compare_methods(
     restorers = prepared(methods, scene, training, config.enhance, config.coarse)
     for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
         keyed = _keyed(name, config.enhance)
-        if name.endswith(TEXTURED):
-            enhancer = Textured(enhancer, references, seed=config.enhance.seed)
+        if name.endswith((TEXTURED, REFINED)):
+            refiner = None
+            if name.endswith(REFINED):
+                refiner = bundled_refiner(half_precision=chosen_precision(config.enhance) == "bfloat16")
+            enhancer = Textured(enhancer, references, seed=config.enhance.seed, refiner=refiner)
         begun = time.perf_counter()
         keyframes = clip_keyframes(scene, references, clips, enhancer, keyed)
         keyframe_seconds = time.perf_counter() - begun
@@ -329,7 +338,7 @@ def bench_enhance(
         sequences: with poses and held-out frames.
         config: settings of `coarse` and `enhance`, seeds included.
         methods: names of `METHODS` or of backends, possibly with a suffix: `/no-references`, `/textured`,
-            `/keyframes` or `/no-keyframes`.
+            `/refined`, `/keyframes` or `/no-keyframes`.
         lpips: LPIPS by backbone; None leaves it out.
 
     Returns:

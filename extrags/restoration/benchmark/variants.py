@@ -10,6 +10,7 @@ import torch
 from extrags.errors import CaptureError, ConfigError
 from extrags.restoration.clips import as_images
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
+from extrags.restoration.refinement.refiner import Refiner, textured_views
 from extrags.restoration.surface_texture import SurfaceTexture
 from extrags.restoration.training_data.augmentation import drop_references, unconfirmed
 from extrags.view_synthesis.conditioning import Layers, condition
@@ -65,34 +66,46 @@ class Textured:
         enhancer: the restorer.
         references: the scene's real views.
         seed: which tile lies where.
+        refiner: makes texture and shapes agree; None lays the texture alone.
 
     Raises:
         CaptureError: when no frame shows the surface closely enough to give texture.
     """
 
-    def __init__(self, enhancer: Enhancer, references: ReferenceViews, *, seed: int = 0) -> None:
+    def __init__(
+        self,
+        enhancer: Enhancer,
+        references: ReferenceViews,
+        *,
+        seed: int = 0,
+        refiner: Refiner | None = None,
+    ) -> None:
         texture = SurfaceTexture.of_references(references, seed=seed)
         if texture is None:
             raise CaptureError("no frame shows the surface closely enough to give texture")
-        self.enhancer, self.texture = enhancer, texture
-        self.name = f"{enhancer.name}/textured"
+        self.enhancer, self.texture, self.refiner = enhancer, texture, refiner
+        self.name = f"{enhancer.name}/{'textured' if refiner is None else 'refined'}"
 
     def restore(self, clip: Clip) -> Restoration:
         """Restore a clip, then lay texture onto what was invented."""
         restoration = self.enhancer.restore(clip)
         depth = (
-            condition(clip.layers, clip.transfer).depth_mm[:, 0]
+            condition(clip.layers, clip.transfer).depth_mm
             if restoration.depth_mm is None
-            else torch.from_numpy(restoration.depth_mm)
+            else torch.from_numpy(restoration.depth_mm)[:, None]
         )
-        rgb = self.texture.applied(
+        rgb = textured_views(
+            self.texture,
+            self.refiner,
             torch.from_numpy(restoration.rgb).permute(0, 3, 1, 2),
             clip.cameras,
             depth,
-            unconfirmed(clip.layers)[:, 0],
+            unconfirmed(clip.layers),
         )
         return replace(
-            restoration, rgb=as_images(rgb), provenance={**restoration.provenance, "textured": True}
+            restoration,
+            rgb=as_images(rgb),
+            provenance={**restoration.provenance, "textured": True, "refined": self.refiner is not None},
         )
 
     def save(self, path: Path) -> None:

@@ -80,10 +80,14 @@ class Adversary(nn.Module):
         channels: of the backbone's activations, one number per layer.
         learning_rate: of its own optimiser.
         seed: of its weights.
+        half_precision: convolutions in bfloat16.
     """
 
-    def __init__(self, channels: list[int], learning_rate: float, seed: int) -> None:
+    def __init__(
+        self, channels: list[int], learning_rate: float, seed: int, *, half_precision: bool = False
+    ) -> None:
         super().__init__()
+        self._half_precision = half_precision
         # The layers draw their weights from the global generator, which stays as it was.
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -156,15 +160,12 @@ class Adversary(nn.Module):
 
     def _judged(self, rgb: Tensor, activations: list[Tensor], scene: Scene) -> list[tuple[Tensor, Tensor]]:
         """Verdicts of each scale, and their weights."""
-        found = []
-        for head, tap in zip(self.heads, TAPS, strict=True):
-            invented = _pooled(scene.invented, activations[tap])
-            found.append((head(activations[tap], invented).float(), invented + KNOWN_WEIGHT))
-        logits = self.pixels(rgb, scene).float()
-        return [
-            *found,
-            (logits, _pooled(scene.invented, logits) + KNOWN_WEIGHT),
-        ]
+        verdicts = []
+        with torch.autocast(rgb.device.type, torch.bfloat16, enabled=self._half_precision):
+            for head, tap in zip(self.heads, TAPS, strict=True):
+                verdicts.append(head(activations[tap], _pooled(scene.invented, activations[tap])))
+            verdicts.append(self.pixels(rgb, scene))
+        return [(logits.float(), _pooled(scene.invented, logits) + KNOWN_WEIGHT) for logits in verdicts]
 
 
 def _pooled(share: Tensor, features: Tensor) -> Tensor:

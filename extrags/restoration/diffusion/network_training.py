@@ -61,6 +61,10 @@ class TrainingSettings:
         drawn_perceptual_weight: of the perceptual distance in these.
         adversarial_weight: pull of the adversary at invented colours, relative to that of all else in these.
         adversary_rate: learning rate of the adversary.
+        drawn_pixel_weight: of the errors of single invented pixels in these, relative to confirmed ones.
+        adversary_every: the adversary judges, and learns, in one of so many steps: it takes longer than all
+            else.
+        adversary_half_precision: its convolutions in bfloat16.
     """
 
     iterations: int
@@ -75,6 +79,9 @@ class TrainingSettings:
     drawn_perceptual_weight: float = 1.0
     adversarial_weight: float = 1.0
     adversary_rate: float = 4e-4
+    drawn_pixel_weight: float = 0.0
+    adversary_every: int = 1
+    adversary_half_precision: bool = False
 
 
 class NetworkTraining:
@@ -105,12 +112,16 @@ class NetworkTraining:
         self.history: list[dict[str, float]] = []
         self.iteration = 0
         self.adversary: Adversary | None = None
+        self._told: dict[str, float] = {}
+        """The adversary's last loss, which need not be of the step that is reported."""
         if settings.drawn_share > 0:
             if settings.perceptual is None:
                 raise ValueError("drawing views is trained with a perceptual distance; none was given")
             probe = torch.zeros(1, 64, 64, 3, device=self.device)
             channels = [tap.shape[1] for tap in settings.perceptual.activations(probe)]
-            self.adversary = Adversary(channels, settings.adversary_rate, 0).to(self.device)
+            self.adversary = Adversary(
+                channels, settings.adversary_rate, 0, half_precision=settings.adversary_half_precision
+            ).to(self.device)
         network.train()
 
     def step(self, batch: Batch) -> dict[str, float]:
@@ -221,30 +232,32 @@ class NetworkTraining:
             (layer.mean((-2, -1)).mean() for layer in settings.perceptual.compared(activations)),
             start=torch.zeros((), device=self.device),
         )
+        faithful = (
+            drawn_loss(predicted, batch, settings.drawn_pixel_weight)
+            + settings.drawn_perceptual_weight * perceptual
+        )
+        self._check(faithful)
+        further = _depth_and_error(predicted, batch, settings)
+        found = {"drawn_loss": float(faithful.detach()), "drawn_perceptual": float(perceptual.detach())}
+        if self.iteration % settings.adversary_every:
+            self._descend([faithful + further], [None])
+            return {**found, **self._told}
         own, true = zip(*(tap.chunk(2) for tap in activations), strict=True)
         adversary.requires_grad_(False)
         deceiving = adversary.generator_loss(shown, list(own), scene)
         adversary.requires_grad_(True)
-        faithful = drawn_loss(predicted, batch) + settings.drawn_perceptual_weight * perceptual
-        self._check(faithful)
         # Both pull at the colours; where they are invented, as strongly as the settings say, whatever the
         # scale of the adversary's verdicts is at this stage of its own training.
         (towards,) = torch.autograd.grad(faithful, predicted.rgb, retain_graph=True)
         (away,) = torch.autograd.grad(deceiving, predicted.rgb)
         pulls = [(pull * scene.invented).norm() for pull in (towards, away)]
         balance = settings.adversarial_weight * pulls[0] / pulls[1].clamp_min(1e-12)
-        self._descend(
-            [predicted.rgb, _depth_and_error(predicted, batch, settings)],
-            [towards + balance * away, None],
-        )
+        self._descend([predicted.rgb, further], [towards + balance * away, None])
         told = adversary.step(
             (shown.detach(), [tap.detach() for tap in own]), (clean, [tap.detach() for tap in true]), scene
         )
-        return {
-            "drawn_loss": float(faithful.detach()),
-            "drawn_perceptual": float(perceptual.detach()),
-            "adversary": told,
-        }
+        self._told = {"adversary": told}
+        return {**found, **self._told}
 
     def _check(self, loss: Tensor) -> None:
         value = float(loss.detach())
@@ -303,7 +316,7 @@ def restoration_loss(predicted: Predicted, batch: Batch, settings: TrainingSetti
     weight, clean = batch.weight, batch.clean
     total = weight.sum().clamp_min(1e-6)
     charbonnier = (_charbonnier(predicted.rgb, clean) * weight).sum()
-    similarity = ssim_map(predicted.rgb.permute(0, 2, 3, 1), clean.permute(0, 2, 3, 1))
+    similarity = ssim_map(predicted.rgb.permute(0, 2, 3, 1), clean.permute(0, 2, 3, 1), figures=False)
     structure = ((1 - similarity) * weight[:, 0]).sum()
     loss: Tensor = (charbonnier + STRUCTURE_WEIGHT * structure) / total
     loss = loss + _depth_and_error(predicted, batch, settings)
@@ -315,10 +328,16 @@ def restoration_loss(predicted: Predicted, batch: Batch, settings: TrainingSetti
     return loss
 
 
-def drawn_loss(predicted: Predicted, batch: Batch) -> Float[Tensor, ""]:
-    """What the colours of a drawn view owe to the truth: confirmed pixels, the others in coarse means."""
+def drawn_loss(predicted: Predicted, batch: Batch, pixel_weight: float = 0.0) -> Float[Tensor, ""]:
+    """What the colours of a drawn view owe to the truth: confirmed pixels, the others in coarse means.
+
+    Args:
+        predicted: drawn views.
+        batch: with the truth.
+        pixel_weight: of single pixels that are invented, relative to confirmed ones.
+    """
     weight = batch.weight
-    confirmed = weight * (1 - batch.invented)
+    confirmed = weight * (1 - (1 - pixel_weight) * batch.invented)
     difference = _charbonnier(predicted.rgb, batch.clean)
     exact = (difference * confirmed).sum() / weight.sum().clamp_min(1e-6)
     side = min(COARSE_PX, *predicted.rgb.shape[-2:])

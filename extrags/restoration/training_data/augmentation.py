@@ -22,6 +22,7 @@ __all__ = [
     "cut_out",
     "drop_references",
     "random_patches",
+    "random_symmetry",
     "unconfirmed",
 ]
 
@@ -191,7 +192,7 @@ class CropSampler:
             # In half of the holes real views may still see the surface.
             layers = cut_out(
                 layers,
-                _random_symmetry(alpha, generator),
+                random_symmetry(alpha, generator),
                 unseen=generator.random() < 0.5,
                 keep_invented=self._keeps_invented(layers),
             )
@@ -201,7 +202,7 @@ class CropSampler:
             )
         if generator.random() < REFERENCE_DROPOUT:
             layers = drop_references(layers)
-        everything = _random_symmetry(torch.cat([layers.data, clean, weight, depth], dim=1), generator)
+        everything = random_symmetry(torch.cat([layers.data, clean, weight, depth], dim=1), generator)
         data, clean, weight, depth = everything.split((layers.data.shape[1], 3, 1, 1), dim=1)
         return data, clean, weight, depth
 
@@ -284,7 +285,7 @@ def random_patches(
                 best, most = frames[frame : frame + 1, :, rows, columns], share
             if share == 1:
                 break
-        cut.append(_random_symmetry(best.float(), generator))
+        cut.append(random_symmetry(best.float(), generator))
     return torch.cat(cut)
 
 
@@ -326,8 +327,10 @@ def drop_references(layers: Layers) -> Layers:
     return layers
 
 
-def _random_symmetry(images: Tensor, generator: np.random.Generator) -> Tensor:
-    """One of the eight symmetries of the square."""
+def random_symmetry(
+    images: Float[Tensor, "n c s s"], generator: np.random.Generator
+) -> Float[Tensor, "n c s s"]:
+    """Square images in one of the eight symmetries of the square."""
     choice = int(generator.integers(8))
     if choice & 1:
         images = images.flip(-1)

@@ -20,6 +20,7 @@ from extrags.cameras import Cameras
 from extrags.config import CoarseConfig, EnhanceConfig
 from extrags.errors import ShapeError, WeightsError
 from extrags.illumination import NearFieldLight
+from extrags.restoration.surface_texture import SurfaceTexture
 from extrags.restoration.training_data.augmentation import unconfirmed
 from extrags.restoration.training_data.degradation import Degradation
 from extrags.restoration.training_data.pairs import Pairs, pair_views
@@ -33,7 +34,7 @@ from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["PretrainingScene", "ReferenceFrames", "make_pretraining_scene"]
 
-PRETRAINING_DATA_VERSION = 3
+PRETRAINING_DATA_VERSION = 4
 """Raised by hand whenever the same scene and settings give other pairs, or files hold something else."""
 REFERENCE_FRAMES = 24
 """Training frames at most that are kept with the pairs."""
@@ -88,6 +89,7 @@ class PretrainingScene:
         clip: which clip each pair belongs to; the views of a clip follow each other.
         cameras: of the pairs.
         references: some training frames.
+        texture: tiles cut out of the training frames; None where no frame shows the surface closely enough.
     """
 
     pairs: Pairs
@@ -95,6 +97,7 @@ class PretrainingScene:
     clip: Int[np.ndarray, "p"]
     cameras: Cameras
     references: ReferenceFrames
+    texture: SurfaceTexture | None = None
 
     def __post_init__(self) -> None:
         if not len(self.pairs) == len(self.clip) == len(self.cameras):
@@ -128,10 +131,13 @@ class PretrainingScene:
             tensors.update(
                 {f"light.{name}": value.detach().clone() for name, value in light.parameters().items()}
             )
+        if self.texture is not None:
+            tensors["texture.tiles"] = self.texture.tiles.half()
         scales = {
             "exponent": self.transfer.exponent,
             "scale_mm": self.transfer.scale_mm,
             "reference_distance": None if light is None else light.reference_distance,
+            "texel_mm": None if self.texture is None else self.texture.texel_mm,
         }
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_suffix(".partial")
@@ -194,7 +200,10 @@ class PretrainingScene:
                 _read_cameras("reference", tensors, pairs.size),
             )
             cameras = _read_cameras("camera", tensors, pairs.size)
-            return cls(pairs, transfer, tensors["clip"].numpy(), cameras, references)
+            texture = None
+            if scales["texel_mm"] is not None:
+                texture = SurfaceTexture(tensors["texture.tiles"].float(), float(scales["texel_mm"]))
+            return cls(pairs, transfer, tensors["clip"].numpy(), cameras, references, texture)
         except WeightsError:
             raise
         except (OSError, SafetensorError, KeyError, ValueError, TypeError, ShapeError) as error:
@@ -234,6 +243,7 @@ def make_pretraining_scene(
         clip,
         sequence.cameras[frames],
         _reference_frames(sequence),
+        SurfaceTexture.of_references(references),
     )
 
 

@@ -407,6 +407,7 @@ class TestBench:
             "classical",
             "classical/no-references",
             "classical/textured",
+            "classical/refined",
             "classical/keyframes",
         ]
         cases = compare_methods(tube.scene, tube.sequence, self.CONFIG, methods, None)
@@ -421,9 +422,9 @@ class TestBench:
             assert {"psnr", "ssim"} <= set(case["well"]) <= measured
             assert not any(key.startswith("lpips") for key in case["well"]), "nobody asked for it"
         # The gap in the wall is filled; exact references are worth something on top.
-        none, classical, alone, _, _ = (case["psnr"] for case in cases)
+        none, classical, alone, _, _, _ = (case["psnr"] for case in cases)
         assert none + 10 < alone < classical - 0.5
-        assert [case["keyframes"] > 0 for case in cases] == [False] * 4 + [True]
+        assert [case["keyframes"] > 0 for case in cases] == [False] * 5 + [True]
         # The tube's wall is plain: no texture to lay down, so that nothing gets worse by it.
         assert cases[3]["psnr"] == pytest.approx(classical, abs=0.3)
         json.dumps(cases, allow_nan=False)

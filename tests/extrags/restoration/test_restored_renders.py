@@ -6,14 +6,19 @@ import numpy as np
 import pytest
 
 from extrags.config import EnhanceConfig
+from extrags.config.stages import Finish
 from extrags.errors import ShapeError
 from extrags.evaluation import render
 from extrags.metrics.protocol import RenderedViews
+from extrags.restoration import restored_renders as restored_renders_module
 from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.classical import ClassicalEnhancer
+from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
+from extrags.restoration.refinement.refiner import Refiner
 from extrags.restoration.restored_renders import FINAL_SHARE, restored_renders
 from tests.extrags.lit_tube import Tube
+from tests.extrags.restoration.test_refinement import untrained
 
 CONFIG = EnhanceConfig(references=4)
 
@@ -25,7 +30,7 @@ def renders(tube: Tube) -> RenderedViews:
 
 def restored(tube: Tube, renders: RenderedViews, enhancer: Enhancer) -> RenderedViews:
     training = tube.sequence.training_part()
-    return restored_renders(tube.scene, renders, tube.sequence, training, enhancer, CONFIG, textured=False)
+    return restored_renders(tube.scene, renders, tube.sequence, training, enhancer, CONFIG, finish="smooth")
 
 
 class Unnamed(AsRendered):
@@ -75,3 +80,31 @@ class TestRestoredRenders:
         one = RenderedViews(renders.rgb[:1], renders.alpha[:1], renders.depth_mm[:1], renders.n_gaussians)
         with pytest.raises(ShapeError, match="1 renders of 2 held-out frames"):
             restored(tube, one, ClassicalEnhancer())
+
+
+def test_a_refiner_changes_only_what_is_invented(
+    tube: Tube, renders: RenderedViews, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training = tube.sequence.training_part()
+
+    def finished(finish: Finish) -> np.ndarray:
+        return restored_renders(
+            tube.scene, renders, tube.sequence, training, ClassicalEnhancer(), CONFIG, finish=finish
+        ).rgb
+
+    smooth, textured = finished("smooth"), finished("textured")
+    asked: list[bool] = []
+
+    def refiner(*, half_precision: bool) -> Refiner:
+        asked.append(half_precision)
+        return untrained(scrambled=True)
+
+    monkeypatch.setattr(restored_renders_module, "bundled_refiner", refiner)
+    refined = finished("refined")
+    changed = np.abs(textured - smooth).max(axis=-1) > 1e-5
+    again = np.abs(refined - smooth).max(axis=-1) > 1e-5
+    assert changed.any()
+    assert (refined != textured)[changed].mean() > 0.9
+    # Where no texture is laid, the view may be invented all the same, but what is known stays.
+    assert not (again & ~changed).mean() > 0.1
+    assert asked == [chosen_precision(CONFIG) == "bfloat16"]

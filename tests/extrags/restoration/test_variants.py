@@ -46,7 +46,7 @@ class TestTextured:
     def test_only_what_is_invented_changes(self, tube: Tube, clip: Clip) -> None:
         plain = ClassicalEnhancer().restore(clip)
         textured = Textured(ClassicalEnhancer(), tube.references, seed=1).restore(clip)
-        assert textured.provenance == {**plain.provenance, "textured": True}
+        assert textured.provenance == {**plain.provenance, "textured": True, "refined": False}
         changed = np.abs(textured.rgb - plain.rgb).max(axis=-1) > 1e-6
         invented = invented_share(unconfirmed(clip.layers)[:, 0]).numpy()
         assert changed[invented > 0].mean() > 0.5

@@ -7,13 +7,14 @@ the data and the scores. A user's own pair of such files is given by its path.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from importlib.resources import files
 from pathlib import Path
 
 from extrags.errors import WeightsError
 from extrags.restoration.description import DESCRIPTION
 
-__all__ = ["BUNDLED", "NONE", "WEIGHTS", "find_weights", "weights_digest"]
+__all__ = ["BUNDLED", "NONE", "WEIGHTS", "files_digest", "find_weights", "weights_digest"]
 
 BUNDLED = "bundled"
 """Setting: the weights of the package."""
@@ -65,8 +66,13 @@ def weights_digest(setting: str) -> str | None:
     weights = find_weights(setting)
     if weights is None:
         return None
+    return files_digest((weights, weights.with_suffix(".json")))
+
+
+def files_digest(files: Iterable[Path]) -> str:
+    """Digest of the content of files, one after the other."""
     digest = hashlib.blake2b(digest_size=16)
-    for file in (weights, weights.with_suffix(".json")):
+    for file in files:
         # The length first: no byte can move from one file to the other unnoticed.
         digest.update(f"{file.stat().st_size}\0".encode())
         with file.open("rb") as stream:
