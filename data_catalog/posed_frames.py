@@ -223,7 +223,7 @@ class _Pixels:
         _check_size(image, frame, frame.file, "rgb", source.intrinsics_file)
         sampling = self._sampling(frame)
         sampled = sampling.colour(image, file=frame.file, frame=frame.label)
-        self.colours.append(sampled)
+        sampled = self.colours.append(sampled)
         if frame.mask_file is None and source.masks is not None:
             source.masks.see(frame, image, sampled)
             self._masks.append(None)

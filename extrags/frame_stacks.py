@@ -89,8 +89,11 @@ class FrameStack:
     def __iter__(self) -> Iterator[np.ndarray]:
         return iter(() if self._array is None else self._array[: self._filled])
 
-    def append(self, frame: np.ndarray) -> None:
+    def append(self, frame: np.ndarray) -> np.ndarray:
         """Take in the next frame; it is copied.
+
+        Returns:
+            The frame as it lies in the stack: who keeps it keeps no copy.
 
         Raises:
             ValueError: when its shape or dtype differs from the first one's, or there is no room for it.
@@ -106,6 +109,7 @@ class FrameStack:
             )
         self._array[self._filled] = frame
         self._filled += 1
+        return np.asarray(self._array[self._filled - 1])
 
     @property
     def array(self) -> np.ndarray:

@@ -57,9 +57,11 @@ def test_chosen_frames_are_a_copy() -> None:
 def test_frames_are_copied_when_they_are_taken_in() -> None:
     frame = np.ones((2, 2), dtype=np.uint8)
     stack = FrameStack(2)
-    stack.append(frame)
+    kept = stack.append(frame)
     frame[:] = 7
     stack.append(frame)
+    assert np.shares_memory(kept, stack.array)
+    assert int(kept.max()) == 1
     assert [int(image.max()) for image in stack] == [1, 7]
 
 

@@ -20,8 +20,9 @@ def test_frames_of_the_size_that_keeps_their_detail_cost_less() -> None:
     assert reduced is not None
     assert (reduced.pixels, reduced.width, reduced.frames) == (450 * 360, 450, 40)
     model = packaged_model()
-    for stage in ("coarse", "finetune", "evaluate"):
-        assert stage_seconds(model, stage, reduced) < 0.75 * stage_seconds(model, stage, whole)
+    # Virtual views, which fine-tuning spends most on, are narrower than either.
+    for stage, share in (("coarse", 0.75), ("finetune", 0.9), ("evaluate", 0.75)):
+        assert stage_seconds(model, stage, reduced) < share * stage_seconds(model, stage, whole)
 
 
 def test_frames_that_hold_all_their_detail_are_the_same_work() -> None:
