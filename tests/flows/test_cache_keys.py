@@ -343,6 +343,9 @@ def test_a_backend_reads_its_own_settings_alone(
             should = ["enhance-train"] if group in read and name not in uncounted else []
         elif name == "enhance.backend" or (name == "enhance.seed" and read):
             should = ["enhance-train"]
+        elif name == "enhance.precision":
+            # That of the refiner of restored views.
+            should = ["evaluate-restore"]
         else:
             should = list(restoring)
         if name != "enhance.backend":
