@@ -3,8 +3,8 @@
 A scene of Gaussians averages what was restored in many virtual views: guesses that do not agree come out
 blurred, and Gaussians placed by a guessed depth stand wrong. A view restored by itself has neither fault, but
 tells a story of its own where nothing was seen. Here the two are put together: the coarse scene's view is
-restored, and mixed with that of the final scene, which all views share. Texture belongs to places in space
-and is the same in all views.
+restored, and mixed with that of the final scene, which all views share; neighbouring views agree on what
+they have invented; and texture belongs to places in space and is the same in all views.
 
 Source: a restorer that is applied to the final renders as well is an idea of [Difix2025], see
 docs/references.md; what is restored and mixed here differs.
@@ -28,21 +28,21 @@ from extrags.errors import ShapeError
 from extrags.events import Progress, emit
 from extrags.frame_stacks import FrameStack, stacked
 from extrags.lens import Undistortion, distortion_of_pinhole
-from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.metrics.protocol import RenderedViews
 from extrags.radial_lens import WIDE_FIELD_DEG
+from extrags.restoration.agreement import agreed_views, feathered_invented_share
 from extrags.restoration.benchmark.evaluation import iterate_held_out_clips
 from extrags.restoration.classical import ClassicalEnhancer
-from extrags.restoration.clips import FEATHER_RADIUS_PX, FEATHER_SIGMA_PX
 from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.protocol import Clip, Enhancer
 from extrags.restoration.refinement.refiner import Refiner, textured_views
 from extrags.restoration.refinement.weights import bundled_refiner
-from extrags.restoration.surface_texture import SurfaceTexture, invented_share
+from extrags.restoration.surface_texture import SurfaceTexture
 from extrags.restoration.training_data.augmentation import unconfirmed
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.threads import one_torch_thread
+from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import condition
 from extrags.view_synthesis.gather import gather_references
 
@@ -109,9 +109,10 @@ def restored_renders(
     for clip in clips:
         part = slice(done, done + len(clip))
         cameras = sequence.cameras[sequence.test[part]]
-        rendered = torch.from_numpy(renders.rgb[part]).permute(0, 3, 1, 2).clamp(0, 1)
-        solid = torch.from_numpy(renders.alpha[part])[:, None].clamp(0, 1)
-        mixed = _mixed(clip, cameras, rendered, solid, enhancer, texture, refiner, keeps_known=keeps_known)
+        final = RenderedViews(
+            renders.rgb[part], renders.alpha[part], renders.depth_mm[part], renders.n_gaussians
+        )
+        mixed = _mixed(clip, cameras, final, enhancer, texture, refiner, keeps_known=keeps_known)
         for view in mixed.permute(0, 2, 3, 1).numpy():
             restored.append(view)
         done += len(clip)
@@ -167,14 +168,15 @@ def _through_pinholes(
 def _mixed(
     clip: Clip,
     cameras: Cameras,
-    rendered: Float[Tensor, "t 3 h w"],
-    solid: Float[Tensor, "t 1 h w"],
+    final: RenderedViews,
     enhancer: Enhancer,
     texture: SurfaceTexture | None,
     refiner: Refiner | None,
     *,
     keeps_known: bool,
 ) -> Float[Tensor, "t 3 h w"]:
+    rendered = torch.from_numpy(final.rgb).permute(0, 3, 1, 2).clamp(0, 1)
+    solid = torch.from_numpy(final.alpha)[:, None].clamp(0, 1)
     restoration = enhancer.restore(clip)
     colors = torch.from_numpy(restoration.rgb).permute(0, 3, 1, 2)
     to_invent = unconfirmed(clip.layers)
@@ -184,23 +186,49 @@ def _mixed(
         else torch.from_numpy(restoration.depth_mm)[:, None]
     )
     size = rendered.shape[-2:]
-    window = gaussian_weights(FEATHER_SIGMA_PX, FEATHER_RADIUS_PX)
-    invented = _enlarged(filter_separable(invented_share(to_invent), window, window), size)
+    depth = _mean_depth(_enlarged(depth, size), torch.from_numpy(final.depth_mm)[:, None], solid)
+    invented = _enlarged(feathered_invented_share(to_invent), size)
     restored = _enlarged(colors, size)
     if colors.shape[-2:] != size:
         # Where the scene knows the surface, its own detail stays, and restoration changes what is coarser.
-        change = _enlarged(colors - functional.interpolate(rendered, colors.shape[-2:], mode="area"), size)
+        change = _enlarged(colors - _shrunk(rendered, colors.shape[-2:]), size)
         restored = invented * restored + (1 - invented) * (rendered + change)
     # A hole of the final scene has no colour that could be met.
     share = FINAL_SHARE * solid
     if keeps_known:
         share = torch.maximum(share, (1 - invented) * solid)
     mixed = (1 - share) * restored + share * rendered
+    # What is agreed on is coarse: it is found at the size that the views are restored at.
+    small = _shrunk(mixed, colors.shape[-2:])
+    exposure = torch.ones(len(clip)) if clip.exposure is None else torch.from_numpy(clip.exposure)
+    agreed = agreed_views(
+        small,
+        _shrunk(depth, colors.shape[-2:]),
+        to_invent,
+        clip.cameras,
+        exposure,
+        clip.transfer,
+    )
+    mixed = mixed + _enlarged(agreed - small, size)
     if texture is not None:
-        mixed = textured_views(
-            texture, refiner, mixed, cameras, _enlarged(depth, size), _enlarged(to_invent, size)
-        )
+        mixed = textured_views(texture, refiner, mixed, cameras, depth, _enlarged(to_invent, size))
     return mixed.clamp(0, 1)
+
+
+def _mean_depth(
+    restored_mm: Float[Tensor, "t 1 h w"], final_mm: Float[Tensor, "t 1 h w"], solid: Float[Tensor, "t 1 h w"]
+) -> Float[Tensor, "t 1 h w"]:
+    """The geometric mean of both depths where the final scene has a surface, that of the view elsewhere.
+
+    The errors of a view that was completed alone and of a scene that many views were fused in have little in
+    common.
+    """
+    known = (solid > HOLE_ALPHA) & (final_mm > 0)
+    return torch.where(known, (restored_mm * final_mm.clamp_min(1e-9)).sqrt(), restored_mm)
+
+
+def _shrunk(image: Float[Tensor, "t c h0 w0"], size: torch.Size) -> Float[Tensor, "t c h w"]:
+    return image if image.shape[-2:] == size else functional.interpolate(image, size, mode="area")
 
 
 def _enlarged(image: Float[Tensor, "t c h0 w0"], size: torch.Size) -> Float[Tensor, "t c h w"]:

@@ -27,7 +27,7 @@ from extrags.view_synthesis.filling import completed_depth, push_pull
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 from extrags.view_synthesis.warp import depth_normals, warp_references
 
-__all__ = ["InventedViews", "evidence", "with_invented"]
+__all__ = ["InventedViews", "border_trust", "evidence", "with_invented"]
 
 BLENDED = 4
 """Invented references of one view at most; those that show most of it."""
@@ -113,7 +113,7 @@ class InventedViews:
             ]
         )[:, None]
         trust = ((facing - GRAZING[0]) / (GRAZING[1] - GRAZING[0])).clamp(0, 1)
-        trust = trust * _border(cameras.height, cameras.width) * evidence(unknown)
+        trust = trust * border_trust(cameras.height, cameras.width) * evidence(unknown)
         packed = torch.cat([rgb, trust, 1 / depth_mm.clamp_min(1e-9), torch.ones_like(trust)], dim=1)
         views = ReferenceViews(
             np.arange(len(rgb)),
@@ -247,7 +247,7 @@ def _in_harmony(
     return bright / bright.amax(dim=1, keepdim=True).clamp_min(1)
 
 
-def _border(height: int, width: int) -> Float[Tensor, "h w"]:
+def border_trust(height: int, width: int) -> Float[Tensor, "h w"]:
     """1 inside, falling to 0 at the border of the image."""
     down, along = (
         torch.minimum(torch.arange(size) + 0.5, size - 0.5 - torch.arange(size)) for size in (height, width)

@@ -20,7 +20,14 @@ from extrags.config import ReferenceChoice
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 
-__all__ = ["Warped", "covisibility", "depth_normals", "fit_falloff_exponent", "warp_references"]
+__all__ = [
+    "Warped",
+    "covisibility",
+    "depth_normals",
+    "fit_falloff_exponent",
+    "seen_by_others",
+    "warp_references",
+]
 
 AGREEMENT = 0.05
 """Relative depth difference at which the weight of a real view falls to 1/e."""
@@ -185,16 +192,7 @@ def _warp_one(
     size = depth_mm.shape[-2:]
     here = _surface(camera, depth_mm, 1)
     seen = _look_up(references, chosen, here, depth_tolerance)
-    transfer = references.transfer
-    facing = (here.normal * here.direction).sum(dim=-1)
-    ratio = transfer.falloff(here.distance, here.axis_cosine, facing)[None] / transfer.falloff(
-        seen.distance, seen.axis_cosine, seen.facing_cosine
-    )
-    ratio = ratio * (gain / references.exposure[chosen])[:, None]
-    ratio = ratio.clamp(1 / BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
-    rgb = transfer.apply_response(transfer.invert_response(seen.rgb) * ratio[:, None])
-    # Too bright for the sensor: darkened as a whole, so that the hue stays.
-    rgb = rgb / rgb.amax(dim=1, keepdim=True).clamp_min(1)
+    rgb = _relit(references, chosen, here, seen, gain)
     trust = seen.weight * (seen.quality / good_quality).clamp(max=1)
     # Squared, because the mean of many views is blurred: the good ones shall dominate.
     votes = (seen.weight * seen.quality).square()
@@ -212,6 +210,51 @@ def _warp_one(
     )
     nearest, nearest_weight, blended, blend_weight, ratios = (part.reshape(-1, *size) for part in shaped)
     return nearest, nearest_weight, blended, blend_weight, ratios
+
+
+def _relit(
+    references: ReferenceViews, chosen: Int[Tensor, "k"], here: _Surface, seen: _Seen, gain: Float[Tensor, ""]
+) -> Float[Tensor, "k 3 p"]:
+    """Colours of other views, as bright as this one shows them."""
+    transfer = references.transfer
+    facing = (here.normal * here.direction).sum(dim=-1)
+    ratio = transfer.falloff(here.distance, here.axis_cosine, facing)[None] / transfer.falloff(
+        seen.distance, seen.axis_cosine, seen.facing_cosine
+    )
+    ratio = ratio * (gain / references.exposure[chosen])[:, None]
+    ratio = ratio.clamp(1 / BRIGHTNESS_LIMIT, BRIGHTNESS_LIMIT)
+    rgb = transfer.apply_response(transfer.invert_response(seen.rgb) * ratio[:, None])
+    # Too bright for the sensor: darkened as a whole, so that the hue stays.
+    return rgb / rgb.amax(dim=1, keepdim=True).clamp_min(1)
+
+
+def seen_by_others(
+    views: ReferenceViews,
+    camera: Cameras,
+    depth_mm: Float[Tensor, "1 h w"],
+    chosen: Int[Tensor, "k"],
+    *,
+    gain: Float[Tensor, ""],
+    depth_tolerance: float,
+) -> tuple[Float[Tensor, "k 3 h w"], Float[Tensor, "k h w"]]:
+    """What chosen views show of a view's surface, as bright as it would, one by one.
+
+    Args:
+        views: any views with depth and trust.
+        camera: the view.
+        depth_mm: its z-depth without gaps.
+        chosen: indices of the others.
+        gain: exposure of the view.
+        depth_tolerance: relative depth difference at which a weight falls to 1/e.
+
+    Returns:
+        Colours, and weights: trust times agreement of depth times likeness of distance and direction.
+    """
+    size = depth_mm.shape[-2:]
+    here = _surface(camera, depth_mm, 1)
+    seen = _look_up(views, chosen, here, depth_tolerance)
+    rgb = _relit(views, chosen, here, seen, gain)
+    return rgb.reshape(-1, 3, *size), (seen.weight * seen.quality).reshape(-1, *size)
 
 
 def _weighted(values: Tensor, votes: Tensor) -> Tensor:

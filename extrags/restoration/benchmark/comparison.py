@@ -24,7 +24,7 @@ from extrags.restoration.benchmark.evaluation import (
     held_out_clips,
     restore_views,
 )
-from extrags.restoration.benchmark.variants import AsRendered, Textured, WithoutReferences
+from extrags.restoration.benchmark.variants import Agreed, AsRendered, Textured, WithoutReferences
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.diffusion.scene_training import train_on_scene
@@ -40,6 +40,7 @@ from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import ReferenceViews
 
 __all__ = [
+    "AGREED",
     "METHODS",
     "NO_KEYFRAMES",
     "NO_REFERENCES",
@@ -60,6 +61,9 @@ NO_REFERENCES = "/no-references"
 """Suffix of a method's name: the same restorer, not told what real views see."""
 TEXTURED = "/textured"
 """Suffix of a method's name: the same restorer, with texture laid onto what it invents."""
+AGREED = "/agreed"
+"""Suffix of a method's name: the same restorer, whose views of a clip agree on what they have invented; so do
+those with texture."""
 REFINED = "/refined"
 """Suffix of a method's name: the same with texture that a network makes agree with the shapes."""
 WITH_KEYFRAMES, NO_KEYFRAMES = "/keyframes", "/no-keyframes"
@@ -169,14 +173,14 @@ def check_methods(names: Iterable[str]) -> list[str]:
     if unknown or not chosen:
         raise ConfigError(
             f"unknown methods {', '.join(unknown) or '(none named)'}; expected {', '.join(known)}, "
-            f"each also with {NO_REFERENCES}, {TEXTURED}, {REFINED}, {WITH_KEYFRAMES} or {NO_KEYFRAMES} "
-            "behind it"
+            f"each also with {NO_REFERENCES}, {AGREED}, {TEXTURED}, {REFINED}, {WITH_KEYFRAMES} or "
+            f"{NO_KEYFRAMES} behind it"
         )
     return chosen
 
 
 def _plain(name: str) -> str:
-    for suffix in (NO_REFERENCES, TEXTURED, REFINED, NO_KEYFRAMES, WITH_KEYFRAMES):
+    for suffix in (NO_REFERENCES, AGREED, TEXTURED, REFINED, NO_KEYFRAMES, WITH_KEYFRAMES):
         if name.endswith(suffix):
             return name.removesuffix(suffix)
     return name
@@ -264,6 +268,8 @@ def compare_methods(
     restorers = prepared(methods, scene, training, config.enhance, config.coarse)
     for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
         keyed = _keyed(name, config.enhance)
+        if name.endswith((AGREED, TEXTURED, REFINED)):
+            enhancer = Agreed(enhancer)
         if name.endswith((TEXTURED, REFINED)):
             refiner = None
             if name.endswith(REFINED):
@@ -337,8 +343,8 @@ def bench_enhance(
     Args:
         sequences: with poses and held-out frames.
         config: settings of `coarse` and `enhance`, seeds included.
-        methods: names of `METHODS` or of backends, possibly with a suffix: `/no-references`, `/textured`,
-            `/refined`, `/keyframes` or `/no-keyframes`.
+        methods: names of `METHODS` or of backends, possibly with a suffix: `/no-references`, `/agreed`,
+            `/textured`, `/refined`, `/keyframes` or `/no-keyframes`.
         lpips: LPIPS by backbone; None leaves it out.
 
     Returns:

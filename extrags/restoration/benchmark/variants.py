@@ -6,8 +6,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from extrags.errors import CaptureError, ConfigError
+from extrags.restoration.agreement import agreed_views
 from extrags.restoration.clips import as_images
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.refinement.refiner import Refiner, textured_views
@@ -16,7 +19,7 @@ from extrags.restoration.training_data.augmentation import drop_references, unco
 from extrags.view_synthesis.conditioning import Layers, condition
 from extrags.view_synthesis.references import ReferenceViews
 
-__all__ = ["AsRendered", "Textured", "WithoutReferences"]
+__all__ = ["Agreed", "AsRendered", "Textured", "WithoutReferences"]
 
 
 class AsRendered:
@@ -59,6 +62,43 @@ class WithoutReferences:
         self.enhancer.save(path)
 
 
+class Agreed:
+    """A restorer whose views of a clip agree on what they have invented, as restored renders do.
+
+    Args:
+        enhancer: the restorer.
+    """
+
+    def __init__(self, enhancer: Enhancer) -> None:
+        self.enhancer = enhancer
+        self.name = f"{enhancer.name}/agreed"
+
+    def restore(self, clip: Clip) -> Restoration:
+        """Restore a clip, then bring its views nearer to each other."""
+        restoration = self.enhancer.restore(clip)
+        exposure = torch.ones(len(clip)) if clip.exposure is None else torch.from_numpy(clip.exposure)
+        rgb = agreed_views(
+            torch.from_numpy(restoration.rgb).permute(0, 3, 1, 2),
+            _completed(restoration, clip),
+            unconfirmed(clip.layers),
+            clip.cameras,
+            exposure,
+            clip.transfer,
+        )
+        return replace(restoration, rgb=as_images(rgb), provenance={**restoration.provenance, "agreed": True})
+
+    def save(self, path: Path) -> None:
+        """Save the wrapped restorer."""
+        self.enhancer.save(path)
+
+
+def _completed(restoration: Restoration, clip: Clip) -> Float[Tensor, "t 1 h w"]:
+    """z-depth without gaps."""
+    if restoration.depth_mm is None:
+        return condition(clip.layers, clip.transfer).depth_mm
+    return torch.from_numpy(restoration.depth_mm)[:, None]
+
+
 class Textured:
     """A restorer whose invented surfaces get texture of the scene's own frames, as restored renders do.
 
@@ -89,17 +129,12 @@ class Textured:
     def restore(self, clip: Clip) -> Restoration:
         """Restore a clip, then lay texture onto what was invented."""
         restoration = self.enhancer.restore(clip)
-        depth = (
-            condition(clip.layers, clip.transfer).depth_mm
-            if restoration.depth_mm is None
-            else torch.from_numpy(restoration.depth_mm)[:, None]
-        )
         rgb = textured_views(
             self.texture,
             self.refiner,
             torch.from_numpy(restoration.rgb).permute(0, 3, 1, 2),
             clip.cameras,
-            depth,
+            _completed(restoration, clip),
             unconfirmed(clip.layers),
         )
         return replace(

@@ -28,6 +28,12 @@ def renders(tube: Tube) -> RenderedViews:
     return render(tube.scene, tube.sequence)
 
 
+@pytest.fixture
+def each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Views that do not look at their neighbours: what is mixed can be told."""
+    monkeypatch.setattr(restored_renders_module, "agreed_views", lambda rgb, *_: rgb)
+
+
 def restored(tube: Tube, renders: RenderedViews, enhancer: Enhancer) -> RenderedViews:
     training = tube.sequence.training_part()
     return restored_renders(tube.scene, renders, tube.sequence, training, enhancer, CONFIG, finish="smooth")
@@ -41,6 +47,7 @@ class Unnamed(AsRendered):
 
 
 class TestRestoredRenders:
+    @pytest.mark.usefixtures("each_alone")
     def test_a_restorer_that_changes_nothing_leaves_the_mean_of_both_scenes(
         self, tube: Tube, renders: RenderedViews
     ) -> None:
@@ -50,6 +57,7 @@ class TestRestoredRenders:
         expected = (1 - FINAL_SHARE) * renders.rgb.clip(0, 1) + FINAL_SHARE * 0.75
         np.testing.assert_allclose(mixed.rgb, expected, atol=1e-5)
 
+    @pytest.mark.usefixtures("each_alone")
     def test_the_final_scene_counts_only_where_it_has_a_surface(
         self, tube: Tube, renders: RenderedViews
     ) -> None:
@@ -69,6 +77,16 @@ class TestRestoredRenders:
         assert changed.mean() < 0.9 * anyhow.mean()
         truth = tube.sequence.rgb[tube.sequence.test] / 255
         assert np.square(mixed.rgb - truth).mean() < np.square(renders.rgb - truth).mean()
+
+    def test_neighbouring_views_agree_on_what_is_invented(
+        self, tube: Tube, renders: RenderedViews, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        agreeing = restored(tube, renders, ClassicalEnhancer()).rgb
+        monkeypatch.setattr(restored_renders_module, "agreed_views", lambda rgb, *_: rgb)
+        alone = restored(tube, renders, ClassicalEnhancer()).rgb
+        changed = np.abs(agreeing - alone).max(axis=-1) > 1e-5
+        assert changed.any()
+        assert not changed.all()
 
     def test_geometry_stays_that_of_the_scene(self, tube: Tube, renders: RenderedViews) -> None:
         mixed = restored(tube, renders, ClassicalEnhancer())
