@@ -69,8 +69,9 @@ def restored_renders(
     """Restore rendered held-out views.
 
     Where the restorer only blends and fills (`classical`, which also stands in for one that the leave-out
-    frames speak against), what the scene knows stays as it is rendered. Views are restored at
-    `enhance.max_width` at most, as virtual views are.
+    frames speak against), what the scene knows stays as it is rendered, views do not follow their neighbours,
+    and no network refines: what one invents is wrong there. Views are restored at `enhance.max_width` at
+    most, as virtual views are.
 
     Args:
         coarse: the scene that the restorer was made for.
@@ -80,7 +81,7 @@ def restored_renders(
         enhancer: the scene's restorer.
         config: the number of references, the working width, the seed, and the refiner's precision.
         finish: what is done to invented colours: `textured` lays texture of the scene's own frames onto them,
-            `refined` gives both to the refiner of the package.
+            `refined` gives both to the refiner of the package, unless the restorer only blends and fills.
 
     Returns:
         The same views with other colours; opacity and depth are those of the final scene.
@@ -98,13 +99,14 @@ def restored_renders(
     small, training = sequence.at_most_width(width), training.at_most_width(width)
     references = gather_references(coarse, training, training.train)
     texture = None if finish == "smooth" else SurfaceTexture.of_references(references, seed=config.seed)
-    refiner = None
-    if finish == "refined":
+    refiner, keeps_known = None, isinstance(enhancer, ClassicalEnhancer)
+    if finish == "refined" and keeps_known:
+        logger.info("restored views are not refined: the restorer only blends and fills")
+    elif finish == "refined":
         refiner = bundled_refiner(half_precision=chosen_precision(config) == "bfloat16")
     if finish != "smooth" and texture is None:
         logger.warning("no frame shows the surface closely enough: restored views stay without texture")
     clips = iterate_held_out_clips(coarse, references, small, sequence.test, count=config.references)
-    keeps_known = isinstance(enhancer, ClassicalEnhancer)
     restored, done = FrameStack(len(renders)), 0
     for clip in clips:
         part = slice(done, done + len(clip))
@@ -198,21 +200,25 @@ def _mixed(
     if keeps_known:
         share = torch.maximum(share, (1 - invented) * solid)
     mixed = (1 - share) * restored + share * rendered
-    # What is agreed on is coarse: it is found at the size that the views are restored at.
-    small = _shrunk(mixed, colors.shape[-2:])
-    exposure = torch.ones(len(clip)) if clip.exposure is None else torch.from_numpy(clip.exposure)
-    agreed = agreed_views(
-        small,
-        _shrunk(depth, colors.shape[-2:]),
-        to_invent,
-        clip.cameras,
-        exposure,
-        clip.transfer,
-    )
-    mixed = mixed + _enlarged(agreed - small, size)
+    if not keeps_known:
+        mixed = mixed + _agreement(clip, mixed, depth, to_invent)
     if texture is not None:
         mixed = textured_views(texture, refiner, mixed, cameras, depth, _enlarged(to_invent, size))
     return mixed.clamp(0, 1)
+
+
+def _agreement(
+    clip: Clip,
+    rgb: Float[Tensor, "t 3 h w"],
+    depth_mm: Float[Tensor, "t 1 h w"],
+    to_invent: Float[Tensor, "t 1 h0 w0"],
+) -> Float[Tensor, "t 3 h w"]:
+    """What is to be added for the views of a clip to agree: coarse, and found at the clip's size."""
+    size = to_invent.shape[-2:]
+    small = _shrunk(rgb, size)
+    exposure = torch.ones(len(clip)) if clip.exposure is None else torch.from_numpy(clip.exposure)
+    agreed = agreed_views(small, _shrunk(depth_mm, size), to_invent, clip.cameras, exposure, clip.transfer)
+    return _enlarged(agreed - small, rgb.shape[-2:])
 
 
 def _mean_depth(
