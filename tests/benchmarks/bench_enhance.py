@@ -35,8 +35,9 @@ from scipy.ndimage import gaussian_filter
 from data_catalog.catalog import read, resolve
 from data_catalog.content import content_circle
 from extrags.cameras import Cameras, pixel_rays
-from extrags.config import PipelineConfig
+from extrags.config import EnhanceConfig, PipelineConfig
 from extrags.data_directories import data_roots
+from extrags.errors import CaptureError
 from extrags.evaluation import render
 from extrags.in_memory_pipeline import InMemoryPipeline
 from extrags.metrics.image import mean_of_known, psnr
@@ -51,6 +52,7 @@ from extrags.restoration.benchmark.comparison import (
     coarse_scene,
     compare_methods,
     prepared,
+    with_suffix,
 )
 from extrags.restoration.benchmark.evaluation import (
     RestorerBenchmark,
@@ -60,7 +62,7 @@ from extrags.restoration.benchmark.evaluation import (
 )
 from extrags.restoration.clips import choose_views, make_pseudo_observations
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
-from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training import finetune
@@ -68,7 +70,8 @@ from extrags.training.finetuning import virtual_steps
 from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.gather import gather_references
-from extrags.view_synthesis.references import LightTransfer
+from extrags.view_synthesis.references import LightTransfer, ReferenceViews
+from extrags.zarr_io import group_exists
 from flows.commands.common import parsed_settings
 from flows.settings import pipeline_config
 from tasks.weights import lpips_by_net, lpips_weights
@@ -327,6 +330,7 @@ def realism(
         (name, replace(enhancer, gamut=hues) if isinstance(enhancer, EmbeddedEnhancer) else enhancer)
         for name, enhancer in strangers
     ]
+    strangers = [(name, FromItself(name, enhancer, config.enhance)) for name, enhancer in strangers]
     cases += shown(benchmark, strangers, folder / "laparoscopy.png", "laparoscopy", config.enhance.seed)
     sink(cases)
     scene, posed = coarse_scene(loaded("sinus/hopkins", config), config.coarse)
@@ -335,11 +339,38 @@ def realism(
     test = np.asarray(posed.test)
     clips = held_out_clips(scene, references, posed, test, count=config.enhance.references)
     natives = prepared(methods, scene, training, config.enhance, config.coarse)
-    own = [(name, enhancer) for name, enhancer, _ in natives]
+    own = [(name, with_suffix(name, enhancer, references, config.enhance)) for name, enhancer, _ in natives]
     benchmark = RestorerBenchmark(clips, TrueViews.of_sequence(posed, test), lpips)
     cases += shown(benchmark, own, folder / "sinus.png", posed.name, config.enhance.seed)
     sink(cases)
     return cases
+
+
+class FromItself:
+    """A method whose texture, if its name asks for any, is that of what the clip itself shows."""
+
+    def __init__(self, name: str, enhancer: Enhancer, config: EnhanceConfig) -> None:
+        self.name, self.enhancer, self.config = name, enhancer, config
+
+    def restore(self, clip: Clip) -> Restoration:
+        layers = clip.layers
+        known = (layers.get("alpha") > 0.98).float()
+        packed = torch.cat(
+            [layers.get("rendered"), known, 1 / layers.get("depth_mm").clamp_min(1.0), known], 1
+        )
+        nothing = torch.zeros(len(clip), 0, dtype=torch.bool)
+        own = ReferenceViews(
+            np.arange(len(clip)), clip.cameras, packed, torch.ones(len(clip)), nothing, clip.transfer
+        )
+        try:
+            method = with_suffix(self.name, self.enhancer, own, self.config)
+        except CaptureError:
+            # As restored renders do where no frame shows enough tissue between holes.
+            return self.enhancer.restore(clip)
+        return method.restore(clip)
+
+    def save(self, path: Path) -> None:
+        raise NotImplementedError
 
 
 def shown(

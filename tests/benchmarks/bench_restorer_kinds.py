@@ -6,7 +6,8 @@ Every scene file of the folder (or those of one family, `--family cavities`) is 
 judge: as rendered, by blending and filling, and by each of the weights, on at most so many of its views.
 `--mix SHARE ...` takes weighted means of the first two weights as well (SHARE of the second): means of
 weights that one training leads from one to the other are often better on both sides than either (Wortsman
-et al., "Robust fine-tuning of zero-shot models", CVPR 2022).
+et al., "Robust fine-tuning of zero-shot models", CVPR 2022). Views of the first weights are also shown with
+texture laid onto them, and refined.
 
 Weights must not have been trained on the scenes that they are compared on: `--last N` takes the last ones of
 each family, which a training keeps for validation. Bundled weights have never seen a cavity.
@@ -29,11 +30,12 @@ from extrags.config import EnhanceConfig
 from extrags.metrics.image import mean_of_known
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.benchmark.evaluation import RestorerBenchmark, TrueViews
-from extrags.restoration.benchmark.variants import AsRendered
+from extrags.restoration.benchmark.variants import AsRendered, Textured
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import as_images
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer, pretrained
 from extrags.restoration.protocol import Clip, Enhancer
+from extrags.restoration.refinement.weights import bundled_refiner
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 from extrags.view_synthesis.gamut import Gamut
 
@@ -115,9 +117,16 @@ def _compared(
     benchmark = RestorerBenchmark(clips, truth, lpips)
     gamut = Gamut.of_images(scene.references.images.float(), scene.references.valid[:, None].float())
     rows = []
-    for name, restorer in restorers.items():
-        own = replace(restorer, gamut=gamut) if isinstance(restorer, EmbeddedEnhancer) else restorer
-        figures = benchmark.evaluate(own)
+    own: dict[str, Enhancer] = {
+        name: replace(restorer, gamut=gamut) if isinstance(restorer, EmbeddedEnhancer) else restorer
+        for name, restorer in restorers.items()
+    }
+    first = next((name for name, restorer in own.items() if isinstance(restorer, EmbeddedEnhancer)), None)
+    if first is not None and scene.texture is not None:
+        own[f"{first}, textured"] = Textured(own[first], scene.texture)
+        own[f"{first}, refined"] = Textured(own[first], scene.texture, refiner=bundled_refiner())
+    for name, restorer in own.items():
+        figures = benchmark.evaluate(restorer)
         row = {"file": file.name, "kind": kind, "restorer": name}
         rows.append(row | {column: _at(figures, column) for column in COLUMNS})
     return rows

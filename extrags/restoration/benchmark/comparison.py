@@ -55,6 +55,7 @@ __all__ = [
     "coarse_scene",
     "compare_methods",
     "prepared",
+    "with_suffix",
 ]
 
 NO_REFERENCES = "/no-references"
@@ -268,13 +269,7 @@ def compare_methods(
     restorers = prepared(methods, scene, training, config.enhance, config.coarse)
     for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
         keyed = _keyed(name, config.enhance)
-        if name.endswith((AGREED, TEXTURED, REFINED)):
-            enhancer = Agreed(enhancer)
-        if name.endswith((TEXTURED, REFINED)):
-            refiner = None
-            if name.endswith(REFINED):
-                refiner = bundled_refiner(half_precision=chosen_precision(config.enhance) == "bfloat16")
-            enhancer = Textured(enhancer, references, seed=config.enhance.seed, refiner=refiner)
+        enhancer = with_suffix(name, enhancer, references, config.enhance)
         begun = time.perf_counter()
         keyframes = clip_keyframes(scene, references, clips, enhancer, keyed)
         keyframe_seconds = time.perf_counter() - begun
@@ -298,6 +293,28 @@ def compare_methods(
         logger.info("bench enhance: %s %s %.2f dB", sequence.name, name, figures["psnr"] or 0.0)
         emit(Progress("bench enhance", done, len(methods)))
     return cases
+
+
+def with_suffix(name: str, enhancer: Enhancer, references: ReferenceViews, config: EnhanceConfig) -> Enhancer:
+    """The restorer with what the suffix of its name asks for, beside references and keyframes.
+
+    Args:
+        name: of a method.
+        enhancer: its restorer.
+        references: the scene's real views, which give texture.
+        config: the seed of the texture, and the refiner's precision.
+
+    Raises:
+        CaptureError: when no frame gives texture, and texture is asked for.
+    """
+    if name.endswith((AGREED, TEXTURED, REFINED)):
+        enhancer = Agreed(enhancer)
+    if name.endswith((TEXTURED, REFINED)):
+        refiner = None
+        if name.endswith(REFINED):
+            refiner = bundled_refiner(half_precision=chosen_precision(config) == "bfloat16")
+        enhancer = Textured.of_references(enhancer, references, seed=config.seed, refiner=refiner)
+    return enhancer
 
 
 def _keyed(name: str, config: EnhanceConfig) -> EnhanceConfig:

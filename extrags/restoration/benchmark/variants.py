@@ -104,27 +104,35 @@ class Textured:
 
     Args:
         enhancer: the restorer.
-        references: the scene's real views.
-        seed: which tile lies where.
+        texture: of the scene.
         refiner: makes texture and shapes agree; None lays the texture alone.
-
-    Raises:
-        CaptureError: when no frame shows the surface closely enough to give texture.
     """
 
     def __init__(
-        self,
-        enhancer: Enhancer,
-        references: ReferenceViews,
-        *,
-        seed: int = 0,
-        refiner: Refiner | None = None,
+        self, enhancer: Enhancer, texture: SurfaceTexture, *, refiner: Refiner | None = None
     ) -> None:
+        self.enhancer, self.texture, self.refiner = enhancer, texture, refiner
+        self.name = f"{enhancer.name}/{'textured' if refiner is None else 'refined'}"
+
+    @classmethod
+    def of_references(
+        cls, enhancer: Enhancer, references: ReferenceViews, *, seed: int = 0, refiner: Refiner | None = None
+    ) -> Textured:
+        """With the texture that real views show.
+
+        Args:
+            enhancer: the restorer.
+            references: the scene's real views.
+            seed: which tile lies where.
+            refiner: makes texture and shapes agree; None lays the texture alone.
+
+        Raises:
+            CaptureError: when no frame shows the surface closely enough to give texture.
+        """
         texture = SurfaceTexture.of_references(references, seed=seed)
         if texture is None:
             raise CaptureError("no frame shows the surface closely enough to give texture")
-        self.enhancer, self.texture, self.refiner = enhancer, texture, refiner
-        self.name = f"{enhancer.name}/{'textured' if refiner is None else 'refined'}"
+        return cls(enhancer, texture, refiner=refiner)
 
     def restore(self, clip: Clip) -> Restoration:
         """Restore a clip, then lay texture onto what was invented."""

@@ -45,7 +45,7 @@ class TestWithoutReferences:
 class TestTextured:
     def test_only_what_is_invented_changes(self, tube: Tube, clip: Clip) -> None:
         plain = ClassicalEnhancer().restore(clip)
-        textured = Textured(ClassicalEnhancer(), tube.references, seed=1).restore(clip)
+        textured = Textured.of_references(ClassicalEnhancer(), tube.references, seed=1).restore(clip)
         assert textured.provenance == {**plain.provenance, "textured": True, "refined": False}
         changed = np.abs(textured.rgb - plain.rgb).max(axis=-1) > 1e-6
         invented = invented_share(unconfirmed(clip.layers)[:, 0]).numpy()
@@ -55,7 +55,8 @@ class TestTextured:
 
     def test_a_seed_is_a_texture(self, tube: Tube, clip: Clip) -> None:
         first, same, other = (
-            Textured(ClassicalEnhancer(), tube.references, seed=seed).restore(clip).rgb for seed in (1, 1, 2)
+            Textured.of_references(ClassicalEnhancer(), tube.references, seed=seed).restore(clip).rgb
+            for seed in (1, 1, 2)
         )
         assert np.array_equal(first, same)
         assert not np.array_equal(first, other)
@@ -64,4 +65,4 @@ class TestTextured:
         packed = tube.references.packed.clone()
         packed[:, 5] = 0
         with pytest.raises(CaptureError, match="no frame shows the surface"):
-            Textured(ClassicalEnhancer(), replace(tube.references, packed=packed))
+            Textured.of_references(ClassicalEnhancer(), replace(tube.references, packed=packed))
