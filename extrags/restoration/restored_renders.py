@@ -13,6 +13,7 @@ docs/references.md; what is restored and mixed here differs.
 from __future__ import annotations
 
 import logging
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from extrags.errors import ShapeError
 from extrags.events import Progress, emit
 from extrags.frame_stacks import FrameStack, stacked
 from extrags.lens import Undistortion, distortion_of_pinhole
+from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.metrics.protocol import RenderedViews
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.restoration.agreement import agreed_views, feathered_invented_share
@@ -53,6 +55,10 @@ logger = logging.getLogger(__name__)
 FINAL_SHARE = 0.4
 """Of the final scene's view; the rest is the restored one. Their errors have little in common, so that the
 mean of both is nearer to the truth than either."""
+DEPTH_SIGMA = 0.02
+"""Standard deviation of the window that the ratio of both depths is smoothed with, in widths of a view."""
+LARGEST_LOG_RATIO = 1.0
+LEAST_SHARE = 1e-3
 
 
 @one_torch_thread()
@@ -188,7 +194,7 @@ def _mixed(
         else torch.from_numpy(restoration.depth_mm)[:, None]
     )
     size = rendered.shape[-2:]
-    depth = _mean_depth(_enlarged(depth, size), torch.from_numpy(final.depth_mm)[:, None], solid)
+    depth = _mean_depth(depth, torch.from_numpy(final.depth_mm)[:, None], solid)
     invented = _enlarged(feathered_invented_share(to_invent), size)
     restored = _enlarged(colors, size)
     if colors.shape[-2:] != size:
@@ -203,34 +209,46 @@ def _mixed(
     if not keeps_known:
         mixed = mixed + _agreement(clip, mixed, depth, to_invent)
     if texture is not None:
-        mixed = textured_views(texture, refiner, mixed, cameras, depth, _enlarged(to_invent, size))
+        full_mm = _enlarged(depth, size)
+        mixed = textured_views(texture, refiner, mixed, cameras, full_mm, _enlarged(to_invent, size))
     return mixed.clamp(0, 1)
 
 
 def _agreement(
     clip: Clip,
     rgb: Float[Tensor, "t 3 h w"],
-    depth_mm: Float[Tensor, "t 1 h w"],
+    depth_mm: Float[Tensor, "t 1 h0 w0"],
     to_invent: Float[Tensor, "t 1 h0 w0"],
 ) -> Float[Tensor, "t 3 h w"]:
     """What is to be added for the views of a clip to agree: coarse, and found at the clip's size."""
     size = to_invent.shape[-2:]
     small = _shrunk(rgb, size)
     exposure = torch.ones(len(clip)) if clip.exposure is None else torch.from_numpy(clip.exposure)
-    agreed = agreed_views(small, _shrunk(depth_mm, size), to_invent, clip.cameras, exposure, clip.transfer)
+    agreed = agreed_views(small, depth_mm, to_invent, clip.cameras, exposure, clip.transfer)
     return _enlarged(agreed - small, rgb.shape[-2:])
 
 
 def _mean_depth(
-    restored_mm: Float[Tensor, "t 1 h w"], final_mm: Float[Tensor, "t 1 h w"], solid: Float[Tensor, "t 1 h w"]
+    restored_mm: Float[Tensor, "t 1 h w"],
+    final_mm: Float[Tensor, "t 1 h0 w0"],
+    solid: Float[Tensor, "t 1 h0 w0"],
 ) -> Float[Tensor, "t 1 h w"]:
     """The geometric mean of both depths where the final scene has a surface, that of the view elsewhere.
 
     The errors of a view that was completed alone and of a scene that many views were fused in have little in
-    common.
+    common. Their ratio is smoothed: a rendered depth is rough, which shows in texture that is laid onto it.
     """
-    known = (solid > HOLE_ALPHA) & (final_mm > 0)
-    return torch.where(known, (restored_mm * final_mm.clamp_min(1e-9)).sqrt(), restored_mm)
+    size = restored_mm.shape[-2:]
+    known = ((solid > HOLE_ALPHA) & (final_mm > 0)).to(restored_mm.dtype)
+    share = _shrunk(known, size)
+    mean_mm = _shrunk(final_mm * known, size) / share.clamp_min(LEAST_SHARE)
+    ratio = torch.where(share > LEAST_SHARE, mean_mm / restored_mm, torch.ones(()))
+    change = ratio.clamp_min(1e-9).log().clamp(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)
+    sigma = DEPTH_SIGMA * size[-1]
+    window = gaussian_weights(sigma, math.ceil(3 * sigma))
+    smooth = filter_separable(change * share, window, window)
+    smooth = smooth / filter_separable(share, window, window).clamp_min(LEAST_SHARE)
+    return restored_mm * (0.5 * smooth).exp()
 
 
 def _shrunk(image: Float[Tensor, "t c h0 w0"], size: torch.Size) -> Float[Tensor, "t c h w"]:

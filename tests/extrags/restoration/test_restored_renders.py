@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from extrags.config import EnhanceConfig
 from extrags.config.stages import Finish
@@ -131,3 +132,23 @@ def test_a_refiner_changes_only_what_is_invented(
     without = finished("refined", ClassicalEnhancer())
     assert np.array_equal(without, finished("textured", ClassicalEnhancer()))
     assert len(asked) == 1
+
+
+class TestMeanDepth:
+    def test_it_lies_between_both_where_the_final_scene_has_a_surface(self) -> None:
+        own, scene, solid = (
+            torch.full((1, 1, 20, 50), 4.0),
+            torch.full((1, 1, 20, 50), 9.0),
+            torch.ones(1, 1, 20, 50),
+        )
+        solid[..., 25:] = 0
+        found = restored_renders_module._mean_depth(own, scene, solid)
+        torch.testing.assert_close(found[..., :25], torch.full((1, 1, 20, 25), 6.0))
+        assert (found[..., 25:] <= 6.0 + 1e-5).all()
+        torch.testing.assert_close(found[..., 40:], own[..., 40:])
+
+    def test_larger_renders_and_unknown_depth(self) -> None:
+        own, scene = torch.full((1, 1, 20, 50), 4.0), torch.full((1, 1, 60, 150), 9.0)
+        scene[..., ::7] = 0
+        found = restored_renders_module._mean_depth(own, scene, torch.ones(1, 1, 60, 150))
+        torch.testing.assert_close(found, torch.full((1, 1, 20, 50), 6.0))
