@@ -246,8 +246,9 @@ class EvaluateConfig(StageConfig):
         "refined",
         description="held-out views of the final scene are also measured after restoration in the image. "
         "textured: what is invented gets texture of the scene's own frames, which looks right and costs some "
-        "PSNR; refined: a network makes that texture and the shapes agree; smooth: without either; none: not "
-        "measured. Each held-out view takes the restorer once, which a large pretrained model makes long",
+        "PSNR; refined: a network makes that texture and the shapes agree, unless the leave-out frames speak "
+        "against networks; smooth: without either; none: not measured. Each held-out view takes the restorer "
+        "once, which a large pretrained model makes long",
     )
 
     @field_validator("lpips_nets")

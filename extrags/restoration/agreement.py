@@ -21,7 +21,7 @@ from extrags.errors import ShapeError
 from extrags.metrics.filters import filter_separable, gaussian_weights
 from extrags.restoration.clips import FEATHER_RADIUS_PX, FEATHER_SIGMA_PX
 from extrags.restoration.surface_texture import invented_share
-from extrags.threads import in_threads
+from extrags.threads import in_threads, one_torch_thread
 from extrags.view_synthesis.invented import border_trust, evidence
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 from extrags.view_synthesis.warp import covisibility, seen_by_others
@@ -32,9 +32,10 @@ NEIGHBOURS = 4
 """Views that a view is compared with, at most: those that see most of the same surface."""
 DEPTH_TOLERANCE = 0.2
 """Relative difference at which two invented depths are taken for the same surface by 1/e."""
-COARSE_SIGMA = 0.02
+COARSE_SHARE = 0.02
 """Standard deviation of the window that the change is smoothed with, as a share of a view's width."""
 LEAST_SHARE = 1e-3
+"""Less is not divided by."""
 
 
 def feathered_invented_share(unconfirmed: Float[Tensor, "v 1 h w"]) -> Float[Tensor, "v 1 h w"]:
@@ -47,12 +48,13 @@ def feathered_invented_share(unconfirmed: Float[Tensor, "v 1 h w"]) -> Float[Ten
     return filter_separable(invented_share(unconfirmed), window, window)
 
 
+@one_torch_thread()
 def agreed_views(
     rgb: Float[Tensor, "v 3 h w"],
     depth_mm: Float[Tensor, "v 1 h w"],
     unconfirmed: Float[Tensor, "v 1 h w"],
     cameras: Cameras,
-    exposure: Float[Tensor, "v"],
+    exposure: Float[np.ndarray, "v"] | None,
     transfer: LightTransfer,
 ) -> Float[Tensor, "v 3 h w"]:
     """Restored views that agree better on what they have invented; a view alone stays as it is.
@@ -62,13 +64,14 @@ def agreed_views(
         depth_mm: z-depth without gaps.
         unconfirmed: share of each pixel that neither the rendering nor a real view confirms.
         cameras: of the views.
-        exposure: gain of each view.
+        exposure: gain of each view; None is 1.
         transfer: how brightness changes with distance.
 
     Raises:
         ShapeError: when the numbers of views differ.
     """
-    counts = {len(rgb), len(depth_mm), len(unconfirmed), len(cameras), len(exposure)}
+    gain = torch.ones(len(rgb)) if exposure is None else torch.from_numpy(exposure).to(rgb.dtype)
+    counts = {len(rgb), len(depth_mm), len(unconfirmed), len(cameras), len(gain)}
     if len(counts) != 1:
         raise ShapeError(f"the parts of views that shall agree have different lengths: {sorted(counts)}")
     count, share = len(rgb), feathered_invented_share(unconfirmed)
@@ -78,11 +81,11 @@ def agreed_views(
     trust = knowledge * border_trust(cameras.height, cameras.width)
     packed = torch.cat([rgb, trust, 1 / depth_mm.clamp_min(1e-9), torch.ones_like(trust)], dim=1)
     nothing = torch.zeros(count, 0, dtype=torch.bool)
-    views = ReferenceViews(np.arange(count), cameras, packed.contiguous(), exposure, nothing, transfer)
+    views = ReferenceViews(np.arange(count), cameras, packed.contiguous(), gain, nothing, transfer)
     common = covisibility(views, cameras, depth_mm, DEPTH_TOLERANCE)
     common.fill_diagonal_(-1.0)
     neighbours = torch.argsort(common, dim=1, descending=True, stable=True)[:, : min(NEIGHBOURS, count - 1)]
-    sigma = COARSE_SIGMA * cameras.width
+    sigma = COARSE_SHARE * cameras.width
     window = gaussian_weights(sigma, math.ceil(3 * sigma))
 
     def agreed(view: int) -> Tensor:
@@ -93,7 +96,7 @@ def agreed_views(
             cameras[[view]],
             depth_mm[view],
             neighbours[view],
-            gain=exposure[view],
+            gain=gain[view],
             depth_tolerance=DEPTH_TOLERANCE,
         )
         all_weights = weight.sum(dim=0) + knowledge[view]

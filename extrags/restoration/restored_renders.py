@@ -55,10 +55,14 @@ logger = logging.getLogger(__name__)
 FINAL_SHARE = 0.4
 """Of the final scene's view; the rest is the restored one. Their errors have little in common, so that the
 mean of both is nearer to the truth than either."""
-DEPTH_SIGMA = 0.02
-"""Standard deviation of the window that the ratio of both depths is smoothed with, in widths of a view."""
+DEPTH_SMOOTHING_SHARE = 0.02
+"""Standard deviation of the window that the ratio of both depths is smoothed with, per width of a view."""
 LARGEST_LOG_RATIO = 1.0
+"""Depths that differ by more are not both of the surface that is looked for."""
+FADING_SHARE = 0.5
+"""Where the final scene has a surface in less of the window, its depth counts the less."""
 LEAST_SHARE = 1e-3
+"""A shrunk pixel that has less of the final scene's surface has none."""
 
 
 @one_torch_thread()
@@ -153,8 +157,9 @@ def _through_pinholes(
         found = (plan.image(image) for plan, image in zip(plans, images, strict=True))
         return stacked(found, len(plans))
 
+    depths = (plan.depth(depth) for plan, depth in zip(plans, renders.depth_mm, strict=True))
     flat = RenderedViews(
-        flattened(renders.rgb), flattened(renders.alpha), flattened(renders.depth_mm), renders.n_gaussians
+        flattened(renders.rgb), flattened(renders.alpha), stacked(depths, len(plans)), renders.n_gaussians
     )
     restored = restored_renders(
         coarse,
@@ -209,8 +214,10 @@ def _mixed(
     if not keeps_known:
         mixed = mixed + _agreement(clip, mixed, depth, to_invent)
     if texture is not None:
-        full_mm = _enlarged(depth, size)
-        mixed = textured_views(texture, refiner, mixed, cameras, full_mm, _enlarged(to_invent, size))
+        full_size_depth_mm = _enlarged(depth, size)
+        mixed = textured_views(
+            texture, refiner, mixed, cameras, full_size_depth_mm, _enlarged(to_invent, size)
+        )
     return mixed.clamp(0, 1)
 
 
@@ -223,8 +230,7 @@ def _agreement(
     """What is to be added for the views of a clip to agree: coarse, and found at the clip's size."""
     size = to_invent.shape[-2:]
     small = _shrunk(rgb, size)
-    exposure = torch.ones(len(clip)) if clip.exposure is None else torch.from_numpy(clip.exposure)
-    agreed = agreed_views(small, depth_mm, to_invent, clip.cameras, exposure, clip.transfer)
+    agreed = agreed_views(small, depth_mm, to_invent, clip.cameras, clip.exposure, clip.transfer)
     return _enlarged(agreed - small, rgb.shape[-2:])
 
 
@@ -244,10 +250,11 @@ def _mean_depth(
     mean_mm = _shrunk(final_mm * known, size) / share.clamp_min(LEAST_SHARE)
     ratio = torch.where(share > LEAST_SHARE, mean_mm / restored_mm, torch.ones(()))
     change = ratio.clamp_min(1e-9).log().clamp(-LARGEST_LOG_RATIO, LARGEST_LOG_RATIO)
-    sigma = DEPTH_SIGMA * size[-1]
+    sigma = DEPTH_SMOOTHING_SHARE * size[-1]
     window = gaussian_weights(sigma, math.ceil(3 * sigma))
     smooth = filter_separable(change * share, window, window)
-    smooth = smooth / filter_separable(share, window, window).clamp_min(LEAST_SHARE)
+    # Not divided by less: inside a hole of the final scene the change fades out, without a step.
+    smooth = smooth / filter_separable(share, window, window).clamp_min(FADING_SHARE)
     return restored_mm * (0.5 * smooth).exp()
 
 

@@ -356,7 +356,7 @@ class FromItself:
         layers = clip.layers
         known = (layers.get("alpha") > 0.98).float()
         packed = torch.cat(
-            [layers.get("rendered"), known, 1 / layers.get("depth_mm").clamp_min(1.0), known], 1
+            [layers.get("rendered"), known, 1 / layers.get("depth_mm").clamp_min(1e-9), known], 1
         )
         nothing = torch.zeros(len(clip), 0, dtype=torch.bool)
         own = ReferenceViews(

@@ -269,10 +269,10 @@ def compare_methods(
     restorers = prepared(methods, scene, training, config.enhance, config.coarse)
     for done, (name, enhancer, seconds) in enumerate(restorers, start=1):
         keyed = _keyed(name, config.enhance)
-        enhancer = with_suffix(name, enhancer, references, config.enhance)
         begun = time.perf_counter()
         keyframes = clip_keyframes(scene, references, clips, enhancer, keyed)
         keyframe_seconds = time.perf_counter() - begun
+        enhancer = with_suffix(name, enhancer, references, config.enhance)
         invented = keyframes.invented(references.transfer)
         restored = restore_views(enhancer, [following(clip, invented) for clip in clips])
         figures = benchmark.figures(restored)

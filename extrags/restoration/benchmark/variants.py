@@ -63,7 +63,9 @@ class WithoutReferences:
 
 
 class Agreed:
-    """A restorer whose views of a clip agree on what they have invented, as restored renders do.
+    """A restorer whose views of a clip agree on what they have invented.
+
+    Restored renders do so as well, unless the restorer only blends and fills.
 
     Args:
         enhancer: the restorer.
@@ -76,13 +78,12 @@ class Agreed:
     def restore(self, clip: Clip) -> Restoration:
         """Restore a clip, then bring its views nearer to each other."""
         restoration = self.enhancer.restore(clip)
-        exposure = torch.ones(len(clip)) if clip.exposure is None else torch.from_numpy(clip.exposure)
         rgb = agreed_views(
             torch.from_numpy(restoration.rgb).permute(0, 3, 1, 2),
             _completed(restoration, clip),
             unconfirmed(clip.layers),
             clip.cameras,
-            exposure,
+            clip.exposure,
             clip.transfer,
         )
         return replace(restoration, rgb=as_images(rgb), provenance={**restoration.provenance, "agreed": True})
@@ -100,7 +101,10 @@ def _completed(restoration: Restoration, clip: Clip) -> Float[Tensor, "t 1 h w"]
 
 
 class Textured:
-    """A restorer whose invented surfaces get texture of the scene's own frames, as restored renders do.
+    """A restorer whose invented surfaces get texture of the scene's own frames.
+
+    Restored renders do so as well, at the mean of this depth and the final scene's; no network refines them
+    where the restorer only blends and fills.
 
     Args:
         enhancer: the restorer.

@@ -37,14 +37,13 @@ def agreed(
     *,
     depth_mm: torch.Tensor | None = None,
     unconfirmed: torch.Tensor | None = None,
-    exposure: torch.Tensor | None = None,
+    exposure: np.ndarray | None = None,
     transfer: LightTransfer = FLAT,
 ) -> torch.Tensor:
     count = len(rgb)
     depth = torch.full((count, *SIZE), DEPTH_MM) if depth_mm is None else depth_mm
     unknown = torch.ones(count, *SIZE) if unconfirmed is None else unconfirmed
-    gain = torch.ones(count) if exposure is None else exposure
-    return agreed_views(rgb, depth, unknown, cameras, gain, transfer)
+    return agreed_views(rgb, depth, unknown, cameras, exposure, transfer)
 
 
 class TestAgreedViews:
@@ -86,7 +85,7 @@ class TestAgreedViews:
         depth = torch.full((2, *SIZE), DEPTH_MM)
         depth[1] = 8.0
         rgb = painted([0.2, 0.625])
-        gain = torch.tensor([1.0, 2.0])
+        gain = np.array([1.0, 2.0])
         found = agreed(rgb, cameras, depth_mm=depth, exposure=gain, transfer=NOT_FLAT)
         middle = (..., slice(14, 18), slice(21, 27))
         # Away from the axis the ratio of distances is another, and painted views are not true.

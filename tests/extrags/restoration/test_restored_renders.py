@@ -79,15 +79,33 @@ class TestRestoredRenders:
         truth = tube.sequence.rgb[tube.sequence.test] / 255
         assert np.square(mixed.rgb - truth).mean() < np.square(renders.rgb - truth).mean()
 
+    @pytest.mark.parametrize("max_width", [None, 32])
     def test_neighbouring_views_agree_on_what_is_invented(
-        self, tube: Tube, renders: RenderedViews, monkeypatch: pytest.MonkeyPatch
+        self, tube: Tube, renders: RenderedViews, monkeypatch: pytest.MonkeyPatch, max_width: int | None
     ) -> None:
-        agreeing = restored(tube, renders, Unnamed()).rgb
+        """Two views of one hole, painted differently, come nearer; also those that are restored small."""
+
+        class Painted(Unnamed):
+            def restore(self, clip: Clip) -> Restoration:
+                found = super().restore(clip)
+                gain = np.linspace(0.7, 1.3, len(clip), dtype=np.float32)[:, None, None, None]
+                return replace(found, rgb=found.rgb * gain)
+
+        config = CONFIG.model_copy(update={"max_width": max_width})
+        training = tube.sequence.training_part()
+
+        def painted() -> np.ndarray:
+            return restored_renders(
+                tube.scene, renders, tube.sequence, training, Painted(), config, finish="smooth"
+            ).rgb
+
+        agreeing = painted()
         monkeypatch.setattr(restored_renders_module, "agreed_views", lambda rgb, *_: rgb)
-        alone = restored(tube, renders, Unnamed()).rgb
-        changed = np.abs(agreeing - alone).max(axis=-1) > 1e-5
-        assert changed.any()
-        assert not changed.all()
+        change = agreeing - painted()
+        # The first view is too dark, the last too bright.
+        assert change[0].mean() > 1e-4
+        assert change[-1].mean() < -1e-4
+        assert (np.abs(change).max(axis=-1) < 1e-6).mean() > 0.05
 
     def test_geometry_stays_that_of_the_scene(self, tube: Tube, renders: RenderedViews) -> None:
         mixed = restored(tube, renders, ClassicalEnhancer())
@@ -136,16 +154,24 @@ def test_a_refiner_changes_only_what_is_invented(
 
 class TestMeanDepth:
     def test_it_lies_between_both_where_the_final_scene_has_a_surface(self) -> None:
-        own, scene, solid = (
-            torch.full((1, 1, 20, 50), 4.0),
-            torch.full((1, 1, 20, 50), 9.0),
-            torch.ones(1, 1, 20, 50),
-        )
-        solid[..., 25:] = 0
+        own, scene, solid = (torch.full((1, 1, 60, 160), value) for value in (4.0, 9.0, 1.0))
+        solid[..., 80:] = 0
         found = restored_renders_module._mean_depth(own, scene, solid)
-        torch.testing.assert_close(found[..., :25], torch.full((1, 1, 20, 25), 6.0))
-        assert (found[..., 25:] <= 6.0 + 1e-5).all()
-        torch.testing.assert_close(found[..., 40:], own[..., 40:])
+        torch.testing.assert_close(found[..., :70], torch.full((1, 1, 60, 70), 6.0))
+        torch.testing.assert_close(found[..., 100:], own[..., 100:])
+        # Without a step that texture and normals would show.
+        assert float(found.log().diff(dim=-1).abs().max()) < 0.15
+
+    def test_roughness_of_rendered_depth_does_not_come_through(self) -> None:
+        noise = 0.2 * torch.randn(1, 1, 60, 160, generator=torch.Generator().manual_seed(0))
+        own, scene = torch.full((1, 1, 60, 160), 4.0), 9 * noise.exp()
+        found = restored_renders_module._mean_depth(own, scene, torch.ones(1, 1, 60, 160))
+        assert float(found.log().std()) < 0.2 * 0.5 * float(scene.log().std())
+
+    def test_far_apart_they_are_not_one_surface(self) -> None:
+        own, scene, solid = (torch.full((1, 1, 60, 160), value) for value in (4.0, 400.0, 1.0))
+        found = restored_renders_module._mean_depth(own, scene, solid)
+        torch.testing.assert_close(found, own * float(np.exp(0.5)))
 
     def test_larger_renders_and_unknown_depth(self) -> None:
         own, scene = torch.full((1, 1, 20, 50), 4.0), torch.full((1, 1, 60, 150), 9.0)
