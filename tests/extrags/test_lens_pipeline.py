@@ -9,12 +9,15 @@ import pytest
 import torch
 
 from extrags.cameras import Cameras, pixel_rays
-from extrags.config import SurfaceConfig
+from extrags.config import EnhanceConfig, SurfaceConfig
 from extrags.depth import estimate
 from extrags.depth.estimate import DepthEstimate
 from extrags.errors import ShapeError
+from extrags.evaluation import render
 from extrags.gaussians import Gaussians
 from extrags.radial_lens import WIDE_FIELD_DEG, RadialLens
+from extrags.restoration import restored_renders as restored_renders_module
+from extrags.restoration.classical import ClassicalEnhancer
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.surface import fuse_depth, rendered_depth
@@ -110,3 +113,36 @@ def test_virtual_views_are_pinholes(facing_a_wall: EndoscopicSequence) -> None:
     cameras = facing_a_wall.training_cameras.as_pinholes()
     assert cameras.K[0, 0, 0] == pytest.approx(facing_a_wall.as_pinhole().K[0, 0, 0])
     np.testing.assert_array_equal(cameras.world_from_camera, facing_a_wall.training_cameras.world_from_camera)
+
+
+def test_restored_renders_are_carried_back_and_depth_is_never_mixed(
+    facing_a_wall: EndoscopicSequence, wall: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A fold of the final scene, 5 and 20 mm away, stays two depths in the flat view."""
+    renders = render(wall, facing_a_wall)
+    folded = np.where(np.arange(40) < 17, 5.0, 20.0).astype(np.float32)
+    folded = np.broadcast_to(folded, renders.depth_mm.shape) * (renders.depth_mm > 0)
+    seen: list[np.ndarray] = []
+
+    def spied(restored_mm: torch.Tensor, final_mm: torch.Tensor, _solid: torch.Tensor) -> torch.Tensor:
+        seen.append(final_mm.numpy())
+        return restored_mm
+
+    monkeypatch.setattr(restored_renders_module, "_mean_depth", spied)
+    restored = restored_renders_module.restored_renders(
+        wall,
+        replace(renders, depth_mm=folded.astype(np.float32)),
+        facing_a_wall,
+        facing_a_wall.training_part(),
+        ClassicalEnhancer(),
+        EnhanceConfig(references=2),
+        finish="smooth",
+    )
+    assert set(np.unique(np.concatenate(seen)).tolist()) == {0.0, 5.0, 20.0}
+    assert restored.rgb.shape == renders.rgb.shape
+    inside = facing_a_wall.mask[facing_a_wall.split.test]
+    assert np.isfinite(restored.rgb).all()
+    # The photographs are colourful, the wall is grey: what restoration brings reaches the lens's own pixels.
+    truth = facing_a_wall.rgb[facing_a_wall.split.test] / 255
+    before, after = (np.abs(rgb - truth)[inside].mean() for rgb in (renders.rgb, restored.rgb))
+    assert after < before
