@@ -248,7 +248,12 @@ def _in_harmony(
 
 
 def border_trust(height: int, width: int) -> Float[Tensor, "h w"]:
-    """1 inside, falling to 0 at the border of the image."""
+    """Trust in a pixel by its place alone: 1 inside, falling to 0 over `FEATHER_PX` at the border.
+
+    Args:
+        height: of the image, in pixels.
+        width: of the image, in pixels.
+    """
     down, along = (
         torch.minimum(torch.arange(size) + 0.5, size - 0.5 - torch.arange(size)) for size in (height, width)
     )

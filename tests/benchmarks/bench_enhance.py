@@ -364,13 +364,14 @@ class FromItself:
         )
         try:
             method = with_suffix(self.name, self.enhancer, own, self.config)
-        except CaptureError:
+        except CaptureError as error:
             # As restored renders do where no frame shows enough tissue between holes.
+            sys.stderr.write(f"{self.name}: clip {clip.index} stays without texture: {error}\n")
             return self.enhancer.restore(clip)
         return method.restore(clip)
 
     def save(self, path: Path) -> None:
-        raise NotImplementedError
+        self.enhancer.save(path)
 
 
 def shown(
