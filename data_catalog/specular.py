@@ -20,11 +20,13 @@ image", PAMI 2005).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from extrags.events import Progress, emit
 from extrags.frame_stacks import stacked
 from extrags.sequence import EndoscopicSequence
 from extrags.thresholds import SATURATED
@@ -58,7 +60,9 @@ def specular_mask(
     inside = np.ones((height, width), dtype=bool) if mask is None else mask
     if not inside.any():
         return np.zeros((height, width), dtype=bool)
-    weakest, strongest = rgb.min(axis=2), rgb.max(axis=2)
+    # Several times as fast as a minimum over the last axis.
+    red, green, blue = cv2.split(rgb)
+    weakest, strongest = cv2.min(cv2.min(red, green), blue), cv2.max(cv2.max(red, green), blue)
     median, around = _surroundings(weakest, inside)
     _, brightest = _surroundings(strongest, inside)
     excess = weakest.astype(np.float32) - around
@@ -80,8 +84,13 @@ def specular_masks(
     rgb: UInt8[np.ndarray, "f h w 3"], mask: Bool[np.ndarray, "f h w"]
 ) -> Bool[np.ndarray, "f h w"]:
     """`specular_mask` of each frame."""
-    found = (specular_mask(image, inside) for image, inside in zip(rgb, mask, strict=True))
-    return stacked(found, len(rgb))
+
+    def found() -> Iterator[Bool[np.ndarray, "h w"]]:
+        for index, (image, inside) in enumerate(zip(rgb, mask, strict=True), start=1):
+            yield specular_mask(image, inside)
+            emit(Progress("ingest", index, len(rgb)))
+
+    return stacked(found(), len(rgb))
 
 
 def with_specular(sequence: EndoscopicSequence) -> EndoscopicSequence:

@@ -500,4 +500,6 @@ class EndoscopicSequence(Storable):
 
 def saturated_mask(rgb: UInt8[np.ndarray, "*f h w 3"]) -> Bool[np.ndarray, "*f h w"]:
     """True where any channel is at or above `SATURATED`: the true radiance is unknown there."""
-    return np.asarray(rgb.max(axis=-1) >= SATURATED)
+    # Several times as fast as a maximum over the last axis.
+    red, green, blue = np.moveaxis(rgb >= SATURATED, -1, 0)
+    return np.asarray(red | green | blue)

@@ -295,7 +295,11 @@ def _first_unreadable(array: zarr.Array[Any]) -> str:
 
 
 def _codecs(dtype: np.dtype[Any]) -> CompressorsLike:
-    # Bit shuffling helps floats (their exponents compress together), but not single bytes.
-    shuffle: Literal["bitshuffle", "noshuffle"] = "bitshuffle" if dtype.itemsize > 1 else "noshuffle"
+    # Shuffling helps floats (their exponents compress together), but not single bytes. Higher levels make
+    # floats no smaller and bytes by a few per cent, and take two to five times as long: a long recording
+    # would be compressed for longer than it is read.
+    size = dtype.itemsize
+    shuffle: Literal["shuffle", "noshuffle"] = "shuffle" if size > 1 else "noshuffle"
+    blosc = BloscCodec(cname="zstd", clevel=1 if size > 1 else 3, shuffle=shuffle, typesize=size)
     # The checksum comes last, over the bytes as they are stored: Blosc decodes many a flipped bit silently.
-    return BloscCodec(cname="zstd", clevel=5, shuffle=shuffle, typesize=dtype.itemsize), Crc32cCodec()
+    return blosc, Crc32cCodec()

@@ -14,8 +14,10 @@ from extrags.redaction import without_credentials
 from extrags.store import Manifest, Ref, Store
 from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
+from flows.estimate import expected_seconds
 from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, NotInStoreError, Runner, StoreRunner
+from flows.workloads import frames_work
 from tasks.progress import StageProgress, notify
 
 __all__ = ["CachedStages"]
@@ -182,4 +184,16 @@ class CachedStages(Pipeline):
     def _report_progress(self, row: StageRow, state: str, done: int = 0, total: int = 0) -> None:
         reason = row.reason if state in ("skipped", "failed") else ""
         made = {} if state == "running" else {str(part): ref for part, ref in self.refs.items()}
-        notify(StageProgress(self.outcome.name, row.stage, state, done, total, reason, row.seconds, made))
+        # What the stages to come will take is known better once frames are read, and once there is a plan.
+        tells = row.stage in ("ingest", "assess") and state in ("ran", "cached") and "ingest" in self.refs
+        expected = self._expected_seconds() if tells else None
+        notify(
+            StageProgress(
+                self.outcome.name, row.stage, state, done, total, reason, row.seconds, made, expected
+            )
+        )
+
+    def _expected_seconds(self) -> Mapping[str, Mapping[str, float]]:
+        config = self.config if self.plan is None else self.plan.applied_to(self.config)
+        found = expected_seconds(config, frames_work(self._manifest("ingest").counts, config))
+        return {str(stage): tasks for stage, tasks in found.items()}

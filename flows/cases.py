@@ -214,7 +214,7 @@ def record_outcome(
     failed = next((row for row in outcome.stages if row.state == "failed"), None)
     work = known_work(case.sequence, config)
     if work is None and "ingest" in outcome.refs:
-        work = frames_work(store.manifest(outcome.refs["ingest"]), config)
+        work = frames_work(store.manifest(outcome.refs["ingest"]).counts, config)
     expected: dict[str, float] = {
         stage: sum(tasks.values()) for stage, tasks in expected_seconds(config, work).items()
     }

@@ -79,6 +79,10 @@ class SequenceEstimate:
         if self.failed:
             # What is skipped now is not done.
             return
+        if progress.expected is not None:
+            self.expected = {
+                stage: dict(progress.expected.get(stage, tasks)) for stage, tasks in self.expected.items()
+            }
         if progress.state != "running":
             self.ended[progress.stage] = progress
             self.stage, self.newest = "", None

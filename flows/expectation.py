@@ -33,11 +33,13 @@ class Expectation:
         case: which.
         seconds: expected.
         measured: whether from an earlier run of its sequence; else from the number and size of its frames.
+        sized: whether these are known; else they are taken to be those of a phantom.
     """
 
     case: SequenceCase
     seconds: float
     measured: bool
+    sized: bool = True
 
 
 def expectations(
@@ -87,7 +89,7 @@ def expectations(
                 seconds += took * (usual / expected if expected else 1.0)
             elif stage in possible and (not times or not _was_skipped(earlier, stage)):
                 seconds += usual * local
-        found.append(Expectation(case, seconds, measured=bool(times)))
+        found.append(Expectation(case, seconds, measured=bool(times), sized=work is not None))
     return found
 
 
@@ -97,7 +99,7 @@ def longest_first(expected: Sequence[Expectation]) -> list[Expectation]:
 
 
 def expected_words(expected: Sequence[Expectation], at_once: int = 1) -> str:
-    """`24 runs, about 3 h; 20 of them as measured before, 4 by their frames`."""
+    """`24 runs, about 3 h; 20 as measured in earlier runs, 4 by their frames`."""
     busy = [0.0] * max(1, at_once)
     for item in longest_first(expected) if at_once > 1 else expected:
         busy[busy.index(min(busy))] += item.seconds
@@ -105,11 +107,14 @@ def expected_words(expected: Sequence[Expectation], at_once: int = 1) -> str:
     words = [f"{len(expected)} {'run' if len(expected) == 1 else 'runs'}, about {duration_text(max(busy))}"]
     if at_once > 1:
         words.append(f"{at_once} at once")
-    guessed = len(expected) - known
-    if guessed and known:
-        words.append(f"{known} as measured in earlier runs, {guessed} by their frames")
-    else:
-        words.append("by the number and size of frames" if guessed else "as measured in earlier runs")
+    unread = sum(not item.measured and not item.sized for item in expected)
+    reasons = {
+        "as measured in earlier runs": known,
+        "by their frames": len(expected) - known - unread,
+        "as a phantom of 48 frames, not being read yet": unread,
+    }
+    given = [f"{count} {reason}" for reason, count in reasons.items() if count]
+    words += [", ".join(given)] if len(given) > 1 else [item.partition(" ")[2] for item in given]
     return "; ".join(words)
 
 

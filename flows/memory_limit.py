@@ -1,4 +1,4 @@
-"""The peak memory of a sequence's run: stated, and held against a limit, before it is reconstructed."""
+"""What a run will need, stated before a sequence is reconstructed; its memory is held against a limit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from typing import Any
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
 from extrags.memory_estimate import FrameSize, MemoryEstimate, estimate_memory, fitting_settings
-from extrags.pipeline import StageName
+from extrags.pipeline import STAGES, StageName
+from flows.estimate import expected_seconds
+from flows.workloads import frames_work
+from tasks.progress import duration_text
 
 __all__ = ["check_memory"]
 
@@ -25,12 +28,15 @@ def check_memory(
     until: StageName,
     leave_out: Collection[str],
 ) -> MemoryEstimate:
-    """State what a run will need, and refuse one that needs more than it may.
+    """State what memory and time a run will need, and refuse one that needs more memory than it may.
+
+    The time is that of all stages that can run, on the machine that `extrags.run_costs` rests on: the plan,
+    which may skip some, is not made yet.
 
     Args:
         name: of the sequence.
         config: settings of all stages.
-        counts: of the artefact of `ingest`: frames, train, width, height.
+        counts: of the artefact of `ingest`: frames, train, test, width, height, has_poses, has_depth.
         limit_gb: in GB (1e9 bytes); None for no limit.
         until: last stage.
         leave_out: stages that the method leaves out.
@@ -42,7 +48,11 @@ def check_memory(
     threads = len(os.sched_getaffinity(0))
     found = estimate_memory(config, size, threads=threads, until=until, leave_out=leave_out)
     what = f"{name}: {size.frames} frames of {size.width} x {size.height} px take {found}"
-    log.info("%s", what)
+    given = {stage for stage in ("poses", "depth") if counts.get(f"has_{stage}")}
+    expected = expected_seconds(config, frames_work(counts, config))
+    ahead = set(STAGES[1 : STAGES.index(until) + 1]) - given - set(leave_out)
+    seconds = sum(sum(expected[stage].values()) for stage in ahead)
+    log.info("%s, and about %s of processor time", what, duration_text(seconds))
     if limit_gb is None or found.peak_gb <= limit_gb:
         return found
     settings = fitting_settings(config, size, limit_gb, threads=threads, until=until, leave_out=leave_out)

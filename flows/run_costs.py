@@ -207,7 +207,7 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
         )
         config = decided.applied_to(config)
         skipped |= {line.stage for line in decided.decisions if not line.run}
-    work = frames_work(store.manifest(outcome.refs["ingest"]), config)
+    work = frames_work(store.manifest(outcome.refs["ingest"]).counts, config)
     return work, {str(stage) for stage in STAGES if stage not in skipped}
 
 

@@ -11,7 +11,6 @@ from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, ExtragsError
 from extrags.pipeline import STAGES
 from extrags.run_costs import STAGE_TASKS, Workload
-from extrags.store import Manifest
 
 __all__ = [
     "at_detail_size",
@@ -43,15 +42,15 @@ def usual_work(config: PipelineConfig) -> Workload:
     return Workload(160 * 128, 48, 24, 24, config, width=160)
 
 
-def frames_work(ingested: Manifest, config: PipelineConfig) -> Workload:
+def frames_work(counts: Mapping[str, Any], config: PipelineConfig) -> Workload:
     """That of a sequence that has been read.
 
     Args:
-        ingested: manifest of its `ingest`.
+        counts: of the artefact of its `ingest`.
         config: settings of all stages.
     """
     width, height, frames, train, test = (
-        float(ingested.counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
+        float(counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
     )
     return Workload(width * height, frames, train, test, config, width=width)
 

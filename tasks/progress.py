@@ -55,6 +55,9 @@ class StageProgress:
     seconds: float = 0.0
     made: Mapping[str, Ref] = field(default_factory=dict)
     """When the stage has ended: what the sequence has, by the names of `flows.outcome.Part`."""
+    expected: Mapping[str, Mapping[str, float]] | None = None
+    """Seconds of the tasks of each stage, where the stage that has ended told more of them: the size of the
+    frames, or the budgets of the plan."""
 
 
 Observer = Callable[[StageProgress], None]

@@ -147,7 +147,7 @@ def stages() -> Stages:
     return Stages()
 
 
-@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 4])
 @pytest.mark.parametrize("stage", STAGES)
 def test_same_bits_on_any_number_of_threads(stages: Stages, stage: str, count: int) -> None:
     with threads(count):

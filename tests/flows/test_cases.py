@@ -158,6 +158,12 @@ class TestExpected:
         )
         assert expected_words(found, 2).startswith("2 runs, about 60 min; 2 at once")
         assert expected_words(found[:1]) == "1 run, about 60 min; as measured in earlier runs"
+        assert expected_words(found[1:]) == "1 run, about 10 min; by their frames"
+
+    def test_a_folder_that_was_not_read_is_taken_for_a_phantom(self, tmp_path: Path) -> None:
+        (found,) = expectations([case(str(tmp_path))], str(tmp_path / "store"), "coarse")
+        assert not found.sized
+        assert expected_words([found]).endswith("; as a phantom of 48 frames, not being read yet")
 
 
 @pytest.mark.usefixtures("prefect_server")

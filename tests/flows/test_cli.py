@@ -493,7 +493,7 @@ class TestThroughPrefect:
         assert "the folder is empty" in first["stages"][0]["reason"]
         assert "folder" in capsys.readouterr().err
         # Quiet or not, a failure is one sentence.
-        assert main(["-q", "run", folder, SEQUENCE, *settled(store)]) == 1
+        assert main(["-q", "run", folder, *settled(store)]) == 1
         said = capsys.readouterr().err.strip().splitlines()
         assert len(said) == 1
         assert "failed in ingest: " in said[0]

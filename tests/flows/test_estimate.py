@@ -62,6 +62,16 @@ class TestEstimate:
         assert estimate.share(60.0) == 1.0
         assert estimate.seconds_left(60.0) == 0.0
 
+    def test_frames_that_are_read_tell_what_is_to_come(self) -> None:
+        estimate = SequenceEstimate(EXPECTED, until="coarse")
+        estimate.receive(step("ingest"), 0.0)
+        larger = {**EXPECTED, "ingest": {"ingest": 24.0}, "coarse": {"coarse": 180.0}}
+        estimate.receive(replace(step("ingest", "ran", seconds=24.0), expected=larger), 24.0)
+        for skipped in ("poses", "depth"):
+            estimate.receive(step(skipped, "skipped"), 24.0)
+        assert estimate.seconds_left(24.0) == pytest.approx(180.0)
+        assert estimate.share(24.0) == pytest.approx(24 / 204)
+
     def test_a_failure_keeps_its_share(self) -> None:
         estimate = SequenceEstimate(EXPECTED, until="coarse")
         estimate.receive(step("ingest"), 0.0)

@@ -3,24 +3,46 @@
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from extrags.config import profile_config
 from extrags.errors import ConfigError
+from extrags.pipeline import StageName
 from flows.memory_limit import check_memory
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
 
-COUNTS = {"frames": 40, "train": 20, "width": 675, "height": 540}
+COUNTS = {"frames": 40, "train": 20, "test": 20, "width": 675, "height": 540, "has_depth": True}
 
 
 def test_the_estimate_is_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, logger="flows.memory_limit"):
         check_memory("a/b", profile_config("balanced"), COUNTS, None, "report", ())
     assert "a/b: 40 frames of 675 x 540 px take at most about" in caplog.text
+    assert re.search(r", and about \d+ min of processor time\n$", caplog.text)
+
+
+def test_stages_that_do_not_run_take_no_time(caplog: pytest.LogCaptureFixture) -> None:
+    config = profile_config("balanced")
+
+    def minutes(counts: Mapping[str, Any], until: StageName, *leave_out: StageName) -> int:
+        caplog.clear()
+        with caplog.at_level(logging.INFO, logger="flows.memory_limit"):
+            check_memory("a/b", config, counts, None, until, leave_out)
+        found = re.search(r"about (\d+) min of processor", caplog.text)
+        assert found is not None
+        return int(found[1])
+
+    whole = minutes(COUNTS, "report")
+    assert whole > minutes(COUNTS, "coarse")
+    assert whole > minutes(COUNTS, "report", "finetune")
+    assert minutes({**COUNTS, "has_depth": False}, "report") > whole
 
 
 def test_a_run_over_the_limit_is_refused_with_settings_that_fit() -> None:

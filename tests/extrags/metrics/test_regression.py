@@ -98,9 +98,10 @@ def test_few_false_alarms_among_many_quantities() -> None:
                 result(entropy=2 * i, groups=20, noise=0.2), result(entropy=2 * i + 1, groups=20, noise=0.2)
             )["regressions"]
         )
-        for i in range(40)
+        for i in range(16)
     )
-    assert alarms <= 6
+    # More come with a chance of 1 %.
+    assert alarms <= 3
 
 
 def test_runs_that_fail_now_are_a_regression() -> None:
