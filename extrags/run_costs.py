@@ -66,7 +66,7 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
     "enhance-train": ("one", "restored", "fold_iterations", "fold_iterations*restored"),
     "enhance": ("one", "views", "views*restored"),
     "finetune-judge": ("judge_iterations", "judge_iterations*pixels", "judge_iterations*gaussians"),
-    "finetune": ("tuning", "tuning*pixels", "tuning*restored", "tuning*gaussians"),
+    "finetune": ("tuning", "tuning*pixels", "tuning*restored", "tuning*final_gaussians"),
     "evaluate-render": ("test", "test*pixels"),
     "evaluate-restore": ("test*pixels", "test*restored"),
     "evaluate-views": ("test*pixels*stacks", "test*pixels*vgg*passes"),
@@ -76,6 +76,12 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
 """Terms of the time of each task; others have a constant alone. Terms that records cannot tell apart (one
 number of iterations only) must not be there: the fit would give one of them the part of the other."""
 MEMORY_TERMS = ("one", "pixels", "frames*pixels", "restored", "gaussians")
+"""Terms of the memory of each task; those of `OF_FINAL_SCENE` depend on the Gaussians of the final scene."""
+OF_FINAL_SCENE = frozenset({"finetune", "evaluate-render", "evaluate-restore", "evaluate-views", "evaluate"})
+GAUSSIANS_WANTED = 70.0
+"""Times the root of all training pixels: where densification ends by itself, without a limit."""
+FINAL_WANTED = 1.75
+"""The same after fine-tuning, as a multiple of the coarse scene's."""
 REWEIGHTED = 20
 """Rounds of reweighting; the fit has settled by then."""
 PRIOR_RECORDS = 2.0
@@ -96,6 +102,8 @@ class Workload:
         views: virtual views to restore; None takes the setting.
         width: of an image, in pixels; None: of one that is narrow enough to be restored as it is.
         stacks: renders of the held-out frames that are measured together.
+        coarse_gaussians: of the coarse scene, where there is one; None: as many as are expected.
+        final_gaussians: of the final scene, likewise.
     """
 
     pixels: float | int
@@ -106,6 +114,8 @@ class Workload:
     views: float | int | None = None
     width: float | int | None = None
     stacks: int = 3
+    coarse_gaussians: float | int | None = None
+    final_gaussians: float | int | None = None
 
     @property
     def size(self) -> dict[str, float]:
@@ -114,9 +124,10 @@ class Workload:
         return found if self.width is None else {**found, "width": float(self.width)}
 
     def numbers(self) -> dict[str, float]:
-        """By name in terms. Gaussians are the limit, which densification reaches in nearly every scene."""
+        """By name in terms."""
         config = self.config
         judge = config.finetune.judge
+        coarse, final = self._gaussians()
         return {
             "one": 1.0,
             "pixels": float(self.pixels),
@@ -126,7 +137,8 @@ class Workload:
             "train": float(self.train),
             "test": float(self.test),
             "iterations": float(config.coarse.iterations),
-            "gaussians": float(config.coarse.densify.max_gaussians),
+            "gaussians": coarse,
+            "final_gaussians": final,
             "trajectories": float(config.explore.trajectories),
             "fold_iterations": float(config.enhance.folds * config.enhance.fold_iterations),
             "views": float(config.enhance.max_views if self.views is None else self.views),
@@ -139,6 +151,14 @@ class Workload:
             # Of a network over a view: the frame once, each render as it is and aligned.
             "passes": 1.0 + 2.0 * self.stacks,
         }
+
+    def _gaussians(self) -> tuple[float, float]:
+        """Of the coarse and of the final scene."""
+        limit = self.config.coarse.densify.max_gaussians
+        wanted = GAUSSIANS_WANTED * math.sqrt(self.train * self.pixels)
+        coarse = float(min(limit, wanted) if self.coarse_gaussians is None else self.coarse_gaussians)
+        tuned = min(self.config.finetune.growth * limit, max(coarse, FINAL_WANTED * wanted))
+        return coarse, float(tuned if self.final_gaussians is None else self.final_gaussians)
 
     def _restored_share(self) -> float:
         if self.width is None:
@@ -269,8 +289,15 @@ def fitted(history: Sequence[tuple[Workload, TaskCost]], probe_s: float) -> Cost
             time[task] = _fit(TIME_TERMS.get(task, ("one",)), timed)
         sized = [(work, cost.peak_mib) for work, cost in records if cost.peak_mib]
         if sized:
-            memory[task] = _fit(MEMORY_TERMS, sized)
+            memory[task] = _fit(memory_terms(task), sized)
     return CostModel(time, memory, probe_s)
+
+
+def memory_terms(task: str) -> tuple[str, ...]:
+    """Terms of the memory of a task."""
+    if task not in OF_FINAL_SCENE:
+        return MEMORY_TERMS
+    return tuple("final_gaussians" if term == "gaussians" else term for term in MEMORY_TERMS)
 
 
 def _fit(terms: Sequence[str], records: Sequence[tuple[Workload, float]]) -> dict[str, float]:

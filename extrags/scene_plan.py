@@ -100,7 +100,15 @@ def _with_savings(plan: ScenePlan, config: PipelineConfig) -> ScenePlan:
     model = packaged_model()
 
     def seconds(stage: str, settings: PipelineConfig) -> float:
-        work = Workload(found["pixels"], frames, frames, 0, settings, width=found["width"])
+        work = Workload(
+            found["pixels"],
+            frames,
+            frames,
+            0,
+            settings,
+            width=found["width"],
+            coarse_gaussians=found.get("gaussians"),
+        )
         return stage_seconds(model, stage, work)
 
     planned = plan.applied_to(config)

@@ -110,6 +110,8 @@ class EndoscopicSequence(Storable):
     """
 
     stored_as: ClassVar[str] = "sequence"
+    kept_when_loaded: ClassVar[bool] = True
+    """A dozen stages read the same frames, and decoding those of a long recording takes a minute."""
 
     name: str
     rgb: UInt8[np.ndarray, "f h w 3"]
@@ -209,7 +211,7 @@ class EndoscopicSequence(Storable):
         """
         if self.withheld_depth_mm is None:
             return self.depth_mm if self.depth_error is None else None
-        return self.withheld_depth_mm if bool((self.withheld_depth_mm > 0).any()) else None
+        return self.withheld_depth_mm if any(bool((d > 0).any()) for d in self.withheld_depth_mm) else None
 
     @property
     def scale_words(self) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, cast
@@ -15,6 +16,7 @@ from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.events import Progress, emit
+from extrags.frame_quantiles import quantile_of_frames
 from extrags.frame_stacks import FrameStack
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
@@ -151,18 +153,20 @@ def fuse_depth(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"], config: S
         raise ShapeError(
             f"depth has shape {depth_mm.shape}, expected {(len(cameras), cameras.height, cameras.width)}"
         )
-    valid = depth_mm[depth_mm > 0]
-    if valid.size == 0:
+
+    def valid() -> Iterator[Float[np.ndarray, "n"]]:
+        return (view[view > 0] for view in depth_mm)
+
+    typical_far_mm = quantile_of_frames(valid, 0.95)
+    far_mm = quantile_of_frames(valid, config.depth_quantile)
+    if typical_far_mm is None or far_mm is None:
         raise CaptureError(
             f"none of the {len(cameras)} views sees a surface; the reconstruction is empty there"
         )
-    # `valid` is a copy, which may be reordered: another one would be as large as all depth.
-    voxel_mm = float(np.quantile(valid, 0.95, overwrite_input=True)) * config.voxel_share
-    far_mm = float(np.quantile(valid, config.depth_quantile, overwrite_input=True))
-    if not (valid < far_mm).any():
+    voxel_mm = typical_far_mm * config.voxel_share
+    if not any(bool((depths < far_mm).any()) for depths in valid()):
         # A wall that faces the camera has one depth, which is to be fused and not cut off.
         far_mm = float(np.nextafter(np.float32(far_mm), np.float32(np.inf)))
-    del valid
 
     import open3d as o3d
     import open3d.core as o3c

@@ -5,13 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
 from extrags.config import PipelineConfig
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
 from extrags.pipeline import STAGES, Pipeline, StageName
 from extrags.redaction import without_credentials
-from extrags.store import Manifest, Ref, Store
+from extrags.store import Manifest, Ref, Store, forget_loaded
 from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
 from flows.estimate import expected_seconds
@@ -87,6 +88,8 @@ class CachedStages(Pipeline):
             for stage in STAGES[: STAGES.index(until) + 1]:
                 if stage not in done:
                     self.skip(stage, f"{failed} failed")
+        finally:
+            forget_loaded()
         self.outcome.seconds = time.monotonic() - begun
         return self.outcome
 
@@ -195,5 +198,9 @@ class CachedStages(Pipeline):
 
     def _expected_seconds(self) -> Mapping[str, Mapping[str, float]]:
         config = self.config if self.plan is None else self.plan.applied_to(self.config)
-        found = expected_seconds(config, frames_work(self._manifest("ingest").counts, config))
+        work = frames_work(self._manifest("ingest").counts, config)
+        if "coarse" in self.refs:
+            counted = self._manifest("coarse").counts.get("n_gaussians")
+            work = replace(work, coarse_gaussians=None if counted is None else int(counted))
+        found = expected_seconds(config, work)
         return {str(stage): tasks for stage, tasks in found.items()}

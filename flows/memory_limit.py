@@ -46,11 +46,13 @@ def check_memory(
     """
     size = FrameSize(int(counts["frames"]), int(counts["train"]), int(counts["width"]), int(counts["height"]))
     threads = len(os.sched_getaffinity(0))
+    given = {stage for stage in ("poses", "depth") if counts.get(f"has_{stage}")}
+    given -= {"poses"} if config.poses.replace_given else set()
+    leave_out = {*leave_out, *given}
     found = estimate_memory(config, size, threads=threads, until=until, leave_out=leave_out)
     what = f"{name}: {size.frames} frames of {size.width} x {size.height} px take {found}"
-    given = {stage for stage in ("poses", "depth") if counts.get(f"has_{stage}")}
     expected = expected_seconds(config, frames_work(counts, config))
-    ahead = set(STAGES[1 : STAGES.index(until) + 1]) - given - set(leave_out)
+    ahead = set(STAGES[1 : STAGES.index(until) + 1]) - leave_out
     seconds = sum(sum(expected[stage].values()) for stage in ahead)
     log.info("%s, and about %s of processor time", what, duration_text(seconds))
     if limit_gb is None or found.peak_gb <= limit_gb:

@@ -208,6 +208,9 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
         config = decided.applied_to(config)
         skipped |= {line.stage for line in decided.decisions if not line.run}
     work = frames_work(store.manifest(outcome.refs["ingest"]).counts, config)
+    if "coarse" in outcome.refs:
+        counted = store.manifest(outcome.refs["coarse"]).counts.get("n_gaussians")
+        work = replace(work, coarse_gaussians=None if counted is None else int(counted))
     return work, {str(stage) for stage in STAGES if stage not in skipped}
 
 
@@ -294,6 +297,8 @@ def _workload(
     width, height, frames, train, test = (float(value or 0) for value in size)
     views = manifest.counts.get("views") if manifest.stage == "enhance" else None
     stacks = manifest.counts.get("stacks")
+    scenes = {item.stage: item.counts.get("n_gaussians") for item in reversed(line)}
+    coarse, final = scenes.get("coarse"), scenes.get("finetune")
     return Workload(
         width * height,
         frames,
@@ -303,6 +308,8 @@ def _workload(
         float(views) if views else None,
         width,
         int(stacks) if stacks else 1,
+        float(coarse) if coarse else None,
+        float(final) if final else None,
     )
 
 

@@ -65,7 +65,7 @@ def at_detail_size(work: Workload, counts: Mapping[str, Any]) -> Workload | None
     width, height = float(counts["detail_width"]), float(counts["detail_height"])
     if work.width is None or width >= work.width:
         return None
-    return replace(work, pixels=width * height, width=width)
+    return replace(work, pixels=width * height, width=width, coarse_gaussians=None)
 
 
 def detail_flags(config: PipelineConfig, counts: Mapping[str, Any]) -> str:

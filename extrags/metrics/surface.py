@@ -16,6 +16,7 @@ F-score); Seitz et al.: A Comparison and Evaluation of Multi-View Stereo Reconst
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -25,7 +26,8 @@ from jaxtyping import Bool, Float, Int
 from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ConfigError
-from extrags.frame_stacks import stacked
+from extrags.frame_quantiles import median_of_frames, quantile_of_frames
+from extrags.frame_stacks import frames_of, stacked
 from extrags.radial_lens import WIDE_FIELD_DEG
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -330,11 +332,9 @@ def seen_by(
 
 def _fused(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"]) -> Mesh:
     """Fusion with the protocol's settings."""
-    known = depth_mm[depth_mm > 0]
-    if known.size:
+    far = quantile_of_frames(lambda: (view[view > 0] for view in depth_mm), PROTOCOL_FUSION.depth_quantile)
+    if far is not None:
         # Cut here and not in the fusion, which cannot do with a view that has nothing near.
-        far = np.quantile(known, PROTOCOL_FUSION.depth_quantile, overwrite_input=True)
-        del known
         depth_mm = stacked((np.where(view > far, np.float32(0), view) for view in depth_mm), len(depth_mm))
     return fuse_depth(cameras, depth_mm, PROTOCOL_FUSION.model_copy(update={"depth_quantile": 1.0}))
 
@@ -346,7 +346,7 @@ def _parts(
     far = _max_fused_depth(sequence)
 
     def by(frames: np.ndarray) -> Bool[np.ndarray, "n"]:
-        return seen_by(points, truth.mesh, sequence.cameras[frames], sequence.mask[frames], far)
+        return seen_by(points, truth.mesh, sequence.cameras[frames], frames_of(sequence.mask, frames), far)
 
     observed = by(sequence.train)
     return observed, by(sequence.test) & ~observed
@@ -357,17 +357,30 @@ def _max_fused_depth(sequence: EndoscopicSequence) -> float:
     frames = _all_frames(sequence)
     if sequence.true_depth_mm is None:
         return float("inf")
-    depth = sequence.true_depth_mm[frames]
-    known = depth[(depth > 0) & np.isfinite(depth) & sequence.mask[frames]]
-    return float(np.quantile(known, PROTOCOL_FUSION.depth_quantile)) if known.size else float("inf")
+    found = quantile_of_frames(_true_depths(sequence, frames), PROTOCOL_FUSION.depth_quantile)
+    return float("inf") if found is None else found
 
 
 def _threshold(sequence: EndoscopicSequence) -> float:
     if sequence.metric or sequence.true_depth_mm is None:
         return THRESHOLD_MM
-    depth = sequence.true_depth_mm[sequence.train]
-    known = depth[(depth > 0) & np.isfinite(depth) & sequence.mask[sequence.train]]
-    return THRESHOLD_SHARE * float(np.median(known)) if known.size else THRESHOLD_MM
+    found = median_of_frames(_true_depths(sequence, sequence.train))
+    return THRESHOLD_MM if found is None else THRESHOLD_SHARE * found
+
+
+def _true_depths(
+    sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]
+) -> Callable[[], Iterator[Float[np.ndarray, "n"]]]:
+    """Known depths of one frame after the other, in a sequence that has true depth."""
+
+    def found() -> Iterator[Float[np.ndarray, "n"]]:
+        for frame in frames:
+            depth = true[frame]
+            yield depth[(depth > 0) & np.isfinite(depth) & sequence.mask[frame]]
+
+    assert sequence.true_depth_mm is not None
+    true = sequence.true_depth_mm
+    return found
 
 
 def _errors(to_truth: np.ndarray, to_mesh: np.ndarray, threshold: float) -> SurfaceErrors:

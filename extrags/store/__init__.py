@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from extrags.store.artefacts import Slot, Store
+from extrags.store.artefacts import Slot, Store, forget_loaded
 from extrags.store.canonical import Ref, canonical, digest_of
 from extrags.store.integrity import content_digest
 from extrags.store.manifest import MANIFEST, Manifest
@@ -19,6 +19,7 @@ __all__ = [
     "canonical",
     "content_digest",
     "digest_of",
+    "forget_loaded",
     "in_work",
     "read_records",
     "write_record",

@@ -23,7 +23,7 @@ from extrags.store.refusal import refused_write
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
 
-__all__ = ["Slot", "Store"]
+__all__ = ["Slot", "Store", "forget_loaded"]
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +32,29 @@ S = TypeVar("S", bound=Storable)
 
 _opened: set[tuple[str, str, int, Depth]] = set()
 """Artefacts whose contents this process has compared: path, digest, inode (another one after a repair)."""
+
+MOST_KEPT = 2
+"""A run reads its frames and, without the held-out ones, its training frames; some stages both."""
+
+_kept: dict[tuple[type[Storable], str], Storable] = {}
+"""The last loaded objects that are kept, by class and digest; the one that was asked for last is the last."""
+
+
+def forget_loaded() -> None:
+    """Keep no loaded object any longer: its memory, or the room of its mapped files, is free."""
+    _make_room(0)
+
+
+def _keep(found: S, ref: Ref) -> S:
+    _make_room(MOST_KEPT - 1)
+    _kept[type(found), ref.digest] = found
+    return found
+
+
+def _make_room(most: int) -> None:
+    """Let the oldest go; other threads may do so at the same time."""
+    for key in list(_kept)[: max(0, len(_kept) - most)]:
+        _kept.pop(key, None)
 
 
 class Slot:
@@ -250,7 +273,7 @@ class Store:
         return damage
 
     def load(self, kind: type[S], ref: Ref) -> S:
-        """An object from an artefact.
+        """An object from an artefact; of `Storable.kept_when_loaded` the one that this process read last.
 
         Args:
             kind: its class, e.g. `extrags.scene.Scene`.
@@ -260,9 +283,15 @@ class Store:
             StoreError: as `open`.
         """
         path = self.open(ref)
+        kept = _kept.pop((kind, ref.digest), None)
+        if isinstance(kept, kind):
+            return _keep(kept, ref)
+        if kind.kept_when_loaded:
+            # Before, not after: long recordings take much room.
+            _make_room(MOST_KEPT - 1)
         with self._blaming([ref]):
             found: S = kind.load(path / kind.stored_as)
-        return found
+        return _keep(found, ref) if kind.kept_when_loaded else found
 
     def load_json(self, file: str, ref: Ref) -> Any:
         """What `Slot.save_json` wrote.

@@ -15,6 +15,9 @@ class Storable(ABC):
     stored_as: ClassVar[str]
     """Name of its file or directory in the artefact; `.` if it is the whole artefact."""
 
+    kept_when_loaded: ClassVar[bool] = False
+    """Whether a process keeps the last ones it has loaded for who asks again; nobody may write into them."""
+
     @abstractmethod
     def save(self, path: Path) -> None:
         """Write to a folder or file."""

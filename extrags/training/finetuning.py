@@ -11,6 +11,8 @@ from scipy.spatial import cKDTree
 
 from extrags.cameras import rays_of_pixels
 from extrags.config import CoarseConfig, FinetuneConfig
+from extrags.frame_quantiles import quantile_of_frames
+from extrags.frame_stacks import stacked
 from extrags.gaussians import Gaussians
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
@@ -280,7 +282,9 @@ def hole_gaussians(
         lit = torch.from_numpy(rgb), torch.from_numpy(local), torch.from_numpy(normals)
         rgb = scene.light.albedo(*lit, min_gain=MIN_GAIN).detach().numpy()
     placed = _near_known_surface(points, scene, max_distance)
-    seen = [_real_depth(scene, sequence, int(frame)) for frame in sequence.train]
+    seen = stacked(
+        (_real_depth(scene, sequence, int(frame)) for frame in sequence.train), len(sequence.train)
+    )
     placed &= ~_in_front_of_real_surface(points, sequence, seen)
     every_camera = np.concatenate([sequence.cameras[sequence.train].centers, cameras.centers])
     placed &= _clear_of_cameras(points, every_camera, seen)
@@ -329,7 +333,7 @@ def _one_per_cell(
 
 
 def _in_front_of_real_surface(
-    points: Float[np.ndarray, "n 3"], sequence: EndoscopicSequence, seen: list[Float[np.ndarray, "h w"]]
+    points: Float[np.ndarray, "n 3"], sequence: EndoscopicSequence, seen: Float[np.ndarray, "m h w"]
 ) -> Bool[np.ndarray, "n"]:
     """Points that stand between a training camera and the surface it saw."""
     hides = np.zeros(len(points), dtype=bool)
@@ -346,14 +350,14 @@ def _in_front_of_real_surface(
 def _clear_of_cameras(
     points: Float[np.ndarray, "n 3"],
     centers: Float[np.ndarray, "c 3"],
-    seen: list[Float[np.ndarray, "h w"]],
+    seen: Float[np.ndarray, "m h w"],
 ) -> Bool[np.ndarray, "n"]:
     """Points that are not implausibly near to a camera, by the nearest surface that training frames show."""
-    known = np.concatenate([depth[depth > 0] for depth in seen])
-    if len(known) == 0:
+    nearest = quantile_of_frames(lambda: (depth[depth > 0] for depth in seen), NEAREST_QUANTILE)
+    if nearest is None:
         return np.ones(len(points), dtype=bool)
     distance, _ = cKDTree(centers).query(points)
-    return np.asarray(distance >= CLEAR_OF_CAMERAS * np.quantile(known, NEAREST_QUANTILE))
+    return np.asarray(distance >= CLEAR_OF_CAMERAS * nearest)
 
 
 def _in_front_of_virtual_surface(

@@ -93,7 +93,7 @@ class FrameWeights:
             view = views[position]
             found[position] = replace(
                 view,
-                weight=view.weight * float(self.weights[position]),
+                weight_factor=float(self.weights[position]),
                 # Divided by what the sum of the weights was: a weighted mean would undo a frame's weight.
                 normalisation=max(float(view.weight.sum()), 1.0),
             )
@@ -122,7 +122,8 @@ def frame_weights(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) ->
     Returns:
         The weights, or None where none of the frames has depth to compare it through.
     """
-    if sequence.depth_mm is None or not (sequence.depth_mm[frames] > 0).any():
+    depth_mm = sequence.depth_mm
+    if depth_mm is None or not any(bool((depth_mm[frame] > 0).any()) for frame in frames):
         logger.info("%s: without depth no blurred or moved frames are looked for", sequence.name)
         return None
     # On image planes: homographies and flow know no lens.

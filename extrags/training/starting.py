@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 
 import numpy as np
 import torch
@@ -12,6 +13,8 @@ from scipy.spatial import cKDTree
 
 from extrags.cameras import rays_of_pixels
 from extrags.errors import CaptureError
+from extrags.frame_quantiles import median_of_frames
+from extrags.frame_stacks import empty_stack, frames_of, stacked
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.sequence import EndoscopicSequence
@@ -52,10 +55,11 @@ def median_depth(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> 
     Raises:
         CaptureError: when neither depth nor points are known, and all cameras stand in one place.
     """
-    depth = _known_depth(sequence, frames)
-    if depth is not None:
-        known = depth[(depth > 0) & _of_frames(sequence.mask, frames)]
-        return float(np.median(known, overwrite_input=True))
+    depth_mm = sequence.depth_mm
+    if depth_mm is not None:
+        known = median_of_frames(lambda: (depth_mm[k][_has_depth(sequence, k)] for k in frames.tolist()))
+        if known is not None:
+            return known
     if sequence.points is not None and len(sequence.points) >= MIN_POINTS_PER_VIEW:
         found = []
         chosen = np.linspace(0, len(frames) - 1, min(len(frames), MEASURED_FRAMES)).round().astype(np.int64)
@@ -75,7 +79,7 @@ def starts_at_random(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"])
 
     Points that no frame sees at all are no sparse start but another world: they are refused as before.
     """
-    if _known_depth(sequence, frames) is not None:
+    if _depth_known(sequence, frames):
         return False
     if sequence.points is None or len(sequence.points) < MIN_POINTS_PER_VIEW:
         return True
@@ -131,18 +135,15 @@ def starting_gaussians(
         )
         depth = random_depth(cameras, within, seed=seed)
     else:
-        known = _known_depth(sequence, frames)
-        depth = (
-            depth_from_points(sequence, frames)[frames]
-            if known is None
-            else np.where(_edges_of_estimate(sequence, frames), 0, known)
-            if sequence.depth_error is not None
-            else known
-        )
-    valid = (depth > 0) & _of_frames(sequence.mask, frames)
-    if where is not None:
-        valid &= where
-    count = int(valid.sum())
+        depth = _starting_depth(sequence, frames)
+
+    def startable() -> Iterator[Bool[np.ndarray, "h w"]]:
+        for position, frame in enumerate(frames):
+            inside = (depth[position] > 0) & sequence.mask[frame]
+            yield inside if where is None else inside & where[position]
+
+    valid = stacked(startable(), len(frames))
+    count = sum(int(np.count_nonzero(frame)) for frame in valid)
     if count == 0:
         raise CaptureError(f"{sequence.name}: no valid depth in any training frame")
     # A point per pixel of all frames would be millions; a tenfold surplus is enough for thinning.
@@ -238,7 +239,7 @@ def depth_from_points(
             f"{sequence.name}: no depth and {0 if points is None else len(points)} sparse points; "
             f"at least {MIN_POINTS_PER_VIEW} are needed to start the reconstruction"
         )
-    depth = np.zeros(sequence.rgb.shape[:3], np.float32)
+    depth = empty_stack(sequence.rgb.shape[:3], np.float32)
     everywhere = np.stack(
         np.meshgrid(np.arange(sequence.width) + 0.5, np.arange(sequence.height) + 0.5), axis=-1
     )
@@ -277,30 +278,39 @@ def _positions(valid: Bool[np.ndarray, "m h w"], ranks: Int[np.ndarray, "n"] | N
 def _of_frames(stack: np.ndarray, frames: Int[np.ndarray, "m"]) -> np.ndarray:
     """Images of some frames; the stack itself, not a copy, where these are all of them in order."""
     whole = len(frames) == len(stack) and np.array_equal(frames, np.arange(len(stack)))
-    return stack if whole else stack[frames]
+    return stack if whole else frames_of(stack, frames)
 
 
-def _known_depth(
-    sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]
-) -> Float[np.ndarray, "m h w"] | None:
-    """Depth of the frames; None where no valid pixel of them has any."""
-    if sequence.depth_mm is None:
-        return None
-    known = any(bool(((sequence.depth_mm[k] > 0) & sequence.mask[k]).any()) for k in frames)
-    return _of_frames(sequence.depth_mm, frames) if known else None
+def _has_depth(sequence: EndoscopicSequence, frame: int) -> Bool[np.ndarray, "h w"]:
+    """Valid pixels of a frame whose depth is known, in a sequence that has depth."""
+    assert sequence.depth_mm is not None
+    return np.asarray((sequence.depth_mm[frame] > 0) & sequence.mask[frame])
 
 
-def _edges_of_estimate(
-    sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]
-) -> Bool[np.ndarray, "m h w"]:
-    """Unsure pixels of estimated depth beside sure ones; none where depth was measured."""
-    edges = np.zeros((len(frames), sequence.height, sequence.width), dtype=bool)
-    reliable = sequence.reliable_depth_mm(frames)
-    if sequence.depth_error is None or reliable is None:
-        return edges
-    for position, sure in enumerate(reliable > 0):
-        edges[position] = binary_dilation(sure, iterations=BESIDE_RELIABLE_PX) & ~sure
-    return edges
+def _depth_known(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> bool:
+    """Whether any valid pixel of the frames has depth."""
+    return sequence.depth_mm is not None and any(
+        bool(_has_depth(sequence, frame).any()) for frame in frames.tolist()
+    )
+
+
+def _starting_depth(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m h w"]:
+    """Depth of the frames that may start Gaussians: known, else interpolated between sparse points."""
+    if sequence.depth_mm is None or not _depth_known(sequence, frames):
+        return _of_frames(depth_from_points(sequence, frames), frames)
+    if sequence.depth_error is None:
+        return _of_frames(sequence.depth_mm, frames)
+    depth_mm = sequence.depth_mm
+    without_edges = (np.where(_edges_of_estimate(sequence, k), 0, depth_mm[k]) for k in frames.tolist())
+    return stacked(without_edges, len(frames))
+
+
+def _edges_of_estimate(sequence: EndoscopicSequence, frame: int) -> Bool[np.ndarray, "h w"]:
+    """Unsure pixels of an estimated depth beside sure ones."""
+    reliable = sequence.reliable_depth_mm(frame)
+    assert reliable is not None
+    sure = reliable > 0
+    return np.asarray(binary_dilation(sure, iterations=BESIDE_RELIABLE_PX) & ~sure)
 
 
 def _seen(

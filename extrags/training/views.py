@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from extrags.cameras import Cameras
+from extrags.frame_stacks import FrameStack
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["View", "depth_confidence", "epochs", "in_steps", "real_views"]
@@ -39,6 +40,7 @@ class View:
             `weight`, which makes them weighted means.
         depth_confidence: weight of the depth term per pixel, in [0, 1], [H, W]; None is one.
         least_weight: what smaller weights of pixels are raised to where they are stored in steps.
+        weight_factor: of all weights of pixels.
     """
 
     camera: Cameras
@@ -51,6 +53,7 @@ class View:
     normalisation: float | None = None
     depth_confidence: Float[Tensor, "h w"] | None = None
     least_weight: float = 0.0
+    weight_factor: float = 1.0
 
     @property
     def colours(self) -> Float[Tensor, "h w 3"]:
@@ -60,11 +63,12 @@ class View:
     @property
     def weights(self) -> Float[Tensor, "h w"]:
         """Weight of the colour terms; decoded anew whenever it is asked for."""
-        if self.weight.dtype == torch.bool:
-            return self.weight.view(torch.uint8).to(torch.float32)  # Faster than from truth values.
-        if self.weight.dtype == torch.uint8:
-            return _from_steps(self.weight).clamp_(min=self.least_weight)
-        return self.weight
+        weights = self.weight
+        if weights.dtype == torch.bool:
+            weights = weights.view(torch.uint8).to(torch.float32)  # Faster than from truth values.
+        elif weights.dtype == torch.uint8:
+            weights = _from_steps(weights).clamp_(min=self.least_weight)
+        return weights if self.weight_factor == 1 else weights * self.weight_factor
 
     def to(self, device: torch.device | str) -> View:
         """The same view with its images on a device; this very one where they are there already."""
@@ -127,38 +131,37 @@ def depth_confidence(expected_error: Float[np.ndarray, "*f h w"]) -> Float[np.nd
 def real_views(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> list[View]:
     """The training frames as views; saturated pixels and specular highlights carry no weight.
 
-    Colours, and depth that is zero outside the mask already, share the memory of the sequence.
+    Colours, and depth that is zero outside the mask already, share the memory of the sequence; what is made
+    of many large frames lies in mapped files, as they do (`extrags.frame_stacks`).
     """
     cameras = sequence.cameras
+    count = len(frames)
+    weights, depths, confidences = FrameStack(count), FrameStack(count), FrameStack(count)
     views = []
     for position, frame in enumerate(frames):
         index = int(frame)
-        mask = sequence.mask[index]
         # A saturated channel says nothing about albedo.
         weight = sequence.supervised_mask(index) & ~saturated_mask(sequence.rgb[index])
-        depth = None
+        depth = confidence = None
         if sequence.depth_mm is not None:
-            depth = _shared(_inside(sequence.depth_mm[index], mask))
+            depth = sequence.depth_mm[index]
+            mask = sequence.mask[index]
+            if depth.dtype != np.float32 or depth[~mask].any():
+                depth = depths.append(np.where(mask, depth, 0).astype(np.float32))
+            depth = _shared(depth)
+        if sequence.depth_error is not None:
+            confidence = _shared(confidences.append(depth_confidence(sequence.depth_error[index])))
         views.append(
             View(
                 camera=cameras[index],
                 rgb=_shared(sequence.rgb[index]),
-                weight=torch.from_numpy(weight),
+                weight=_shared(weights.append(weight)),
                 depth_mm=depth,
                 frame=position,
-                depth_confidence=None
-                if sequence.depth_error is None
-                else torch.from_numpy(depth_confidence(sequence.depth_error[index])),
+                depth_confidence=confidence,
             )
         )
     return views
-
-
-def _inside(depth_mm: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Depth inside a mask, zero elsewhere, in float32; not copied where it is that already."""
-    if depth_mm.dtype == np.float32 and not depth_mm[~mask].any():
-        return depth_mm
-    return np.where(mask, depth_mm, 0).astype(np.float32)
 
 
 def epochs(count: int, generator: np.random.Generator) -> Iterator[int]:

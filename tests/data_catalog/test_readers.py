@@ -227,6 +227,12 @@ class TestResampling:
         small = Resampling.planned(32, 32, IngestConfig(downscale=2)).depth(depth)
         assert set(np.unique(small)) <= {0.0, 10.0, 30.0}
 
+    def test_depth_of_frames_that_are_not_shrunk_stays_as_it_is(self) -> None:
+        depth = np.random.default_rng(0).uniform(0, 30, (40, 48)).astype(np.float32)
+        depth[depth < 3] = 0
+        plan = Resampling.planned(48, 40, IngestConfig(size="source"), box=(3, 5, 32, 30))
+        np.testing.assert_array_equal(plan.depth(depth), depth[5:35, 3:35])
+
     def test_crop_moves_the_principal_point(self) -> None:
         plan = Resampling.planned(100, 90, IngestConfig(downscale=2), box=(10, 6, 61, 70))
         assert (plan.width, plan.height, plan.crop_width) == (30, 35, 60)

@@ -64,7 +64,8 @@ class TestAssess:
         sequence = make_ball().sequence
         frames, pixels = len(sequence.train), sequence.width * sequence.height
         assert (plan.measurements["pixels"], plan.measurements["width"]) == (pixels, sequence.width)
-        work = Workload(pixels, frames, frames, 0, settings, width=sequence.width)
+        gaussians = plan.measurements["gaussians"]
+        work = Workload(pixels, frames, frames, 0, settings, width=sequence.width, coarse_gaussians=gaussians)
         model = packaged_model()
         for line in plan.decisions:
             tasks = ("finetune-judge",) if line.stage == "finetune" else STAGE_TASKS[line.stage]

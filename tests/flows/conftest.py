@@ -17,10 +17,11 @@ from prefect.settings import (
 )
 from prefect.testing.utilities import prefect_test_harness
 
+from extrags.sequence import EndoscopicSequence
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
-from tests.flows.tiny import SEQUENCE, spared, tiny_config
+from tests.flows.tiny import SEQUENCE, FramesRead, images_of, spared, tiny_config
 
 HERE = Path(__file__).parent
 # As `flows.environment` has it, the server calls nobody; and it keeps no events, which no test asks for.
@@ -63,10 +64,28 @@ def little_work() -> Iterator[None]:
 
 
 @pytest.fixture(scope="package")
-def finished(little_work: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, SequenceOutcome]:
+def frames_read() -> FramesRead:
+    """Filled while `finished` is made."""
+    return FramesRead()
+
+
+@pytest.fixture(scope="package")
+def finished(
+    little_work: None, frames_read: FramesRead, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[str, SequenceOutcome]:
     """A store in which the tiny sequence has gone through all stages."""
     store = str(tmp_path_factory.mktemp("finished") / "store")
-    outcome = run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), profile="quick")
+    read = EndoscopicSequence.load
+
+    def noted(path: Path) -> EndoscopicSequence:
+        found = read(path)
+        frames_read.frames.append(found)
+        frames_read.as_read.append({name: value.copy() for name, value in images_of(found).items()})
+        return found
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(EndoscopicSequence, "load", noted)
+        outcome = run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), profile="quick")
     if outcome.error is not None:
         raise outcome.error
     return store, outcome

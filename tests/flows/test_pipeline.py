@@ -25,7 +25,7 @@ from flows.methods import METHODS
 from flows.outcome import SequenceOutcome
 from flows.runners import DirectRunner, NotInStoreError, StoreRunner
 from flows.wiring import run_sequence
-from tests.flows.tiny import GIVEN, SEQUENCE, tiny_config
+from tests.flows.tiny import GIVEN, SEQUENCE, FramesRead, tiny_config
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +61,16 @@ class TestAgreement:
         assert in_memory.pseudo_views is not None
         for name in ("rendered", "restored", "target", "depth_mm", "uncertainty", "pixel_confidence"):
             np.testing.assert_array_equal(getattr(views, name), getattr(in_memory.pseudo_views, name))
+
+    def test_frames_are_decoded_once_and_written_into_by_no_stage(
+        self, finished: tuple[str, SequenceOutcome], frames_read: FramesRead
+    ) -> None:
+        """A dozen stages read the training frames, and those that evaluate all frames."""
+        assert [len(frames) for frames in frames_read.frames] == [24, 10]
+        for frames, as_read in zip(frames_read.frames, frames_read.as_read, strict=True):
+            assert {"rgb", "mask", "depth_mm", "K", "world_from_camera"} <= as_read.keys()
+            for name, image in as_read.items():
+                np.testing.assert_array_equal(getattr(frames, name), image, err_msg=name)
 
     def test_plan_and_metrics(self, finished: tuple[str, SequenceOutcome], in_memory: extrags.Result) -> None:
         _, outcome = finished

@@ -7,8 +7,11 @@ import functools
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any
 from unittest.mock import patch
+
+import numpy as np
 
 import data_catalog.phantom.recording
 import extrags.metrics.surface
@@ -71,6 +74,19 @@ TINY: dict[str, Any] = {
     "report.held_out_views": 1,
     "report.virtual_views": 1,
 }
+
+
+@dataclass
+class FramesRead:
+    """Frames that stages were given, and their images as they were read."""
+
+    frames: list[EndoscopicSequence] = field(default_factory=list)
+    as_read: list[dict[str, np.ndarray]] = field(default_factory=list)
+
+
+def images_of(frames: EndoscopicSequence) -> dict[str, np.ndarray]:
+    """All arrays of a sequence, by name."""
+    return {name: value for name, value in vars(frames).items() if isinstance(value, np.ndarray)}
 
 
 def tiny_config(**overrides: Any) -> PipelineConfig:

@@ -135,7 +135,7 @@ class TestViews:
         plain = real_views(sequence, sequence.train)[3]
         views, found = weighted_views(sequence, sequence.train, WEIGHT)
         assert found is not None
-        torch.testing.assert_close(views[3].weight, plain.weights * float(found.weights[3]))
+        torch.testing.assert_close(views[3].weights, plain.weights * float(found.weights[3]))
         assert views[3].normalisation == pytest.approx(float(plain.weight.sum()))
         assert views[3].depth_confidence is None
 
