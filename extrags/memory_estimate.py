@@ -13,7 +13,9 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 from extrags.config import PipelineConfig
+from extrags.frame_stacks import MAPPED_BYTES
 from extrags.pipeline import STAGES, StageName
+from extrags.training.frame_comparison import MAX_WIDTH_PX
 
 __all__ = ["FrameSize", "MemoryEstimate", "estimate_memory", "fitting_settings"]
 
@@ -22,11 +24,16 @@ GB = 1e9
 PROCESS = 700_000_000
 """Interpreter, libraries and the flow, before anything is read."""
 SEQUENCE = 16
-"""Bytes per pixel of a frame: colours, masks and depth, and the copy that holds the training frames."""
+"""Bytes per pixel of a frame where stacks are not mapped: colours, masks and depth, and a copy of some."""
+SEQUENCE_STACKS = (3, 1, 1, 4, 4)
+"""Bytes per pixel of the stacks of a sequence: colours, two masks, two of depth."""
 DECODED = 60
 """Bytes per source pixel of the frame that is being read, with its resampling grid."""
-TRAINING_VIEW = 16
-"""Bytes per pixel of a training frame while Gaussians are optimised: weights, depth and its median."""
+TRAINING_STACKS = (1, 4, 4, 4)
+"""Bytes per pixel of the stacks of training views: weights, depth inside the mask, its confidence, and the
+depth that new Gaussians must not hide."""
+COMPARED = 36
+"""Bytes per pixel of a training frame, at the width at which blurred and moved frames are looked for."""
 DEPTH_FRAME = 60
 """Bytes per pixel of a training frame while its depth is estimated."""
 STEP = 140
@@ -35,7 +42,7 @@ GAUSSIAN = 2400
 """Bytes of a Gaussian with all harmonics while it is optimised: parameters, gradients, moments, tiles."""
 PAIR = 325
 """Bytes per pixel of a leave-out pair while the restorer is prepared: its layers."""
-REFERENCE = 30
+REFERENCE = 64
 """Bytes per pixel of a training frame that is carried into virtual views."""
 CLIP = 360
 """Bytes per pixel of a view of a batch: layers, conditioning and what is made of it."""
@@ -50,7 +57,9 @@ ENLARGED = 100
 CLIP_VIEWS = 8
 """Held-out views that are restored at once."""
 RENDERED_VIEW = 24
-"""Bytes per pixel of a rendered held-out view."""
+"""Bytes per pixel of a rendered held-out view: what is computed of many at once is not mapped."""
+FUSED_STACKS = (4, 4, 4, 4)
+"""Bytes per pixel of the stacks of rendered training views: depth, and what is made of it to be fused."""
 PIXELS_MEASURED_AT_ONCE = 400_000
 SURFACE_WIDTH = 320
 SMALLEST_WIDTH = 32
@@ -134,14 +143,17 @@ def estimate_memory(
     harmonics = ((config.coarse.sh_degree + 1) ** 2 + 15) / 31
     coarse_gaussians = max(config.coarse.max_points, config.coarse.densify.max_gaussians)
     gaussian = GAUSSIAN * min(1.0, harmonics)
-    held = PROCESS + SEQUENCE * train * pixels
-    steps = TRAINING_VIEW * train * pixels + STEP * pixels
+    held = PROCESS + _held(SEQUENCE_STACKS, train * pixels)
+    compared = round(pixels * min(1.0, MAX_WIDTH_PX / size.width) ** 2)
+    if config.coarse.inconsistent_frames == "ignore":
+        compared = 0
+    steps = _held(TRAINING_STACKS, train * pixels) + max(STEP * pixels, COMPARED * train * compared)
     batch_views = min(views, config.enhance.clips_per_batch * (config.explore.length + 1))
     network = NETWORK * threads * working if config.enhance.backend == "embedded" else 0
     references = REFERENCE * train * working
     small = round(pixels * min(1.0, SURFACE_WIDTH / size.width) ** 2)
     metrics = METRICS * max(pixels, min(PIXELS_MEASURED_AT_ONCE, pixels * max(1, all_frames - train)))
-    whole = PROCESS + SEQUENCE * all_frames * pixels
+    whole = PROCESS + _held(SEQUENCE_STACKS, all_frames * pixels)
     rendered = RENDERED_VIEW * max(0, all_frames - train) * pixels
     # Held-out views are restored as well, in clips.
     restored = references + CLIP * CLIP_VIEWS * working + network + ENLARGED * CLIP_VIEWS * pixels
@@ -150,12 +162,12 @@ def estimate_memory(
     # The views of all renders are measured together: coarse, final, restored.
     stacks = 1 + ("finetune" not in leave_out) + (restored > 0)
     found: dict[StageName, float] = {
-        "ingest": PROCESS + SEQUENCE * all_frames * pixels + DECODED * source,
-        "poses": whole,
-        "depth": held + DEPTH_FRAME * train * pixels,
+        "ingest": whole + DECODED * source,
+        "poses": PROCESS + SEQUENCE * all_frames * pixels,
+        "depth": PROCESS + (SEQUENCE + DEPTH_FRAME) * train * pixels,
         "coarse": held + steps + gaussian * coarse_gaussians,
-        "surface": held + 40 * train * small,
-        "explore": held + 8 * train * small,
+        "surface": held + _held(FUSED_STACKS, train * small),
+        "explore": held + _held(FUSED_STACKS, train * small),
         "enhance": held
         + max(
             # The judge of the restorer runs the network beside the pairs.
@@ -172,6 +184,11 @@ def estimate_memory(
     }
     wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in leave_out]
     return MemoryEstimate({stage: round(found[stage]) for stage in wanted if stage in found})
+
+
+def _held(stacks: Collection[int], pixels: int) -> int:
+    """Bytes in memory of stacks of so many pixels in all, of which larger ones are mapped files."""
+    return sum(min(size * pixels, MAPPED_BYTES) for size in stacks)
 
 
 def _pairs(config: PipelineConfig, training_frames: int) -> int:

@@ -21,6 +21,7 @@ import numpy as np
 
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError
+from extrags.frame_stacks import MAPPED_BYTES
 
 __all__ = [
     "MEMORY_TERMS",
@@ -58,15 +59,36 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
     "ingest": ("one", "frames", "frames*pixels"),
     "poses": ("one", "frames", "frames*pixels"),
     "depth": ("one", "train", "train*pixels"),
-    "coarse": ("one", "iterations", "iterations*pixels", "iterations*gaussians"),
+    "training-frames": ("one", "train*pixels"),
+    "coarse": (
+        "one",
+        "train*pixels",
+        "iterations",
+        "iterations*pixels",
+        "iterations*gaussians",
+        "iterations*coefficients",
+    ),
     "assess": ("one", "gaussians"),
     "surface": ("one", "train*pixels", "gaussians"),
     "freespace": ("one", "gaussians"),
     "explore": ("trajectories", "trajectories*gaussians"),
-    "enhance-train": ("one", "restored", "fold_iterations", "fold_iterations*restored"),
-    "enhance": ("one", "views", "views*restored"),
-    "finetune-judge": ("judge_iterations", "judge_iterations*pixels", "judge_iterations*gaussians"),
-    "finetune": ("tuning", "tuning*pixels", "tuning*restored", "tuning*final_gaussians"),
+    "enhance-train": (
+        "one",
+        "train*pixels",
+        "restored",
+        "fold_iterations",
+        "fold_iterations*restored",
+        "fold_iterations*gaussians",
+    ),
+    "enhance": ("one", "views", "views*restored", "views*restored*samples"),
+    "finetune-judge": (
+        "train*pixels",
+        "judge_iterations",
+        "judge_iterations*pixels",
+        "judge_iterations*gaussians",
+        "judge_iterations*final_gaussians",
+    ),
+    "finetune": ("train*pixels", "tuning", "tuning*pixels", "tuning*restored", "tuning*final_gaussians"),
     "evaluate-render": ("test", "test*pixels"),
     "evaluate-restore": ("test*pixels", "test*restored"),
     "evaluate-views": ("test*pixels*stacks", "test*pixels*vgg*passes"),
@@ -75,13 +97,20 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
 }
 """Terms of the time of each task; others have a constant alone. Terms that records cannot tell apart (one
 number of iterations only) must not be there: the fit would give one of them the part of the other."""
-MEMORY_TERMS = ("one", "pixels", "frames*pixels", "restored", "gaussians")
+MEMORY_TERMS = ("one", "pixels", "held_pixels", "restored", "train*restored", "gaussians")
 """Terms of the memory of each task; those of `OF_FINAL_SCENE` depend on the Gaussians of the final scene."""
+EVALUATION_TERMS = ("pixels*stacks", "pixels*vgg")
+"""Further terms of the memory of what evaluates."""
+HELD_PIXELS = MAPPED_BYTES / 3
+"""Of all frames together, at most: the images of more are a mapped file, which the memory does not count."""
 OF_FINAL_SCENE = frozenset({"finetune", "evaluate-render", "evaluate-restore", "evaluate-views", "evaluate"})
-GAUSSIANS_WANTED = 70.0
-"""Times the root of all training pixels: where densification ends by itself, without a limit."""
-FINAL_WANTED = 1.75
-"""The same after fine-tuning, as a multiple of the coarse scene's."""
+GAUSSIANS_WANTED = (51_000, 5000, 0.39)
+"""So many, after so many iterations, and the power by which they grow with these: where densification ends
+without a limit. In ten scenes of 160 x 128 to 675 x 540 px it depended on neither size nor number of frames
+(28,000 to 36,000 Gaussians after 1,500 iterations, 33,000 to 95,000 after 5,000, 97,000 to 105,000 after
+30,000)."""
+FINAL_WANTED = 5.0
+"""The same after fine-tuning, as a multiple: 3.4 and 7.4 in the two scenes whose limit was far away."""
 REWEIGHTED = 20
 """Rounds of reweighting; the fit has settled by then."""
 PRIOR_RECORDS = 2.0
@@ -131,6 +160,7 @@ class Workload:
         return {
             "one": 1.0,
             "pixels": float(self.pixels),
+            "held_pixels": float(min(self.frames * self.pixels, HELD_PIXELS)),
             # Of a virtual view.
             "restored": float(self.pixels) * self._restored_share(),
             "frames": float(self.frames),
@@ -138,6 +168,7 @@ class Workload:
             "test": float(self.test),
             "iterations": float(config.coarse.iterations),
             "gaussians": coarse,
+            "coefficients": coarse * (config.coarse.sh_degree + 1) ** 2,
             "final_gaussians": final,
             "trajectories": float(config.explore.trajectories),
             "fold_iterations": float(config.enhance.folds * config.enhance.fold_iterations),
@@ -148,6 +179,7 @@ class Workload:
             # LPIPS with this backbone takes longer than all other metrics together.
             "vgg": float("vgg" in config.evaluate.lpips_nets),
             "stacks": float(self.stacks),
+            "samples": float(config.enhance.samples),
             # Of a network over a view: the frame once, each render as it is and aligned.
             "passes": 1.0 + 2.0 * self.stacks,
         }
@@ -155,9 +187,10 @@ class Workload:
     def _gaussians(self) -> tuple[float, float]:
         """Of the coarse and of the final scene."""
         limit = self.config.coarse.densify.max_gaussians
-        wanted = GAUSSIANS_WANTED * math.sqrt(self.train * self.pixels)
+        count, iterations, power = GAUSSIANS_WANTED
+        wanted = count * (self.config.coarse.iterations / iterations) ** power
         coarse = float(min(limit, wanted) if self.coarse_gaussians is None else self.coarse_gaussians)
-        tuned = min(self.config.finetune.growth * limit, max(coarse, FINAL_WANTED * wanted))
+        tuned = min(self.config.finetune.growth * limit, FINAL_WANTED * max(wanted, coarse))
         return coarse, float(tuned if self.final_gaussians is None else self.final_gaussians)
 
     def _restored_share(self) -> float:
@@ -297,7 +330,8 @@ def memory_terms(task: str) -> tuple[str, ...]:
     """Terms of the memory of a task."""
     if task not in OF_FINAL_SCENE:
         return MEMORY_TERMS
-    return tuple("final_gaussians" if term == "gaussians" else term for term in MEMORY_TERMS)
+    measured = EVALUATION_TERMS if task.startswith("evaluate") else ()
+    return (*("final_gaussians" if term == "gaussians" else term for term in MEMORY_TERMS), *measured)
 
 
 def _fit(terms: Sequence[str], records: Sequence[tuple[Workload, float]]) -> dict[str, float]:
