@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from statistics import median
 
 from extrags.config import PipelineConfig
@@ -139,12 +140,11 @@ def _measured(records: Sequence[OutcomeRecord]) -> dict[str, tuple[float, float]
 
 
 def _was_skipped(records: Sequence[OutcomeRecord], stage: str) -> bool:
-    """Whether the plan left the stage out in a run of the same sequence that went well."""
+    """Whether a run of the same sequence left the stage out, and not because one before it had failed."""
     return any(
         row["stage"] == stage and row["state"] == "skipped"
         for record in records
-        if record["status"] == "ok"
-        for row in record["stages"]
+        for row in takewhile(lambda row: row["state"] != "failed", record["stages"])
     )
 
 

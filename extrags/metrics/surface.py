@@ -173,16 +173,16 @@ def surface_from_depth(sequence: EndoscopicSequence) -> TrueSurface | None:
     if true_depth_mm is None:
         return None
     # Frame by frame: of hundreds of full size, arrays of all at once would be the largest of the run.
-    known = (sequence.mask[frame] & np.isfinite(true_depth_mm[frame]) for frame in frames)
+    far = _max_fused_depth(sequence)
     depth = stacked(
         (
-            np.where(there, true_depth_mm[frame], 0).astype(np.float32)
-            for frame, there in zip(frames, known, strict=True)
+            np.where(sequence.mask[frame] & (shown <= far) & np.isfinite(shown), shown, 0).astype(np.float32)
+            for frame, shown in ((frame, true_depth_mm[frame]) for frame in frames)
         ),
         len(frames),
     )
     try:
-        return TrueSurface(_fused(sequence.cameras[frames], depth), "depth")
+        return TrueSurface(fuse_depth(sequence.cameras[frames], depth, FUSED_WHOLE), "depth")
     except CaptureError:
         return None
 
@@ -330,13 +330,17 @@ def seen_by(
     return seen
 
 
+FUSED_WHOLE = PROTOCOL_FUSION.model_copy(update={"depth_quantile": 1.0})
+"""For depth that is cut already: the fusion, which would cut it as well, cannot do with a view that has
+nothing near."""
+
+
 def _fused(cameras: Cameras, depth_mm: Float[np.ndarray, "c h w"]) -> Mesh:
     """Fusion with the protocol's settings."""
     far = quantile_of_frames(lambda: (view[view > 0] for view in depth_mm), PROTOCOL_FUSION.depth_quantile)
     if far is not None:
-        # Cut here and not in the fusion, which cannot do with a view that has nothing near.
         depth_mm = stacked((np.where(view > far, np.float32(0), view) for view in depth_mm), len(depth_mm))
-    return fuse_depth(cameras, depth_mm, PROTOCOL_FUSION.model_copy(update={"depth_quantile": 1.0}))
+    return fuse_depth(cameras, depth_mm, FUSED_WHOLE)
 
 
 def _parts(
@@ -354,10 +358,10 @@ def _parts(
 
 def _max_fused_depth(sequence: EndoscopicSequence) -> float:
     """Largest depth that is fused; surface that is only seen from farther away is not evaluated."""
-    frames = _all_frames(sequence)
     if sequence.true_depth_mm is None:
         return float("inf")
-    found = quantile_of_frames(_true_depths(sequence, frames), PROTOCOL_FUSION.depth_quantile)
+    depths = _true_depths(sequence, _all_frames(sequence))
+    found = quantile_of_frames(depths, PROTOCOL_FUSION.depth_quantile)
     return float("inf") if found is None else found
 
 

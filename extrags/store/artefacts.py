@@ -13,6 +13,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+import numpy as np
+
 from extrags.errors import ArtefactGoneError, ConfigError, DamagedArtefactError, StoreError
 from extrags.redaction import has_credentials, without_credentials, without_credentials_in
 from extrags.store.canonical import Ref
@@ -35,6 +37,8 @@ _opened: set[tuple[str, str, int, Depth]] = set()
 
 MOST_KEPT = 2
 """A run reads its frames and, without the held-out ones, its training frames; some stages both."""
+KEPT_BYTES = 4 << 30
+"""Beside the last one, of all arrays together: those of a long recording take room for temporary files."""
 
 _kept: dict[tuple[type[Storable], str], Storable] = {}
 """The last loaded objects that are kept, by class and digest; the one that was asked for last is the last."""
@@ -42,19 +46,27 @@ _kept: dict[tuple[type[Storable], str], Storable] = {}
 
 def forget_loaded() -> None:
     """Keep no loaded object any longer: its memory, or the room of its mapped files, is free."""
-    _make_room(0)
+    _kept.clear()
 
 
 def _keep(found: S, ref: Ref) -> S:
-    _make_room(MOST_KEPT - 1)
+    _make_room(MOST_KEPT - 1, KEPT_BYTES - _size(found))
     _kept[type(found), ref.digest] = found
     return found
 
 
-def _make_room(most: int) -> None:
+def _make_room(most: int, most_bytes: int) -> None:
     """Let the oldest go; other threads may do so at the same time."""
-    for key in list(_kept)[: max(0, len(_kept) - most)]:
-        _kept.pop(key, None)
+    for key in list(_kept):
+        if len(_kept) > most or sum(map(_size, list(_kept.values()))) > most_bytes:
+            _kept.pop(key, None)
+        else:
+            break
+
+
+def _size(found: Storable) -> int:
+    """Bytes of its arrays."""
+    return sum(value.nbytes for value in vars(found).values() if isinstance(value, np.ndarray))
 
 
 class Slot:
@@ -288,7 +300,7 @@ class Store:
             return _keep(kept, ref)
         if kind.kept_when_loaded:
             # Before, not after: long recordings take much room.
-            _make_room(MOST_KEPT - 1)
+            _make_room(MOST_KEPT - 1, KEPT_BYTES)
         with self._blaming([ref]):
             found: S = kind.load(path / kind.stored_as)
         return _keep(found, ref) if kind.kept_when_loaded else found

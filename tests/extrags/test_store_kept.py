@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import pytest
 
 from extrags.errors import StoreError
-from extrags.store import Ref, Storable, Store, forget_loaded
+from extrags.store import Ref, Storable, Store, artefacts, forget_loaded
 
 
 @dataclass(frozen=True)
@@ -87,3 +88,34 @@ def test_forgotten(tmp_path: Path) -> None:
     found = store.load(Kept, one)
     forget_loaded()
     assert store.load(Kept, one) is not found
+
+
+@dataclass(frozen=True)
+class Frames(Storable):
+    """As many bytes as its word has letters."""
+
+    stored_as: ClassVar[str] = "word"
+    kept_when_loaded: ClassVar[bool] = True
+
+    rgb: np.ndarray
+
+    def save(self, path: Path) -> None:
+        raise AssertionError
+
+    @classmethod
+    def load(cls, path: Path) -> Any:
+        return cls(np.frombuffer(path.read_bytes(), np.uint8))
+
+
+def test_of_large_ones_the_last_alone_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two long recordings would take the room of both in the folder of temporary files."""
+    monkeypatch.setattr(artefacts, "KEPT_BYTES", 10)
+    store = Store(tmp_path)
+    small, other, large = (stored(store, word, word) for word in ("12345", "abcde", "1234567"))
+    first = store.load(Frames, small)
+    second = store.load(Frames, other)
+    assert store.load(Frames, small) is first
+    third = store.load(Frames, large)
+    assert store.load(Frames, large) is third
+    assert store.load(Frames, other) is not second
+    assert store.load(Frames, large) is not third

@@ -151,6 +151,20 @@ class TestExpected:
         assert expectations([case()], store, "coarse", refresh=True)[0].seconds > 2.0
         assert expectations([case()], store, "finetune")[0].seconds > 0
 
+    def test_what_the_source_spares_is_spared_after_a_failure_too(self, tmp_path: Path) -> None:
+        """But not what was skipped because a stage before it had failed."""
+        store, folder = str(tmp_path / "store"), case(str(tmp_path))
+        read = StageRow("ingest", "ran", made_seconds=2.0)
+        spared = [StageRow("poses", "skipped"), StageRow("depth", "skipped")]
+        left = [StageRow("coarse", "failed"), StageRow("assess", "skipped"), StageRow("surface", "skipped")]
+        leave(store, folder, read, *spared, *left, status="failed")
+        (found,) = expectations([folder], store, "surface")
+        leave(store, folder, read, *left, status="failed")
+        (with_depth,) = expectations([folder], store, "surface")
+        leave(store, folder, read, *spared, StageRow("coarse", "failed"), status="failed")
+        (same,) = expectations([folder], store, "surface")
+        assert found.seconds == same.seconds < with_depth.seconds
+
     def test_in_words(self) -> None:
         found = [Expectation(case(), 3600.0, measured=True), Expectation(case(), 600.0, measured=False)]
         assert (
