@@ -2,19 +2,36 @@
 
 from __future__ import annotations
 
+import weakref
+
 from extrags.metrics.surface import TrueSurface, surface_from_depth
 from extrags.sequence import EndoscopicSequence
 from extrags.surface import Mesh
 
 __all__ = ["true_surface"]
 
+_last: list[tuple[weakref.ref[EndoscopicSequence], TrueSurface | None]] = []
+"""The sequence that was asked for last, as long as it is in memory, and its surface."""
+
 
 def true_surface(sequence: EndoscopicSequence) -> TrueSurface | None:
     """Ground truth that a reconstruction of the sequence is compared with; None where there is none.
 
+    Who asks again for that of the same object gets the same one: a run evaluates several scenes on the same
+    frames, and to fuse a thousand large ones takes minutes.
+
     The wall of a phantom or a cavern is made again from the settings that the sequence carries in `truth`;
     where poses were estimated, the wall is in another world than they are, and depth takes its place.
     """
+    for of, known in _last:
+        if of() is sequence:
+            return known
+    found = _made(sequence)
+    _last[:] = [(weakref.ref(sequence, lambda _: _last.clear()), found)]
+    return found
+
+
+def _made(sequence: EndoscopicSequence) -> TrueSurface | None:
     phantom = sequence.truth.get("phantom")
     if phantom is not None and sequence.truth.get("world") != "estimated":
         from data_catalog.phantom.config import PhantomConfig
