@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from extrags.config import PipelineConfig
 from extrags.frame_stacks import MAPPED_BYTES
 from extrags.pipeline import STAGES, StageName
-from extrags.training.frame_comparison import MAX_WIDTH_PX
 
 __all__ = ["FrameSize", "MemoryEstimate", "estimate_memory", "fitting_settings"]
 
@@ -34,6 +33,8 @@ TRAINING_STACKS = (1, 4, 4, 4)
 depth that new Gaussians must not hide."""
 COMPARED = 36
 """Bytes per pixel of a training frame, at the width at which blurred and moved frames are looked for."""
+COMPARED_WIDTH = 320
+"""That width (`extrags.training.frame_comparison`, which loads more than an estimate needs)."""
 DEPTH_FRAME = 60
 """Bytes per pixel of a training frame while its depth is estimated."""
 STEP = 140
@@ -144,7 +145,7 @@ def estimate_memory(
     coarse_gaussians = max(config.coarse.max_points, config.coarse.densify.max_gaussians)
     gaussian = GAUSSIAN * min(1.0, harmonics)
     held = PROCESS + _held(SEQUENCE_STACKS, train * pixels)
-    compared = round(pixels * min(1.0, MAX_WIDTH_PX / size.width) ** 2)
+    compared = round(pixels * min(1.0, COMPARED_WIDTH / size.width) ** 2)
     if config.coarse.inconsistent_frames == "ignore":
         compared = 0
     steps = _held(TRAINING_STACKS, train * pixels) + max(STEP * pixels, COMPARED * train * compared)

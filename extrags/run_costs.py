@@ -179,7 +179,7 @@ class Workload:
             # LPIPS with this backbone takes longer than all other metrics together.
             "vgg": float("vgg" in config.evaluate.lpips_nets),
             "stacks": float(self.stacks),
-            "samples": float(config.enhance.samples),
+            "samples": 1.0 if config.enhance.samples == "mean" else float(config.enhance.samples),
             # Of a network over a view: the frame once, each render as it is and aligned.
             "passes": 1.0 + 2.0 * self.stacks,
         }

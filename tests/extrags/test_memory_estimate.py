@@ -5,12 +5,17 @@ from __future__ import annotations
 import pytest
 
 from extrags.config import PROFILES, profile_config
-from extrags.memory_estimate import FrameSize, estimate_memory, fitting_settings
+from extrags.memory_estimate import COMPARED_WIDTH, FrameSize, estimate_memory, fitting_settings
+from extrags.training.frame_comparison import MAX_WIDTH_PX
 
 THUMBNAILS = FrameSize(60, 52, 225, 180)
 HUNDREDS = FrameSize(400, 200, 675, 540)
 SYNTHETIC = FrameSize(200, 200, 675, 540)
 FULL = FrameSize(40, 20, 675, 540)
+
+
+def test_the_width_at_which_frames_are_compared() -> None:
+    assert COMPARED_WIDTH == MAX_WIDTH_PX
 
 
 class TestEstimate:

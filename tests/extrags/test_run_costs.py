@@ -114,6 +114,11 @@ class TestGaussians:
         assert work(5120).numbers()["held_pixels"] == 48 * 5120
 
 
+def test_the_mean_of_a_restorer_is_one_sample() -> None:
+    found = replace(work(), config=work().config.with_overrides({"enhance.samples": "mean"})).numbers()
+    assert found["samples"] == 1
+
+
 class TestPace:
     model = CostModel({"coarse": {"one": 10.0}, "ingest": {"one": 5.0}}, {}, 0.01)
 
