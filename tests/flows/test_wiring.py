@@ -183,10 +183,12 @@ def test_absent_weights_are_a_reason_not_a_failure(
 
     monkeypatch.setattr(search, "find_weights", nowhere)
     store, _ = finished
-    outcome = run_sequence(SEQUENCE, tiny_config(), store, DirectRunner(store), until="evaluate")
+    # Measured anew, also where there are no weights for `finished` either.
+    config = tiny_config(**{"evaluate.lpips_nets": ("alex", "vgg")})
+    outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="evaluate")
     assert outcome.status == "ok"
     assert outcome.metrics["final"]["lpips_alex"] is None
-    assert lpips_weights(tiny_config().evaluate)[0].reason == "no LPIPS weights here; put them there"
+    assert lpips_weights(config.evaluate)[0].reason == "no LPIPS weights here; put them there"
     (measured,) = [
         json.loads((Store(store).open(ref) / "metrics.json").read_bytes())
         for ref in [Store(store).find(Path(outcome.artefacts["metrics_final"]).name)]
@@ -219,14 +221,14 @@ def test_a_process_that_lacks_a_metric_says_so(finished: tuple[str, SequenceOutc
     found = {
         name: Store(store).find(Path(outcome.artefacts[name]).name) for name in ("renders_final", "sequence")
     }
-    with pytest.raises(ConfigError, match="toy_error@1; registered in this process: none"):
+    with pytest.raises(ConfigError, match="other_error@1; registered in this process: none"):
         measure.fn(
             store=store,
             renders=found["renders_final"],
             sequence=found["sequence"],
             lpips_digests={"alex": None},
             weights=[Weights(net="alex")],
-            added=["toy_error@1"],
+            added=["other_error@1"],
         )
 
 
