@@ -29,11 +29,8 @@ def median_of_frames(frames: Frames) -> float | None:
     Returns:
         The median; None where there are no values.
     """
-    upper = _counts_of_upper_halves(frames)
-    count = int(upper.sum())
-    if count == 0:
-        return None
-    return float(np.median(_at_ranks(frames, upper, (count - 1) // 2, count // 2)))
+    pair = _at_ranks(frames, lambda count: ((count - 1) // 2, count // 2))
+    return None if pair is None else float(np.median(pair))
 
 
 def quantile_of_frames(frames: Frames, share: float) -> float | None:
@@ -46,14 +43,16 @@ def quantile_of_frames(frames: Frames, share: float) -> float | None:
     Returns:
         The quantile; None where there are no values.
     """
-    upper = _counts_of_upper_halves(frames)
-    count = int(upper.sum())
-    if count == 0:
-        return None
-    place = share * (count - 1)
-    below = int(place)
-    pair = _at_ranks(frames, upper, below, min(below + 1, count - 1))
-    return float(np.quantile(pair, place - below))
+    part = 0.0
+
+    def ranks(count: int) -> tuple[int, int]:
+        nonlocal part
+        place = share * (count - 1)
+        part = place - int(place)
+        return int(place), min(int(place) + 1, count - 1)
+
+    pair = _at_ranks(frames, ranks)
+    return None if pair is None else float(np.quantile(pair, part))
 
 
 def _counts_of_upper_halves(frames: Frames) -> np.ndarray:
@@ -63,8 +62,13 @@ def _counts_of_upper_halves(frames: Frames) -> np.ndarray:
     return found
 
 
-def _at_ranks(frames: Frames, upper: np.ndarray, *ranks: int) -> Float[np.ndarray, "n"]:
-    """Values at ranks, from 0, in ascending order of all values."""
+def _at_ranks(frames: Frames, ranks_of: Callable[[int], tuple[int, int]]) -> Float[np.ndarray, "2"] | None:
+    """Values at two ranks, from 0, which follow from how many there are; None where there are none."""
+    upper = _counts_of_upper_halves(frames)
+    count = int(upper.sum())
+    if count == 0:
+        return None
+    ranks = ranks_of(count)
     ends = np.cumsum(upper)
     halves = np.searchsorted(ends, ranks, side="right")
     lower = {int(half): np.zeros(1 << _HALF, dtype=np.int64) for half in halves}

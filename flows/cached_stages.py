@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 from extrags.config import PipelineConfig
@@ -198,9 +197,6 @@ class CachedStages(Pipeline):
 
     def _expected_seconds(self) -> Mapping[str, Mapping[str, float]]:
         config = self.config if self.plan is None else self.plan.applied_to(self.config)
-        work = frames_work(self._manifest("ingest").counts, config)
-        if "coarse" in self.refs:
-            counted = self._manifest("coarse").counts.get("n_gaussians")
-            work = replace(work, coarse_gaussians=None if counted is None else int(counted))
-        found = expected_seconds(config, work)
+        coarse = self._manifest("coarse").counts if "coarse" in self.refs else None
+        found = expected_seconds(config, frames_work(self._manifest("ingest").counts, config, coarse))
         return {str(stage): tasks for stage, tasks in found.items()}

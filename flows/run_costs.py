@@ -207,10 +207,8 @@ def planned_work(store: Store, outcome: SequenceOutcome, config: PipelineConfig)
         )
         config = decided.applied_to(config)
         skipped |= {line.stage for line in decided.decisions if not line.run}
-    work = frames_work(store.manifest(outcome.refs["ingest"]).counts, config)
-    if "coarse" in outcome.refs:
-        counted = store.manifest(outcome.refs["coarse"]).counts.get("n_gaussians")
-        work = replace(work, coarse_gaussians=None if counted is None else int(counted))
+    coarse = store.manifest(outcome.refs["coarse"]).counts if "coarse" in outcome.refs else None
+    work = frames_work(store.manifest(outcome.refs["ingest"]).counts, config, coarse)
     return work, {str(stage) for stage in STAGES if stage not in skipped}
 
 

@@ -42,17 +42,21 @@ def usual_work(config: PipelineConfig) -> Workload:
     return Workload(160 * 128, 48, 24, 24, config, width=160)
 
 
-def frames_work(counts: Mapping[str, Any], config: PipelineConfig) -> Workload:
+def frames_work(
+    counts: Mapping[str, Any], config: PipelineConfig, coarse: Mapping[str, Any] | None = None
+) -> Workload:
     """That of a sequence that has been read.
 
     Args:
         counts: of the artefact of its `ingest`.
         config: settings of all stages.
+        coarse: counts of that of its coarse scene, where there is one.
     """
+    gaussians = None if coarse is None else coarse.get("n_gaussians")
     width, height, frames, train, test = (
         float(counts[name] or 0) for name in ("width", "height", "frames", "train", "test")
     )
-    return Workload(width * height, frames, train, test, config, width=width)
+    return Workload(width * height, frames, train, test, config, width=width, coarse_gaussians=gaussians)
 
 
 def at_detail_size(work: Workload, counts: Mapping[str, Any]) -> Workload | None:
