@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +24,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--fit", nargs="+", required=True, metavar="STORE")
     parser.add_argument("--check", nargs="*", default=[], metavar="STORE")
+    parser.add_argument("--leave-one-out", action="store_true", help="predict each run without its records")
     parser.add_argument("--output", type=Path)
     given = parser.parse_args()
     import flows.wiring  # noqa: F401  (all stages with their present versions)
@@ -52,6 +55,31 @@ def main() -> None:
                 f"{name:8} {cost.task:16} {work.pixels:7.0f} px  s {cost.seconds:7.2f} {guess.seconds:7.2f} "
                 f"{guess.seconds / cost.seconds - 1:+.0%}{memory}"
             )
+    if given.leave_one_out:
+        print_without_each(known)
+
+
+def print_without_each(known: list[tuple[Workload, TaskCost]]) -> None:
+    """Sums of each run's tasks but ingest, and by a fit to the others, with Gaussians as expected before."""
+    from extrags.run_costs import fitted
+
+    runs: dict[tuple[float, float, int], list[tuple[Workload, TaskCost]]] = defaultdict(list)
+    for work, cost in known:
+        runs[float(work.pixels), float(work.train), work.config.coarse.iterations].append((work, cost))
+    for (pixels, train, iterations), own in sorted(runs.items()):
+        model = fitted([item for other in runs.values() if other is not own for item in other], 1.0)
+        pairs = [
+            (cost, model.predict(cost.task, replace(work, coarse_gaussians=None, final_gaussians=None)))
+            for work, cost in own
+            if cost.task != "ingest" and cost.task in model.time
+        ]
+        spent, guessed = sum(cost.seconds for cost, _ in pairs), sum(guess.seconds for _, guess in pairs)
+        most = max((cost.peak_mib or 0.0 for cost, _ in pairs), default=0.0)
+        guessed_most = max((guess.peak_mib or 0.0 for _, guess in pairs), default=0.0)
+        print(
+            f"without {pixels:.0f} px, {train:.0f} frames, {iterations} iterations: s {spent:.0f} "
+            f"{guessed:.0f}, MiB {most:.0f} {guessed_most:.0f}"
+        )
 
 
 if __name__ == "__main__":
