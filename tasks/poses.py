@@ -14,7 +14,7 @@ def estimating_settings(config: PosesConfig) -> PosesConfig:
     return config.model_copy(update={"replace_given": False})
 
 
-@stage("poses", version=5)
+@stage("poses", version=6)
 def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
     """Estimate poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
 

@@ -33,6 +33,8 @@ from extrags.depth.weights import BUNDLED, NONE, completion_digest, load_complet
 from extrags.devices import chosen_device
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
+from extrags.frame_quantiles import median_of_frames
+from extrags.frame_stacks import FrameStack
 from extrags.lens import distortion_of_pinhole
 from extrags.poses.triangulation import triangulate_points
 from extrags.radial_lens import WIDE_FIELD_DEG
@@ -195,11 +197,11 @@ def estimate_depth(
             network = network.to(device)
             log_depth, error, stereo = _completed(network, frames, small, stereo, config, settings, told)
         log_depth = sharpened(log_depth, error, frames)
-    full = sequence.height, sequence.width
-    depth = np.where(sequence.mask, np.exp(_enlarged(log_depth, *full)), 0).astype(np.float32)
-    expected = np.clip(_enlarged(error, *full), CERTAIN, HOPELESS)
-    expected = np.where(sequence.mask, expected, 0).astype(np.float32)
+    depth, expected = _at_full_size(sequence, log_depth, error)
     confirmed = (stereo.agrees * stereo.seen > 0) & frames.mask
+    median = median_of_frames(
+        lambda: (image[mask] for image, mask in zip(expected, sequence.mask, strict=True))
+    )
     report: dict[str, Any] = {
         "points_from": origin,
         "n_points": len(points),
@@ -228,7 +230,7 @@ def estimate_depth(
         if config.completion in (BUNDLED, NONE)
         else f"weights {completion_digest(config.completion)}",
         "device": device.type,
-        "median_expected_error": float(np.median(expected[sequence.mask])) if sequence.mask.any() else 1.0,
+        "median_expected_error": 1.0 if median is None else median,
     }
     return DepthEstimate(depth, expected, points.astype(np.float64), points_rgb, report)
 
@@ -239,14 +241,13 @@ def _through_lens(
     """The depth of wide pinholes, at the pixels of the frames they were resampled from; 0 outside them."""
     lens = sequence.lens
     assert lens is not None
-    parts: list[list[np.ndarray]] = [[], []]
+    depth, expected = FrameStack(len(sequence)), FrameStack(len(sequence))
     for index in range(len(sequence)):
         back = distortion_of_pinhole(sequence.K[index], lens, flat.K[index], sequence.width, sequence.height)
         known = sequence.mask[index] & (back.depth(flat.mask[index].astype(np.float32)) > 0)
-        for part, image in zip(parts, (estimate.depth, estimate.expected_error), strict=True):
-            part.append(np.where(known, back.depth(image[index]), 0).astype(np.float32))
-    depth, expected = (np.stack(part) for part in parts)
-    return replace(estimate, depth=depth, expected_error=expected)
+        for stack, image in ((depth, estimate.depth), (expected, estimate.expected_error)):
+            stack.append(np.where(known, back.depth(image[index]), 0).astype(np.float32))
+    return replace(estimate, depth=depth.array, expected_error=expected.array)
 
 
 def with_estimated_depth(sequence: EndoscopicSequence, estimate: DepthEstimate) -> EndoscopicSequence:
@@ -405,11 +406,16 @@ def _run_network(
     # Without sparse points: those of triangulation are 6 to 7 % off in the mean, which is worse than what
     # stereo and the network make of the pixels around them (AbsRel .034 with them and .031 without on three
     # phantoms), and practice with points as wrong as these did not change it.
-    inputs = completion_inputs(frames, stereo)
-    answers = in_threads(network, inputs.channels.split(1))
-    log_depth, log_error = (torch.cat(parts) for parts in zip(*answers, strict=True))
+
+    def completed(frame: Tensor) -> tuple[Tensor, Tensor]:
+        inputs = completion_inputs(frames.of_frames(frame), stereo.of_frames(frame))
+        log_depth, log_error = network(inputs.channels)
+        return log_depth + inputs.log_scale[:, None, None], log_error.exp()
+
+    answers = in_threads(completed, torch.arange(len(frames), device=stereo.cost.device).split(1))
+    log_depth, error = (torch.cat(parts) for parts in zip(*answers, strict=True))
     told.step(len(frames))
-    return log_depth + inputs.log_scale[:, None, None], log_error.exp()
+    return log_depth, error
 
 
 def _sources(sequence: EndoscopicSequence, typical: np.ndarray, config: DepthConfig) -> Tensor:
@@ -448,9 +454,21 @@ def _predicted(monocular: MonocularPredictor, sequence: EndoscopicSequence, fram
     return predictions(monocular, images, frames.size).to(device)
 
 
-def _enlarged(images: Tensor, height: int, width: int) -> np.ndarray:
-    if images.shape[1:] != (height, width):
-        images = functional.interpolate(
-            images[:, None], size=(height, width), mode="bilinear", align_corners=False
-        )[:, 0]
-    return images.cpu().numpy()
+def _at_full_size(
+    sequence: EndoscopicSequence, log_depth: Float[Tensor, "f h w"], error: Float[Tensor, "f h w"]
+) -> tuple[Float[np.ndarray, "f h0 w0"], Float[np.ndarray, "f h0 w0"]]:
+    """Depth and its expected error at the pixels of the frames, one frame after the other."""
+    depth, expected = FrameStack(len(sequence)), FrameStack(len(sequence))
+    for mask, own_log_depth, own_error in zip(sequence.mask, log_depth, error, strict=True):
+        depth.append(np.where(mask, np.exp(_enlarged(own_log_depth, mask.shape)), 0).astype(np.float32))
+        bounded = np.clip(_enlarged(own_error, mask.shape), CERTAIN, HOPELESS)
+        expected.append(np.where(mask, bounded, 0).astype(np.float32))
+    return depth.array, expected.array
+
+
+def _enlarged(image: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[np.ndarray, "h0 w0"]:
+    if image.shape != size:
+        image = functional.interpolate(image[None, None], size=size, mode="bilinear", align_corners=False)[
+            0, 0
+        ]
+    return np.asarray(image.cpu().numpy())

@@ -41,6 +41,12 @@ class PosedFrames:
     def __len__(self) -> int:
         return int(self.rgb.shape[0])
 
+    def of_frames(self, chosen: Int[Tensor, "k"]) -> PosedFrames:
+        """Some of the frames."""
+        return PosedFrames(
+            self.rgb[chosen], self.mask[chosen], self.K[chosen], self.world_from_camera[chosen]
+        )
+
     @property
     def size(self) -> tuple[int, int]:
         """Height and width in pixels."""

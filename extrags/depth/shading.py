@@ -59,9 +59,7 @@ class ShadingFit:
 
 def smoothed_brightness(frames: PosedFrames) -> Float[Tensor, "f h w"]:
     """Logarithm of brightness, blurred inside the mask."""
-    value = torch.log(frames.rgb.mean(dim=1) + 0.02)
-    weight = frames.mask.float()
-    kernel = torch.exp(-0.5 * (torch.arange(-4, 5, device=value.device) / SMOOTHING_PX) ** 2)
+    kernel = torch.exp(-0.5 * (torch.arange(-4, 5, device=frames.rgb.device) / SMOOTHING_PX) ** 2)
     kernel = kernel / kernel.sum()
 
     def blurred(image: Tensor) -> Tensor:
@@ -69,7 +67,12 @@ def smoothed_brightness(frames: PosedFrames) -> Float[Tensor, "f h w"]:
         image = functional.conv2d(image, kernel[None, None, None])
         return functional.conv2d(image, kernel[None, None, :, None])[:, 0]
 
-    return blurred(value * weight) / blurred(weight).clamp_min(1e-6)
+    found = torch.empty_like(frames.rgb[:, 0])
+    for frame in range(len(frames)):
+        value = torch.log(frames.rgb[frame : frame + 1].mean(dim=1) + 0.02)
+        weight = frames.mask[frame : frame + 1].float()
+        found[frame] = (blurred(value * weight) / blurred(weight).clamp_min(1e-6))[0]
+    return found
 
 
 def fit_shading(
@@ -100,29 +103,40 @@ def fit_shading(
 
 
 def _fit(brightness: Tensor, log_depth: Tensor, sure: Tensor) -> ShadingFit:
-    frames = len(brightness)
-    weight = sure.flatten(1).double()
-    x, y = brightness.flatten(1).double(), log_depth.flatten(1).double()
-    counts = weight.sum(1)
+    frames, device = len(brightness), brightness.device
+    # Of each frame its sure pixels alone: a long recording has many others.
+    x, y = (
+        [image[own].double() for image, own in zip(stack, sure, strict=True)]
+        for stack in (brightness, log_depth)
+    )
+    counts = torch.tensor([len(values) for values in x], device=device)
     total = int(counts.sum())
     if total < 50:
-        zero = torch.zeros(frames, device=x.device)
+        zero = torch.zeros(frames, device=device)
         return ShadingFit(0.0, zero, float("inf"), float("inf"), total)
-    robust = weight
+    robust = [torch.ones_like(values) for values in x]
     slope, scale = 0.0, 1.0
-    intercept = torch.zeros(frames, dtype=torch.float64, device=x.device)
+    intercept = torch.zeros(frames, dtype=torch.float64, device=device)
     for _ in range(ITERATIONS):
-        n = robust.sum(1).clamp_min(1e-9)
-        mean_x, mean_y = (robust * x).sum(1) / n, (robust * y).sum(1) / n
-        dx, dy = x - mean_x[:, None], y - mean_y[:, None]
-        covariance, variance = float((robust * dx * dy).sum()), float((robust * dx * dx).sum())
-        slope = min(max(-covariance / max(variance, 1e-9), 0.0), STEEPEST)
+        means = [_weighted_means(*own) for own in zip(robust, x, y, strict=True)]
+        moments = torch.stack(
+            [
+                torch.stack([(w * (u - mean[0]) * (v - mean[1])).sum(), (w * (u - mean[0]).square()).sum()])
+                for w, u, v, mean in zip(robust, x, y, means, strict=True)
+            ]
+        ).sum(0)
+        slope = min(max(-float(moments[0]) / max(float(moments[1]), 1e-9), 0.0), STEEPEST)
+        mean_x, mean_y = torch.stack(means).unbind(1)
         intercept = mean_y + slope * mean_x
-        residual = (y - intercept[:, None] + slope * x).abs()
-        scale = max(1.4826 * float(residual[sure.flatten(1)].median()), 1e-4)
-        robust = weight * (HUBER_SCALES * scale / residual.clamp_min(1e-9)).clamp_max(1)
+        residual = [(v - own + slope * u).abs() for own, u, v in zip(intercept, x, y, strict=True)]
+        scale = max(1.4826 * float(torch.cat(residual).median()), 1e-4)
+        robust = [(HUBER_SCALES * scale / away.clamp_min(1e-9)).clamp_max(1) for away in residual]
     present = counts > 0
     intercept = torch.where(present, intercept, intercept[present].mean())
-    deviation = (y - (weight * y).sum(1, keepdim=True) / counts.clamp_min(1)[:, None]).abs()
-    spread = 1.4826 * float(deviation[sure.flatten(1)].median())
-    return ShadingFit(slope, intercept.float(), scale, spread, total)
+    deviation = torch.cat([(values - values.mean()).abs() for values in y if len(values)])
+    return ShadingFit(slope, intercept.float(), scale, 1.4826 * float(deviation.median()), total)
+
+
+def _weighted_means(weight: Tensor, x: Tensor, y: Tensor) -> Float[Tensor, "2"]:
+    total = weight.sum().clamp_min(1e-9)
+    return torch.stack([(weight * x).sum(), (weight * y).sum()]) / total

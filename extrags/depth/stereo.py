@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TypedDict
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -18,6 +19,7 @@ from extrags.depth.monocular import MonocularFit, aligned, fit_monocular
 from extrags.depth.prior import DepthPrior
 from extrags.depth.shading import ShadingFit, fit_shading, smoothed_brightness
 from extrags.errors import ShapeError
+from extrags.frame_stacks import empty_stack
 
 __all__ = [
     "SECOND_SWEEP",
@@ -129,6 +131,26 @@ class StereoDepth:
     recording: Int[Tensor, "f"]
     n_sources: Int[Tensor, "f"]
 
+    def of_frames(self, chosen: Int[Tensor, "k"]) -> StereoDepth:
+        """The same of some frames; the fits stay those of all."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _OF_FRAMES})
+
+
+_OF_FRAMES = (
+    "log_depth",
+    "cost",
+    "margin",
+    "seen",
+    "agrees",
+    "violates",
+    "difference",
+    "fused",
+    "prior",
+    "prior_scatter",
+    "recording",
+    "n_sources",
+)
+
 
 def multi_view_stereo(
     frames: PosedFrames,
@@ -170,12 +192,14 @@ def multi_view_stereo(
     offsets = 0.5 * (far.log() - near.log())[:, None] * steps[None]
     parts = _parts(frames, settings.hypotheses, chunk)
     kernels = native if device.type == "cpu" else matching
-    costs, first = [], []
+    # Costs of all frames are kept for the prior, which needs depth of all: as bytes, in a mapped file.
+    shape = (n, settings.hypotheses, *frames.size)
+    costs, first = torch.from_numpy(empty_stack(shape, np.uint8)), []
     for part in parts:
         base = log_base[part].exp()[:, None, None].expand(-1, *frames.size)
         cost = _cost(frames, part, sources, base, offsets[part], settings)
-        # A byte is fine enough for what is only ranked again, and many frames are kept.
-        costs.append((cost * COST_LEVELS).round().clamp(0, 255).to(torch.uint8).cpu())
+        # A byte is fine enough for what is only ranked again.
+        costs[part.cpu()] = (cost * COST_LEVELS).round().clamp(0, 255).to(torch.uint8).cpu()
         position, _, _ = kernels.best_steps(
             cost, grey[part], small_step=settings.small_step, jump=settings.jump
         )
@@ -195,12 +219,11 @@ def multi_view_stereo(
         prior = prior & other if settings.shading else other
     prior_weight = settings.prior_weight if settings.shading or monocular is not None else 0.0
     found, matched, margins = [], [], []
-    for number, part in enumerate(parts):
-        cost = costs[number].to(device).float() / COST_LEVELS
+    for part in parts:
+        cost = costs[part.cpu()].to(device).float() / COST_LEVELS
         cost += prior.cost(
             part, log_base[part], offsets[part], weight=prior_weight, scatters=settings.prior_scatters
         )
-        costs[number] = torch.empty(0)
         position, _, margin = kernels.best_steps(
             cost, grey[part], small_step=settings.small_step, jump=settings.jump
         )

@@ -8,6 +8,7 @@ import numpy as np
 
 from extrags.depth.estimate import DepthEstimate, with_estimated_depth
 from extrags.errors import ShapeError
+from extrags.frame_stacks import empty_stack
 from extrags.sequence import EndoscopicSequence
 
 __all__ = ["with_training_depth"]
@@ -32,7 +33,8 @@ def with_training_depth(sequence: EndoscopicSequence, estimate: DepthEstimate) -
         raise ShapeError(
             f"{sequence.name}: {len(estimate.depth)} depth maps for {len(train)} training frames"
         )
-    depth = np.zeros(sequence.rgb.shape[:3], np.float32)
-    error = np.zeros_like(depth)
-    depth[train], error[train] = estimate.depth, estimate.expected_error
+    shape = sequence.rgb.shape[:3]
+    depth, error = empty_stack(shape, np.float32), empty_stack(shape, np.float32)
+    for position, frame in enumerate(train):
+        depth[frame], error[frame] = estimate.depth[position], estimate.expected_error[position]
     return with_estimated_depth(sequence, replace(estimate, depth=depth, expected_error=error))

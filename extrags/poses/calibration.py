@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from extrags.errors import ShapeError
+from extrags.frame_stacks import stacked
 from extrags.lens import LENS_PARAMETERS, Lens, Undistortion
 from extrags.sequence import EndoscopicSequence
 
@@ -115,22 +117,22 @@ def with_calibration(sequence: EndoscopicSequence, calibration: LensCalibration)
     if lens.is_pinhole:
         return replace(known, K=np.tile(lens.K, (len(sequence), 1, 1)))
     plan = Undistortion.planned(lens)
-    observed, specular = sequence.observed, sequence.specular
 
-    def moved(lengths: np.ndarray | None) -> np.ndarray | None:
-        return None if lengths is None else np.stack([plan.depth(frame) for frame in lengths])
+    def through(change: Callable[[np.ndarray], np.ndarray], stack: np.ndarray | None) -> Any:
+        return None if stack is None else stacked((change(frame) for frame in stack), len(stack))
+
+    def without_highlights(specular: np.ndarray) -> np.ndarray:
+        # One highlight among the pixels that a sample touches spoils it.
+        return np.asarray(plan.valid & ~plan.mask(~specular))
 
     return replace(
         known,
         K=np.tile(plan.K, (len(sequence), 1, 1)),
-        rgb=np.stack([plan.colour(image) for image in sequence.rgb]),
-        mask=np.stack([plan.mask(mask) for mask in sequence.mask]),
-        depth_mm=moved(sequence.depth_mm),
-        withheld_depth_mm=moved(sequence.withheld_depth_mm),
-        depth_error=moved(sequence.depth_error),
-        observed=None if observed is None else np.stack([plan.mask(frame) for frame in observed]),
-        # One highlight among the pixels that a sample touches spoils it.
-        specular=None
-        if specular is None
-        else np.stack([plan.valid & ~plan.mask(~frame) for frame in specular]),
+        rgb=through(plan.colour, sequence.rgb),
+        mask=through(plan.mask, sequence.mask),
+        depth_mm=through(plan.depth, sequence.depth_mm),
+        withheld_depth_mm=through(plan.depth, sequence.withheld_depth_mm),
+        depth_error=through(plan.depth, sequence.depth_error),
+        observed=through(plan.mask, sequence.observed),
+        specular=through(without_highlights, sequence.specular),
     )

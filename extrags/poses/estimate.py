@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 from extrags.cameras import as_rotation
 from extrags.config import PosesConfig
 from extrags.errors import CaptureError, ShapeError
+from extrags.frame_stacks import frames_of, stacked
 from extrags.poses.calibration import LensCalibration, with_calibration
 from extrags.poses.job import PoseJob, PoseJobResult, run_job
 from extrags.poses.registration_report import (
@@ -349,22 +350,23 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         return np.asarray(number[frames[estimate.registered[frames]]], dtype=np.int64)
 
     def of_kept(stack: np.ndarray | None) -> Any:
-        return None if stack is None else stack[kept]
+        return None if stack is None else frames_of(stack, kept)
 
     def of_truth(depth: np.ndarray | None) -> Any:
         if depth is None or estimate.metric:
             return of_kept(depth)
         if estimate.truth_per_unit is None:
             return None  # its unit is not that of the poses, so that nothing could be compared with it
-        return (depth[kept] / estimate.truth_per_unit).astype(depth.dtype)
+        unit = estimate.truth_per_unit
+        return stacked(((depth[frame] / unit).astype(depth.dtype) for frame in kept), len(kept))
 
     split = sequence.split
     hidden = not sequence.training_depth_known
     posed = replace(
         sequence,
-        rgb=sequence.rgb[kept],
+        rgb=of_kept(sequence.rgb),
         K=sequence.K[kept],
-        mask=sequence.mask[kept],
+        mask=of_kept(sequence.mask),
         depth_mm=of_truth(sequence.depth_mm) if hidden else of_kept(sequence.depth_mm),
         withheld_depth_mm=of_truth(sequence.withheld_depth_mm),
         recording=of_kept(sequence.recording),

@@ -6,8 +6,10 @@ Nothing here imports pycolmap: it is handed in by the process that has it (see `
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from extrags.poses.job import PoseJob, PoseJobResult
+from extrags.poses.matching import mutual_matches
 from extrags.poses.pairs import Pair
 
 __all__ = [
@@ -137,7 +140,6 @@ def match(
     matching = pycolmap.FeatureMatchingOptions()
     matching.use_gpu = False
     matching.guided_matching = lenient
-    matching.skip_geometric_verification = not verify
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = seed
     if lenient:
@@ -146,6 +148,12 @@ def match(
     listed = folder / "pairs.txt"
     for start in range(0, len(pairs), PAIRS_PER_CALL):
         part = pairs[start : start + PAIRS_PER_CALL]
+        _write_matches(pycolmap, folder, part)
+        if told is not None:
+            told.step(len(part))
+        if not verify:
+            continue
+        # Of pairs that have matches COLMAP finds the geometry.
         listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in part))
         pairing.match_list_path = listed
         pycolmap.match_image_pairs(
@@ -155,8 +163,18 @@ def match(
             verification_options=verification,
             device=pycolmap.Device.cpu,
         )
-        if told is not None:
-            told.step(len(part))
+
+
+def _write_matches(pycolmap: Any, folder: Path, pairs: list[Pair]) -> None:
+    """Mutual nearest neighbours of pairs of frames, into `database.db`."""
+    with opened(pycolmap, folder / "database.db") as database:
+        frames = sorted({frame for pair in pairs for frame in pair})
+        ids = {frame: database.read_image_with_name(image_name(frame)).image_id for frame in frames}
+        features = {frame: database.read_descriptors(number).data for frame, number in ids.items()}
+        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
+            found = threads.map(lambda pair: mutual_matches(features[pair[0]], features[pair[1]]), pairs)
+            for (i, j), matches in zip(pairs, found, strict=True):
+                database.write_matches(ids[i], ids[j], matches.astype(np.uint32))
 
 
 def read_model(model: Any, poses: np.ndarray, report: dict[str, Any]) -> PoseJobResult:

@@ -54,11 +54,12 @@ class PoseJob:
         known: dict[str, Any] = {}
         if self.world_from_camera is not None:
             known["world_from_camera"] = self.world_from_camera
+        # Stacks as files of their own, which are mapped: a long recording is in memory in neither process.
+        np.save(folder / "rgb.npy", self.rgb)
+        np.save(folder / "mask.npy", self.mask)
         np.savez(
             folder / "job.npz",
             **known,
-            rgb=self.rgb,
-            mask=self.mask,
             K=self.K,
             recording=self.recording,
             train=self.train,
@@ -75,6 +76,8 @@ class PoseJob:
     def load(cls, folder: Path) -> PoseJob:
         """Read the job."""
         fields: dict[str, Any] = {**load_npz(folder / "job.npz")}
+        for name in ("rgb", "mask"):
+            fields[name] = np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
         return cls(**fields, **json.loads((folder / "job.json").read_text()))
 
 
@@ -170,7 +173,8 @@ def run_job(module: str, job: PoseJob, name: str, *, stage: str) -> PoseJobResul
                 text=True,
                 # Ctrl-C is for the caller, which then ends this process.
                 start_new_session=True,
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)},
+                # Pairs are matched in threads of their own: more of them in each product are in the way.
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(paths), "OPENBLAS_NUM_THREADS": "1"},
             ) as process,
         ):
             try:

@@ -11,6 +11,7 @@ from jaxtyping import Float, Int, UInt8
 
 from extrags.config import PosesConfig
 from extrags.errors import ShapeError
+from extrags.frame_stacks import frames_of
 from extrags.poses.job import PoseJob, PoseJobResult, run_job
 from extrags.poses.registration_report import triangulation_angles_deg
 from extrags.sequence import EndoscopicSequence
@@ -102,8 +103,8 @@ def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:
     recording = sequence.recording
     poses = sequence.cameras.world_from_camera[train].astype(np.float64)
     return PoseJob(
-        rgb=sequence.rgb[train],
-        mask=sequence.mask[train],
+        rgb=frames_of(sequence.rgb, train),
+        mask=frames_of(sequence.mask, train),
         K=sequence.K[train].astype(np.float64),
         recording=np.zeros(len(train), dtype=np.int64) if recording is None else recording[train],
         train=np.arange(len(train)),

@@ -57,6 +57,12 @@ def test_it_knows_where_it_is_wrong(withheld: EndoscopicSequence, estimate: Dept
     assert estimate.report["median_expected_error"] == pytest.approx(np.median(expected), rel=0.05)
 
 
+def test_the_median_is_of_all_valid_pixels(withheld: EndoscopicSequence, estimate: DepthEstimate) -> None:
+    expected = estimate.expected_error[withheld.mask]
+    assert estimate.report["median_expected_error"] == float(np.median(expected))
+    assert not estimate.expected_error[~withheld.mask].any()
+
+
 def test_stereo_alone_is_farther_off(withheld: EndoscopicSequence, estimate: DepthEstimate) -> None:
     plain = estimate_depth(withheld.training_part(), DepthConfig(completion="none", **SETTINGS))
     completed, alone = relative_error(withheld, estimate), relative_error(withheld, plain)
