@@ -27,6 +27,7 @@ from extrags.events import MetricRecorded, Progress, emit
 from extrags.metrics.image import psnr_per_image
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.protocol import Enhancer
+from extrags.restoration.restored_renders import share_where_known
 from extrags.restoration.trajectories import restored_batches
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
@@ -98,6 +99,8 @@ class Judgement(Storable):
         reason: in words, with the number it rests on.
         trials: in the order they were made.
         left_out: positions, among the training frames, of the frames left out.
+        known_share: how much of a view restored in the image serves where the scene knows the surface, from
+            the trial that is kept; None where that was not measured.
     """
 
     stored_as: ClassVar[str] = "judgement.json"
@@ -106,6 +109,7 @@ class Judgement(Storable):
     reason: str
     trials: tuple[Trial, ...] = ()
     left_out: tuple[int, ...] = ()
+    known_share: float | None = None
 
     def applied_to(self, config: FinetuneConfig) -> FinetuneConfig:
         """The settings with the weight of virtual views that is kept; for amounts above zero."""
@@ -122,7 +126,8 @@ class Judgement(Storable):
         """Read what `save` wrote."""
         values = json.loads(path.read_bytes())
         trials = tuple(Trial(**trial) for trial in values["trials"])
-        return cls(values["amount"], values["reason"], trials, tuple(values["left_out"]))
+        left_out = tuple(values["left_out"])
+        return cls(values["amount"], values["reason"], trials, left_out, values["known_share"])
 
 
 @one_torch_thread()
@@ -199,15 +204,18 @@ def judge_finetuning(
     )
     before = [value for part, start, _ in arms for value in _psnr_db(start, part)]
 
+    tried: dict[float | None, list[Scene]] = {None: [start for _, start, _ in arms]}
+
     def after_finetuning(amount: float) -> list[float]:
         weight = {"pseudo_weight": amount * config.pseudo_weight} if amount > 0 else {}
-        after = []
+        after, tried[amount] = [], []
         for part, start, views in arms:
             pseudo_views = views if amount > 0 else None
             found = finetune(
                 start, part, pseudo_views, brief.model_copy(update=weight), coarse, stage="finetune-judge"
             )
             after += _psnr_db(found.scene, part)
+            tried[amount].append(found.scene)
         return after
 
     control = after_finetuning(0.0)
@@ -222,6 +230,12 @@ def judge_finetuning(
     judgement = decide(trials, settings.max_loss_db, np.sort(np.concatenate(left)))
     if config.keep_scene:
         judgement = replace(judgement, reason=f"{KEPT}; {judgement.reason}")
+    if enhancer is not None:
+        parts = zip(arms, tried[judgement.amount], strict=True)
+        shown = ((start, render(scene, part), part) for (part, start, _), scene in parts)
+        judgement = replace(judgement, known_share=share_where_known(shown, enhancer, enhance))
+        if judgement.known_share is not None:
+            emit(MetricRecorded("finetune", "known_share", judgement.known_share))
     logger.info("finetune: %s", judgement.reason)
     return judgement
 

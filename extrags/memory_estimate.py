@@ -22,8 +22,6 @@ GB = 1e9
 
 PROCESS = 700_000_000
 """Interpreter, libraries and the flow, before anything is read."""
-SEQUENCE = 16
-"""Bytes per pixel of a frame where stacks are not mapped: colours, masks and depth, and a copy of some."""
 SEQUENCE_STACKS = (3, 1, 1, 4, 4)
 """Bytes per pixel of the stacks of a sequence: colours, two masks, two of depth."""
 DECODED = 60
@@ -35,8 +33,12 @@ COMPARED = 36
 """Bytes per pixel of a training frame, at the width at which blurred and moved frames are looked for."""
 COMPARED_WIDTH = 320
 """That width (`extrags.training.frame_comparison`, which loads more than an estimate needs)."""
-DEPTH_FRAME = 60
-"""Bytes per pixel of a training frame while its depth is estimated."""
+DEPTH_FRAME = 195
+"""Bytes per pixel of a training frame, at the width it is matched at, while its depth is estimated."""
+DEPTH_STACKS = (3, 1, 4, 4)
+"""Bytes per pixel of copies of training frames then, and of their depth with its error."""
+FEATURES = 350
+"""Bytes per pixel of a frame and thread while COLMAP finds features, in a process of its own."""
 STEP = 140
 """Bytes per pixel of the image of one optimisation step: rendering, loss and their gradients."""
 GAUSSIAN = 2400
@@ -153,6 +155,8 @@ def estimate_memory(
     network = NETWORK * threads * working if config.enhance.backend == "embedded" else 0
     references = REFERENCE * train * working
     small = round(pixels * min(1.0, SURFACE_WIDTH / size.width) ** 2)
+    matched = round(pixels * min(1.0, config.depth.max_width / size.width) ** 2)
+    features = FEATURES * threads * pixels
     metrics = METRICS * max(pixels, min(PIXELS_MEASURED_AT_ONCE, pixels * max(1, all_frames - train)))
     whole = PROCESS + _held(SEQUENCE_STACKS, all_frames * pixels)
     rendered = RENDERED_VIEW * max(0, all_frames - train) * pixels
@@ -164,8 +168,8 @@ def estimate_memory(
     stacks = 1 + ("finetune" not in leave_out) + (restored > 0)
     found: dict[StageName, float] = {
         "ingest": whole + DECODED * source,
-        "poses": PROCESS + SEQUENCE * all_frames * pixels,
-        "depth": PROCESS + (SEQUENCE + DEPTH_FRAME) * train * pixels,
+        "poses": whole + features,
+        "depth": held + _held(DEPTH_STACKS, train * pixels) + max(features, DEPTH_FRAME * train * matched),
         "coarse": held + steps + gaussian * coarse_gaussians,
         "surface": held + _held(FUSED_STACKS, train * small),
         "explore": held + _held(FUSED_STACKS, train * small),

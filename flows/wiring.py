@@ -97,6 +97,9 @@ class SequenceRun(CachedStages):
     The arguments are those of `run_sequence`.
     """
 
+    _known_share: float | None = None
+    """Of restored views where the scene knows the surface, from the judge of the fine-tuning."""
+
     def has_poses(self) -> bool:
         """Whether the source has camera poses."""
         return bool(self._manifest("sequence").counts["has_poses"])
@@ -315,6 +318,7 @@ class SequenceRun(CachedStages):
             }
             self.refs["judgement"] = self._run_task(row, Call(judge, inputs))
             judgement = self.store.load(Judgement, self.refs["judgement"])
+            self._known_share = judgement.known_share
             planned = self.planned("finetune")
             if planned is None or "judge.enabled" not in planned.budget:
                 row.reason = judgement.reason
@@ -399,6 +403,7 @@ class SequenceRun(CachedStages):
             "config": renders_settings(self.config.enhance, kind),
             "finish": kind,
             "refiner": refiner_digest() if kind == "refined" else None,
+            "known_share": self._known_share,
         }
         return self._run_task(row, Call(restore_renders, inputs))
 

@@ -66,7 +66,7 @@ def restoring_settings(config: EnhanceConfig, finish: Finish) -> EnhanceConfig:
     return settings.model_copy(update={"precision": chosen_precision(config)})
 
 
-@stage("evaluate-restore", version=6)
+@stage("evaluate-restore", version=7)
 def restore(
     slot: Slot,
     renders: Ref,
@@ -77,6 +77,7 @@ def restore(
     config: EnhanceConfig,
     finish: Finish,
     refiner: str | None,
+    known_share: float | None,
 ) -> None:
     """Restore rendered held-out views in the image; writes `renders/`, and the scene's `mesh/` again.
 
@@ -90,6 +91,7 @@ def restore(
         config: from `restoring_settings`.
         finish: see `extrags.restoration.restored_renders.restored_renders`.
         refiner: digest of the refiner, where it is used; only part of the key.
+        known_share: of the restored view where the scene knows the surface; None where nothing was judged.
     """
     from extrags.metrics.protocol import RenderedViews
     from extrags.restoration.backends import load_enhancer
@@ -106,6 +108,7 @@ def restore(
         load_enhancer(slot.open(restorer) / RESTORER),
         config,
         finish=finish,
+        known_share=known_share,
     )
     slot.save(views)
     slot.counts["views"] = len(views)

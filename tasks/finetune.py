@@ -19,7 +19,7 @@ def finetuning_settings(config: FinetuneConfig) -> FinetuneConfig:
 
 
 # The weights' digest is in the key; where their file lies is not. Batches only bound the memory.
-@stage("finetune-judge", version=9, ignore=("weights", "clips_per_batch"))
+@stage("finetune-judge", version=10, ignore=("weights", "clips_per_batch"))
 def judge(
     slot: Slot,
     scene: Ref,
@@ -59,7 +59,7 @@ def judge(
         measure=weights.perceptual_difference(),
     )
     slot.save(judgement)
-    slot.counts["amount"] = judgement.amount
+    slot.counts.update(amount=judgement.amount, known_share=judgement.known_share)
 
 
 @stage("finetune", version=10)

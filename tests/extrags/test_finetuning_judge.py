@@ -14,8 +14,10 @@ from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, DensifyConfig, EnhanceConfig, FinetuneConfig
 from extrags.config.stages import JudgeConfig
 from extrags.finetuning_judge import AMOUNTS, Judgement, Trial, decide, judge_finetuning
+from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.classical import ClassicalEnhancer
-from extrags.restoration.protocol import Clip, Restoration
+from extrags.restoration.protocol import Clip, Enhancer, Restoration
+from extrags.restoration.restored_renders import RESTORED_SHARE
 from tests.extrags.lit_tube import Tube, tube_cameras
 
 COARSE = CoarseConfig(iterations=60, max_points=300, densify=DensifyConfig(max_gaussians=500))
@@ -38,7 +40,7 @@ def trajectories() -> list[Cameras]:
     return [tube_cameras(3, offset_mm=3.0, start_mm=start, turn=0.4) for start in (0.0, 4.0)]
 
 
-def judged(tube: Tube, enhancer: ClassicalEnhancer | None, config: FinetuneConfig = FINETUNE) -> Judgement:
+def judged(tube: Tube, enhancer: Enhancer | None, config: FinetuneConfig = FINETUNE) -> Judgement:
     return judge_finetuning(
         tube.scene,
         tube.sequence,
@@ -97,6 +99,16 @@ def test_a_restorer_that_destroys_is_left_out(tube: Tube) -> None:
     # views tell them apart by less than the standard error.
     sound = judged(tube, ClassicalEnhancer(""), config)
     assert sound.trials[0] == control
+
+
+def test_it_tells_how_much_of_restored_views_serves(tube: Tube) -> None:
+    """Of a restorer that changes nothing: the trial's coarse scene against its fine-tuned one."""
+    config = FINETUNE.model_copy(update={"iterations": 300})
+    found = judged(tube, AsRendered(), config)
+    assert found.trials[-1].gain_db > 0.5
+    assert found.known_share is not None
+    assert found.known_share < RESTORED_SHARE
+    assert judged(tube, ClassicalEnhancer("")).known_share is None
 
 
 def test_the_control_is_compared_frame_by_frame(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -185,6 +197,6 @@ def test_the_weight_of_virtual_views_follows() -> None:
 
 def test_storage(tmp_path: Path) -> None:
     for amount in (None, 0.0, 1.0):
-        found = Judgement(amount, "why", (trial(0.0, 0.5, 0.5), trial(1.0, -0.25, 0.5, 0.2)), (2, 5))
+        found = Judgement(amount, "why", (trial(0.0, 0.5, 0.5), trial(1.0, -0.25, 0.5, 0.2)), (2, 5), 0.25)
         found.save(tmp_path / "judgement.json")
         assert Judgement.load(tmp_path / "judgement.json") == found

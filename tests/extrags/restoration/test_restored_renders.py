@@ -17,7 +17,7 @@ from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.refinement.refiner import Refiner
-from extrags.restoration.restored_renders import FINAL_SHARE, restored_renders
+from extrags.restoration.restored_renders import RESTORED_SHARE, restored_renders, share_where_known
 from tests.extrags.lit_tube import Tube
 from tests.extrags.restoration.test_refinement import untrained
 
@@ -55,8 +55,31 @@ class TestRestoredRenders:
         """The restored view is the coarse scene's own, at the exposure of the protocol."""
         bright = replace(renders, rgb=np.full_like(renders.rgb, 0.75), alpha=np.ones_like(renders.alpha))
         mixed = restored(tube, bright, AsRendered())
-        expected = (1 - FINAL_SHARE) * renders.rgb.clip(0, 1) + FINAL_SHARE * 0.75
+        expected = RESTORED_SHARE * renders.rgb.clip(0, 1) + (1 - RESTORED_SHARE) * 0.75
         np.testing.assert_allclose(mixed.rgb, expected, atol=1e-5)
+
+    @pytest.mark.usefixtures("each_alone")
+    def test_what_is_known_keeps_more_of_the_final_scene_where_that_was_judged(
+        self, tube: Tube, renders: RenderedViews
+    ) -> None:
+        bright = replace(renders, rgb=np.full_like(renders.rgb, 0.75), alpha=np.ones_like(renders.alpha))
+        training = tube.sequence.training_part()
+        mixed = restored_renders(
+            tube.scene,
+            bright,
+            tube.sequence,
+            training,
+            AsRendered(),
+            CONFIG,
+            finish="smooth",
+            known_share=0.1,
+        )
+        share = np.abs(mixed.rgb - 0.75) / np.abs(renders.rgb.clip(0, 1) - 0.75).clip(1e-3)
+        known, invented = np.abs(share - 0.1) < 1e-3, np.abs(share - RESTORED_SHARE) < 1e-3
+        assert known.mean() > 0.05
+        assert share.mean() < 0.6 * RESTORED_SHARE
+        assert invented.any()
+        assert share.max() < RESTORED_SHARE + 1e-2
 
     @pytest.mark.usefixtures("each_alone")
     def test_the_final_scene_counts_only_where_it_has_a_surface(
@@ -117,6 +140,39 @@ class TestRestoredRenders:
         one = RenderedViews(renders.rgb[:1], renders.alpha[:1], renders.depth_mm[:1], renders.n_gaussians)
         with pytest.raises(ShapeError, match="1 renders of 2 held-out frames"):
             restored(tube, one, ClassicalEnhancer())
+
+
+class Shifted(Unnamed):
+    """Makes all views brighter than those it was made for."""
+
+    def __init__(self, views: np.ndarray, shift: float) -> None:
+        super().__init__()
+        self._views, self._shift = iter(views), shift
+
+    def restore(self, clip: Clip) -> Restoration:
+        views = np.stack([next(self._views) for _ in range(len(clip))])
+        return replace(super().restore(clip), rgb=(views + self._shift).astype(np.float32))
+
+
+class TestShareWhereKnown:
+    @pytest.mark.parametrize(
+        ("nearest", "expected"),
+        # Too little to gain is no harm; what harms is taken as far as it helps, or not at all.
+        [(1.0, RESTORED_SHARE), (0.35, RESTORED_SHARE), (0.2, 0.2), (-0.5, 0.0)],
+    )
+    def test_it_is_that_of_the_nearest_mixture_where_restoring_harms(
+        self, tube: Tube, renders: RenderedViews, nearest: float, expected: float
+    ) -> None:
+        shift = 0.1
+        truth = tube.sequence.rgb[tube.sequence.test].astype(np.float32) / 255
+        rendered = (truth - nearest * shift).astype(np.float32)
+        shown = replace(renders, rgb=rendered)
+        trials = [(tube.scene, shown, tube.sequence)]
+        found = share_where_known(trials, Shifted(rendered.clip(0, 1), shift), CONFIG)
+        assert found == pytest.approx(expected, abs=0.01)
+
+    def test_blending_and_filling_needs_none(self, tube: Tube, renders: RenderedViews) -> None:
+        assert share_where_known([(tube.scene, renders, tube.sequence)], ClassicalEnhancer(), CONFIG) is None
 
 
 def test_a_refiner_changes_only_what_is_invented(
