@@ -18,12 +18,13 @@ from extrags.redaction import has_credentials, without_credentials, without_cred
 from extrags.store.canonical import Ref
 from extrags.store.directory import ABOUT, DirectoryBackend, private_directory, sweep_directories
 from extrags.store.integrity import Damage, Depth, default_depth, find_damage, list_contents
+from extrags.store.kept import kept_or_read
 from extrags.store.manifest import Manifest, is_name, software_versions, stage_of
 from extrags.store.refusal import refused_write
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
 
-__all__ = ["Slot", "Store", "forget_loaded"]
+__all__ = ["Slot", "Store"]
 
 log = logging.getLogger(__name__)
 
@@ -32,40 +33,6 @@ S = TypeVar("S", bound=Storable)
 
 _opened: set[tuple[str, str, int, Depth]] = set()
 """Artefacts whose contents this process has compared: path, digest, inode (another one after a repair)."""
-
-MOST_KEPT = 2
-"""A run reads its frames and, without the held-out ones, its training frames; some stages both."""
-KEPT_BYTES = 4 << 30
-"""Beside the last one, of all arrays together: those of a long recording take room for temporary files."""
-
-_kept: dict[tuple[type[Storable], str], Storable] = {}
-"""The last loaded objects that are kept, by class and digest; the one that was asked for last is the last."""
-
-
-def forget_loaded() -> None:
-    """Keep no loaded object any longer: its memory, or the room of its mapped files, is free."""
-    _kept.clear()
-
-
-def _keep(found: S, ref: Ref) -> S:
-    _make_room(MOST_KEPT - 1, KEPT_BYTES - _size(found))
-    _kept[type(found), ref.digest] = found
-    return found
-
-
-def _make_room(most: int, most_bytes: int) -> None:
-    """Let the oldest go; other threads may do so at the same time."""
-    for key in list(_kept):
-        if len(_kept) > most or sum(map(_size, list(_kept.values()))) > most_bytes:
-            _kept.pop(key, None)
-        else:
-            break
-
-
-def _size(found: Storable) -> int:
-    """Bytes of its arrays."""
-    # Without numpy, which commands that only look into a store do not load.
-    return sum(getattr(value, "nbytes", 0) for value in vars(found).values())
 
 
 class Slot:
@@ -294,15 +261,13 @@ class Store:
             StoreError: as `open`.
         """
         path = self.open(ref)
-        kept = _kept.pop((kind, ref.digest), None)
-        if isinstance(kept, kind):
-            return _keep(kept, ref)
-        if kind.kept_when_loaded:
-            # Before, not after: long recordings take much room.
-            _make_room(MOST_KEPT - 1, KEPT_BYTES)
-        with self._blaming([ref]):
-            found: S = kind.load(path / kind.stored_as)
-        return _keep(found, ref) if kind.kept_when_loaded else found
+
+        def read() -> S:
+            with self._blaming([ref]):
+                found: S = kind.load(path / kind.stored_as)
+            return found
+
+        return kept_or_read(kind, ref.digest, read) if kind.kept_when_loaded else read()
 
     def load_json(self, file: str, ref: Ref) -> Any:
         """What `Slot.save_json` wrote.

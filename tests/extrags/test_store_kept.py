@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from extrags.errors import StoreError
-from extrags.store import Ref, Storable, Store, artefacts, forget_loaded
+from extrags.store import Ref, Storable, Store, forget_loaded, kept
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class Frames(Storable):
 
 def test_of_large_ones_the_last_alone_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two long recordings would take the room of both in the folder of temporary files."""
-    monkeypatch.setattr(artefacts, "KEPT_BYTES", 10)
+    monkeypatch.setattr(kept, "KEPT_BYTES", 10)
     store = Store(tmp_path)
     small, other, large = (stored(store, word, word) for word in ("12345", "abcde", "1234567"))
     first = store.load(Frames, small)
