@@ -27,7 +27,7 @@ from extrags.events import MetricRecorded, Progress, emit
 from extrags.metrics.image import psnr_per_image
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.protocol import Enhancer
-from extrags.restoration.restored_renders import share_where_known
+from extrags.restoration.restored_renders import RestoredShares, restored_shares
 from extrags.restoration.trajectories import restored_batches
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
@@ -47,6 +47,12 @@ AMOUNTS = (1.0, 0.3, 0.1)
 MIN_LEFT_OUT = 4
 """Two or three frames say too little of how PSNR changes: then a trial leaves out others as well, in a second
 reconstruction."""
+
+
+COMPARED_FRAMES = 8
+"""Training frames that tell how much better the scene is than its brief reconstructions."""
+SOLID = 0.98
+"""Opacity of pixels that are compared for it."""
 
 
 KEPT = (
@@ -99,8 +105,8 @@ class Judgement(Storable):
         reason: in words, with the number it rests on.
         trials: in the order they were made.
         left_out: positions, among the training frames, of the frames left out.
-        known_share: how much of a view restored in the image serves where the scene knows the surface, from
-            the trial that is kept; None where that was not measured.
+        restored_shares: how much of views restored in the image serves, from the trial that is kept; None
+            where that was not measured.
     """
 
     stored_as: ClassVar[str] = "judgement.json"
@@ -109,7 +115,7 @@ class Judgement(Storable):
     reason: str
     trials: tuple[Trial, ...] = ()
     left_out: tuple[int, ...] = ()
-    known_share: float | None = None
+    restored_shares: RestoredShares | None = None
 
     def applied_to(self, config: FinetuneConfig) -> FinetuneConfig:
         """The settings with the weight of virtual views that is kept; for amounts above zero."""
@@ -127,7 +133,9 @@ class Judgement(Storable):
         values = json.loads(path.read_bytes())
         trials = tuple(Trial(**trial) for trial in values["trials"])
         left_out = tuple(values["left_out"])
-        return cls(values["amount"], values["reason"], trials, left_out, values["known_share"])
+        shares = values["restored_shares"]
+        shares = None if shares is None else RestoredShares(**shares)
+        return cls(values["amount"], values["reason"], trials, left_out, shares)
 
 
 @one_torch_thread()
@@ -231,11 +239,11 @@ def judge_finetuning(
     if config.keep_scene:
         judgement = replace(judgement, reason=f"{KEPT}; {judgement.reason}")
     if enhancer is not None:
+        share = np.mean([_error_share(scene, sequence, start, part) for part, start, _ in arms])
         parts = zip(arms, tried[judgement.amount], strict=True)
-        shown = ((start, render(scene, part), part) for (part, start, _), scene in parts)
-        judgement = replace(judgement, known_share=share_where_known(shown, enhancer, enhance))
-        if judgement.known_share is not None:
-            emit(MetricRecorded("finetune", "known_share", judgement.known_share))
+        shown = ((start, render(final, part), part) for (part, start, _), final in parts)
+        shares = restored_shares(shown, enhancer, enhance, error_share=float(share))
+        judgement = replace(judgement, restored_shares=shares)
     logger.info("finetune: %s", judgement.reason)
     return judgement
 
@@ -283,6 +291,37 @@ def _psnr_db(scene: Scene, sequence: EndoscopicSequence) -> list[float]:
     mask = torch.from_numpy(sequence.mask[sequence.test])
     values = psnr_per_image(torch.from_numpy(renders.rgb).clamp(0, 1), truth, mask)
     return [value for value in values if value is not None]
+
+
+def _error_share(scene: Scene, sequence: EndoscopicSequence, brief: Scene, part: EndoscopicSequence) -> float:
+    """Squared error of the scene as a share of a brief reconstruction's, on frames that both were made with.
+
+    Args:
+        scene: the coarse scene.
+        sequence: its frames.
+        brief: the brief one.
+        part: the frames it was made with, which may be smaller.
+    """
+    places = np.linspace(0, len(part.train) - 1, min(COMPARED_FRAMES, len(part.train)))
+    frames = part.train[places.round().astype(np.int64)]
+    truth = part.rgb[frames].astype(np.float32) / 255
+    errors = []
+    for shown, its_frames in ((scene, sequence), (brief, part)):
+        views = render(shown, its_frames, frames)
+        solid = [_resized(alpha, part) > SOLID for alpha in views.alpha]
+        rgb = [_resized(view.clip(0, 1), part) for view in views.rgb]
+        errors.append((np.square(np.stack(rgb) - truth), np.stack(solid) & part.mask[frames]))
+    known = errors[0][1] & errors[1][1]
+    own, other = (float(squares[known].mean()) if known.any() else 1.0 for squares, _ in errors)
+    return own / max(other, 1e-9)
+
+
+def _resized(image: Float[np.ndarray, "..."], like: EndoscopicSequence) -> Float[np.ndarray, "..."]:
+    import cv2
+
+    if image.shape[:2] == (like.height, like.width):
+        return image
+    return np.asarray(cv2.resize(image, (like.width, like.height), interpolation=cv2.INTER_AREA))
 
 
 def _trial(amount: float, before: list[float], after: list[float], control: list[float]) -> Trial:

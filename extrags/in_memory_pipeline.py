@@ -368,7 +368,7 @@ class InMemoryPipeline(Pipeline):
             self._enhancer,
             self.config.enhance,
             finish=self.config.evaluate.restored,
-            known_share=None if self.result.judgement is None else self.result.judgement.known_share,
+            shares=None if self.result.judgement is None else self.result.judgement.restored_shares,
         )
 
     def report(self) -> None:

@@ -97,8 +97,8 @@ class SequenceRun(CachedStages):
     The arguments are those of `run_sequence`.
     """
 
-    _known_share: float | None = None
-    """Of restored views where the scene knows the surface, from the judge of the fine-tuning."""
+    _restored_shares: tuple[float, float] | None = None
+    """Of restored views, where the scene knows the surface and elsewhere, from the judge of fine-tuning."""
 
     def has_poses(self) -> bool:
         """Whether the source has camera poses."""
@@ -318,7 +318,8 @@ class SequenceRun(CachedStages):
             }
             self.refs["judgement"] = self._run_task(row, Call(judge, inputs))
             judgement = self.store.load(Judgement, self.refs["judgement"])
-            self._known_share = judgement.known_share
+            shares = judgement.restored_shares
+            self._restored_shares = None if shares is None else (shares.known, shares.invented)
             planned = self.planned("finetune")
             if planned is None or "judge.enabled" not in planned.budget:
                 row.reason = judgement.reason
@@ -403,7 +404,7 @@ class SequenceRun(CachedStages):
             "config": renders_settings(self.config.enhance, kind),
             "finish": kind,
             "refiner": refiner_digest() if kind == "refined" else None,
-            "known_share": self._known_share,
+            "shares": self._restored_shares,
         }
         return self._run_task(row, Call(restore_renders, inputs))
 

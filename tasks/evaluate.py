@@ -77,7 +77,7 @@ def restore(
     config: EnhanceConfig,
     finish: Finish,
     refiner: str | None,
-    known_share: float | None,
+    shares: tuple[float, float] | None,
 ) -> None:
     """Restore rendered held-out views in the image; writes `renders/`, and the scene's `mesh/` again.
 
@@ -91,11 +91,12 @@ def restore(
         config: from `restoring_settings`.
         finish: see `extrags.restoration.restored_renders.restored_renders`.
         refiner: digest of the refiner, where it is used; only part of the key.
-        known_share: of the restored view where the scene knows the surface; None where nothing was judged.
+        shares: of the restored views, where the scene knows the surface and where it is invented; None where
+            nothing was judged.
     """
     from extrags.metrics.protocol import RenderedViews
     from extrags.restoration.backends import load_enhancer
-    from extrags.restoration.restored_renders import restored_renders
+    from extrags.restoration.restored_renders import RestoredShares, restored_renders
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
     from extrags.surface import Mesh
@@ -108,7 +109,7 @@ def restore(
         load_enhancer(slot.open(restorer) / RESTORER),
         config,
         finish=finish,
-        known_share=known_share,
+        shares=None if shares is None else RestoredShares(*shares),
     )
     slot.save(views)
     slot.counts["views"] = len(views)

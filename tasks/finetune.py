@@ -59,7 +59,7 @@ def judge(
         measure=weights.perceptual_difference(),
     )
     slot.save(judgement)
-    slot.counts.update(amount=judgement.amount, known_share=judgement.known_share)
+    slot.counts["amount"] = judgement.amount
 
 
 @stage("finetune", version=10)

@@ -26,7 +26,7 @@ from torch.nn import functional
 from extrags.config import EnhanceConfig
 from extrags.config.stages import Finish
 from extrags.errors import ShapeError
-from extrags.events import Progress, emit
+from extrags.events import MetricRecorded, Progress, emit
 from extrags.frame_stacks import FrameStack, frames_of, stacked
 from extrags.lens import Undistortion, distortion_of_pinhole
 from extrags.metrics.filters import filter_separable, gaussian_weights
@@ -48,16 +48,21 @@ from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import condition
 from extrags.view_synthesis.gather import gather_references
 
-__all__ = ["RESTORED_SHARE", "restored_renders", "share_where_known"]
+__all__ = ["RESTORED_SHARE", "RestoredShares", "restored_renders", "restored_shares"]
 
 logger = logging.getLogger(__name__)
 
 RESTORED_SHARE = 0.6
 """Of the restored view; the rest is the final scene's. Their errors have little in common, so that the mean
 of both is nearer to the truth than either."""
-KNOWN_SHARE = 0.5
-"""Pixels that are invented to less than this share tell how much of the restored view serves where the scene
-knows the surface."""
+MOSTLY = 0.5
+"""Pixels that are invented to more than this share tell how much of the restored view serves where it is
+invented, all others how much where the scene knows the surface."""
+TOLERATED_LOSS_DB = 1.0
+"""Left-out frames lie near the path, where a scene knows best: on two phantoms held-out views gained a
+decibel where left-out frames told of neither gain nor loss."""
+LEAST_PIXELS = 500
+"""Fewer pixels of a kind tell nothing."""
 DEPTH_SMOOTHING_SHARE = 0.02
 """Standard deviation of the window that the ratio of both depths is smoothed with, per width of a view."""
 LARGEST_LOG_RATIO = 1.0
@@ -66,6 +71,25 @@ FADING_SHARE = 0.5
 """Where the final scene has a surface in less of the window, its depth counts the less."""
 LEAST_SHARE = 1e-3
 """A shrunk pixel that has less of the final scene's surface has none."""
+
+
+@dataclass(frozen=True)
+class RestoredShares:
+    """How much of a restored view is taken; the rest is the final scene's.
+
+    Args:
+        known: where the scene knows the surface.
+        invented: elsewhere, as far as the final scene has a surface there.
+    """
+
+    known: float = RESTORED_SHARE
+    invented: float = RESTORED_SHARE
+
+    def __str__(self) -> str:
+        return (
+            f"{self.known:.2f} of what is restored where the scene knows the surface, {self.invented:.2f} "
+            f"where it is invented ({RESTORED_SHARE:g} unless left-out frames lose by it)"
+        )
 
 
 @one_torch_thread()
@@ -78,7 +102,7 @@ def restored_renders(
     config: EnhanceConfig,
     *,
     finish: Finish = "refined",
-    known_share: float | None = None,
+    shares: RestoredShares | None = None,
 ) -> RenderedViews:
     """Restore rendered held-out views.
 
@@ -96,8 +120,7 @@ def restored_renders(
         config: the number of references, the working width, the seed, and the refiner's precision.
         finish: what is done to invented colours: `textured` lays texture of the scene's own frames onto them,
             `refined` gives both to the refiner of the package, unless the restorer only blends and fills.
-        known_share: of the restored view where the scene knows the surface, from `share_where_known`; None
-            takes that of invented pixels, `RESTORED_SHARE`.
+        shares: how much of the restored views to take, from `restored_shares`; None takes `RESTORED_SHARE`.
 
     Returns:
         The same views with other colours; opacity and depth are those of the final scene.
@@ -111,21 +134,18 @@ def restored_renders(
         raise ShapeError(f"{len(renders)} renders of {len(sequence.test)} held-out frames")
     if sequence.lens is not None:
         return _through_pinholes(
-            coarse, renders, sequence, training, enhancer, config, finish=finish, known_share=known_share
+            coarse, renders, sequence, training, enhancer, config, finish=finish, shares=shares
         )
-    known_share = RESTORED_SHARE if known_share is None else known_share
-    if known_share < RESTORED_SHARE and not isinstance(enhancer, ClassicalEnhancer):
-        logger.info(
-            "where the scene knows the surface, views take %.2f of what is restored in place of %.2f: "
-            "left-out frames show no more to gain",
-            known_share,
-            RESTORED_SHARE,
-        )
+    shares = RestoredShares() if shares is None else shares
     width = config.working_width(sequence.width)
     small, training = sequence.at_most_width(width), training.at_most_width(width)
     references = gather_references(coarse, training, training.train)
     texture = None if finish == "smooth" else SurfaceTexture.of_references(references, seed=config.seed)
     refiner, keeps_known = None, isinstance(enhancer, ClassicalEnhancer)
+    if keeps_known:
+        shares = RestoredShares(known=0.0)
+    elif shares != RestoredShares():
+        logger.info("restored views: %s", shares)
     if finish == "refined" and keeps_known:
         logger.info("restored views are not refined: the restorer only blends and fills")
     elif finish == "refined":
@@ -138,13 +158,14 @@ def restored_renders(
         part = slice(done, done + len(clip))
         cameras = sequence.cameras[sequence.test[part]]
         view = _RestoredClip.of_clip(clip, _part_of(renders, part), enhancer)
-        mixed = view.mixed(0.0 if keeps_known else known_share)
+        mixed, to_invent = view.mixed(shares), view.still_to_invent(shares)
         if not keeps_known:
-            mixed = mixed + view.agreement(mixed)
+            mixed = mixed + view.agreement(mixed, to_invent)
         if texture is not None:
-            mixed = textured_views(
-                texture, refiner, mixed, cameras, _enlarged(view.depth_mm, view.size), view.enlarged_to_invent
+            full_size_depth_mm, invented = (
+                _enlarged(image, view.size) for image in (view.depth_mm, to_invent)
             )
+            mixed = textured_views(texture, refiner, mixed, cameras, full_size_depth_mm, invented)
         mixed = mixed.clamp(0, 1)
         for view in mixed.permute(0, 2, 3, 1).numpy():
             restored.append(view)
@@ -153,31 +174,34 @@ def restored_renders(
     return replace(renders, rgb=restored.array)
 
 
-def share_where_known(
+def restored_shares(
     trials: Iterable[tuple[Scene, RenderedViews, EndoscopicSequence]],
     enhancer: Enhancer,
     config: EnhanceConfig,
-) -> float | None:
-    """How much of the restored view to take where the scene knows the surface, as left-out frames tell.
+    *,
+    error_share: float = 1.0,
+) -> RestoredShares | None:
+    """How much of the restored views to take, as left-out frames tell.
 
-    `RESTORED_SHARE`, unless these frames are worse off with it than with the final scene's views alone: what
-    is known well is only blurred by a network. Then the share with which mixtures of both are nearest to the
-    frames, by least squares over the pixels that are not invented. A smaller harm is no evidence, nor is a
-    smaller gain: left-out frames lie near the path, where less of what restoration changes pays than far off.
+    `RESTORED_SHARE`, unless known pixels lose more than `TOLERATED_LOSS_DB` by it against the final scene's
+    views alone: what is known well is only blurred by a network. Then the share with which mixtures of both
+    are nearest to the frames, by least squares; and the same is asked of invented pixels. These alone decide
+    nothing: left-out frames have few of them, and squared errors prefer what is smooth there.
 
     Args:
         trials: of each, a coarse scene without some frames, the views of these by its fine-tuned scene (at
             the exposure of the protocol), and the frames, with those that are left out as the held-out ones.
         enhancer: the scene's restorer.
         config: the number of references and the working width.
+        error_share: squared error of the whole scene as a share of the trials', which are brief: of so much
+            the errors of their views are taken.
 
     Returns:
-        The share; None where the restorer only blends and fills, which leaves known pixels alone in any case,
-        and without any such pixel.
+        The shares; None where the restorer only blends and fills, which leaves known pixels alone anyway.
     """
     if isinstance(enhancer, ClassicalEnhancer):
         return None
-    met = changes = 0.0
+    known, invented = _Errors(), _Errors()
     for coarse, renders, sequence in trials:
         if sequence.lens is not None:
             renders, sequence = _flattened(renders, sequence)[0], sequence.as_pinhole(WIDE_FIELD_DEG)
@@ -190,19 +214,49 @@ def share_where_known(
             frames = sequence.test[part]
             view = _RestoredClip.of_clip(clip, _part_of(renders, part), enhancer)
             truth = torch.from_numpy(frames_of(sequence.rgb, frames)).permute(0, 3, 1, 2).float() / 255
-            known = torch.from_numpy(frames_of(sequence.mask, frames))[:, None] & (
-                view.invented < KNOWN_SHARE
-            )
-            weight = (1 - view.invented) * known
-            change = view.restored - view.rendered
-            met += float((weight * change * (truth - view.rendered)).double().sum())
-            changes += float((weight * change.square()).double().sum())
+            solid = view.solid * torch.from_numpy(frames_of(sequence.mask, frames))[:, None]
+            mostly = view.invented > MOSTLY
+            known.add(view, truth, solid * (1 - view.invented) * ~mostly)
+            invented.add(view, truth, solid * view.invented * mostly)
             done += len(clip)
-    if changes == 0:
-        return None
-    nearest = met / changes
-    # Squared errors are a parabola of the share: at twice the nearest one they are what they are at none.
-    return RESTORED_SHARE if 2 * nearest >= RESTORED_SHARE else max(nearest, 0.0)
+    of_known = known.share("known", error_share)
+    if of_known == RESTORED_SHARE:
+        return RestoredShares()
+    return RestoredShares(of_known, invented.share("invented", error_share))
+
+
+@dataclass
+class _Errors:
+    """Weighted sums of squared errors of the final scene's views and of restored ones, and of the product."""
+
+    pixels: float = 0.0
+    rendered: float = 0.0
+    restored: float = 0.0
+    product: float = 0.0
+
+    def add(
+        self, view: _RestoredClip, truth: Float[Tensor, "t 3 h0 w0"], weight: Float[Tensor, "t 1 h0 w0"]
+    ) -> None:
+        """Count the pixels of a clip by their weight."""
+        rendered, restored = view.rendered - truth, view.restored - truth
+        self.pixels += float(weight.sum())
+        self.rendered += float((weight * rendered.square()).double().sum())
+        self.restored += float((weight * restored.square()).double().sum())
+        self.product += float((weight * rendered * restored).double().sum())
+
+    def share(self, kind: str, error_share: float) -> float:
+        """Of the restored view, for pixels of this kind; see `restored_shares`."""
+        if self.pixels < LEAST_PIXELS or self.rendered == 0:
+            return RESTORED_SHARE
+        rendered, product = error_share * self.rendered, math.sqrt(error_share) * self.product
+        own = 1 - RESTORED_SHARE
+        mixed = own**2 * rendered + RESTORED_SHARE**2 * self.restored + 2 * own * RESTORED_SHARE * product
+        loss_db = 10 * math.log10(mixed / rendered)
+        emit(MetricRecorded("finetune", f"{kind}_loss_db", loss_db))
+        if loss_db <= TOLERATED_LOSS_DB:
+            return RESTORED_SHARE
+        nearest = (rendered - product) / (rendered + self.restored - 2 * product)
+        return min(max(nearest, 0.0), RESTORED_SHARE)
 
 
 def _part_of(renders: RenderedViews, part: slice) -> RenderedViews:
@@ -240,7 +294,7 @@ def _through_pinholes(
     config: EnhanceConfig,
     *,
     finish: Finish,
-    known_share: float | None,
+    shares: RestoredShares | None,
 ) -> RenderedViews:
     """Views through a lens, restored as wide pinholes: what restoration changes there is carried back.
 
@@ -257,7 +311,7 @@ def _through_pinholes(
         enhancer,
         config,
         finish=finish,
-        known_share=known_share,
+        shares=shares,
     )
     changed = FrameStack(len(plans))
     for index, plan in enumerate(plans):
@@ -319,25 +373,27 @@ class _RestoredClip:
         """Height and width of the final scene's views."""
         return self.rendered.shape[-2:]
 
-    @property
-    def enlarged_to_invent(self) -> Float[Tensor, "t 1 h0 w0"]:
-        """What is to be invented, at that size."""
-        return _enlarged(self.to_invent, self.size)
-
-    def mixed(self, known_share: float) -> Float[Tensor, "t 3 h0 w0"]:
-        """Both views: `RESTORED_SHARE` of the restored one where it is invented, `known_share` elsewhere."""
-        final_share = ((1 - known_share) * (1 - self.invented)).clamp_min(1 - RESTORED_SHARE)
+    def mixed(self, shares: RestoredShares) -> Float[Tensor, "t 3 h0 w0"]:
+        """Both views, the restored one by its shares."""
+        most = max(shares.known, shares.invented)
+        least_of_final = 1 - most + (most - shares.invented) * self.invented
+        final_share = torch.maximum((1 - shares.known) * (1 - self.invented), least_of_final)
         # A hole of the final scene has no colour that could be met.
         share = final_share * self.solid
         return (1 - share) * self.restored + share * self.rendered
 
-    def agreement(self, rgb: Float[Tensor, "t 3 h0 w0"]) -> Float[Tensor, "t 3 h0 w0"]:
+    def still_to_invent(self, shares: RestoredShares) -> Float[Tensor, "t 1 h w"]:
+        """What is to be invented; where the final scene serves as well or better, its holes alone."""
+        solid = _shrunk(self.solid, self.to_invent.shape[-2:])
+        return self.to_invent * (1 - (1 - shares.invented / RESTORED_SHARE) * solid)
+
+    def agreement(
+        self, rgb: Float[Tensor, "t 3 h0 w0"], to_invent: Float[Tensor, "t 1 h w"]
+    ) -> Float[Tensor, "t 3 h0 w0"]:
         """What is to be added for the views to agree: coarse, and found at the clip's size."""
         clip = self.clip
-        small = _shrunk(rgb, self.to_invent.shape[-2:])
-        agreed = agreed_views(
-            small, self.depth_mm, self.to_invent, clip.cameras, clip.exposure, clip.transfer
-        )
+        small = _shrunk(rgb, to_invent.shape[-2:])
+        agreed = agreed_views(small, self.depth_mm, to_invent, clip.cameras, clip.exposure, clip.transfer)
         return _enlarged(agreed - small, self.size)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from extrags.finetuning_judge import AMOUNTS, Judgement, Trial, decide, judge_fi
 from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
-from extrags.restoration.restored_renders import RESTORED_SHARE
+from extrags.restoration.restored_renders import RESTORED_SHARE, RestoredShares, restored_shares
 from tests.extrags.lit_tube import Tube, tube_cameras
 
 COARSE = CoarseConfig(iterations=60, max_points=300, densify=DensifyConfig(max_gaussians=500))
@@ -101,14 +102,23 @@ def test_a_restorer_that_destroys_is_left_out(tube: Tube) -> None:
     assert sound.trials[0] == control
 
 
-def test_it_tells_how_much_of_restored_views_serves(tube: Tube) -> None:
+def test_it_tells_how_much_of_restored_views_serves(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a restorer that changes nothing: the trial's coarse scene against its fine-tuned one."""
+    asked: list[float] = []
+
+    def keeping(*arguments: Any, error_share: float) -> RestoredShares | None:
+        asked.append(error_share)
+        return restored_shares(*arguments, error_share=error_share)
+
+    monkeypatch.setattr(finetuning_judge, "restored_shares", keeping)
     config = FINETUNE.model_copy(update={"iterations": 300})
     found = judged(tube, AsRendered(), config)
     assert found.trials[-1].gain_db > 0.5
-    assert found.known_share is not None
-    assert found.known_share < RESTORED_SHARE
-    assert judged(tube, ClassicalEnhancer("")).known_share is None
+    assert found.restored_shares is not None
+    assert 0 <= found.restored_shares.known <= RESTORED_SHARE
+    # The tube's scene is the truth, far from what sixty steps reach.
+    assert 0 < asked[0] < 0.5
+    assert judged(tube, ClassicalEnhancer("")).restored_shares is None
 
 
 def test_the_control_is_compared_frame_by_frame(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -197,6 +207,8 @@ def test_the_weight_of_virtual_views_follows() -> None:
 
 def test_storage(tmp_path: Path) -> None:
     for amount in (None, 0.0, 1.0):
-        found = Judgement(amount, "why", (trial(0.0, 0.5, 0.5), trial(1.0, -0.25, 0.5, 0.2)), (2, 5), 0.25)
+        found = Judgement(
+            amount, "why", (trial(0.0, 0.5, 0.5), trial(1.0, -0.25, 0.5, 0.2)), (2, 5), RestoredShares(0.25)
+        )
         found.save(tmp_path / "judgement.json")
         assert Judgement.load(tmp_path / "judgement.json") == found

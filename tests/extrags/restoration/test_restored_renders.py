@@ -17,7 +17,12 @@ from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.diffusion.precision import chosen_precision
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.refinement.refiner import Refiner
-from extrags.restoration.restored_renders import RESTORED_SHARE, restored_renders, share_where_known
+from extrags.restoration.restored_renders import (
+    RESTORED_SHARE,
+    RestoredShares,
+    restored_renders,
+    restored_shares,
+)
 from tests.extrags.lit_tube import Tube
 from tests.extrags.restoration.test_refinement import untrained
 
@@ -59,27 +64,37 @@ class TestRestoredRenders:
         np.testing.assert_allclose(mixed.rgb, expected, atol=1e-5)
 
     @pytest.mark.usefixtures("each_alone")
-    def test_what_is_known_keeps_more_of_the_final_scene_where_that_was_judged(
-        self, tube: Tube, renders: RenderedViews
+    @pytest.mark.parametrize(
+        "shares", [RestoredShares(0.1), RestoredShares(0.1, 0.0), RestoredShares(0.6, 0.2)]
+    )
+    def test_more_of_the_final_scene_is_kept_where_that_was_judged(
+        self, tube: Tube, renders: RenderedViews, shares: RestoredShares
     ) -> None:
         bright = replace(renders, rgb=np.full_like(renders.rgb, 0.75), alpha=np.ones_like(renders.alpha))
         training = tube.sequence.training_part()
         mixed = restored_renders(
-            tube.scene,
-            bright,
-            tube.sequence,
-            training,
-            AsRendered(),
-            CONFIG,
-            finish="smooth",
-            known_share=0.1,
+            tube.scene, bright, tube.sequence, training, AsRendered(), CONFIG, finish="smooth", shares=shares
         )
         share = np.abs(mixed.rgb - 0.75) / np.abs(renders.rgb.clip(0, 1) - 0.75).clip(1e-3)
-        known, invented = np.abs(share - 0.1) < 1e-3, np.abs(share - RESTORED_SHARE) < 1e-3
-        assert known.mean() > 0.05
-        assert share.mean() < 0.6 * RESTORED_SHARE
-        assert invented.any()
-        assert share.max() < RESTORED_SHARE + 1e-2
+        for expected in (shares.known, shares.invented):
+            assert (np.abs(share - expected) < 1e-3).mean() > 0.05
+        assert share.max() < max(shares.known, shares.invented) + 1e-2
+        assert share.min() > min(shares.known, shares.invented) - 1e-2
+
+    def test_what_serves_as_it_is_gets_no_texture(self, tube: Tube, renders: RenderedViews) -> None:
+        """Where invented pixels lose, only holes of the final scene are finished, and here it has none."""
+        solid = replace(renders, alpha=np.ones_like(renders.alpha))
+        training = tube.sequence.training_part()
+
+        def finished(finish: Finish, shares: RestoredShares) -> np.ndarray:
+            return restored_renders(
+                tube.scene, solid, tube.sequence, training, Unnamed(), CONFIG, finish=finish, shares=shares
+            ).rgb
+
+        alone = RestoredShares(0.0, 0.0)
+        np.testing.assert_array_equal(finished("textured", alone), finished("smooth", alone))
+        np.testing.assert_allclose(finished("smooth", alone), renders.rgb.clip(0, 1), atol=1e-6)
+        assert (finished("textured", RestoredShares()) != finished("smooth", RestoredShares())).any()
 
     @pytest.mark.usefixtures("each_alone")
     def test_the_final_scene_counts_only_where_it_has_a_surface(
@@ -154,25 +169,44 @@ class Shifted(Unnamed):
         return replace(super().restore(clip), rgb=(views + self._shift).astype(np.float32))
 
 
-class TestShareWhereKnown:
+class TestRestoredShares:
     @pytest.mark.parametrize(
         ("nearest", "expected"),
-        # Too little to gain is no harm; what harms is taken as far as it helps, or not at all.
-        [(1.0, RESTORED_SHARE), (0.35, RESTORED_SHARE), (0.2, 0.2), (-0.5, 0.0)],
+        # What restoring gains, or loses a little, is taken; what harms is taken as far as it helps, or not.
+        [(1.0, RESTORED_SHARE), (0.29, RESTORED_SHARE), (0.2, 0.2), (-0.5, 0.0)],
     )
-    def test_it_is_that_of_the_nearest_mixture_where_restoring_harms(
+    def test_known_pixels_take_the_nearest_mixture_where_restoring_harms(
         self, tube: Tube, renders: RenderedViews, nearest: float, expected: float
     ) -> None:
         shift = 0.1
         truth = tube.sequence.rgb[tube.sequence.test].astype(np.float32) / 255
         rendered = (truth - nearest * shift).astype(np.float32)
-        shown = replace(renders, rgb=rendered)
-        trials = [(tube.scene, shown, tube.sequence)]
-        found = share_where_known(trials, Shifted(rendered.clip(0, 1), shift), CONFIG)
-        assert found == pytest.approx(expected, abs=0.01)
+        trials = [(tube.scene, replace(renders, rgb=rendered), tube.sequence)]
+        found = restored_shares(trials, Shifted(rendered.clip(0, 1), shift), CONFIG)
+        assert found is not None
+        assert found.known == pytest.approx(expected, abs=0.01)
+
+    def test_the_errors_of_a_brief_trial_are_larger_than_the_scenes(
+        self, tube: Tube, renders: RenderedViews
+    ) -> None:
+        """Restored views a little better than those of the trial are worse than those of the scene."""
+        truth = tube.sequence.rgb[tube.sequence.test].astype(np.float32) / 255
+        rng = np.random.default_rng(0)
+        rendered = (truth + 0.10 * rng.choice([-1, 1], truth.shape)).astype(np.float32)
+        other = (truth + 0.09 * rng.choice([-1, 1], truth.shape)).astype(np.float32)
+        trials = [(tube.scene, replace(renders, rgb=rendered), tube.sequence)]
+
+        def found(error_share: float) -> RestoredShares | None:
+            return restored_shares(trials, Shifted(other, 0.0), CONFIG, error_share=error_share)
+
+        assert found(1.0) == RestoredShares()
+        better = found(0.1)
+        assert better is not None
+        # Of independent errors the weights are the inverse squares.
+        assert better.known == pytest.approx(0.1 * 0.10**2 / (0.1 * 0.10**2 + 0.09**2), abs=0.05)
 
     def test_blending_and_filling_needs_none(self, tube: Tube, renders: RenderedViews) -> None:
-        assert share_where_known([(tube.scene, renders, tube.sequence)], ClassicalEnhancer(), CONFIG) is None
+        assert restored_shares([(tube.scene, renders, tube.sequence)], ClassicalEnhancer(), CONFIG) is None
 
 
 def test_a_refiner_changes_only_what_is_invented(
