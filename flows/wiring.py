@@ -300,6 +300,7 @@ class SequenceRun(CachedStages):
     def finetune(self) -> None:
         """The final scene; there is none where the judge keeps the coarse one."""
         from extrags.finetuning_judge import Judgement
+        from extrags.restoration.restored_renders import RestoredShares
 
         with self._stage("finetune") as row:
             settings, coarse = self.config.finetune, self.config.coarse
@@ -319,7 +320,9 @@ class SequenceRun(CachedStages):
             self.refs["judgement"] = self._run_task(row, Call(judge, inputs))
             judgement = self.store.load(Judgement, self.refs["judgement"])
             shares = judgement.restored_shares
-            self._restored_shares = None if shares is None else (shares.known, shares.invented)
+            # The usual shares are those of a run without a judge: the same views.
+            usual = shares is None or shares == RestoredShares()
+            self._restored_shares = None if usual else (shares.known, shares.invented)
             planned = self.planned("finetune")
             if planned is None or "judge.enabled" not in planned.budget:
                 row.reason = judgement.reason

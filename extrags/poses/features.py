@@ -149,20 +149,19 @@ def match(
     for start in range(0, len(pairs), PAIRS_PER_CALL):
         part = pairs[start : start + PAIRS_PER_CALL]
         _write_matches(pycolmap, folder, part)
+        if verify:
+            # Of pairs that have matches COLMAP finds the geometry.
+            listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in part))
+            pairing.match_list_path = listed
+            pycolmap.match_image_pairs(
+                folder / "database.db",
+                matching_options=matching,
+                pairing_options=pairing,
+                verification_options=verification,
+                device=pycolmap.Device.cpu,
+            )
         if told is not None:
             told.step(len(part))
-        if not verify:
-            continue
-        # Of pairs that have matches COLMAP finds the geometry.
-        listed.write_text("".join(f"{image_name(i)} {image_name(j)}\n" for i, j in part))
-        pairing.match_list_path = listed
-        pycolmap.match_image_pairs(
-            folder / "database.db",
-            matching_options=matching,
-            pairing_options=pairing,
-            verification_options=verification,
-            device=pycolmap.Device.cpu,
-        )
 
 
 def _write_matches(pycolmap: Any, folder: Path, pairs: list[Pair]) -> None:

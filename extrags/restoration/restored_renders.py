@@ -167,8 +167,8 @@ def restored_renders(
             )
             mixed = textured_views(texture, refiner, mixed, cameras, full_size_depth_mm, invented)
         mixed = mixed.clamp(0, 1)
-        for view in mixed.permute(0, 2, 3, 1).numpy():
-            restored.append(view)
+        for image in mixed.permute(0, 2, 3, 1).numpy():
+            restored.append(image)
         done += len(clip)
         emit(Progress("restore renders", done, len(renders)))
     return replace(renders, rgb=restored.array)
@@ -188,6 +188,8 @@ def restored_shares(
     are nearest to the frames, by least squares; and the same is asked of invented pixels. These alone decide
     nothing: left-out frames have few of them, and squared errors prefer what is smooth there.
 
+    Frames are restored as they are mixed, without agreement and texture, and at the size of the trials.
+
     Args:
         trials: of each, a coarse scene without some frames, the views of these by its fine-tuned scene (at
             the exposure of the protocol), and the frames, with those that are left out as the held-out ones.
@@ -204,9 +206,13 @@ def restored_shares(
     known, invented = _Errors(), _Errors()
     for coarse, renders, sequence in trials:
         if sequence.lens is not None:
-            renders, sequence = _flattened(renders, sequence)[0], sequence.as_pinhole(WIDE_FIELD_DEG)
-        small = sequence.at_most_width(config.working_width(sequence.width))
-        references = gather_references(coarse, small, small.train)
+            training, renders = sequence.as_pinhole(), _flattened(renders, sequence)[0]
+            sequence = sequence.as_pinhole(WIDE_FIELD_DEG)
+        else:
+            training = sequence
+        width = config.working_width(sequence.width)
+        small, training = sequence.at_most_width(width), training.at_most_width(width)
+        references = gather_references(coarse, training, training.train)
         clips = iterate_held_out_clips(coarse, references, small, sequence.test, count=config.references)
         done = 0
         for clip in clips:
@@ -246,12 +252,15 @@ class _Errors:
 
     def share(self, kind: str, error_share: float) -> float:
         """Of the restored view, for pixels of this kind; see `restored_shares`."""
-        if self.pixels < LEAST_PIXELS or self.rendered == 0:
-            return RESTORED_SHARE
         rendered, product = error_share * self.rendered, math.sqrt(error_share) * self.product
+        if self.pixels < LEAST_PIXELS:
+            return RESTORED_SHARE
+        if rendered == 0:
+            # Nothing is nearer than what is right.
+            return 0.0 if self.restored > 0 else RESTORED_SHARE
         own = 1 - RESTORED_SHARE
         mixed = own**2 * rendered + RESTORED_SHARE**2 * self.restored + 2 * own * RESTORED_SHARE * product
-        loss_db = 10 * math.log10(mixed / rendered)
+        loss_db = 10 * math.log10(max(mixed / rendered, LEAST_SHARE))
         emit(MetricRecorded("finetune", f"{kind}_loss_db", loss_db))
         if loss_db <= TOLERATED_LOSS_DB:
             return RESTORED_SHARE
@@ -383,7 +392,7 @@ class _RestoredClip:
         return (1 - share) * self.restored + share * self.rendered
 
     def still_to_invent(self, shares: RestoredShares) -> Float[Tensor, "t 1 h w"]:
-        """What is to be invented; where the final scene serves as well or better, its holes alone."""
+        """What is to be invented: the less, the smaller the share of it; at none only the scene's holes."""
         solid = _shrunk(self.solid, self.to_invent.shape[-2:])
         return self.to_invent * (1 - (1 - shares.invented / RESTORED_SHARE) * solid)
 

@@ -115,7 +115,8 @@ def test_it_tells_how_much_of_restored_views_serves(tube: Tube, monkeypatch: pyt
     found = judged(tube, AsRendered(), config)
     assert found.trials[-1].gain_db > 0.5
     assert found.restored_shares is not None
-    assert 0 <= found.restored_shares.known <= RESTORED_SHARE
+    # The coarse trial is worse than the fine-tuned one, whose errors are taken for even smaller.
+    assert found.restored_shares.known < 0.5 * RESTORED_SHARE
     # The tube's scene is the truth, far from what sixty steps reach.
     assert 0 < asked[0] < 0.5
     assert judged(tube, ClassicalEnhancer("")).restored_shares is None

@@ -26,6 +26,8 @@ class TestEstimate:
             ("quick", HUNDREDS, "enhance", 3481.1),
             ("balanced", FULL, "enhance", 3613.5),
             ("balanced", FULL, "finetune", 3997.1),
+            # Plain frames of a phantom: depth was estimated.
+            ("quick", FrameSize(100, 87, 640, 512), "depth", 1741.8),
         ],
     )
     def test_covers_recorded_peaks_without_exceeding_them_much(

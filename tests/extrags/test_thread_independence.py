@@ -105,7 +105,9 @@ class Stages:
             COARSE,
             measure=MEASURE,
         )
-        return {str(trial.amount): np.array(list(asdict(trial).values())) for trial in found.trials}
+        assert found.restored_shares is not None
+        told = {str(trial.amount): np.array(list(asdict(trial).values())) for trial in found.trials}
+        return told | {"shares": np.array(list(asdict(found.restored_shares).values()))}
 
     def finetuned_scene(self) -> Arrays:
         found = finetune(self.tube.scene, self.tube.sequence, self.pseudo_views, FINETUNE, COARSE)

@@ -26,15 +26,22 @@ LACKING = {"lacking_share": 0.1}
 """What the assessment measured: the plan then takes 8 of 20 trajectories."""
 
 
+KEPT = Judgement(1.0, "made up")
+"""A judgement that keeps everything."""
+
+
 class RecordedRun:
     """Runner and store in one.
 
     Args:
         has_poses: whether the source has poses.
         has_depth: whether the source has depth.
+        judgement: of the fine-tuning.
     """
 
-    def __init__(self, *, has_poses: bool, has_depth: bool) -> None:
+    def __init__(self, *, has_poses: bool, has_depth: bool, judgement: Judgement) -> None:
+        self.judgement = judgement
+        self.inputs: dict[str, dict[str, Any]] = {}
         self.keys: dict[str, list[str]] = defaultdict(list)
         self.plans: dict[str, ScenePlan] = {}
         self.counts: dict[str, Any] = {
@@ -60,6 +67,7 @@ class RecordedRun:
     def _made(self, call: Call) -> Ref:
         key = stage_key(call.task, call.inputs)
         self.keys[call.task.name].append(key)
+        self.inputs[call.task.name] = call.inputs
         ref = Ref(uri=f"made-up/{key}", digest=digest_of(key))
         if call.task.name == "plan":
             made = decide(LACKING, call.inputs["config"])
@@ -78,8 +86,8 @@ class RecordedRun:
         return Manifest(stage="made-up", version=1, key=ref.uri, digest=ref.digest, counts=counts)
 
     def load(self, kind: type, ref: Ref) -> Any:
-        """The plan, or a judgement that keeps everything."""
-        return Judgement(1.0, "made up") if kind is Judgement else self.plans[ref.uri]
+        """The plan, or the judgement."""
+        return self.judgement if kind is Judgement else self.plans[ref.uri]
 
     def load_json(self, file: str, ref: Ref) -> Any:
         """No figures."""
@@ -94,7 +102,7 @@ def recorded_keys(
     has_depth: bool = False,
     leave_out: Mapping[str, str] | None = None,
 ) -> dict[str, list[str]]:
-    """The keys of all stages of a sequence, by the stage's name; nothing is run.
+    """The keys of all stages of a sequence, by the stage's name; nothing is run, and all is judged well.
 
     Args:
         name: of the sequence; its content is looked at as in any run.
@@ -106,7 +114,19 @@ def recorded_keys(
     Raises:
         Exception: what a stage failed with.
     """
-    recorded = RecordedRun(has_poses=has_poses, has_depth=has_depth)
+    recorded = RecordedRun(has_poses=has_poses, has_depth=has_depth, judgement=KEPT)
+    recorded_run(name, config, recorded, leave_out)
+    return dict(recorded.keys)
+
+
+def recorded_run(
+    name: str, config: PipelineConfig, recorded: RecordedRun, leave_out: Mapping[str, str] | None = None
+) -> None:
+    """Go through all stages of a sequence; the arguments are those of `recorded_keys`.
+
+    Raises:
+        Exception: what a stage failed with.
+    """
     run = SequenceRun(name, config, "memory://made-up", recorded, leave_out=leave_out)
     run.store = recorded  # type: ignore[assignment]
     # Nothing is kept of it.
@@ -114,4 +134,3 @@ def recorded_keys(
         outcome = run.run()
     if outcome.error is not None:
         raise outcome.error
-    return dict(recorded.keys)

@@ -24,11 +24,13 @@ import flows.wiring
 from extrags.config import PipelineConfig
 from extrags.config.settings import Setting, settings_of
 from extrags.errors import ConfigError
+from extrags.finetuning_judge import Judgement
+from extrags.restoration.restored_renders import RestoredShares
 from extrags.store import Store
 from flows.runners import DirectRunner, StoreRunner
 from flows.wiring import run_sequence
 from tasks.stage import StageKey
-from tests.flows.recorded_keys import recorded_keys
+from tests.flows.recorded_keys import RecordedRun, recorded_keys, recorded_run
 from tests.flows.tiny import SEQUENCE, tiny_config
 
 SETTINGS = settings_of(PipelineConfig)
@@ -306,6 +308,20 @@ def test_features_of_triangulation_count_where_the_source_has_poses() -> None:
             assert stages == expected(["depth"], present), name
         else:
             assert stages == {"report"}, name
+
+
+@pytest.mark.usefixtures("hashed_once")
+@pytest.mark.parametrize(
+    ("shares", "given"),
+    [(None, None), (RestoredShares(), None), (RestoredShares(0.1, 0.3), (0.1, 0.3))],
+)
+def test_restored_views_are_given_what_the_judge_found(
+    shares: RestoredShares | None, given: tuple[float, float] | None
+) -> None:
+    judgement = Judgement(1.0, "made up", restored_shares=shares)
+    recorded = RecordedRun(has_poses=True, has_depth=True, judgement=judgement)
+    recorded_run(SEQUENCE, BASE, recorded)
+    assert recorded.inputs["evaluate-restore"]["shares"] == given
 
 
 @pytest.mark.usefixtures("hashed_once")
