@@ -321,8 +321,8 @@ class SequenceRun(CachedStages):
             judgement = self.store.load(Judgement, self.refs["judgement"])
             shares = judgement.restored_shares
             # The usual shares are those of a run without a judge: the same views.
-            usual = shares is None or shares == RestoredShares()
-            self._restored_shares = None if usual else (shares.known, shares.invented)
+            if shares is not None and shares != RestoredShares():
+                self._restored_shares = (shares.known, shares.invented)
             planned = self.planned("finetune")
             if planned is None or "judge.enabled" not in planned.budget:
                 row.reason = judgement.reason
