@@ -278,7 +278,17 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
             row += [None if calibration is None else calibration["rank_correlation"]]
             rows.append([*row, case["seconds_per_frame"], case["prepare_seconds"]])
         _print(header, rows)
-        # In a table of its own: one of both would be wider than a terminal.
+        # In tables of their own: one of all would be wider than a terminal.
+        rows = []
+        for case in chosen:
+            aligned, found = case["aligned"], case["aligned"]["calibration"]
+            coverage = {} if found is None else found["coverage"]
+            row = [case["method"], *(aligned.get(figure.key) for figure in measured)]
+            row += [aligned["well"]["psnr"], aligned["hole"]["psnr"], aligned["kept"]["well"]["psnr"]]
+            row += [None if found is None else found["rank_correlation"]]
+            rows.append([*row, coverage.get("50"), coverage.get("90")])
+        labels = [f"aligned: {measured[0].label}", *(figure.label for figure in measured[1:])]
+        _print(["method", *labels, "well", "hole", "kept well", "rank corr.", "within 50 %", "90 %"], rows)
         names = ("within", "across", "of_photographs")
         _print(
             ["method", "error flicker", "invented: within clips", "across clips", "photographs"],

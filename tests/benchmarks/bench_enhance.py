@@ -114,13 +114,17 @@ def table(names: list[str], methods: list[str], configs: list[PipelineConfig], s
 MEASURED = {figure.label: (figure.key,) for figure in figures("restoration")}
 RESTORED = {
     **MEASURED,
-    "aligned": ("aligned_psnr",),
+    "aligned": ("aligned", "psnr"),
+    "aligned well": ("aligned", "well", "psnr"),
+    "aligned hole": ("aligned", "hole", "psnr"),
+    "aligned kept well": ("aligned", "kept", "well", "psnr"),
     "well": ("well", "psnr"),
     "hole": ("hole", "psnr"),
     "unobserved": ("unobserved", "psnr"),
     "kept PSNR": ("kept", "psnr"),
     "kept well": ("kept", "well", "psnr"),
     "rank corr.": ("calibration", "rank_correlation"),
+    "aligned rank corr.": ("aligned", "calibration", "rank_correlation"),
     "error flicker": ("error_flicker",),
     "s/frame": ("seconds_per_frame",),
     "prepared in s": ("prepare_seconds",),

@@ -41,6 +41,8 @@ def test_a_table_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert [case["method"] for case in found["cases"]] == ["none", "classical", "classical/no-references"]
     for case in found["cases"]:
         assert {"psnr", "ssim", "lpips_alex", "steps", "seconds_per_frame", "kept", "flicker"} <= set(case)
+        assert case["aligned"]["psnr"] >= case["psnr"]
+        assert {"psnr", "lpips_alex", "well", "hole", "kept", "calibration"} <= set(case["aligned"])
         assert (case["sequence"], case["seed"], case["views"]) == (SEQUENCE, 2, 14)
         for part in ("well", "hole", "observed", "unobserved"):
             assert {"psnr", "ssim", "lpips_alex"} <= set(case[part])

@@ -21,7 +21,7 @@ from torch import Tensor
 from extrags.cameras import Cameras
 from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.metrics.exposure import align_exposure
-from extrags.metrics.image import mean_of_known, psnr
+from extrags.metrics.image import mean_of_known
 from extrags.metrics.lpips import Lpips, LpipsByNet
 from extrags.metrics.photometric import photometric_values
 from extrags.metrics.protocol import COLOR_LEVELS, MIN_REGION_SHARE
@@ -249,14 +249,15 @@ class RestorerBenchmark:
             restored: of this benchmark's clips.
 
         Returns:
-            `{psnr, ssim, lpips_alex, well: {...}, hole: {...}, rim: {...}, ...}` of the raw restoration, its
-            `aligned_psnr` (the best gain of each image divided out: the exposure of another recording cannot
-            be known), the same tree of the target of the fine-tuning in `kept`, and `changed_share` (of the
-            target's pixels inside the mask), `flicker`, `error_flicker`,
+            `{psnr, ssim, lpips_alex, well: {...}, hole: {...}, rim: {...}, ...}` of the raw restoration, the
+            same tree of the target of the fine-tuning in `kept`, both with the best gain of each image
+            divided out in `aligned` (the exposure of another recording cannot be known), `changed_share` (of
+            the target's pixels inside the mask), `flicker`, `error_flicker`,
             `inconsistency: {within, across, of_photographs}` of what was invented (in both views a hole, or
             never observed; see `invented_inconsistency`), `frechet` and `detail` by region (see `Realism`),
-            `seconds_per_frame`, `calibration` (see `calibration`; None without prediction) with
-            `rank_correlation_of`: the rank correlation of the error with what else could predict it.
+            `seconds_per_frame`, `calibration` (see `calibration`; None without prediction; in `aligned` of
+            the errors after alignment) with `rank_correlation_of`: the rank correlation of the error with
+            what else could predict it.
 
         Raises:
             ShapeError: when the views are not those of the benchmark.
@@ -267,26 +268,36 @@ class RestorerBenchmark:
         target = torch.from_numpy(np.ascontiguousarray(restored.target, dtype=np.float32)).clamp(0, 1)
         mask = self.regions["valid"]
         changed = (target - self._rendered).abs().amax(dim=-1) > CHANGED
+        aligned = align_exposure(rgb, self._truth, mask)
         error = (rgb - self._truth).abs().mean(dim=-1)
-        found = None
-        if restored.predicted_error is not None:
-            found = calibration(restored.predicted_error, error.numpy(), self.truth.mask)
         change = (rgb - self._rendered).abs().mean(dim=-1)
         return {
             **self._compared(rgb),
-            "aligned_psnr": psnr(align_exposure(rgb, self._truth, mask), self._truth, mask),
+            "aligned": {
+                **self._compared(aligned),
+                "kept": self._compared(align_exposure(target, self._truth, mask)),
+                "calibration": self._calibration(restored, aligned),
+            },
             "kept": self._compared(target),
             "changed_share": float(changed[mask].float().mean()) if bool(mask.any()) else None,
             **self._flicker(rgb),
             "inconsistency": self._inconsistency(rgb),
             **self._realism.figures(rgb),
             "seconds_per_frame": restored.seconds_per_frame,
-            "calibration": found,
+            "calibration": self._calibration(restored, rgb),
             "rank_correlation_of": {
                 name: cell_correlation(np.asarray(values), error.numpy(), self.truth.mask)
                 for name, values in (("uncertainty", self._layer("uncertainty")), ("change", change))
             },
         }
+
+    def _calibration(
+        self, restored: RestoredViews, images: Float[Tensor, "v h w 3"]
+    ) -> dict[str, Any] | None:
+        if restored.predicted_error is None:
+            return None
+        error = (images - self._truth).abs()
+        return calibration(restored.predicted_error, error.numpy(), self.truth.mask)
 
     @cached_property
     def regions(self) -> dict[str, Bool[Tensor, "v h w"]]:

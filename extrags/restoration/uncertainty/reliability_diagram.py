@@ -21,16 +21,16 @@ INTERVALS = (0.5, 0.9)
 
 def calibration(
     predicted: Shaped[np.ndarray, "v h w"],
-    error: Shaped[np.ndarray, "v h w"],
+    error: Shaped[np.ndarray, "v h w c"],
     mask: Bool[np.ndarray, "v h w"],
     *,
     bins: int = CALIBRATION_BINS,
 ) -> dict[str, Any]:
-    """Predicted against true error, on means over cells of 8 x 8 pixels.
+    """Predicted against true error, on means over channels and cells of 8 x 8 pixels.
 
     Args:
         predicted: the error the restorer expects.
-        error: the true absolute error, mean of the channels.
+        error: the true absolute error of each channel.
         mask: which pixels count; a cell counts with at least half of its pixels.
         bins: of equal numbers of cells, by prediction.
 
@@ -43,11 +43,11 @@ def calibration(
         ShapeError: when the shapes differ.
         ConfigError: without any bin.
     """
-    if not predicted.shape == error.shape == mask.shape:
+    if not predicted.shape == error.shape[:-1] == mask.shape:
         raise ShapeError(f"predicted {predicted.shape}, error {error.shape} and mask {mask.shape} differ")
     if bins < 1:
         raise ConfigError(f"{bins} calibration bins; expected 1 or more")
-    expected, found = _cells(predicted, mask), _cells(error, mask)
+    expected, found = _cells(predicted, mask), _cells(error.mean(axis=-1), mask)
     order = np.argsort(expected, kind="stable")
     table = []
     for chosen in np.array_split(order, bins):
@@ -75,24 +75,25 @@ def calibration(
 
 def interval_coverage(
     predicted: Shaped[np.ndarray, "v h w"],
-    error: Shaped[np.ndarray, "v h w"],
+    error: Shaped[np.ndarray, "v h w c"],
     mask: Bool[np.ndarray, "v h w"],
 ) -> dict[str, float | None]:
-    r"""Share of pixels whose error lies in an interval that should hold 50 % or 90 % of them.
+    r"""Share of values whose error lies in an interval that should hold 50 % or 90 % of them.
 
-    An absolute error whose colours are Laplace distributed, as the restorer's likelihood takes them to be,
-    is exponentially distributed: with the predicted mean :math:`b` a share :math:`q` of the errors lies
-    between 0 and :math:`-b \log(1 - q)`.
+    Where a channel's error is Laplace distributed, as the restorer's likelihood takes it to be, its absolute
+    value is exponentially distributed: with the predicted mean :math:`b` a share :math:`q` of them lies
+    between 0 and :math:`-b \log(1 - q)`. The mean of the channels has another distribution, of fewer small
+    values.
 
     Args:
         predicted: the error the restorer expects.
-        error: the true absolute error, mean of the channels.
+        error: the true absolute error of each channel.
         mask: which pixels count.
 
     Returns:
         Share by percentage; None without any pixel.
     """
-    ratio = error[mask] / np.maximum(predicted[mask], np.finfo(np.float32).tiny)
+    ratio = error[mask] / np.maximum(predicted[mask], np.finfo(np.float32).tiny)[:, None]
     return {
         f"{100 * share:.0f}": float((ratio <= -math.log(1 - share)).mean()) if len(ratio) else None
         for share in INTERVALS

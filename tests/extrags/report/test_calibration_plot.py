@@ -13,7 +13,7 @@ from extrags.restoration.uncertainty.reliability_diagram import calibration
 
 def curve(bias: float) -> dict[str, object]:
     error = np.random.default_rng(2).random((1, 64, 64)) * np.linspace(0.02, 0.3, 64)
-    return calibration(bias * error, error, np.ones(error.shape, bool))
+    return calibration(bias * error, error[..., None], np.ones(error.shape, bool))
 
 
 def test_a_picture_of_one_and_of_several(tmp_path: Path) -> None:
@@ -33,7 +33,7 @@ def test_the_chart_of_a_page_is_the_same_every_time() -> None:
 
 
 def test_a_bad_prediction_without_ranks_is_drawn_too(tmp_path: Path) -> None:
-    flat = calibration(np.zeros((1, 16, 16)), np.zeros((1, 16, 16)), np.ones((1, 16, 16), bool))
+    flat = calibration(np.zeros((1, 16, 16)), np.zeros((1, 16, 16, 3)), np.ones((1, 16, 16), bool))
     assert flat["rank_correlation"] is None
     write_calibration_plot({"flat": flat}, tmp_path / "flat.svg")
     assert (tmp_path / "flat.svg").read_text().startswith("<?xml")

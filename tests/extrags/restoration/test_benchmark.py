@@ -137,7 +137,20 @@ class TestFigures:
     def test_a_gain_is_divided_out(self, tube_benchmark: RestorerBenchmark) -> None:
         darker = tube_benchmark.evaluate(Given(0.6 * tube_benchmark.truth.rgb))
         assert darker["psnr"] < 30
-        assert darker["aligned_psnr"] > 50
+        assert darker["aligned"]["psnr"] > 50
+        assert darker["aligned"]["calibration"] is None
+
+    def test_errors_are_those_after_the_gain(self) -> None:
+        clip = plain_clip()
+        truth = flat_truth(0.4)
+        # Twice as bright as the photograph on the left, which is the larger error, and less on the right.
+        right = np.arange(SIZE[0]) >= SIZE[0] // 2
+        images = 2 * np.where(right[None, None, :, None], truth.rgb - 0.1, truth.rgb)
+        restored = replace(restore_views(Given(images), [clip]), predicted_error=images[..., 0] - 0.6)
+        found = RestorerBenchmark([clip], truth).figures(restored)
+        assert found["calibration"]["rank_correlation"] > 0.99
+        # The gain by least squares leaves the left half too bright and the right one, by more, too dark.
+        assert found["aligned"]["calibration"]["rank_correlation"] < -0.99
 
     def test_the_target_is_what_keep_known_makes(self) -> None:
         clip = plain_clip()
@@ -304,7 +317,7 @@ class TestFlicker:
 class TestCalibration:
     def test_a_prophet(self) -> None:
         error = np.random.default_rng(0).random((2, 40, 48))
-        found = calibration(error, error, np.ones(error.shape, bool))
+        found = calibration(error, error[..., None], np.ones(error.shape, bool))
         assert found["rank_correlation"] == pytest.approx(1)
         assert found["calibration_error"] == pytest.approx(0, abs=1e-12)
         assert found["cells"] == sum(row["cells"] for row in found["bins"]) == 2 * 5 * 6
@@ -317,29 +330,42 @@ class TestCalibration:
         blocks = np.linspace(0.1, 0.9, 20).reshape(1, 4, 5)
         error = np.kron(blocks, np.ones((1, 8, 8)))
         mask = np.ones(error.shape, bool)
-        found = calibration(error**3, error, mask)
+        found = calibration(error**3, error[..., None], mask)
         assert found["rank_correlation"] == pytest.approx(1)
         assert found["calibration_error"] > 0.1
-        assert calibration(1 - error, error, mask)["rank_correlation"] == pytest.approx(-1)
+        assert calibration(1 - error, error[..., None], mask)["rank_correlation"] == pytest.approx(-1)
 
     def test_cells_with_little_mask_do_not_count(self) -> None:
         error = np.full((1, 16, 16), 0.1)
         error[0, :8, :8] = 9.0
         mask = np.ones(error.shape, bool)
         mask[0, :8, 3:8] = False
-        found = calibration(error, error, mask, bins=2)
+        found = calibration(error, error[..., None], mask, bins=2)
         assert found["cells"] == 3
         assert found["bins"][-1]["error"] == pytest.approx(0.1)
         assert found["rank_correlation"] is None
 
     def test_nothing_to_compare(self) -> None:
-        nothing = calibration(np.zeros((1, 8, 8)), np.zeros((1, 8, 8)), np.zeros((1, 8, 8), bool))
+        nothing = calibration(np.zeros((1, 8, 8)), np.zeros((1, 8, 8, 3)), np.zeros((1, 8, 8), bool))
         assert nothing.pop("coverage") == {"50": None, "90": None}
         assert nothing == {"rank_correlation": None, "calibration_error": None, "cells": 0, "bins": []}
         with pytest.raises(ConfigError, match="bins"):
-            calibration(np.zeros((1, 8, 8)), np.zeros((1, 8, 8)), np.ones((1, 8, 8), bool), bins=0)
+            calibration(np.zeros((1, 8, 8)), np.zeros((1, 8, 8, 3)), np.ones((1, 8, 8), bool), bins=0)
         with pytest.raises((ShapeError, TypeCheckError)):
-            calibration(np.zeros((1, 8, 8)), np.zeros((1, 8, 9)), np.ones((1, 8, 8), bool))
+            calibration(np.zeros((1, 8, 8)), np.zeros((1, 8, 9, 3)), np.ones((1, 8, 8), bool))
+
+    def test_intervals_hold_what_they_should(self) -> None:
+        """Channels that err independently, and all alike: each value counts, not their mean."""
+        rng = np.random.default_rng(4)
+        expected = rng.uniform(0.01, 0.2, (2, 64, 64))
+        mask = np.ones(expected.shape, bool)
+        independent = expected[..., None] * rng.exponential(size=(2, 64, 64, 3))
+        alike = expected[..., None] * rng.exponential(size=(2, 64, 64, 1)).repeat(3, axis=-1)
+        for error in (independent, alike):
+            found = calibration(expected, error, mask)["coverage"]
+            # Five standard deviations of a share among 8,192 values.
+            assert found["50"] == pytest.approx(0.5, abs=0.028)
+            assert found["90"] == pytest.approx(0.9, abs=0.017)
 
     def test_ranks(self) -> None:
         values = np.array([3.0, 1.0, 2.0, 2.0])
