@@ -39,6 +39,7 @@ _OF_EMBEDDED = frozenset(
         "batch",
         "channels",
         "crop",
+        "depth_from_image",
         "fold_iterations",
         "folds",
         "judge",
@@ -117,7 +118,7 @@ def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=11, ignore=("given",))
+@stage("enhance-train", version=12, ignore=("given",))
 def train(
     slot: Slot,
     scene: Ref,

@@ -182,6 +182,11 @@ class EnhanceConfig(StageConfig):
         "number: so many of them are drawn, of which the first is used, and their spread adds to the "
         "expected error. Weights that are not generative give the mean of what they draw",
     )
+    depth_from_image: bool = Field(
+        True,
+        description="read the depth of what the embedded restorer has invented from its image, with the "
+        "bundled network of the depth completion; false: the restorer's own guess alone",
+    )
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto", description="of the convolutions; auto: bfloat16 where the processor computes it faster"
     )

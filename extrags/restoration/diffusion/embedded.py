@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,9 @@ from torch import Tensor
 
 from extrags.array_files import load_safetensors
 from extrags.config import EnhanceConfig
+from extrags.depth.completion import CompletionNetwork
+from extrags.depth.hidden import depth_from_image
+from extrags.depth.weights import BUNDLED, load_completion
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.description import description_fields, read_description, write_description
 from extrags.restoration.diffusion.network import RestorationNetwork, build_network
@@ -74,6 +77,7 @@ class EmbeddedEnhancer:
             [R, 3, S, S]; None without.
         domain: what it was trained on, by which a scene is told to be of that world or not; None where that
             is not known.
+        depth_from_image: depth in holes is read from the restored image as well.
     """
 
     network: RestorationNetwork
@@ -89,6 +93,7 @@ class EmbeddedEnhancer:
     drawing: bool = False
     patches: Float[Tensor, "r 3 s s"] | None = None
     domain: Domain | None = None
+    depth_from_image: bool = False
 
     name = "embedded"
     follows_keyframes = True
@@ -115,6 +120,7 @@ class EmbeddedEnhancer:
             gamut=gamut,
             drawing=generative and config.samples != "mean",
             patches=patches if generative else None,
+            depth_from_image=config.depth_from_image,
         )
 
     def candidate_steps(self, config: EnhanceConfig) -> tuple[int, ...]:
@@ -143,8 +149,21 @@ class EmbeddedEnhancer:
             shown.permute(0, 2, 3, 1).contiguous().numpy(),
             self.calibration.applied(expected) * self.modesty,
             self.provenance,
-            draws[0].depth_mm[:, 0].contiguous().numpy(),
+            self._depth(clip, shown, draws[0].depth_mm)[:, 0].contiguous().numpy(),
         )
+
+    def _depth(
+        self, clip: Clip, rgb: Float[Tensor, "t 3 h w"], guess_mm: Float[Tensor, "t 1 h w"]
+    ) -> Float[Tensor, "t 1 h w"]:
+        """Z-depth of a restored clip, of which the network has a guess."""
+        if not self.depth_from_image:
+            return guess_mm
+        network = _completion()
+        with torch.no_grad():
+            filled_mm = condition(clip.layers, clip.transfer).depth_mm[:, 0]
+        opacity = clip.layers.get("alpha")[:, 0]
+        K = torch.from_numpy(clip.cameras.K).to(rgb)
+        return depth_from_image(network, rgb, filled_mm, guess_mm[:, 0], opacity, K)[:, None]
 
     def restored_layers(
         self,
@@ -279,6 +298,7 @@ class EmbeddedEnhancer:
             "deterministic": self.deterministic,
             "generative": self.network.generative,
             "drawing": self.drawing,
+            "depth_from_image": self.depth_from_image,
             "domain": None if self.domain is None else self.domain.as_dict(),
             "record": self.record,
         }
@@ -333,6 +353,8 @@ class EmbeddedEnhancer:
                 bool(description["drawing"]),
                 _read_patches(weights_file.with_name(PATCHES)),
                 None if description["domain"] is None else Domain.from_dict(description["domain"]),
+                # Weights of a package say nothing of a scene's settings.
+                bool(description.get("depth_from_image", False)),
             )
         try:
             network.load_state_dict(
@@ -341,6 +363,13 @@ class EmbeddedEnhancer:
         except (OSError, RuntimeError, ValueError) as error:
             raise WeightsError(f"{weights_file}: not the weights of this network ({error})") from error
         return enhancer
+
+
+@cache
+def _completion() -> CompletionNetwork:
+    network = load_completion(BUNDLED)
+    assert network is not None
+    return network
 
 
 def _read_patches(file: Path) -> Float[Tensor, "r 3 s s"] | None:

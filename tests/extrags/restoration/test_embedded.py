@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from extrags.config import CoarseConfig
+from extrags.depth.hidden import SOLID
 from extrags.errors import ConfigError, DivergedError, WeightsError
 from extrags.restoration.backends import load_enhancer, train_enhancer
 from extrags.restoration.classical import ClassicalEnhancer
@@ -30,6 +31,7 @@ from extrags.restoration.protocol import Clip, Enhancer
 from extrags.restoration.training_data.augmentation import Batch
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.uncertainty.calibration import Calibration
+from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Conditioning
 from extrags.view_synthesis.gamut import Gamut
 from tests.extrags.lit_tube import Tube, tube_cameras
@@ -191,6 +193,25 @@ class TestEmbedded:
         assert isinstance(loaded, Enhancer)
         assert np.array_equal(loaded.restore(clip).rgb, trained.restore(clip).rgb)
         assert loaded.restore(clip).provenance == trained.restore(clip).provenance
+
+    def test_depth_of_holes_is_read_from_the_image(
+        self, trained: EmbeddedEnhancer, clip: Clip, tmp_path
+    ) -> None:
+        assert trained.depth_from_image
+        guessing = trained.with_settings(SMALL.model_copy(update={"depth_from_image": False}), trained.gamut)
+        read, guessed = trained.restore(clip), guessing.restore(clip)
+        assert np.array_equal(read.rgb, guessed.rgb)
+        assert read.depth_mm is not None
+        assert guessed.depth_mm is not None
+        alpha = clip.layers.get("alpha")[:, 0].numpy()
+        np.testing.assert_allclose(read.depth_mm[alpha > SOLID], guessed.depth_mm[alpha > SOLID], rtol=1e-5)
+        holes = alpha < HOLE_ALPHA
+        assert holes.any()
+        assert np.abs(np.log(read.depth_mm / guessed.depth_mm))[holes].mean() > 1e-3
+        guessing.save(tmp_path)
+        loaded = load_enhancer(tmp_path).restore(clip).depth_mm
+        assert loaded is not None
+        assert np.array_equal(loaded, guessed.depth_mm)
 
     def test_samples_add_to_the_expected_error(self, trained: EmbeddedEnhancer, clip: Clip) -> None:
         plain = replace(trained, steps=4, calibration=Calibration())

@@ -1,0 +1,128 @@
+"""Depth of what a restored view has invented, read from its image.
+
+A restorer paints what was never seen, and its painting says how far that is: it gets darker with distance,
+and folds have shades. The network that completes stereo reads images for that very purpose. It is given what
+the scene shows as depth that all sources confirm, and what it does not show as depth that none confirms.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional
+
+from extrags.depth.completion import CompletionNetwork, completion_inputs
+from extrags.depth.frames import PosedFrames
+from extrags.depth.shading import fit_shading, smoothed_brightness
+from extrags.depth.stereo import SATURATED, StereoDepth
+from extrags.threads import in_threads
+from extrags.thresholds import HOLE_ALPHA
+from extrags.view_synthesis.filling import push_pull
+
+__all__ = ["IMAGE_SHARE", "depth_from_image"]
+
+IMAGE_SHARE = 0.65
+"""Of the log-depth that is read, in holes; the rest is the guess's: their errors have little in common."""
+SOLID = 0.8
+"""Opacity from which a rendered depth is taken as it is; down to `HOLE_ALPHA` its share falls to none."""
+LONGEST_SIDES_PX = (160, 80)
+"""Sizes that depth is read at, whose mean is taken: the smaller serves large holes, the larger small ones."""
+SOURCES = 6
+CONFIRMED_COST, CONFIRMED_MARGIN, CONFIRMED_DIFFERENCE = 0.25, 0.1, 0.02
+UNCONFIRMED_COST, UNCONFIRMED_DIFFERENCE = 1.0, 0.3
+"""What stereo usually reports of a pixel that all sources confirm, and of one that none does."""
+
+
+@torch.no_grad()
+def depth_from_image(
+    network: CompletionNetwork,
+    rgb: Float[Tensor, "t 3 h w"],
+    depth_mm: Float[Tensor, "t h w"],
+    guess_mm: Float[Tensor, "t h w"],
+    opacity: Float[Tensor, "t h w"],
+    K: Float[Tensor, "t 3 3"],
+) -> Float[Tensor, "t h w"]:
+    """Z-depth without gaps: as it is where the scene is solid, read from the image in holes.
+
+    Depths that are read have no step at the border of a hole: what they are off there is carried inside.
+
+    Args:
+        network: of the depth completion.
+        rgb: restored views of one scene under one light, in [0, 1].
+        depth_mm: rendered z-depth, smoothly continued into holes.
+        guess_mm: another guess of the whole, which is mixed with what is read.
+        opacity: of the rendering.
+        K: pinhole intrinsics in pixels.
+
+    Returns:
+        In the units of `depth_mm`.
+    """
+    size = opacity.shape[-2:]
+    smooth = depth_mm.clamp_min(1e-9).log()
+    read = torch.zeros_like(smooth)
+    for longest in LONGEST_SIDES_PX:
+        scale = min(1.0, longest / max(size))
+        height, width = (math.ceil(scale * side) for side in size)
+
+        def resized(image: Tensor, small: tuple[int, int] = (height, width)) -> Tensor:
+            return image if image.shape[-2:] == small else functional.interpolate(image, small, mode="area")
+
+        zoom = torch.tensor([width / size[1], height / size[0], 1.0])[:, None]
+        change = _read_change(
+            network,
+            resized(rgb),
+            resized(smooth[:, None])[:, 0],
+            resized(opacity[:, None])[:, 0] > SOLID,
+            zoom * K,
+        )
+        change = functional.interpolate(change[:, None], size, mode="bilinear", align_corners=False)
+        read += change[:, 0] / len(LONGEST_SIDES_PX)
+    guess = guess_mm.clamp_min(1e-9).log()
+    hidden = ((SOLID - opacity) / (SOLID - HOLE_ALPHA)).clamp(0, 1)
+    return (guess + IMAGE_SHARE * hidden * (smooth + read - guess)).exp()
+
+
+def _read_change(
+    network: CompletionNetwork,
+    rgb: Float[Tensor, "t 3 h w"],
+    log_depth: Float[Tensor, "t h w"],
+    known: Bool[Tensor, "t h w"],
+    K: Float[Tensor, "t 3 3"],
+) -> Float[Tensor, "t h w"]:
+    """What is to be added to smoothly continued log-depths, at the size of the images given here."""
+    # Poses play no part: nothing is matched.
+    frames = PosedFrames(rgb, torch.ones_like(known), K, torch.eye(4).expand(len(rgb), 4, 4))
+    brightness = smoothed_brightness(frames)
+    (fit,) = fit_shading(brightness, log_depth, known & (rgb.amax(dim=1) < SATURATED))
+    confirmed = known.to(log_depth.dtype)
+    nothing = torch.zeros_like(confirmed)
+    stereo = StereoDepth(
+        log_depth=log_depth,
+        cost=torch.where(known, CONFIRMED_COST, UNCONFIRMED_COST),
+        margin=CONFIRMED_MARGIN * confirmed,
+        seen=confirmed,
+        agrees=confirmed,
+        violates=nothing,
+        difference=torch.where(known, CONFIRMED_DIFFERENCE, UNCONFIRMED_DIFFERENCE),
+        fused=log_depth,
+        prior=fit.log_depth(brightness),
+        prior_scatter=torch.full((len(rgb),), fit.scatter),
+        fits=[fit],
+        monocular=[],
+        recording=torch.zeros(len(rgb), dtype=torch.long),
+        n_sources=torch.full((len(rgb),), SOURCES),
+    )
+
+    def of_view(view: Tensor) -> Tensor:
+        inputs = completion_inputs(frames.of_frames(view), stereo.of_frames(view))
+        found, _ = network(inputs.channels)
+        found = found + inputs.log_scale[:, None, None]
+        off = (log_depth[view] - found) * confirmed[view]
+        carried = push_pull(off[:, None], confirmed[view][:, None])
+        change: Tensor = found + carried[:, 0] - log_depth[view]
+        return change
+
+    return torch.cat(in_threads(of_view, torch.arange(len(rgb)).split(1)))

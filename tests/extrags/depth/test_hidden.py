@@ -1,0 +1,83 @@
+"""Depth that is read from an image, against true depth of procedural cavities."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from extrags.depth.hidden import SOLID, depth_from_image
+from extrags.depth.pretraining.cavities import Cavities
+from extrags.depth.pretraining.photographs import Clips, photograph
+from extrags.depth.weights import load_completion
+from extrags.view_synthesis.filling import completed_depth
+
+SIZE = (64, 80)
+MEDIAN_MM = 20.0
+
+
+@pytest.fixture(scope="module")
+def clips() -> Clips:
+    """Pictures of scenes drawn with another seed than any of the training, all seen to the end."""
+    generator = torch.Generator().manual_seed(990)
+    found = photograph(Cavities("colon", 8, generator), generator, SIZE, 1)
+    assert len(found.depth) >= 5
+    return found
+
+
+def true_depth_mm(clips: Clips) -> Tensor:
+    depth = torch.where(clips.depth > 0, clips.depth, clips.depth.amax(dim=(1, 2), keepdim=True))
+    return MEDIAN_MM * depth / depth.flatten(1).median(dim=1).values[:, None, None]
+
+
+def with_a_hole() -> Tensor:
+    """Opacity: nothing is known of the farther half of a view, or of a side of it."""
+    opacity = torch.ones(SIZE)
+    opacity[12:52, 24:76] = 0
+    return opacity
+
+
+def hidden(clips: Clips, opacity: Tensor, guess_mm: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """What is read, and smooth filling."""
+    network = load_completion("bundled")
+    assert network is not None
+    truth = true_depth_mm(clips)
+    opacity = opacity.expand(len(truth), *SIZE)
+    filled = completed_depth(truth[:, None] * (opacity[:, None] > 0), opacity[:, None], MEDIAN_MM)[:, 0]
+    guess_mm = filled if guess_mm is None else guess_mm
+    read = depth_from_image(network, clips.frames.rgb, filled, guess_mm, opacity, clips.frames.K)
+    return read, filled
+
+
+def test_it_is_nearer_to_the_truth_than_smooth_filling(clips: Clips) -> None:
+    opacity = with_a_hole()
+    read, filled = hidden(clips, opacity)
+    inside = (opacity == 0).expand_as(read) & clips.frames.mask & (clips.depth > 0)
+    errors = [(depth / true_depth_mm(clips)).log().abs()[inside].mean() for depth in (read, filled)]
+    assert errors[0] < 0.7 * errors[1]
+
+
+def test_what_is_solid_stays(clips: Clips) -> None:
+    opacity = with_a_hole()
+    opacity[:12] = SOLID + 0.01
+    guess = 2 * true_depth_mm(clips)
+    read, _ = hidden(clips, opacity, guess)
+    solid = (opacity > SOLID).expand_as(read)
+    torch.testing.assert_close(read[solid], guess[solid], atol=0, rtol=1e-5)
+    assert not torch.isclose(read[~solid], guess[~solid]).all()
+
+
+def test_lengths_have_any_unit(clips: Clips) -> None:
+    network = load_completion("bundled")
+    assert network is not None
+    truth, opacity = true_depth_mm(clips), with_a_hole().expand(len(clips.depth), *SIZE)
+    given = [clips.frames.rgb, truth, truth, opacity, clips.frames.K]
+    here = depth_from_image(network, *given)
+    given[1:3] = [1000 * truth, 1000 * truth]
+    torch.testing.assert_close(depth_from_image(network, *given), 1000 * here, atol=0, rtol=1e-4)
+
+
+def test_a_view_of_which_nothing_is_known(clips: Clips) -> None:
+    read, _ = hidden(clips, torch.zeros(SIZE), torch.full_like(clips.depth, MEDIAN_MM))
+    assert torch.isfinite(read).all()
+    assert (read > 0).all()
