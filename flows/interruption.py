@@ -67,11 +67,11 @@ class _Interruption:
             if self.signal is not None:
                 return
             self.signal = number
-            # In one piece: other threads may log at the same time.
+            # What follows from the interruption is no news: Ctrl-C ends the server too, which others miss.
+            logging.disable(logging.CRITICAL)
+            # In one piece: other threads may be writing.
             sys.stderr.write(f"extrags: {INTERRUPTED}\n")
             sys.stderr.flush()
-            # What follows from the interruption is no news.
-            logging.disable(logging.CRITICAL)
             progress = sys.modules.get("tasks.progress")
             if progress is not None:
                 progress.interrupt_stages()

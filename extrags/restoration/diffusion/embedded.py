@@ -42,10 +42,13 @@ from extrags.view_synthesis.references import LightTransfer
 
 __all__ = ["EmbeddedEnhancer", "pretrained"]
 
-FORMAT = 3
+FORMAT = 4
 """Raised when a saved restorer cannot be read by newer code."""
-BEFORE_GENERATIVE = 2
-"""The format of restorers without generative networks, whose entries it lacks."""
+ADDED_ENTRIES: dict[int, dict[str, Any]] = {
+    2: {"generative": False, "drawing": False, "domain": None, "depth_from_image": False},
+    3: {"depth_from_image": False},
+}
+"""What earlier formats that can be read lack, and what stands for it."""
 PATCHES = "patches.safetensors"
 COLOR_STEPS = 255
 CHANNELS_OF_NETWORKS = (CONDITION_CHANNELS, CONDITION_CHANNELS + INVENTED_CHANNELS)
@@ -320,9 +323,10 @@ class EmbeddedEnhancer:
             raise WeightsError(f"{weights_file}: no such file; train the restorer first (stage enhance)")
         description = read_description(description_file)
         channels = description.get("condition_channels")
-        if description.get("format") == BEFORE_GENERATIVE:
-            description = {"generative": False, "drawing": False, "domain": None} | description
-        if description.get("format") not in (BEFORE_GENERATIVE, FORMAT) or (
+        for number, entries in ADDED_ENTRIES.items():
+            if description.get("format") == number:
+                description = entries | description
+        if description.get("format") not in (*ADDED_ENTRIES, FORMAT) or (
             channels not in CHANNELS_OF_NETWORKS
         ):
             readable = " or ".join(map(str, CHANNELS_OF_NETWORKS))
@@ -353,8 +357,7 @@ class EmbeddedEnhancer:
                 bool(description["drawing"]),
                 _read_patches(weights_file.with_name(PATCHES)),
                 None if description["domain"] is None else Domain.from_dict(description["domain"]),
-                # Weights of a package say nothing of a scene's settings.
-                bool(description.get("depth_from_image", False)),
+                bool(description["depth_from_image"]),
             )
         try:
             network.load_state_dict(
