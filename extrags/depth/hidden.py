@@ -7,8 +7,6 @@ the scene shows as depth that all sources confirm, and what it does not show as 
 
 from __future__ import annotations
 
-import math
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -18,7 +16,7 @@ from extrags.depth.completion import CompletionNetwork, completion_inputs
 from extrags.depth.frames import PosedFrames
 from extrags.depth.shading import fit_shading, smoothed_brightness
 from extrags.depth.stereo import SATURATED, StereoDepth
-from extrags.threads import in_threads
+from extrags.threads import in_threads, one_torch_thread
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.filling import push_pull
 
@@ -27,7 +25,8 @@ __all__ = ["IMAGE_SHARE", "depth_from_image"]
 IMAGE_SHARE = 0.65
 """Of the log-depth that is read, in holes; the rest is the guess's: their errors have little in common."""
 SOLID = 0.8
-"""Opacity from which a rendered depth is taken as it is; down to `HOLE_ALPHA` its share falls to none."""
+"""Opacity from which a rendered depth counts as confirmed, and the guess is left as it is. From there down to
+`HOLE_ALPHA` the share of what is read rises."""
 LONGEST_SIDES_PX = (160, 80)
 """Sizes that depth is read at, whose mean is taken: the smaller serves large holes, the larger small ones."""
 SOURCES = 6
@@ -36,6 +35,7 @@ UNCONFIRMED_COST, UNCONFIRMED_DIFFERENCE = 1.0, 0.3
 """What stereo usually reports of a pixel that all sources confirm, and of one that none does."""
 
 
+@one_torch_thread()
 @torch.no_grad()
 def depth_from_image(
     network: CompletionNetwork,
@@ -45,15 +45,15 @@ def depth_from_image(
     opacity: Float[Tensor, "t h w"],
     K: Float[Tensor, "t 3 3"],
 ) -> Float[Tensor, "t h w"]:
-    """Z-depth without gaps: as it is where the scene is solid, read from the image in holes.
+    """Z-depth without gaps: the guess where the scene is solid, in holes mixed with what the image says.
 
-    Depths that are read have no step at the border of a hole: what they are off there is carried inside.
+    What is read meets the rendered depth at the border of a hole: what it is off there is carried inside.
 
     Args:
         network: of the depth completion.
         rgb: restored views of one scene under one light, in [0, 1].
         depth_mm: rendered z-depth, smoothly continued into holes.
-        guess_mm: another guess of the whole, which is mixed with what is read.
+        guess_mm: a guess of the whole by other means.
         opacity: of the rendering.
         K: pinhole intrinsics in pixels.
 
@@ -63,9 +63,8 @@ def depth_from_image(
     size = opacity.shape[-2:]
     smooth = depth_mm.clamp_min(1e-9).log()
     read = torch.zeros_like(smooth)
-    for longest in LONGEST_SIDES_PX:
-        scale = min(1.0, longest / max(size))
-        height, width = (math.ceil(scale * side) for side in size)
+    sizes = {_size_of(size, longest) for longest in LONGEST_SIDES_PX}
+    for height, width in sorted(sizes):
 
         def resized(image: Tensor, small: tuple[int, int] = (height, width)) -> Tensor:
             return image if image.shape[-2:] == small else functional.interpolate(image, small, mode="area")
@@ -79,10 +78,16 @@ def depth_from_image(
             zoom * K,
         )
         change = functional.interpolate(change[:, None], size, mode="bilinear", align_corners=False)
-        read += change[:, 0] / len(LONGEST_SIDES_PX)
+        read += change[:, 0] / len(sizes)
     guess = guess_mm.clamp_min(1e-9).log()
     hidden = ((SOLID - opacity) / (SOLID - HOLE_ALPHA)).clamp(0, 1)
     return (guess + IMAGE_SHARE * hidden * (smooth + read - guess)).exp()
+
+
+def _size_of(size: torch.Size, longest: int) -> tuple[int, int]:
+    """Height and width with the longest side at most so long."""
+    height, width = (-(-longest * side // max(size)) if longest < max(size) else side for side in size)
+    return height, width
 
 
 def _read_change(

@@ -8,10 +8,14 @@ from __future__ import annotations
 import hashlib
 from importlib.resources import files
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from extrags.array_files import load_safetensors
-from extrags.depth.completion import CompletionNetwork
 from extrags.errors import WeightsError
+
+if TYPE_CHECKING:
+    # What computes is imported on first use: digests are asked for whenever an artefact is looked up.
+    from extrags.depth.completion import CompletionNetwork
 
 __all__ = ["BUNDLED", "NONE", "completion_digest", "find_completion", "load_completion"]
 
@@ -55,6 +59,8 @@ def load_completion(setting: str) -> CompletionNetwork | None:
     Raises:
         WeightsError: when there is no such file, or it holds another network.
     """
+    from extrags.depth.completion import CompletionNetwork
+
     file = find_completion(setting)
     if file is None:
         return None

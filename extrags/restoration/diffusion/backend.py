@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.depth.weights import BUNDLED, completion_digest, find_completion
 from extrags.restoration.diffusion.weights import weights_digest
 from extrags.restoration.protocol import Enhancer
 from extrags.scene import Scene
@@ -31,14 +32,19 @@ class EmbeddedBackend:
         from extrags.restoration.diffusion.embedded import pretrained
 
         pretrained(config)
+        if config.depth_from_image:
+            find_completion(BUNDLED)
 
     def digest(self, config: EnhanceConfig) -> str | None:
-        """Digest of the weights; None where training starts from random ones.
+        """Digest of the weights, also of those that depth is read with; None where there are neither.
 
         Raises:
             WeightsError: when the weights are missing.
         """
-        return weights_digest(config.pretrained_weights)
+        weights = weights_digest(config.pretrained_weights)
+        if not config.depth_from_image:
+            return weights
+        return f"{weights} {completion_digest(BUNDLED)}"
 
     def needs_text(self, config: EnhanceConfig) -> bool:
         """No text is read."""

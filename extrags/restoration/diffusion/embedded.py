@@ -16,7 +16,7 @@ from extrags.array_files import load_safetensors
 from extrags.config import EnhanceConfig
 from extrags.depth.completion import CompletionNetwork
 from extrags.depth.hidden import depth_from_image
-from extrags.depth.weights import BUNDLED, load_completion
+from extrags.depth.weights import BUNDLED, completion_digest, load_completion
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.description import description_fields, read_description, write_description
 from extrags.restoration.diffusion.network import RestorationNetwork, build_network
@@ -36,6 +36,7 @@ from extrags.view_synthesis.conditioning import (
     INVENTED_CHANNELS,
     Layers,
     condition,
+    filled_depth,
 )
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
@@ -45,8 +46,8 @@ __all__ = ["EmbeddedEnhancer", "pretrained"]
 FORMAT = 4
 """Raised when a saved restorer cannot be read by newer code."""
 ADDED_ENTRIES: dict[int, dict[str, Any]] = {
-    2: {"generative": False, "drawing": False, "domain": None, "depth_from_image": False},
-    3: {"depth_from_image": False},
+    2: {"generative": False, "drawing": False, "domain": None, "depth_from_image": None},
+    3: {"depth_from_image": None},
 }
 """What earlier formats that can be read lack, and what stands for it."""
 PATCHES = "patches.safetensors"
@@ -162,9 +163,9 @@ class EmbeddedEnhancer:
         if not self.depth_from_image:
             return guess_mm
         network = _completion()
-        with torch.no_grad():
-            filled_mm = condition(clip.layers, clip.transfer).depth_mm[:, 0]
-        opacity = clip.layers.get("alpha")[:, 0]
+        filled_mm = filled_depth(clip.layers, clip.transfer.scale_mm)[:, 0]
+        # What a keyframe has invented is as sure as its colour.
+        opacity = torch.maximum(clip.layers.get("alpha"), clip.layers.get("invented_weight"))[:, 0]
         K = torch.from_numpy(clip.cameras.K).to(rgb)
         return depth_from_image(network, rgb, filled_mm, guess_mm[:, 0], opacity, K)[:, None]
 
@@ -263,6 +264,7 @@ class EmbeddedEnhancer:
             "seed": self.seed,
             "precision": "bfloat16" if self.half_precision else "float32",
             "drawing": self.drawing,
+            "depth_from_image": self.depth_from_image,
             "domain_score": self.domain_score,
             "validation": self.record.get("validation", {}),
             "scene_training_kept": self.record.get("scene_training_kept"),
@@ -301,7 +303,8 @@ class EmbeddedEnhancer:
             "deterministic": self.deterministic,
             "generative": self.network.generative,
             "drawing": self.drawing,
-            "depth_from_image": self.depth_from_image,
+            # The weights that read it are not saved: cached views follow their digest.
+            "depth_from_image": completion_digest(BUNDLED) if self.depth_from_image else None,
             "domain": None if self.domain is None else self.domain.as_dict(),
             "record": self.record,
         }
@@ -332,7 +335,8 @@ class EmbeddedEnhancer:
             readable = " or ".join(map(str, CHANNELS_OF_NETWORKS))
             raise WeightsError(
                 f"{description_file}: format {description.get('format')} with {channels} channels, this "
-                f"version reads format {FORMAT} with {readable}; train the restorer again"
+                f"version reads formats {min(ADDED_ENTRIES)} to {FORMAT} with {readable}; train the restorer "
+                "again"
             )
         with description_fields(description_file):
             first, second, third = description["widths"]

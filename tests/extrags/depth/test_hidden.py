@@ -31,7 +31,7 @@ def true_depth_mm(clips: Clips) -> Tensor:
 
 
 def with_a_hole() -> Tensor:
-    """Opacity: nothing is known of the farther half of a view, or of a side of it."""
+    """Opacity of views of which only a frame is known."""
     opacity = torch.ones(SIZE)
     opacity[12:52, 24:76] = 0
     return opacity
@@ -55,6 +55,30 @@ def test_it_is_nearer_to_the_truth_than_smooth_filling(clips: Clips) -> None:
     inside = (opacity == 0).expand_as(read) & clips.frames.mask & (clips.depth > 0)
     errors = [(depth / true_depth_mm(clips)).log().abs()[inside].mean() for depth in (read, filled)]
     assert errors[0] < 0.7 * errors[1]
+
+
+def test_views_of_any_size_and_pixels_that_are_not_square() -> None:
+    """Read at two smaller sizes, from images with different focal lengths; the last view shows nothing."""
+    generator = torch.Generator().manual_seed(991)
+    found = photograph(Cavities("colon", 3, generator), generator, (198, 171), 1)
+    assert len(found.depth) >= 2
+    frames = found.frames
+    truth = true_depth_mm(found)
+    # Every second row of a view with square pixels has twice its height.
+    rgb, truth, mask = frames.rgb[:, :, ::2], truth[:, ::2], frames.mask[:, ::2] & (found.depth[:, ::2] > 0)
+    K = frames.K.clone()
+    K[:, 1] /= 2
+    opacity = torch.ones_like(truth)
+    opacity[:, 20:80, 50:163] = 0
+    opacity[-1] = 0
+    filled = completed_depth(truth[:, None] * (opacity[:, None] > 0), opacity[:, None], MEDIAN_MM)[:, 0]
+    network = load_completion("bundled")
+    assert network is not None
+    read = depth_from_image(network, rgb, filled, filled, opacity, K)
+    assert torch.isfinite(read).all()
+    inside = ((opacity == 0) & mask)[:-1]
+    errors = [(depth / truth)[:-1].log().abs()[inside].mean() for depth in (read, filled)]
+    assert errors[0] < 0.8 * errors[1]
 
 
 def test_what_is_solid_stays(clips: Clips) -> None:

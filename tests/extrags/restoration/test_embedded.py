@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -212,6 +213,12 @@ class TestEmbedded:
         loaded = load_enhancer(tmp_path).restore(clip).depth_mm
         assert loaded is not None
         assert np.array_equal(loaded, guessed.depth_mm)
+        # Restorers of the format before are of a time when none read it.
+        file = tmp_path / "restorer.json"
+        description = json.loads(file.read_text())
+        del description["depth_from_image"]
+        file.write_text(json.dumps(description | {"format": 3}))
+        assert load_enhancer(tmp_path).provenance["depth_from_image"] is False
 
     def test_samples_add_to_the_expected_error(self, trained: EmbeddedEnhancer, clip: Clip) -> None:
         plain = replace(trained, steps=4, calibration=Calibration())
