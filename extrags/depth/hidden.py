@@ -20,7 +20,7 @@ from extrags.threads import in_threads, one_torch_thread
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.filling import push_pull
 
-__all__ = ["IMAGE_SHARE", "depth_from_image"]
+__all__ = ["depth_from_image"]
 
 IMAGE_SHARE = 0.65
 """Of the log-depth that is read, in holes; the rest is the guess's: their errors have little in common."""
@@ -30,6 +30,7 @@ SOLID = 0.8
 LONGEST_SIDES_PX = (160, 80)
 """Sizes that depth is read at, whose mean is taken: the smaller serves large holes, the larger small ones."""
 SOURCES = 6
+"""Of every view, as stereo usually has them; they count as all or none of them confirming a pixel."""
 CONFIRMED_COST, CONFIRMED_MARGIN, CONFIRMED_DIFFERENCE = 0.25, 0.1, 0.02
 UNCONFIRMED_COST, UNCONFIRMED_DIFFERENCE = 1.0, 0.3
 """What stereo usually reports of a pixel that all sources confirm, and of one that none does."""

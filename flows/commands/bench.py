@@ -291,9 +291,22 @@ def _print_restorers(cases: list[dict[str, Any]]) -> None:
         _print(["method", *labels, "well", "hole", "kept well", "rank corr.", "within 50 %", "90 %"], rows)
         names = ("within", "across", "of_photographs")
         _print(
-            ["method", "error flicker", "invented: within clips", "across clips", "photographs"],
             [
-                [case["method"], case["error_flicker"], *(case["inconsistency"][name] for name in names)]
+                "method",
+                "error flicker",
+                "invented: within clips",
+                "across clips",
+                "photographs",
+                "hole depth: mean error",
+                "median",
+            ],
+            [
+                [
+                    case["method"],
+                    case["error_flicker"],
+                    *(case["inconsistency"][name] for name in names),
+                    *(case["hole_depth_error"][name] for name in ("mean", "median")),
+                ]
                 for case in chosen
             ],
         )

@@ -125,6 +125,8 @@ RESTORED = {
     "kept well": ("kept", "well", "psnr"),
     "rank corr.": ("calibration", "rank_correlation"),
     "aligned rank corr.": ("aligned", "calibration", "rank_correlation"),
+    "hole depth": ("hole_depth_error", "mean"),
+    "hole depth, median": ("hole_depth_error", "median"),
     "error flicker": ("error_flicker",),
     "s/frame": ("seconds_per_frame",),
     "prepared in s": ("prepare_seconds",),

@@ -178,6 +178,7 @@ class RestoredViews:
         predicted_error: `Restoration.expected_error`, [V, H, W]; None where the restorer predicts none.
         seconds_per_frame: median over the clips.
         provenance: of the first clip.
+        depth_mm: z-depth without gaps, [V, H, W]; None where the restorer gives none.
     """
 
     rgb: Float[np.ndarray, "v h w 3"]
@@ -185,6 +186,7 @@ class RestoredViews:
     predicted_error: Float[np.ndarray, "v h w"] | None
     seconds_per_frame: float
     provenance: dict[str, Any]
+    depth_mm: Float[np.ndarray, "v h w"] | None = None
 
 
 def restore_views(enhancer: Enhancer, clips: Sequence[Clip]) -> RestoredViews:
@@ -204,12 +206,14 @@ def restore_views(enhancer: Enhancer, clips: Sequence[Clip]) -> RestoredViews:
         rendered = as_images(clip.layers.get("rendered").clamp(0, 1))
         targets.append(keep_known(rendered, restoration.rgb, as_planes(clip.layers.get("uncertainty")))[0])
     expected = [item.expected_error for item in restorations if item.expected_error is not None]
+    depths = [item.depth_mm for item in restorations if item.depth_mm is not None]
     return RestoredViews(
         np.concatenate([item.rgb for item in restorations]),
         np.concatenate(targets),
         np.concatenate(expected) if len(expected) == len(restorations) else None,
         float(np.median(seconds)),
         restorations[0].provenance,
+        np.concatenate(depths) if len(depths) == len(restorations) else None,
     )
 
 
@@ -255,6 +259,7 @@ class RestorerBenchmark:
             the target's pixels inside the mask), `flicker`, `error_flicker`,
             `inconsistency: {within, across, of_photographs}` of what was invented (in both views a hole, or
             never observed; see `invented_inconsistency`), `frechet` and `detail` by region (see `Realism`),
+            `hole_depth_error: {mean, median}` (absolute difference of log-depths; None without either depth),
             `seconds_per_frame`, `calibration` (see `calibration`; None without prediction; in `aligned` of
             the errors after alignment) with `rank_correlation_of`: the rank correlation of the error with
             what else could predict it.
@@ -283,6 +288,7 @@ class RestorerBenchmark:
             **self._flicker(rgb),
             "inconsistency": self._inconsistency(rgb),
             **self._realism.figures(rgb),
+            "hole_depth_error": self._hole_depth_error(restored.depth_mm),
             "seconds_per_frame": restored.seconds_per_frame,
             "calibration": self._calibration(restored, rgb),
             "rank_correlation_of": {
@@ -290,6 +296,16 @@ class RestorerBenchmark:
                 for name, values in (("uncertainty", self._layer("uncertainty")), ("change", change))
             },
         }
+
+    def _hole_depth_error(self, depth_mm: Float[np.ndarray, "v h w"] | None) -> dict[str, float | None]:
+        true_mm, nothing = self.truth.depth_mm, dict.fromkeys(("mean", "median"))
+        if depth_mm is None or true_mm is None:
+            return nothing
+        holes = self.regions["hole"].numpy() & (true_mm > 0)
+        if not holes.any():
+            return nothing
+        error = np.abs(np.log(depth_mm[holes] / true_mm[holes]))
+        return {"mean": float(error.mean()), "median": float(np.median(error))}
 
     def _calibration(
         self, restored: RestoredViews, images: Float[Tensor, "v h w 3"]

@@ -140,6 +140,18 @@ class TestFigures:
         assert darker["aligned"]["psnr"] > 50
         assert darker["aligned"]["calibration"] is None
 
+    def test_depth_of_holes(self) -> None:
+        truth = replace(flat_truth(0.4), depth_mm=np.full((1, SIZE[1], SIZE[0]), 20.0, np.float32))
+        truth.depth_mm[:, 0] = 0  # type: ignore[index]
+        benchmark = RestorerBenchmark([plain_clip()], truth)
+        restored = restore_views(Given(truth.rgb), [plain_clip()])
+        assert benchmark.figures(restored)["hole_depth_error"] == {"mean": None, "median": None}
+        # The right half is known, and its depth is not asked.
+        left = np.arange(SIZE[0]) < SIZE[0] // 2
+        depth = np.where(left, 20.0 * np.e, 1.0) * np.ones(truth.mask.shape)
+        found = benchmark.figures(replace(restored, depth_mm=depth))["hole_depth_error"]
+        assert found == {"mean": pytest.approx(1), "median": pytest.approx(1)}
+
     def test_errors_are_those_after_the_gain(self) -> None:
         clip = plain_clip()
         truth = flat_truth(0.4)
