@@ -34,6 +34,7 @@ from extrags.sequence import EndoscopicSequence, Split
 from extrags.store.storable import Storable
 from extrags.threads import one_torch_thread
 from extrags.training.finetuning import finetune
+from extrags.training.frame_weights import frame_weights
 from extrags.training.leave_out import MIN_FRAMES, leave_out_folds, partial_scene
 
 __all__ = ["AMOUNTS", "Judgement", "Trial", "decide", "judge_finetuning"]
@@ -207,6 +208,9 @@ def judge_finetuning(
             small = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
             views = _restored(start, part, small, enhancer, enhance, settings.views, measure)
         arms.append((part, start, views))
+    # Once for all amounts.
+    weighted = coarse.inconsistent_frames == "weight"
+    weights_of_arms = [frame_weights(part, part.train) if weighted else None for part, _, _ in arms]
     brief = config.model_copy(
         update={"iterations": max(1, round(settings.iterations_share * config.iterations))}
     )
@@ -217,10 +221,16 @@ def judge_finetuning(
     def after_finetuning(amount: float) -> list[float]:
         weight = {"pseudo_weight": amount * config.pseudo_weight} if amount > 0 else {}
         after, tried[amount] = [], []
-        for part, start, views in arms:
+        for (part, start, views), weights in zip(arms, weights_of_arms, strict=True):
             pseudo_views = views if amount > 0 else None
             found = finetune(
-                start, part, pseudo_views, brief.model_copy(update=weight), coarse, stage="finetune-judge"
+                start,
+                part,
+                pseudo_views,
+                brief.model_copy(update=weight),
+                coarse,
+                stage="finetune-judge",
+                frame_weights=weights,
             )
             after += _psnr_db(found.scene, part)
             tried[amount].append(found.scene)

@@ -296,12 +296,15 @@ class InMemoryPipeline(Pipeline):
                 measure=self._perceptual_difference(),
             )
             if judgement.amount is not None:
+                made = self.result.reconstruction
                 found = finetune(
                     scene,
                     self._training,
                     self.result.pseudo_views if judgement.amount > 0 else None,
                     judgement.applied_to(self.config.finetune),
                     self.config.coarse,
+                    # Where poses were refined, frames are compared anew through these.
+                    frame_weights=None if made is None or made.refined is not None else made.frame_weights,
                 )
                 self.result.finetuning = replace(found, scene=found.scene.to("cpu"))
 

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "COARSE_VERSION",
-    "FRAME_WEIGHTS",
     "HISTORY",
     "coarse",
     "refined_frames",
@@ -24,9 +23,6 @@ __all__ = [
 
 COARSE_VERSION = 8
 """Of the reconstruction, wherever it begins: scenes that go on from an earlier one follow it."""
-
-FRAME_WEIGHTS = "frame_weights.json"
-"""What was found of each training frame (`extrags.training.frame_weights.FrameWeights.to_json`)."""
 
 HISTORY = "history.json"
 """Training curve: a list of `{iteration, loss, psnr, n_gaussians}`."""
@@ -68,7 +64,7 @@ def save_reconstruction(slot: Slot, frames: EndoscopicSequence, result: Training
     slot.save_json(HISTORY, result.history)
     slot.counts["n_gaussians"] = len(result.scene.gaussians)
     if result.frame_weights is not None:
-        slot.save_json(FRAME_WEIGHTS, result.frame_weights.to_json(), indent=1)
+        slot.save(result.frame_weights)
         if result.frame_weights.statements:
             slot.counts["inconsistent_frames"] = "; ".join(result.frame_weights.statements)
     # Without depth and points there is nothing that says where the surface is: to be told beside the figures.

@@ -81,7 +81,13 @@ def finetune(
     from extrags.pseudo_views import PseudoViews
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
+    from extrags.training.frame_weights import FrameWeights
+    from extrags.training.pose_refinement import RefinedPoses
 
+    # Of the coarse stage. Where it refined poses, frames are compared anew through these.
+    found = slot.open(scene)
+    known = (found / FrameWeights.stored_as).exists() and not (found / RefinedPoses.stored_as).exists()
+    weights = slot.load(FrameWeights, scene) if known else None
     start, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
     start = start.to(chosen_device(device, "device"))
     with keep_last_finite_scene(slot):
@@ -92,6 +98,7 @@ def finetune(
             None if pseudo_views is None else slot.load(PseudoViews, pseudo_views),
             config,
             coarse,
+            frame_weights=weights,
         )
     slot.save(result.scene)
     slot.save_json(HISTORY, result.history)

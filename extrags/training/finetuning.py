@@ -20,7 +20,7 @@ from extrags.sequence import EndoscopicSequence
 from extrags.threads import one_torch_thread
 from extrags.thresholds import HOLE_ALPHA
 from extrags.training.filling import FillingStep, filling_schedule
-from extrags.training.frame_weights import weighted_views
+from extrags.training.frame_weights import FrameWeights, weighted_views
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
 from extrags.training.starting import median_depth, surface_normals, thin_out
@@ -68,6 +68,7 @@ def finetune(
     coarse: CoarseConfig | None = None,
     *,
     stage: str = "finetune",
+    frame_weights: FrameWeights | None = None,
 ) -> TrainingResult:
     r"""Fine-tune a scene on real and virtual views together.
 
@@ -102,9 +103,12 @@ def finetune(
         config: budgets and shares; None takes the defaults.
         coarse: rates and weights, those the coarse scene was made with; None takes the defaults.
         stage: named in progress events.
+        frame_weights: of the training frames, where they are known from the reconstruction; None looks for
+            blurred frames where `coarse.inconsistent_frames` is `weight`.
 
     Raises:
         DivergedError: when the optimisation does not stay finite.
+        ShapeError: for weights of other frames.
 
     Source: [ExtraGS, eq. 24] (training views) and [ExtraGS, eq. 25] (virtual views), see
     docs/references.md; their depth term is our own.
@@ -133,7 +137,7 @@ def finetune(
         if config.keep_scene and len(start.gaussians) == len(scene.gaussians):
             return TrainingResult(scene.detached(), [])
         if coarse.inconsistent_frames == "weight":
-            real, _ = weighted_views(sequence, frames, coarse)
+            real, _ = weighted_views(sequence, frames, coarse, frame_weights)
         else:
             real = real_views(sequence, frames)
         virtual = [] if pseudo_views is None else virtual_views(pseudo_views, config)

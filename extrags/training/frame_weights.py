@@ -7,17 +7,21 @@ sharp enough. What remains displaced after the warp has moved by itself, or the 
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 
 from extrags.config import CoarseConfig
+from extrags.errors import ShapeError
 from extrags.sequence import EndoscopicSequence
+from extrags.store.storable import Storable
 from extrags.training.frame_comparison import ComparedFrames, PairComparison
 from extrags.training.views import View, real_views
 
@@ -51,7 +55,7 @@ LEAST_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
-class FrameWeights:
+class FrameWeights(Storable):
     """What training frames are worth.
 
     Args:
@@ -62,6 +66,8 @@ class FrameWeights:
         weights: of a frame's colours, [M]: one unless it is blurred.
         applied: whether training used the weights, or they are only reported.
     """
+
+    stored_as: ClassVar[str] = "frame_weights.json"
 
     names: tuple[str, ...]
     sharpness: Float[np.ndarray, "m"]
@@ -111,6 +117,22 @@ class FrameWeights:
             for position, name in enumerate(self.names)
         ]
 
+    def save(self, path: Path) -> None:
+        """Write `to_json`, which leaves out whether they are applied."""
+        path.write_text(json.dumps(self.to_json(), indent=1, allow_nan=False), encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: Path) -> FrameWeights:
+        """Read what `save` wrote."""
+        rows = json.loads(path.read_bytes())
+        sharpness = [np.nan if row["sharpness"] is None else row["sharpness"] for row in rows]
+        return cls(
+            names=tuple(row["frame"] for row in rows),
+            sharpness=np.array(sharpness, dtype=np.float64),
+            displaced=np.array([row["displaced_share"] for row in rows], dtype=np.float64),
+            weights=np.array([row["weight"] for row in rows], dtype=np.float64),
+        )
+
 
 def frame_weights(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) -> FrameWeights | None:
     """Find frames that are blurred, or show tissue that has moved.
@@ -156,7 +178,10 @@ def frame_weights(sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"]) ->
 
 
 def weighted_views(
-    sequence: EndoscopicSequence, frames: Int[np.ndarray, "m"], config: CoarseConfig
+    sequence: EndoscopicSequence,
+    frames: Int[np.ndarray, "m"],
+    config: CoarseConfig,
+    found: FrameWeights | None = None,
 ) -> tuple[list[View], FrameWeights | None]:
     """Frames as views, and what was found of them; None where the settings or the data say nothing.
 
@@ -164,9 +189,19 @@ def weighted_views(
         sequence: posed frames.
         frames: which of them.
         config: says in `inconsistent_frames` whether to look, and whether the views get the weights.
+        found: of these frames, earlier; None looks for it.
+
+    Raises:
+        ShapeError: where something was found of other frames than these.
     """
     views = real_views(sequence, frames)
-    weights = None if config.inconsistent_frames == "ignore" else frame_weights(sequence, frames)
+    if config.inconsistent_frames == "ignore":
+        return views, None
+    weights = frame_weights(sequence, frames) if found is None else found
+    if weights is not None and weights.names != tuple(sequence.frame_name(int(frame)) for frame in frames):
+        raise ShapeError(
+            f"{sequence.name}: weights of {len(weights.names)} frames do not fit {len(frames)} frames"
+        )
     if weights is None or config.inconsistent_frames == "report":
         return views, weights
     return weights.applied_to(views), replace(weights, applied=True)

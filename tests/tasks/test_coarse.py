@@ -2,9 +2,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from extrags.config import CoarseConfig, DensifyConfig
+import pytest
+
+from extrags.config import CoarseConfig, DensifyConfig, FinetuneConfig
 from extrags.store import Slot, Store
-from tasks.coarse import FRAME_WEIGHTS, coarse
+from extrags.training.frame_weights import FrameWeights
+from tasks.coarse import coarse
+from tasks.finetune import finetune
 from tasks.stage import stage
 from tests.extrags.training.textured_plane import blurred_along_rows, changed, textured_plane
 
@@ -20,7 +24,7 @@ def one_blurred(slot: Slot) -> None:
 def test_blurred_frames_stand_in_artefact_and_counts(tmp_path: Path) -> None:
     store = str(tmp_path)
     done = coarse.fn(store=store, sequence=one_blurred.fn(store=store), config=CONFIG)
-    rows = Store(store).load_json(FRAME_WEIGHTS, done)
+    rows = Store(store).load_json(FrameWeights.stored_as, done)
     assert [row["frame"] for row in rows if row["weight"] < 1] == ["003.png"]
     said = Store(store).manifest(done).counts["inconsistent_frames"]
     assert isinstance(said, str)
@@ -32,4 +36,22 @@ def test_nothing_is_said_where_nothing_is_looked_for(tmp_path: Path) -> None:
     config = CONFIG.model_copy(update={"inconsistent_frames": "ignore"})
     done = coarse.fn(store=store, sequence=one_blurred.fn(store=store), config=config)
     assert "inconsistent_frames" not in Store(store).manifest(done).counts
-    assert not (Store(store).open(done) / FRAME_WEIGHTS).exists()
+    assert not (Store(store).open(done) / FrameWeights.stored_as).exists()
+
+
+def test_finetuning_does_not_look_for_blurred_frames_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = str(tmp_path)
+    config = CONFIG.model_copy(update={"inconsistent_frames": "weight"})
+    sequence = one_blurred.fn(store=store)
+    scene = coarse.fn(store=store, sequence=sequence, config=config)
+
+    def compared(*_: object) -> None:
+        raise AssertionError("looked for blurred frames again")
+
+    monkeypatch.setattr("extrags.training.frame_weights.frame_weights", compared)
+    settings = FinetuneConfig(iterations=3, densify_share=0.0)
+    finetune.fn(
+        store=store, scene=scene, sequence=sequence, pseudo_views=None, config=settings, coarse=config
+    )

@@ -2,16 +2,17 @@ from __future__ import annotations
 
 import logging
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from extrags.config import CoarseConfig, DensifyConfig
-from extrags.errors import CaptureError
+from extrags.config import CoarseConfig, DensifyConfig, FinetuneConfig
+from extrags.errors import CaptureError, ShapeError
 from extrags.sequence import EndoscopicSequence
-from extrags.training import reconstruct
+from extrags.training import finetune, reconstruct
 from extrags.training.frame_comparison import ComparedFrames
 from extrags.training.frame_weights import (
     LEAST_SHARPNESS,
@@ -207,3 +208,28 @@ class TestReconstruct:
         assert result.frame_weights is not None
         assert result.frame_weights.sharpness[3] < LEAST_SHARPNESS
         assert "frame 003.png is blurred" in caplog.text
+
+
+class TestFinetune:
+    def test_weights_of_reconstruction_give_the_same_bits(
+        self, plane: EndoscopicSequence, tmp_path: Path
+    ) -> None:
+        coarse, config = TestReconstruct.CONFIG, FinetuneConfig(iterations=20, densify_share=0.0)
+        sequence = changed(plane, 3, blurred_along_rows(plane.rgb[3], 9))
+        made = reconstruct(sequence, coarse)
+        assert made.frame_weights is not None
+        made.frame_weights.save(tmp_path / FrameWeights.stored_as)
+        stored = FrameWeights.load(tmp_path / FrameWeights.stored_as)
+        given = finetune(made.scene, sequence, None, config, coarse, frame_weights=stored)
+        looked = finetune(made.scene, sequence, None, config, coarse)
+        unweighted = coarse.model_copy(update={"inconsistent_frames": "ignore"})
+        ignored = finetune(made.scene, sequence, None, config, unweighted)
+        for name, value in looked.scene.gaussians.parameters().items():
+            assert torch.equal(value, given.scene.gaussians.parameters()[name]), name
+        assert not torch.equal(ignored.scene.gaussians.means, given.scene.gaussians.means)
+
+    def test_weights_of_other_frames_are_refused(self, plane: EndoscopicSequence) -> None:
+        found = judged(plane)
+        fewer = replace(found, names=found.names[1:])
+        with pytest.raises(ShapeError, match="made/plane: weights of"):
+            weighted_views(plane, plane.train, WEIGHT, fewer)
