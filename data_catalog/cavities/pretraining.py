@@ -80,11 +80,15 @@ def cavity_config(index: int, *, size_factor: int = 1, real_textures: bool = Fal
     )
 
 
-def cavity_recording(config: CavityConfig) -> PretrainingRecording:
+def cavity_recording(config: CavityConfig, *, to_restore: bool = True) -> PretrainingRecording:
     """A recording of a cavity with its clips of views to restore.
 
     Training frames come first, as a camera shows them. The clips' views are free of noise, motion and
     compression and taken at the mean exposure; depth is exact everywhere.
+
+    Args:
+        config: what it is like.
+        to_restore: whether there are views to restore; the training frames are the same without.
 
     Raises:
         SourceNotFoundError: when real textures are asked for and not on this machine.
@@ -100,6 +104,8 @@ def cavity_recording(config: CavityConfig) -> PretrainingRecording:
         except CaptureError as error:
             problem = str(error)
             continue
+        if not to_restore:
+            targets, clip = targets[np.arange(0)], clip[:0]
         return _photographed(scene, config, cavity, train, targets, clip)
     raise CaptureError(f"cavity {config.scene} ({config.kind}): {problem}, in {_ATTEMPTS} draws")
 
@@ -199,7 +205,7 @@ def _photographed(
         metric=True,
         truth=truth,
     )
-    return PretrainingRecording(sequence, clip, config.kind)
+    return PretrainingRecording(sequence, clip, config.kind, lambda camera: z_depth(cavity.rays, camera))
 
 
 def _exposures(

@@ -50,8 +50,13 @@ def pretraining_scene_config(index: int) -> PhantomConfig:
     )
 
 
-def pretraining_recording(index: int) -> PretrainingRecording:
-    """A pretraining scene with its clips of views to restore; training frames come first."""
+def pretraining_recording(index: int, *, to_restore: bool = True) -> PretrainingRecording:
+    """A pretraining scene with its clips of views to restore; training frames come first.
+
+    Args:
+        index: from 0.
+        to_restore: whether there are such views; the training frames are the same without.
+    """
     config = pretraining_scene_config(index)
     phantom = Phantom(config)
     rng = stream(config.scene, "variation", 2)
@@ -59,7 +64,7 @@ def pretraining_recording(index: int) -> PretrainingRecording:
     sensor = recording_sensor(config, TRAINS, gain)
     video = np.arange(0, config.video_frames, config.train_every)
     train = phantom.cameras("b", video / (config.video_frames - 1))
-    targets = _target_cameras(phantom, rng)
+    targets = _target_cameras(phantom, rng) if to_restore else train[np.arange(0)]
     rgb, exposures = [], []
     for k, frame in enumerate(video):
         image, exposure = phantom.photograph(train[k], sensor, TRAINS, int(frame))
@@ -92,7 +97,7 @@ def pretraining_recording(index: int) -> PretrainingRecording:
         truth=truth,
     )
     clip = np.repeat(np.arange(len(targets) // _CLIP_VIEWS), _CLIP_VIEWS)
-    return PretrainingRecording(sequence, clip, "phantom")
+    return PretrainingRecording(sequence, clip, "phantom", phantom.z_depth)
 
 
 def _target_cameras(phantom: Phantom, rng: np.random.Generator) -> Cameras:

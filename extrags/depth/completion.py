@@ -41,7 +41,8 @@ NORM_GROUPS = 8
 FARTHEST_LOG = 3.0
 """Bound of log-depths relative to the frame's median."""
 
-RGB, STEREO, SHADING, MASK, RAYS, POINTS, SOURCES = slice(0, 3), 3, 4, 11, slice(12, 14), slice(15, 17), 17
+RGB, STEREO, SHADING, SEEN = slice(0, 3), 3, 4, 7
+MASK, RAYS, POINTS, SOURCES = 11, slice(12, 14), slice(15, 17), 17
 """Where these channels lie; the others are listed in `completion_inputs`."""
 
 

@@ -7,12 +7,14 @@ the scene shows as depth that all sources confirm, and what it does not show as 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrags.depth.completion import CompletionNetwork, completion_inputs
+from extrags.depth.completion import CompletionInputs, CompletionNetwork, completion_inputs
 from extrags.depth.frames import PosedFrames
 from extrags.depth.shading import fit_shading, smoothed_brightness
 from extrags.depth.stereo import SATURATED, StereoDepth
@@ -20,7 +22,17 @@ from extrags.threads import in_threads, one_torch_thread
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.filling import push_pull
 
-__all__ = ["depth_from_image"]
+__all__ = [
+    "LONGEST_SIDES_PX",
+    "SOLID",
+    "depth_from_image",
+    "met_where_known",
+    "read_depth",
+    "reading_inputs",
+    "reading_size",
+    "shrunk",
+    "shrunk_intrinsics",
+]
 
 IMAGE_SHARE = 0.65
 """Of the log-depth that is read, in holes; the rest is the guess's: their errors have little in common."""
@@ -48,10 +60,8 @@ def depth_from_image(
 ) -> Float[Tensor, "t h w"]:
     """Z-depth without gaps: the guess where the scene is solid, in holes mixed with what the image says.
 
-    What is read meets the rendered depth at the border of a hole: what it is off there is carried inside.
-
     Args:
-        network: of the depth completion.
+        network: reads depth.
         rgb: restored views of one scene under one light, in [0, 1].
         depth_mm: rendered z-depth, smoothly continued into holes.
         guess_mm: a guess of the whole by other means.
@@ -61,34 +71,65 @@ def depth_from_image(
     Returns:
         In the units of `depth_mm`.
     """
+    read = read_depth(network, rgb, depth_mm, opacity, K).log()
+    guess = guess_mm.clamp_min(1e-9).log()
+    hidden = ((SOLID - opacity) / (SOLID - HOLE_ALPHA)).clamp(0, 1)
+    return (guess + IMAGE_SHARE * hidden * (read - guess)).exp()
+
+
+@one_torch_thread()
+@torch.no_grad()
+def read_depth(
+    network: CompletionNetwork,
+    rgb: Float[Tensor, "t 3 h w"],
+    depth_mm: Float[Tensor, "t h w"],
+    opacity: Float[Tensor, "t h w"],
+    K: Float[Tensor, "t 3 3"],
+) -> Float[Tensor, "t h w"]:
+    """Z-depth as the image and the rendered depth around holes say, in the units of `depth_mm`.
+
+    What is read meets the rendered depth at the border of a hole: what it is off there is carried inside.
+
+    Args:
+        network: reads depth.
+        rgb: restored views of one scene under one light, in [0, 1].
+        depth_mm: rendered z-depth, smoothly continued into holes.
+        opacity: of the rendering.
+        K: pinhole intrinsics in pixels.
+    """
     size = opacity.shape[-2:]
     smooth = depth_mm.clamp_min(1e-9).log()
     read = torch.zeros_like(smooth)
-    sizes = {_size_of(size, longest) for longest in LONGEST_SIDES_PX}
-    for height, width in sorted(sizes):
-
-        def resized(image: Tensor, small: tuple[int, int] = (height, width)) -> Tensor:
-            return image if image.shape[-2:] == small else functional.interpolate(image, small, mode="area")
-
-        zoom = torch.tensor([width / size[1], height / size[0], 1.0])[:, None]
+    sizes = {reading_size(size, longest) for longest in LONGEST_SIDES_PX}
+    for small in sorted(sizes):
         change = _read_change(
             network,
-            resized(rgb),
-            resized(smooth[:, None])[:, 0],
-            resized(opacity[:, None])[:, 0] > SOLID,
-            zoom * K,
+            shrunk(rgb, small),
+            shrunk(smooth[:, None], small)[:, 0],
+            shrunk(opacity[:, None], small)[:, 0] > SOLID,
+            shrunk_intrinsics(K, size, small),
         )
         change = functional.interpolate(change[:, None], size, mode="bilinear", align_corners=False)
         read += change[:, 0] / len(sizes)
-    guess = guess_mm.clamp_min(1e-9).log()
-    hidden = ((SOLID - opacity) / (SOLID - HOLE_ALPHA)).clamp(0, 1)
-    return (guess + IMAGE_SHARE * hidden * (smooth + read - guess)).exp()
+    return (smooth + read).exp()
 
 
-def _size_of(size: torch.Size, longest: int) -> tuple[int, int]:
+def reading_size(size: Sequence[int], longest: int) -> tuple[int, int]:
     """Height and width with the longest side at most so long."""
     height, width = (-(-longest * side // max(size)) if longest < max(size) else side for side in size)
     return height, width
+
+
+def shrunk(image: Float[Tensor, "t c h w"], size: tuple[int, int]) -> Float[Tensor, "t c h2 w2"]:
+    """Means over areas; as it is where it has that size."""
+    return image if image.shape[-2:] == size else functional.interpolate(image, size, mode="area")
+
+
+def shrunk_intrinsics(
+    K: Float[Tensor, "t 3 3"], size: Sequence[int], small: tuple[int, int]
+) -> Float[Tensor, "t 3 3"]:
+    """Of images of another height and width."""
+    return torch.tensor([small[1] / size[1], small[0] / size[0], 1.0])[:, None] * K
 
 
 def _read_change(
@@ -99,6 +140,50 @@ def _read_change(
     K: Float[Tensor, "t 3 3"],
 ) -> Float[Tensor, "t h w"]:
     """What is to be added to smoothly continued log-depths, at the size of the images given here."""
+    frames, stereo = _as_stereo(rgb, log_depth, known, K)
+    confirmed = known.to(log_depth.dtype)
+
+    def of_view(view: Tensor) -> Tensor:
+        inputs = completion_inputs(frames.of_frames(view), stereo.of_frames(view))
+        found, _ = network(inputs.channels)
+        found = found + inputs.log_scale[:, None, None]
+        change: Tensor = met_where_known(found, log_depth[view], confirmed[view]) - log_depth[view]
+        return change
+
+    return torch.cat(in_threads(of_view, torch.arange(len(rgb)).split(1)))
+
+
+def met_where_known(
+    found: Float[Tensor, "t h w"], log_depth: Float[Tensor, "t h w"], known: Float[Tensor, "t h w"]
+) -> Float[Tensor, "t h w"]:
+    """Log-depth that meets another one where that is known: what it is off there is carried inside."""
+    off = push_pull(((log_depth - found) * known)[:, None], known[:, None])
+    return found + off[:, 0]
+
+
+def reading_inputs(
+    rgb: Float[Tensor, "t 3 h w"],
+    log_depth: Float[Tensor, "t h w"],
+    known: Bool[Tensor, "t h w"],
+    K: Float[Tensor, "t 3 3"],
+) -> CompletionInputs:
+    """What the network is shown of views of one scene under one light, at the size it reads them at.
+
+    Args:
+        rgb: restored views, in [0, 1].
+        log_depth: rendered, smoothly continued into holes.
+        known: where the rendering is solid.
+        K: pinhole intrinsics in pixels.
+    """
+    return completion_inputs(*_as_stereo(rgb, log_depth, known, K))
+
+
+def _as_stereo(
+    rgb: Float[Tensor, "t 3 h w"],
+    log_depth: Float[Tensor, "t h w"],
+    known: Bool[Tensor, "t h w"],
+    K: Float[Tensor, "t 3 3"],
+) -> tuple[PosedFrames, StereoDepth]:
     # Poses play no part: nothing is matched.
     frames = PosedFrames(rgb, torch.ones_like(known), K, torch.eye(4).expand(len(rgb), 4, 4))
     brightness = smoothed_brightness(frames)
@@ -121,14 +206,4 @@ def _read_change(
         recording=torch.zeros(len(rgb), dtype=torch.long),
         n_sources=torch.full((len(rgb),), SOURCES),
     )
-
-    def of_view(view: Tensor) -> Tensor:
-        inputs = completion_inputs(frames.of_frames(view), stereo.of_frames(view))
-        found, _ = network(inputs.channels)
-        found = found + inputs.log_scale[:, None, None]
-        off = (log_depth[view] - found) * confirmed[view]
-        carried = push_pull(off[:, None], confirmed[view][:, None])
-        change: Tensor = found + carried[:, 0] - log_depth[view]
-        return change
-
-    return torch.cat(in_threads(of_view, torch.arange(len(rgb)).split(1)))
+    return frames, stereo

@@ -3,111 +3,24 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
 from flows.commands.common import further_settings, set_up_logging, showing
 from flows.commands.options import Parser
+from flows.commands.pretrain_scenes import SOURCES, make_scenes, scene_sources
 
 if TYPE_CHECKING:
-    from data_catalog.cavities.pretraining import CavityConfig
-    from data_catalog.phantom.config import PhantomConfig
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
-    from extrags.restoration.training_data.recordings import PretrainingRecording
 
 __all__ = ["add_arguments", "pretrain"]
 
 
 CHECKPOINT = "checkpoint.safetensors"
-SOURCES = ("phantom", "cavities")
-"""Families of pretraining scenes."""
-
-
-@dataclass(frozen=True)
-class SceneSource:
-    """Which pretraining scene is meant.
-
-    Args:
-        family: one of `SOURCES`.
-        index: its number within the family, from 0.
-        size_factor: how many times wider and higher pictures of cavities are.
-        real_textures: whether some cavities wear tissue of real frames.
-    """
-
-    family: str
-    index: int
-    size_factor: int = 1
-    real_textures: bool = False
-
-    @property
-    def file_name(self) -> str:
-        """Of its file."""
-        return f"{self.family}_{self.index:05d}.safetensors"
-
-    @property
-    def config(self) -> PhantomConfig | CavityConfig:
-        """What the scene is like."""
-        if self.family == "phantom":
-            from data_catalog.phantom.pretraining import pretraining_scene_config
-
-            return pretraining_scene_config(self.index)
-        from data_catalog.cavities.pretraining import cavity_config
-
-        return cavity_config(self.index, size_factor=self.size_factor, real_textures=self.real_textures)
-
-    @property
-    def origin(self) -> str:
-        """What the scene depends on, as text: a scene made otherwise is made again."""
-        from data_catalog.cavities.pretraining import GENERATOR_VERSION as CAVITY_VERSION
-        from data_catalog.phantom.config import GENERATOR_VERSION as PHANTOM_VERSION
-        from extrags.config import profile_config
-        from extrags.restoration.training_data.pretraining_scenes import PRETRAINING_DATA_VERSION
-
-        quick = profile_config("quick")
-        parts = {
-            "family": self.family,
-            "generator": PHANTOM_VERSION if self.family == "phantom" else CAVITY_VERSION,
-            "data": PRETRAINING_DATA_VERSION,
-            "scene": self.config.model_dump(mode="json"),
-            "coarse": quick.coarse.model_dump(mode="json"),
-            "references": quick.enhance.references,
-        }
-        return json.dumps(parts, sort_keys=True)
-
-    @property
-    def seed(self) -> int:
-        """Of the degradation and the reconstruction: families do not share their draws."""
-        return self.index + 1_000_000 * SOURCES.index(self.family)
-
-    def recording(self) -> PretrainingRecording:
-        """Photograph the scene."""
-        if self.family == "phantom":
-            from data_catalog.phantom.pretraining import pretraining_recording
-
-            return pretraining_recording(self.index)
-        from data_catalog.cavities.pretraining import CavityConfig, cavity_recording
-
-        config = self.config
-        assert isinstance(config, CavityConfig)
-        return cavity_recording(config)
-
-
-def scene_sources(given: argparse.Namespace, count: int) -> list[SceneSource]:
-    """Scenes of the families asked for, which take turns, from a number on."""
-    made = dict.fromkeys(SOURCES, given.first_scene)
-    sources = []
-    for number in range(count):
-        family = given.kinds[number % len(given.kinds)]
-        sources.append(SceneSource(family, made[family], given.size_factor, given.real_textures))
-        made[family] += 1
-    return sources
 
 
 def add_arguments(parser: Parser) -> None:
@@ -201,6 +114,13 @@ def add_arguments(parser: Parser) -> None:
         "views it refines (default: bundled). It keeps no checkpoint",
     )
     parser.add_argument(
+        "--hidden-depth",
+        action="store_true",
+        help="train the network that reads the depth of what a restored view has invented; the scenes are "
+        "explored, and --start names the restorer of their virtual views (default: bundled). It keeps no "
+        "checkpoint",
+    )
+    parser.add_argument(
         "--set",
         action="append",
         default=[],
@@ -221,32 +141,47 @@ def pretrain(given: argparse.Namespace) -> int:
 
     from extrags.raster.bench import machine
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+    from extrags.restoration.diffusion.pretraining import PretrainingConfig
     from extrags.restoration.diffusion.pretraining import pretrain as trained
     from extrags.restoration.diffusion.weights import BUNDLED
+    from extrags.restoration.hidden_depth.training import HiddenDepthConfig
     from extrags.restoration.refinement.training import RefinerConfig
+    from flows.commands.pretrain_hidden_depth import hidden_depth_settings, make_examples, trained_reader
     from flows.commands.pretrain_refiner import refiner_settings, start_of_refiner, trained_refiner
     from flows.progress_display import progress_display
     from flows.terminal import console
     from tasks.progress import reporting
 
-    config = refiner_settings(given) if given.refiner else _settings(given)
-    perceptual = isinstance(config, RefinerConfig) or config.perceptual
+    config: HiddenDepthConfig | RefinerConfig | PretrainingConfig
+    if given.hidden_depth:
+        config = hidden_depth_settings(given)
+    else:
+        config = refiner_settings(given) if given.refiner else _settings(given)
+    perceptual = isinstance(config, RefinerConfig) or (
+        isinstance(config, PretrainingConfig) and config.perceptual
+    )
     checked(given, config.scenes, config.validation_scenes, perceptual=perceptual)
     start = None
     if isinstance(config, RefinerConfig):
         restorer = start_of_refiner(given.start or BUNDLED)
-    elif given.start is not None:
+    elif isinstance(config, PretrainingConfig) and given.start is not None:
         start = EmbeddedEnhancer.load(Path(given.start))
     # As things are now: in some hours the working tree may be another.
     about: dict[str, Any] = {"command": _command(given), "machine": machine()}
     sources = scene_sources(given, config.scenes)
     with progress_display(showing(given)), reporting("restorer", "pretrain"):
-        files = make_scenes(Path(given.scenes_folder), sources, given.workers)
+        folder = Path(given.scenes_folder)
+        if isinstance(config, HiddenDepthConfig):
+            files = make_examples(folder, sources, given.start or BUNDLED, given.workers)
+        else:
+            files = make_scenes(folder, sources, given.workers)
         if given.scenes_only:
             console().print(f"{len(files)} scenes in {given.scenes_folder}")
             return 0
         if given.threads is not None:
             torch.set_num_threads(given.threads)
+        if isinstance(config, HiddenDepthConfig):
+            return _told(trained_reader(files, config, Path(given.out), about), given.out)
         if isinstance(config, RefinerConfig):
             refiner = trained_refiner(files, config, restorer, about)
             refiner.save(Path(given.out))
@@ -338,59 +273,6 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
             raise ConfigError(f"{folder} cannot be written: {error.strerror or error}") from error
 
 
-def make_scenes(folder: Path, sources: Sequence[SceneSource], workers: int) -> list[Path]:
-    """Pretraining scenes as files; those that are there and made in the same way stay.
-
-    Args:
-        folder: where they are kept.
-        sources: which scenes.
-        workers: processes at once.
-    """
-    from extrags.events import Progress, emit
-    from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
-
-    files = [folder / source.file_name for source in sources]
-    missing = [
-        (source, file)
-        for source, file in zip(sources, files, strict=True)
-        if PretrainingScene.made_from(file) != source.origin
-    ]
-    count = len(files)
-    done = count - len(missing)
-    emit(Progress("pretraining-scenes", done, count))
-    import multiprocessing
-
-    # In processes of their own: they set their numbers of threads, and a fork would take over OpenMP's.
-    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
-        running = [pool.submit(make_scene, source, file) for source, file in missing]
-        try:
-            for future in as_completed(running):
-                future.result()
-                done += 1
-                emit(Progress("pretraining-scenes", done, count))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return files
-
-
-def make_scene(source: SceneSource, file: Path) -> None:
-    """One pretraining scene, on one thread: the same bits on every machine with the same instructions."""
-    import cv2
-    import torch
-
-    from extrags.config import profile_config
-    from extrags.raster import set_num_threads
-    from extrags.restoration.training_data.pretraining_scenes import make_pretraining_scene
-
-    torch.set_num_threads(1)
-    cv2.setNumThreads(1)
-    set_num_threads(1)
-    quick = profile_config("quick")
-    scene = make_pretraining_scene(source.recording(), quick.enhance, quick.coarse, source.seed)
-    scene.save(file, origin=source.origin)
-
-
 def _command(given: argparse.Namespace) -> str:
     parts = ["extrags pretrain"]
     for name in (
@@ -415,7 +297,14 @@ def _command(given: argparse.Namespace) -> str:
         parts.append(f"--size-factor {given.size_factor}")
     parts += [
         f"--{name.replace('_', '-')}"
-        for name in ("real_textures", "without_perceptual", "deterministic", "generative", "refiner")
+        for name in (
+            "real_textures",
+            "without_perceptual",
+            "deterministic",
+            "generative",
+            "refiner",
+            "hidden_depth",
+        )
         if getattr(given, name)
     ]
     parts += [f"--set {text}" for text in given.set]

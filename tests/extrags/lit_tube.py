@@ -46,6 +46,11 @@ def cast_tube(cameras: Cameras, light: NearFieldLight | None) -> tuple[np.ndarra
     return rgb.clip(0, 1), depth
 
 
+def tube_depth_mm(camera: Cameras) -> np.ndarray:
+    """True z-depth of one view."""
+    return np.asarray(cast_tube(camera, None)[1][0])
+
+
 def tube_cameras(
     n: int, *, offset_mm: float = 2.0, start_mm: float = 0.0, turn: float = 0.0, enlarged: int = 1
 ) -> Cameras:

@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 import torch
 
+from extrags.array_files import load_safetensors
 from extrags.cameras import Cameras
+from extrags.depth.completion import CompletionNetwork
+from extrags.errors import CaptureError
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
 from extrags.restoration.refinement.refiner import Refiner
 from extrags.restoration.surface_texture import SurfaceTexture
 from extrags.restoration.training_data.pairs import Pairs
@@ -19,9 +23,10 @@ from extrags.restoration.training_data.pretraining_scenes import PretrainingScen
 from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
 from extrags.view_synthesis.references import LightTransfer
 from flows.cli import main
-from flows.commands import pretrain as command
-from flows.commands.pretrain import SceneSource, make_scenes, scene_sources
+from flows.commands import pretrain_scenes
+from flows.commands.pretrain_scenes import SceneSource, make_scenes, scene_sources
 from tests.extrags.random_lpips import random_weights
+from tests.extrags.restoration.test_hidden_depth import half_hidden
 
 
 def small_scene(seed: int) -> PretrainingScene:
@@ -69,8 +74,8 @@ def test_scenes_made_in_the_same_way_stay(scenes: Path, monkeypatch: pytest.Monk
     assert [file.stat().st_mtime_ns for file in files] == before
     small_scene(1).save(files[1], origin="of another version")
     made: list[str] = []
-    monkeypatch.setattr(command, "ProcessPoolExecutor", _Here)
-    monkeypatch.setattr(command, "make_scene", lambda source, file: made.append(file.name))
+    monkeypatch.setattr(pretrain_scenes, "ProcessPoolExecutor", _Here)
+    monkeypatch.setattr(pretrain_scenes, "make_scene", lambda source, file: made.append(file.name))
     make_scenes(scenes, wanted, workers=1)
     assert made == ["cavities_00000.safetensors"]
 
@@ -247,3 +252,60 @@ class TestRefiner:
 def test_scenes_can_begin_at_a_number() -> None:
     given = Namespace(kinds=["phantom", "cavities"], first_scene=7, size_factor=1, real_textures=False)
     assert [source.index for source in scene_sources(given, 4)] == [7, 7, 8, 8]
+
+
+class TestHiddenDepth:
+    @pytest.fixture
+    def given(self, tmp_path: Path) -> list[str]:
+        common = ["--scenes-folder", str(tmp_path / "scenes"), "--scenes", "3", "--validation-scenes", "1"]
+        return ["pretrain", "--hidden-depth", *common, "--threads", "1", "--iterations", "2", "--batch", "2"]
+
+    def test_scenes_are_explored_and_the_network_trained(
+        self,
+        given: list[str],
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        caplog: pytest.LogCaptureFixture,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        made: list[str] = []
+
+        def explored(recording: str, *_given: object) -> HiddenDepthExamples:
+            made.append(recording)
+            if recording == "cavities 0":
+                raise CaptureError("nothing to explore")
+            return half_hidden(len(made))
+
+        monkeypatch.setattr(pretrain_scenes, "ProcessPoolExecutor", _Here)
+        monkeypatch.setattr(
+            SceneSource, "recording", lambda source, *, to_restore: f"{source.family} {source.index}"
+        )
+        monkeypatch.setattr(HiddenDepthExamples, "of_recording", explored)
+        out = tmp_path / "reader"
+        assert main([*given, "--out", str(out)]) == 0
+        assert made == ["phantom 0", "cavities 0", "phantom 1"]
+        assert "trained" in capsys.readouterr().out
+        assert "cavities_00000: left out, nothing to explore" in caplog.text
+        record = json.loads((out / "hidden.json").read_text())
+        assert "--hidden-depth" in record["command"]
+        assert record["scenes"] == 2
+        weights = load_safetensors(out / "hidden.safetensors")
+        CompletionNetwork().load_state_dict({name: value.float() for name, value in weights.items()})
+        # What could be explored is kept.
+        assert main([*given, "--out", str(tmp_path / "again")]) == 0
+        assert made[3:] == ["cavities 0"]
+
+    def test_wrong_settings_are_named(
+        self, given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        out = ["--out", str(tmp_path / "reader")]
+        assert main([*given, *out, "--set", "drawn_share=0.3"]) == 2
+        assert "slope_weight" in capsys.readouterr().err
+        assert main([*given, *out, "--learning-rate", "-1"]) == 2
+        assert "learning_rate" in capsys.readouterr().err
+        for start in ("none", str(tmp_path / "typo")):
+            assert main([*given, *out, "--start", start]) == 2
+            assert f"--start {start}" in capsys.readouterr().err
+        for option in ("--generative", "--deterministic", "--refiner", "--without-perceptual"):
+            assert main([*given, *out, option]) == 2
+            assert option in capsys.readouterr().err

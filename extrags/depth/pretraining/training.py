@@ -27,6 +27,10 @@ __all__ = [
 ]
 
 
+Loss = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], dict[str, Tensor]]
+"""From channels, log-depth, log-error, truth, and where that is known: terms of the loss."""
+
+
 @dataclass(frozen=True)
 class CompletionTraining:
     """Budget and rates.
@@ -125,6 +129,7 @@ def train_completion(
     *,
     told: Callable[[int, dict[str, float]], None] | None = None,
     half: bool = False,
+    loss: Loss | None = None,
 ) -> CompletionNetwork:
     """Train on examples; the running mean of the weights is returned.
 
@@ -134,6 +139,7 @@ def train_completion(
         network: to train further; None starts anew.
         told: called every hundred iterations with the mean loss terms since.
         half: compute in bfloat16 where it is safe.
+        loss: terms of the loss, from the channels and what `completion_loss` is given, which is the default.
 
     Raises:
         DivergedError: when the loss stops being finite.
@@ -157,12 +163,15 @@ def train_completion(
         channels = channels.contiguous(memory_format=torch.channels_last)
         with torch.autocast(device.type, torch.bfloat16, enabled=half):
             log_depth, log_error = network(channels)
-        terms = completion_loss(log_depth, log_error, truth, known)
-        loss = (
+        if loss is None:
+            terms = completion_loss(log_depth, log_error, truth, known)
+        else:
+            terms = loss(channels, log_depth, log_error, truth, known)
+        total = (
             terms["depth"] + settings.slope_weight * terms["slope"] + settings.error_weight * terms["error"]
         )
         optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        total.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
         with torch.no_grad():

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
+from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.sequence import EndoscopicSequence
 
@@ -23,6 +25,8 @@ class PretrainingRecording:
         clip: which clip each held-out frame belongs to, in the order of `sequence.test`; the views of a
             clip follow each other.
         kind: what was recorded.
+        z_depth_mm: the true z-depth of any view of what was recorded, at pixel centres; infinite where a ray
+            meets nothing.
 
     Raises:
         ShapeError: when there is not one clip number for each held-out frame.
@@ -31,6 +35,7 @@ class PretrainingRecording:
     sequence: EndoscopicSequence
     clip: Int[np.ndarray, "t"]
     kind: str
+    z_depth_mm: Callable[[Cameras], Float[np.ndarray, "h w"]]
 
     def __post_init__(self) -> None:
         if len(self.clip) != len(self.sequence.test):

@@ -16,7 +16,7 @@ from extrags.restoration.training_data.parallel import drawn_in_processes
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, make_pretraining_scene
 from extrags.restoration.training_data.recordings import PretrainingRecording
 from extrags.view_synthesis.references import LightTransfer
-from tests.extrags.lit_tube import Tube
+from tests.extrags.lit_tube import Tube, tube_depth_mm
 from tests.extrags.restoration.conftest import SMALL
 
 TINY = PretrainingConfig(
@@ -36,7 +36,8 @@ def scene(tube: Tube) -> PretrainingScene:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (10, 20))
         patch.setattr("extrags.restoration.training_data.degradation._WITH_LIGHT", 1.0)
-        recording = PretrainingRecording(tube.sequence, np.zeros(len(tube.sequence.test), np.int64), "tube")
+        clip = np.zeros(len(tube.sequence.test), np.int64)
+        recording = PretrainingRecording(tube.sequence, clip, "tube", tube_depth_mm)
         return make_pretraining_scene(recording, SMALL, CoarseConfig(max_points=800), 3)
 
 

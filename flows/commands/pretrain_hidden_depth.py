@@ -1,0 +1,157 @@
+"""`pretrain --hidden-depth`: weights of the network that reads the depth of what a view has invented."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from extrags.errors import CaptureError, ConfigError, ExtragsError
+from flows.commands.common import further_settings
+from flows.commands.pretrain_scenes import in_processes
+
+if TYPE_CHECKING:
+    from extrags.restoration.hidden_depth.training import HiddenDepthConfig
+    from flows.commands.pretrain_scenes import SceneSource
+
+__all__ = ["hidden_depth_settings", "make_examples", "make_views", "trained_reader"]
+
+logger = logging.getLogger(__name__)
+
+FOLDER = "hidden_depth"
+"""Where the examples are kept, beside the scenes of the other trainings."""
+
+
+def hidden_depth_settings(given: argparse.Namespace) -> HiddenDepthConfig:
+    """Settings of the training.
+
+    Raises:
+        ConfigError: for an option that this training does not have, an unknown setting, or a wrong value.
+    """
+    from extrags.restoration.hidden_depth.training import HiddenDepthConfig
+
+    for name in ("generative", "deterministic", "refiner", "without_perceptual", "perceptual_weight"):
+        if getattr(given, name) not in (None, False):
+            raise ConfigError(
+                f"--{name.replace('_', '-')}: this is not for --hidden-depth, which trains a reader of depth"
+            )
+    names = ("scenes", "validation_scenes", "iterations", "batch", "learning_rate", "error_weight", "seed")
+    values: dict[str, Any] = {name: getattr(given, name) for name in names}
+    values |= further_settings(given.set, HiddenDepthConfig)
+    try:
+        return HiddenDepthConfig(**{name: value for name, value in values.items() if value is not None})
+    except ValueError as error:
+        raise ConfigError(f"extrags pretrain --hidden-depth: {error}") from error
+
+
+def make_examples(folder: Path, sources: Sequence[SceneSource], restorer: str, workers: int) -> list[Path]:
+    """Restored virtual views of pretraining scenes as files; those made in the same way stay.
+
+    Args:
+        folder: of the pretraining scenes.
+        sources: which scenes.
+        restorer: a folder with weights, or `bundled`.
+        workers: processes at once.
+
+    Returns:
+        Files of the scenes that could be explored.
+
+    Raises:
+        ConfigError: where there is no such restorer.
+    """
+    from extrags.restoration.diffusion.weights import weights_digest
+    from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
+
+    try:
+        digest = weights_digest(restorer)
+    except ExtragsError as error:
+        raise ConfigError(f"--start {restorer}: {error}") from error
+    if digest is None:
+        raise ConfigError(f"--start {restorer}: depth is read from what a restorer has painted")
+    origins = {folder / FOLDER / source.file_name: origin_of(source, digest) for source in sources}
+    jobs = [
+        partial(make_views, source, file, restorer, origin)
+        for source, (file, origin) in zip(sources, origins.items(), strict=True)
+        if PretrainingScene.made_from(file) != origin
+    ]
+    in_processes(jobs, workers, "pretraining-views", done=len(sources) - len(jobs))
+    return [file for file, origin in origins.items() if PretrainingScene.made_from(file) == origin]
+
+
+def origin_of(source: SceneSource, digest: str) -> str:
+    """What the examples of a scene depend on, as text.
+
+    Args:
+        source: of the scene.
+        digest: of the restorer's weights.
+    """
+    from extrags.config import profile_config
+    from extrags.restoration.hidden_depth.examples import EXAMPLES_VERSION
+
+    quick = profile_config("quick")
+    stages = {
+        name: getattr(quick, name).model_dump(mode="json") for name in ("surface", "freespace", "explore")
+    }
+    parts = {"version": EXAMPLES_VERSION, "restorer": digest, "scene": source.origin, **stages}
+    return json.dumps(parts, sort_keys=True)
+
+
+def make_views(source: SceneSource, file: Path, restorer: str, origin: str) -> None:
+    """The examples of one scene, on one thread; none where there is nothing to explore.
+
+    Args:
+        source: of the scene.
+        file: where they go.
+        restorer: a folder with weights, or `bundled`.
+        origin: what they are made from.
+    """
+    from extrags.config import EnhanceConfig, profile_config
+    from extrags.restoration.diffusion.embedded import pretrained
+    from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
+
+    enhancer = pretrained(EnhanceConfig(pretrained_weights=restorer))
+    assert enhancer is not None
+    try:
+        recording = source.recording(to_restore=False)
+        made = HiddenDepthExamples.of_recording(recording, enhancer, profile_config("quick"), source.seed)
+    except CaptureError as error:
+        logger.warning("%s: left out, %s", file.stem, error)
+        return
+    made.save(file, origin=origin)
+
+
+def trained_reader(
+    files: Sequence[Path], config: HiddenDepthConfig, out: Path, about: dict[str, Any]
+) -> dict[str, Any]:
+    """Train on examples, and write weights and record.
+
+    Args:
+        files: of the examples.
+        config: budget.
+        out: folder.
+        about: command and machine, for the record.
+
+    Returns:
+        The record.
+
+    Raises:
+        ExtragsError: as `train_hidden_depth`.
+    """
+    from safetensors.torch import save_file
+
+    from extrags.depth.weights import HIDDEN, load_completion
+    from extrags.restoration.hidden_depth.training import train_hidden_depth
+
+    start = load_completion(config.start)
+    if start is None:
+        raise ConfigError("start=none: the training needs a network that completes depth")
+    network, record = train_hidden_depth(files, config, start)
+    record = {**record, **about}
+    weights = {name: value.half().contiguous() for name, value in network.state_dict().items()}
+    save_file(weights, out / f"{HIDDEN}.safetensors")
+    (out / f"{HIDDEN}.json").write_text(json.dumps(record, indent=1) + "\n")
+    return record

@@ -1,0 +1,178 @@
+"""Scenes to pretrain on: which are meant, and how they are made."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from data_catalog.cavities.pretraining import CavityConfig
+    from data_catalog.phantom.config import PhantomConfig
+    from extrags.restoration.training_data.recordings import PretrainingRecording
+
+__all__ = ["SOURCES", "SceneSource", "in_processes", "make_scene", "make_scenes", "scene_sources"]
+
+SOURCES = ("phantom", "cavities")
+"""Families of pretraining scenes."""
+
+
+@dataclass(frozen=True)
+class SceneSource:
+    """Which pretraining scene is meant.
+
+    Args:
+        family: one of `SOURCES`.
+        index: its number within the family, from 0.
+        size_factor: how many times wider and higher pictures of cavities are.
+        real_textures: whether some cavities wear tissue of real frames.
+    """
+
+    family: str
+    index: int
+    size_factor: int = 1
+    real_textures: bool = False
+
+    @property
+    def file_name(self) -> str:
+        """Of its file."""
+        return f"{self.family}_{self.index:05d}.safetensors"
+
+    @property
+    def config(self) -> PhantomConfig | CavityConfig:
+        """What the scene is like."""
+        if self.family == "phantom":
+            from data_catalog.phantom.pretraining import pretraining_scene_config
+
+            return pretraining_scene_config(self.index)
+        from data_catalog.cavities.pretraining import cavity_config
+
+        return cavity_config(self.index, size_factor=self.size_factor, real_textures=self.real_textures)
+
+    @property
+    def origin(self) -> str:
+        """What the scene depends on, as text: a scene made otherwise is made again."""
+        from data_catalog.cavities.pretraining import GENERATOR_VERSION as CAVITY_VERSION
+        from data_catalog.phantom.config import GENERATOR_VERSION as PHANTOM_VERSION
+        from extrags.config import profile_config
+        from extrags.restoration.training_data.pretraining_scenes import PRETRAINING_DATA_VERSION
+
+        quick = profile_config("quick")
+        parts = {
+            "family": self.family,
+            "generator": PHANTOM_VERSION if self.family == "phantom" else CAVITY_VERSION,
+            "data": PRETRAINING_DATA_VERSION,
+            "scene": self.config.model_dump(mode="json"),
+            "coarse": quick.coarse.model_dump(mode="json"),
+            "references": quick.enhance.references,
+        }
+        return json.dumps(parts, sort_keys=True)
+
+    @property
+    def seed(self) -> int:
+        """Of the degradation and the reconstruction: families do not share their draws."""
+        return self.index + 1_000_000 * SOURCES.index(self.family)
+
+    def recording(self, *, to_restore: bool = True) -> PretrainingRecording:
+        """Photograph the scene.
+
+        Args:
+            to_restore: whether there are views to restore besides the training frames.
+        """
+        if self.family == "phantom":
+            from data_catalog.phantom.pretraining import pretraining_recording
+
+            return pretraining_recording(self.index, to_restore=to_restore)
+        from data_catalog.cavities.pretraining import CavityConfig, cavity_recording
+
+        config = self.config
+        assert isinstance(config, CavityConfig)
+        return cavity_recording(config, to_restore=to_restore)
+
+
+def scene_sources(given: argparse.Namespace, count: int) -> list[SceneSource]:
+    """Scenes of the families asked for, which take turns, from a number on."""
+    made = dict.fromkeys(SOURCES, given.first_scene)
+    sources = []
+    for number in range(count):
+        family = given.kinds[number % len(given.kinds)]
+        sources.append(SceneSource(family, made[family], given.size_factor, given.real_textures))
+        made[family] += 1
+    return sources
+
+
+def make_scenes(folder: Path, sources: Sequence[SceneSource], workers: int) -> list[Path]:
+    """Pretraining scenes as files; those that are there and made in the same way stay.
+
+    Args:
+        folder: where they are kept.
+        sources: which scenes.
+        workers: processes at once.
+    """
+    from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
+
+    files = [folder / source.file_name for source in sources]
+    missing = [
+        (source, file)
+        for source, file in zip(sources, files, strict=True)
+        if PretrainingScene.made_from(file) != source.origin
+    ]
+    jobs = [partial(make_scene, source, file) for source, file in missing]
+    in_processes(jobs, workers, "pretraining-scenes", done=len(files) - len(missing))
+    return files
+
+
+def make_scene(source: SceneSource, file: Path) -> None:
+    """One pretraining scene."""
+    from extrags.config import profile_config
+    from extrags.restoration.training_data.pretraining_scenes import make_pretraining_scene
+
+    quick = profile_config("quick")
+    scene = make_pretraining_scene(source.recording(), quick.enhance, quick.coarse, source.seed)
+    scene.save(file, origin=source.origin)
+
+
+def in_processes(jobs: Sequence[Callable[[], None]], workers: int, told_as: str, *, done: int = 0) -> None:
+    """Run jobs on one thread each, and tell the progress.
+
+    Args:
+        jobs: can be pickled.
+        workers: processes at once.
+        told_as: named in progress events.
+        done: how many more there were, which are done already.
+    """
+    import multiprocessing
+
+    from extrags.events import Progress, emit
+
+    count = done + len(jobs)
+    emit(Progress(told_as, done, count))
+    # In processes of their own: they set their numbers of threads, and a fork would take over OpenMP's.
+    with ProcessPoolExecutor(workers, multiprocessing.get_context("spawn")) as pool:
+        running = [pool.submit(_on_one_thread, job) for job in jobs]
+        try:
+            for future in as_completed(running):
+                future.result()
+                done += 1
+                emit(Progress(told_as, done, count))
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def _on_one_thread(job: Callable[[], None]) -> None:
+    """The same bits on every machine with the same instructions."""
+    import cv2
+    import torch
+
+    from extrags.raster import set_num_threads
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    set_num_threads(1)
+    job()
