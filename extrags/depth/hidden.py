@@ -2,7 +2,8 @@
 
 A restorer paints what was never seen, and its painting says how far that is: it gets darker with distance,
 and folds have shades. The network that completes stereo reads images for that very purpose. It is given what
-the scene shows as depth that all sources confirm, and what it does not show as depth that none confirms.
+the scene shows as depth that all sources confirm, and what it does not show as depth that none confirms, and
+has practised this on explored views of procedural scenes (`extrags.restoration.hidden_depth`).
 """
 
 from __future__ import annotations
@@ -34,11 +35,9 @@ __all__ = [
     "shrunk_intrinsics",
 ]
 
-IMAGE_SHARE = 0.65
-"""Of the log-depth that is read, in holes; the rest is the guess's: their errors have little in common."""
 SOLID = 0.8
 """Opacity from which a rendered depth counts as confirmed, and the guess is left as it is. From there down to
-`HOLE_ALPHA` the share of what is read rises."""
+`HOLE_ALPHA` the share of what is read rises to all."""
 LONGEST_SIDES_PX = (160, 80)
 """Sizes that depth is read at, whose mean is taken: the smaller serves large holes, the larger small ones."""
 SOURCES = 6
@@ -58,7 +57,7 @@ def depth_from_image(
     opacity: Float[Tensor, "t h w"],
     K: Float[Tensor, "t 3 3"],
 ) -> Float[Tensor, "t h w"]:
-    """Z-depth without gaps: the guess where the scene is solid, in holes mixed with what the image says.
+    """Z-depth without gaps: the guess where the scene is solid, in holes what the image says.
 
     Args:
         network: reads depth.
@@ -74,7 +73,7 @@ def depth_from_image(
     read = read_depth(network, rgb, depth_mm, opacity, K).log()
     guess = guess_mm.clamp_min(1e-9).log()
     hidden = ((SOLID - opacity) / (SOLID - HOLE_ALPHA)).clamp(0, 1)
-    return (guess + IMAGE_SHARE * hidden * (read - guess)).exp()
+    return (guess + hidden * (read - guess)).exp()
 
 
 @one_torch_thread()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from extrags.config import CoarseConfig, EnhanceConfig
-from extrags.depth.weights import BUNDLED, completion_digest, find_completion
+from extrags.depth.weights import hidden_digest
 from extrags.restoration.diffusion.weights import weights_digest
 from extrags.restoration.protocol import Enhancer
 from extrags.scene import Scene
@@ -33,7 +33,7 @@ class EmbeddedBackend:
 
         pretrained(config)
         if config.depth_from_image:
-            find_completion(BUNDLED)
+            hidden_digest()
 
     def digest(self, config: EnhanceConfig) -> str | None:
         """Digest of the weights, also of those that depth is read with; None where there are neither.
@@ -44,7 +44,7 @@ class EmbeddedBackend:
         weights = weights_digest(config.pretrained_weights)
         if not config.depth_from_image:
             return weights
-        return f"{weights} {completion_digest(BUNDLED)}"
+        return f"{weights} {hidden_digest()}"
 
     def needs_text(self, config: EnhanceConfig) -> bool:
         """No text is read."""

@@ -16,7 +16,7 @@ from extrags.array_files import load_safetensors
 from extrags.config import EnhanceConfig
 from extrags.depth.completion import CompletionNetwork
 from extrags.depth.hidden import depth_from_image
-from extrags.depth.weights import BUNDLED, completion_digest, load_completion
+from extrags.depth.weights import hidden_digest, load_hidden
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.description import description_fields, read_description, write_description
 from extrags.restoration.diffusion.network import RestorationNetwork, build_network
@@ -162,7 +162,7 @@ class EmbeddedEnhancer:
         """Z-depth of a restored clip, of which the network has a guess."""
         if not self.depth_from_image:
             return guess_mm
-        network = _completion()
+        network = _reader_of_depth()
         filled_mm = filled_depth(clip.layers, clip.transfer.scale_mm)[:, 0]
         # What a keyframe has invented is as sure as its colour.
         opacity = torch.maximum(clip.layers.get("alpha"), clip.layers.get("invented_weight"))[:, 0]
@@ -304,7 +304,7 @@ class EmbeddedEnhancer:
             "generative": self.network.generative,
             "drawing": self.drawing,
             # The weights that read it are not saved: cached views follow their digest.
-            "depth_from_image": completion_digest(BUNDLED) if self.depth_from_image else None,
+            "depth_from_image": hidden_digest() if self.depth_from_image else None,
             "domain": None if self.domain is None else self.domain.as_dict(),
             "record": self.record,
         }
@@ -373,10 +373,8 @@ class EmbeddedEnhancer:
 
 
 @cache
-def _completion() -> CompletionNetwork:
-    network = load_completion(BUNDLED)
-    assert network is not None
-    return network
+def _reader_of_depth() -> CompletionNetwork:
+    return load_hidden()
 
 
 def _read_patches(file: Path) -> Float[Tensor, "r 3 s s"] | None:

@@ -9,7 +9,7 @@ from torch import Tensor
 from extrags.depth.hidden import SOLID, depth_from_image
 from extrags.depth.pretraining.cavities import Cavities
 from extrags.depth.pretraining.photographs import Clips, photograph
-from extrags.depth.weights import load_completion
+from extrags.depth.weights import load_hidden
 from extrags.view_synthesis.filling import completed_depth
 
 SIZE = (64, 80)
@@ -39,8 +39,7 @@ def with_a_hole() -> Tensor:
 
 def hidden(clips: Clips, opacity: Tensor, guess_mm: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """What is read, and smooth filling."""
-    network = load_completion("bundled")
-    assert network is not None
+    network = load_hidden()
     truth = true_depth_mm(clips)
     opacity = opacity.expand(len(truth), *SIZE)
     filled = completed_depth(truth[:, None] * (opacity[:, None] > 0), opacity[:, None], MEDIAN_MM)[:, 0]
@@ -72,8 +71,7 @@ def test_views_of_any_size_and_pixels_that_are_not_square() -> None:
     opacity[:, 20:80, 50:163] = 0
     opacity[-1] = 0
     filled = completed_depth(truth[:, None] * (opacity[:, None] > 0), opacity[:, None], MEDIAN_MM)[:, 0]
-    network = load_completion("bundled")
-    assert network is not None
+    network = load_hidden()
     read = depth_from_image(network, rgb, filled, filled, opacity, K)
     assert torch.isfinite(read).all()
     inside = ((opacity == 0) & mask)[:-1]
@@ -92,8 +90,7 @@ def test_what_is_solid_stays(clips: Clips) -> None:
 
 
 def test_lengths_have_any_unit(clips: Clips) -> None:
-    network = load_completion("bundled")
-    assert network is not None
+    network = load_hidden()
     truth, opacity = true_depth_mm(clips), with_a_hole().expand(len(clips.depth), *SIZE)
     given = [clips.frames.rgb, truth, truth, opacity, clips.frames.K]
     here = depth_from_image(network, *given)

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from extrags.config import CaptionConfig, CheckpointConfig, EnhanceConfig, PretrainedConfig
-from extrags.depth.weights import BUNDLED, completion_digest
+from extrags.depth.weights import hidden_digest
 from extrags.errors import ConfigError, MissingDependencyError, SourceNotFoundError, WeightsError
 from extrags.restoration.backends import check_restorer, restorer_digest
 from extrags.restoration.pretrained.captions import URL_VARIABLE
@@ -183,4 +183,4 @@ class TestOwn:
         guessing = alone.model_copy(update={"depth_from_image": False})
         assert restorer_digest(guessing) is None
         # What reads depth counts too: cached views follow its weights.
-        assert str(completion_digest(BUNDLED)) in str(restorer_digest(alone))
+        assert hidden_digest() in str(restorer_digest(alone))
