@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from argparse import Namespace
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -309,3 +310,11 @@ class TestHiddenDepth:
         for option in ("--generative", "--deterministic", "--refiner", "--without-perceptual"):
             assert main([*given, *out, option]) == 2
             assert option in capsys.readouterr().err
+
+    def test_the_weights_of_the_package_say_where_they_come_from(self) -> None:
+        weights = Path(str(files("extrags.depth.weights"))) / "hidden.safetensors"
+        assert weights.stat().st_size < 5_000_000
+        record = json.loads(weights.with_suffix(".json").read_text())
+        assert record["command"].startswith("extrags pretrain ")
+        scores = record["validation_scores"]
+        assert scores["trained"]["error"] < 0.8 * scores["before"]["error"] < scores["smooth"]["error"]
