@@ -184,8 +184,8 @@ class EnhanceConfig(StageConfig):
     )
     depth_from_image: bool = Field(
         True,
-        description="read the depth of what the embedded restorer has invented from its image, with a bundled "
-        "network; false: the restorer's own guess",
+        description="read the depth of what the embedded restorer has invented from its image, with a "
+        "network of the package; false: the restorer's own guess",
     )
     precision: Literal["auto", "float32", "bfloat16"] = Field(
         "auto", description="of the convolutions; auto: bfloat16 where the processor computes it faster"
