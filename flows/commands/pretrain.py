@@ -72,22 +72,30 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.add_argument("--scenes-only", action="store_true", help="make the scenes, and train nothing")
     parser.add_argument(
-        "--scenes", type=int, metavar="N", help="pretraining scenes (default: 86; of a refiner 90)"
+        "--scenes",
+        type=int,
+        metavar="N",
+        help="pretraining scenes (default: 86; of a refiner 90, of hidden depth 80)",
     )
     parser.add_argument(
-        "--validation-scenes", type=int, metavar="N", help="how many of them validate only (default: 6; 8)"
+        "--validation-scenes", type=int, metavar="N", help="how many of them validate only (default: 6; 8; 8)"
     )
     parser.add_argument(
-        "--iterations", type=int, metavar="N", help="optimisation steps (default: 13500; 10000)"
+        "--iterations", type=int, metavar="N", help="optimisation steps (default: 13500; 10000; 4000)"
     )
-    parser.add_argument("--batch", type=int, metavar="N", help="crops per step (default: 4)")
+    parser.add_argument("--batch", type=int, metavar="N", help="crops per step (default: 4; 4; 8 views)")
     parser.add_argument("--start", metavar="FOLDER", help="go on from these weights instead of from nothing")
-    parser.add_argument("--learning-rate", type=float, metavar="X", help="the peak (default: 8e-4; 5e-4)")
+    parser.add_argument(
+        "--learning-rate", type=float, metavar="X", help="the peak (default: 8e-4; 5e-4; 6e-4)"
+    )
     parser.add_argument(
         "--perceptual-weight", type=float, metavar="X", help="of the perceptual distance (default: 0.15; 4)"
     )
     parser.add_argument(
-        "--error-weight", type=float, metavar="X", help="of the expected error's likelihood (default: 0.02)"
+        "--error-weight",
+        type=float,
+        metavar="X",
+        help="of the expected error's likelihood (default: 0.02; of hidden depth 0.1)",
     )
     parser.add_argument("--seed", type=int, metavar="N", help="of the training (default: 0)")
     parser.add_argument("--threads", type=int, metavar="N", help="threads of the training (default: all)")
