@@ -82,12 +82,11 @@ def finetune(
     from extrags.scene import Scene
     from extrags.sequence import EndoscopicSequence
     from extrags.training.frame_weights import FrameWeights
-    from extrags.training.pose_refinement import RefinedPoses
 
     # Of the coarse stage. Where it refined poses, frames are compared anew through these.
-    found = slot.open(scene)
-    known = (found / FrameWeights.stored_as).exists() and not (found / RefinedPoses.stored_as).exists()
-    weights = slot.load(FrameWeights, scene) if known else None
+    known = (slot.open(scene) / FrameWeights.stored_as).exists()
+    refined = bool(slot.store.manifest(scene).counts.get("refined_poses"))
+    weights = slot.load(FrameWeights, scene) if known and not refined else None
     start, frames = slot.load(Scene, scene), slot.load(EndoscopicSequence, sequence)
     start = start.to(chosen_device(device, "device"))
     with keep_last_finite_scene(slot):

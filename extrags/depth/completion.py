@@ -185,7 +185,7 @@ def completion_loss(
         log_depth: predicted, relative.
         log_error: logarithm of the expected absolute error of it.
         truth: true log-depth, relative to the same scale.
-        mask: one where the truth is known.
+        mask: one where the truth is known. Shares between weigh slopes and expected error.
 
     Returns:
         `depth`: mean absolute error; `slope`: of its differences between neighbours at three scales, which

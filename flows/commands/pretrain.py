@@ -133,9 +133,9 @@ def add_arguments(parser: Parser) -> None:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="any setting of the training, such as device=cuda, most_seconds=1200, drawing_processes=14 or "
-        "drawn_share=0.8; repeatable. A wrong name lists all of them. A training that was ended goes on from "
-        "the checkpoint in its folder",
+        help="any setting of the training, such as most_seconds=1200, or of a restorer's device=cuda, "
+        "drawing_processes=14 or drawn_share=0.8; repeatable. A wrong name lists all of them. A restorer's "
+        "training that was ended goes on from the checkpoint in its folder",
     )
 
 
@@ -154,7 +154,13 @@ def pretrain(given: argparse.Namespace) -> int:
     from extrags.restoration.diffusion.weights import BUNDLED
     from extrags.restoration.hidden_depth.training import HiddenDepthConfig
     from extrags.restoration.refinement.training import RefinerConfig
-    from flows.commands.pretrain_hidden_depth import hidden_depth_settings, make_examples, trained_reader
+    from flows.commands.pretrain_hidden_depth import (
+        FOLDER,
+        beginning,
+        hidden_depth_settings,
+        make_examples,
+        trained_reader,
+    )
     from flows.commands.pretrain_refiner import refiner_settings, start_of_refiner, trained_refiner
     from flows.progress_display import progress_display
     from flows.terminal import console
@@ -170,7 +176,9 @@ def pretrain(given: argparse.Namespace) -> int:
     )
     checked(given, config.scenes, config.validation_scenes, perceptual=perceptual)
     start = None
-    if isinstance(config, RefinerConfig):
+    if isinstance(config, HiddenDepthConfig):
+        begun = beginning(given.start or BUNDLED, config.completion)
+    elif isinstance(config, RefinerConfig):
         restorer = start_of_refiner(given.start or BUNDLED)
     elif isinstance(config, PretrainingConfig) and given.start is not None:
         start = EmbeddedEnhancer.load(Path(given.start))
@@ -180,16 +188,17 @@ def pretrain(given: argparse.Namespace) -> int:
     with progress_display(showing(given)), reporting("restorer", "pretrain"):
         folder = Path(given.scenes_folder)
         if isinstance(config, HiddenDepthConfig):
-            files = make_examples(folder, sources, given.start or BUNDLED, given.workers)
+            files = make_examples(folder, sources, begun, given.workers)
+            folder = folder / FOLDER
         else:
             files = make_scenes(folder, sources, given.workers)
         if given.scenes_only:
-            console().print(f"{len(files)} scenes in {given.scenes_folder}")
+            console().print(f"{len(files)} scenes in {folder}")
             return 0
         if given.threads is not None:
             torch.set_num_threads(given.threads)
         if isinstance(config, HiddenDepthConfig):
-            return _told(trained_reader(files, config, Path(given.out), about), given.out)
+            return _told(trained_reader(files, config, begun, Path(given.out), about), given.out)
         if isinstance(config, RefinerConfig):
             refiner = trained_refiner(files, config, restorer, about)
             refiner.save(Path(given.out))

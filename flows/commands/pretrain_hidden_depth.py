@@ -6,19 +6,21 @@ import argparse
 import json
 import logging
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from extrags.errors import CaptureError, ConfigError, ExtragsError
+from extrags.errors import CaptureError, ConfigError, DivergedError, ExtragsError
 from flows.commands.common import further_settings
 from flows.commands.pretrain_scenes import in_processes
 
 if TYPE_CHECKING:
+    from extrags.depth.completion import CompletionNetwork
     from extrags.restoration.hidden_depth.training import HiddenDepthConfig
     from flows.commands.pretrain_scenes import SceneSource
 
-__all__ = ["hidden_depth_settings", "make_examples", "make_views", "trained_reader"]
+__all__ = ["Beginning", "beginning", "hidden_depth_settings", "make_examples", "make_views", "trained_reader"]
 
 logger = logging.getLogger(__name__)
 
@@ -48,23 +50,35 @@ def hidden_depth_settings(given: argparse.Namespace) -> HiddenDepthConfig:
         raise ConfigError(f"extrags pretrain --hidden-depth: {error}") from error
 
 
-def make_examples(folder: Path, sources: Sequence[SceneSource], restorer: str, workers: int) -> list[Path]:
-    """Restored virtual views of pretraining scenes as files; those made in the same way stay.
+@dataclass(frozen=True)
+class Beginning:
+    """What the training begins with.
 
     Args:
-        folder: of the pretraining scenes.
-        sources: which scenes.
-        restorer: a folder with weights, or `bundled`.
-        workers: processes at once.
+        restorer: of the views that depth is read from: a folder with weights, or `bundled`.
+        restorer_digest: of its weights.
+        network: completes stereo.
+        network_digest: of its weights.
+    """
 
-    Returns:
-        Files of the scenes that could be explored.
+    restorer: str
+    restorer_digest: str
+    network: CompletionNetwork
+    network_digest: str
+
+
+def beginning(restorer: str, completion: str) -> Beginning:
+    """Find both weights.
+
+    Args:
+        restorer: a folder with weights, or `bundled`.
+        completion: a file with weights of the depth completion, or `bundled`.
 
     Raises:
-        ConfigError: where there is no such restorer.
+        ConfigError: where there is no such restorer, or no such completion.
     """
+    from extrags.depth.weights import completion_digest, load_completion
     from extrags.restoration.diffusion.weights import weights_digest
-    from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 
     try:
         digest = weights_digest(restorer)
@@ -72,14 +86,45 @@ def make_examples(folder: Path, sources: Sequence[SceneSource], restorer: str, w
         raise ConfigError(f"--start {restorer}: {error}") from error
     if digest is None:
         raise ConfigError(f"--start {restorer}: depth is read from what a restorer has painted")
+    try:
+        network, network_digest = load_completion(completion), completion_digest(completion)
+    except ExtragsError as error:
+        raise ConfigError(f"--set completion={completion}: {error}") from error
+    if network is None or network_digest is None:
+        raise ConfigError(f"--set completion={completion}: the training begins with a depth completion")
+    return Beginning(restorer, digest, network, network_digest)
+
+
+def make_examples(folder: Path, sources: Sequence[SceneSource], begun: Beginning, workers: int) -> list[Path]:
+    """Restored virtual views of pretraining scenes as files; those made in the same way stay.
+
+    Args:
+        folder: of the pretraining scenes.
+        sources: which scenes.
+        begun: names the restorer.
+        workers: processes at once.
+
+    Returns:
+        Files of the scenes that could be explored.
+    """
+    from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
+
+    digest = begun.restorer_digest
     origins = {folder / FOLDER / source.file_name: origin_of(source, digest) for source in sources}
     jobs = [
-        partial(make_views, source, file, restorer, origin)
+        partial(make_views, source, file, begun.restorer, origin)
         for source, (file, origin) in zip(sources, origins.items(), strict=True)
         if PretrainingScene.made_from(file) != origin
     ]
     in_processes(jobs, workers, "pretraining-views", done=len(sources) - len(jobs))
-    return [file for file, origin in origins.items() if PretrainingScene.made_from(file) == origin]
+    found = []
+    for file, origin in origins.items():
+        if PretrainingScene.made_from(file) == origin:
+            found.append(file)
+        else:
+            # Told here: what a process of its own logs goes past the progress bar.
+            logger.warning("%s: left out, it could not be reconstructed or explored", file.stem)
+    return found
 
 
 def origin_of(source: SceneSource, digest: str) -> str:
@@ -101,7 +146,7 @@ def origin_of(source: SceneSource, digest: str) -> str:
 
 
 def make_views(source: SceneSource, file: Path, restorer: str, origin: str) -> None:
-    """The examples of one scene, on one thread; none where there is nothing to explore.
+    """The examples of one scene; none where it cannot be reconstructed, or there is nothing to explore.
 
     Args:
         source: of the scene.
@@ -118,20 +163,20 @@ def make_views(source: SceneSource, file: Path, restorer: str, origin: str) -> N
     try:
         recording = source.recording(to_restore=False)
         made = HiddenDepthExamples.of_recording(recording, enhancer, profile_config("quick"), source.seed)
-    except CaptureError as error:
-        logger.warning("%s: left out, %s", file.stem, error)
+    except (CaptureError, DivergedError):
         return
     made.save(file, origin=origin)
 
 
 def trained_reader(
-    files: Sequence[Path], config: HiddenDepthConfig, out: Path, about: dict[str, Any]
+    files: Sequence[Path], config: HiddenDepthConfig, begun: Beginning, out: Path, about: dict[str, Any]
 ) -> dict[str, Any]:
     """Train on examples, and write weights and record.
 
     Args:
         files: of the examples.
         config: budget.
+        begun: what it begins with.
         out: folder.
         about: command and machine, for the record.
 
@@ -143,14 +188,11 @@ def trained_reader(
     """
     from safetensors.torch import save_file
 
-    from extrags.depth.weights import HIDDEN, load_completion
+    from extrags.depth.weights import HIDDEN
     from extrags.restoration.hidden_depth.training import train_hidden_depth
 
-    start = load_completion(config.start)
-    if start is None:
-        raise ConfigError("start=none: the training needs a network that completes depth")
-    network, record = train_hidden_depth(files, config, start)
-    record = {**record, **about}
+    network, record = train_hidden_depth(files, config, begun.network)
+    record |= {"restorer": begun.restorer_digest, "completion": begun.network_digest, **about}
     weights = {name: value.half().contiguous() for name, value in network.state_dict().items()}
     save_file(weights, out / f"{HIDDEN}.safetensors")
     (out / f"{HIDDEN}.json").write_text(json.dumps(record, indent=1) + "\n")

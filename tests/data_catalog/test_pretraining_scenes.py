@@ -42,11 +42,24 @@ def test_pretraining_scenes_are_none_of_the_catalogue() -> None:
 
 @pytest.fixture(scope="module")
 def recording() -> PretrainingRecording:
+    return small_recording()
+
+
+def small_recording(*, to_restore: bool = True) -> PretrainingRecording:
     ordinary = pretraining_scene_config(2)
     reduced = ordinary.model_copy(update={"width": 48, "height": 40, "supersample": 1, "train_every": 50})
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pretraining, "pretraining_scene_config", lambda index: reduced)
-        return pretraining_recording(2)
+        return pretraining_recording(2, to_restore=to_restore)
+
+
+def test_without_views_to_restore_it_trains_on_the_same(recording: PretrainingRecording) -> None:
+    whole, alone = recording.sequence, small_recording(to_restore=False)
+    assert len(alone.sequence.test) == len(alone.clip) == 0
+    assert np.array_equal(alone.sequence.rgb, whole.rgb[whole.train])
+    assert whole.depth_mm is not None
+    depth_mm = alone.z_depth_mm(whole.cameras[7])
+    assert np.array_equal(np.where(np.isfinite(depth_mm), depth_mm, 0), whole.depth_mm[7])
 
 
 def test_what_is_to_be_restored_is_not_trained_on(recording: PretrainingRecording) -> None:

@@ -19,6 +19,8 @@ from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.restored_renders import RESTORED_SHARE, RestoredShares, restored_shares
+from extrags.sequence import EndoscopicSequence
+from extrags.training.frame_weights import FrameWeights, frame_weights
 from tests.extrags.lit_tube import Tube, tube_cameras
 
 COARSE = CoarseConfig(iterations=60, max_points=300, densify=DensifyConfig(max_gaussians=500))
@@ -145,6 +147,21 @@ def test_the_control_is_compared_frame_by_frame(tube: Tube, monkeypatch: pytest.
     # The standard deviation of 0, 0, 0 and -1.2 is 0.6, over the root of four frames.
     assert once.over_control_error_db == pytest.approx(0.3)
     assert found.amount == 0.3
+
+
+def test_frames_are_compared_once_for_all_amounts(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
+    compared: list[int] = []
+
+    def counted(sequence: EndoscopicSequence, frames: np.ndarray) -> FrameWeights | None:
+        compared.append(len(frames))
+        return frame_weights(sequence, frames)
+
+    # Fine-tuning looks for itself where it is given none.
+    for module in ("extrags.finetuning_judge", "extrags.training.frame_weights"):
+        monkeypatch.setattr(f"{module}.frame_weights", counted)
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
+    assert len(judged(tube, Destroyer("")).trials) > 1
+    assert len(compared) == 1
 
 
 def test_a_scene_that_is_kept(tube: Tube) -> None:

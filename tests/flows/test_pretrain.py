@@ -76,6 +76,7 @@ def test_scenes_made_in_the_same_way_stay(scenes: Path, monkeypatch: pytest.Monk
     small_scene(1).save(files[1], origin="of another version")
     made: list[str] = []
     monkeypatch.setattr(pretrain_scenes, "ProcessPoolExecutor", _Here)
+    monkeypatch.setattr(pretrain_scenes, "_on_one_thread", lambda job: job())
     monkeypatch.setattr(pretrain_scenes, "make_scene", lambda source, file: made.append(file.name))
     make_scenes(scenes, wanted, workers=1)
     assert made == ["cavities_00000.safetensors"]
@@ -278,6 +279,7 @@ class TestHiddenDepth:
             return half_hidden(len(made))
 
         monkeypatch.setattr(pretrain_scenes, "ProcessPoolExecutor", _Here)
+        monkeypatch.setattr(pretrain_scenes, "_on_one_thread", lambda job: job())
         monkeypatch.setattr(
             SceneSource, "recording", lambda source, *, to_restore: f"{source.family} {source.index}"
         )
@@ -286,10 +288,11 @@ class TestHiddenDepth:
         assert main([*given, "--out", str(out)]) == 0
         assert made == ["phantom 0", "cavities 0", "phantom 1"]
         assert "trained" in capsys.readouterr().out
-        assert "cavities_00000: left out, nothing to explore" in caplog.text
+        assert "cavities_00000: left out" in caplog.text
         record = json.loads((out / "hidden.json").read_text())
         assert "--hidden-depth" in record["command"]
         assert record["scenes"] == 2
+        assert len(record["restorer"]) == len(record["completion"]) == 32
         weights = load_safetensors(out / "hidden.safetensors")
         CompletionNetwork().load_state_dict({name: value.float() for name, value in weights.items()})
         # What could be explored is kept.
@@ -307,14 +310,20 @@ class TestHiddenDepth:
         for start in ("none", str(tmp_path / "typo")):
             assert main([*given, *out, "--start", start]) == 2
             assert f"--start {start}" in capsys.readouterr().err
-        for option in ("--generative", "--deterministic", "--refiner", "--without-perceptual"):
-            assert main([*given, *out, option]) == 2
-            assert option in capsys.readouterr().err
+        for completion in ("none", str(tmp_path / "typo")):
+            assert main([*given, *out, "--set", f"completion={completion}"]) == 2
+            assert f"completion={completion}" in capsys.readouterr().err
+        refused = ["--generative", "--deterministic", "--refiner", "--without-perceptual"]
+        for option in ([name] for name in refused):
+            assert main([*given, *out, *option]) == 2
+            assert option[0] in capsys.readouterr().err
+        assert main([*given, *out, "--perceptual-weight", "1"]) == 2
+        assert "--perceptual-weight" in capsys.readouterr().err
 
     def test_the_weights_of_the_package_say_where_they_come_from(self) -> None:
         weights = Path(str(files("extrags.depth.weights"))) / "hidden.safetensors"
         assert weights.stat().st_size < 5_000_000
         record = json.loads(weights.with_suffix(".json").read_text())
-        assert record["command"].startswith("extrags pretrain ")
+        assert "--hidden-depth" in record["command"]
         scores = record["validation_scores"]
         assert scores["trained"]["error"] < 0.8 * scores["before"]["error"] < scores["smooth"]["error"]

@@ -2,12 +2,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from extrags.config import CoarseConfig, DensifyConfig, FinetuneConfig
+from extrags.sequence import EndoscopicSequence
 from extrags.store import Slot, Store
-from extrags.training.frame_weights import FrameWeights
-from tasks.coarse import coarse
+from extrags.training.frame_weights import FrameWeights, frame_weights
+from tasks.coarse import coarse, refined_frames
 from tasks.finetune import finetune
 from tasks.stage import stage
 from tests.extrags.training.textured_plane import blurred_along_rows, changed, textured_plane
@@ -55,3 +57,23 @@ def test_finetuning_does_not_look_for_blurred_frames_again(
     finetune.fn(
         store=store, scene=scene, sequence=sequence, pseudo_views=None, config=settings, coarse=config
     )
+
+
+def test_where_poses_were_refined_frames_are_compared_anew(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = str(tmp_path)
+    config = CONFIG.model_copy(update={"inconsistent_frames": "weight", "refine_poses": True})
+    sequence = one_blurred.fn(store=store)
+    scene = coarse.fn(store=store, sequence=sequence, config=config)
+    refined = refined_frames.fn(store=store, sequence=sequence, coarse=scene)
+    looked: list[int] = []
+
+    def compared(frames: EndoscopicSequence, chosen: np.ndarray) -> FrameWeights | None:
+        looked.append(len(chosen))
+        return frame_weights(frames, chosen)
+
+    monkeypatch.setattr("extrags.training.frame_weights.frame_weights", compared)
+    settings = FinetuneConfig(iterations=3, densify_share=0.0)
+    finetune.fn(store=store, scene=scene, sequence=refined, pseudo_views=None, config=settings, coarse=config)
+    assert len(looked) == 1

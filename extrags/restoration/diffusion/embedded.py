@@ -81,7 +81,7 @@ class EmbeddedEnhancer:
             [R, 3, S, S]; None without.
         domain: what it was trained on, by which a scene is told to be of that world or not; None where that
             is not known.
-        depth_from_image: depth in holes is read from the restored image as well.
+        depth_from_image: depth in holes is read from the restored image.
     """
 
     network: RestorationNetwork

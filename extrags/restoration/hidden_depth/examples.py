@@ -51,7 +51,7 @@ class HiddenDepthExamples:
         opacity: of the rendering, half precision, [V, H, W].
         depth_mm: the true z-depth, 0 where a ray meets nothing, [V, H, W].
         K: pinhole intrinsics in pixels, [V, 3, 3].
-        clip: number of the trajectory of each view, whose views follow each other, [V].
+        clip: number of the trajectory of each view, which never falls from one view to the next, [V].
     """
 
     rgb: Float[Tensor, "v 3 h w"]
@@ -142,16 +142,15 @@ class HiddenDepthExamples:
     def _teaching(
         self, off: Float[Tensor, "v h w"], known: Float[Tensor, "v h w"], solid: Float[Tensor, "v h w"]
     ) -> Int[Tensor, "n"]:
-        """Views with a hole, and with depth beside it that can be trusted, in the order of their clips."""
+        """Views with a hole, and with depth beside it that can be trusted."""
         taken = []
-        for number in torch.unique(self.clip):
-            for view in torch.nonzero(self.clip == number)[:, 0].tolist():
-                shown = off[view][(known[view] * solid[view]) > 0]
-                enough = float((known[view] * (1 - solid[view])).mean()) > LEAST_HIDDEN
-                if not enough or shown.numel() < LEAST_KNOWN * off[view].numel():
-                    continue
-                if float((shown - shown.median()).abs().mean()) <= LARGEST_ERROR:
-                    taken.append(view)
+        for view in range(len(off)):
+            shown = off[view][(known[view] * solid[view]) > 0]
+            enough = float((known[view] * (1 - solid[view])).mean()) > LEAST_HIDDEN
+            if not enough or shown.numel() < LEAST_KNOWN * off[view].numel():
+                continue
+            if float((shown - shown.median()).abs().mean()) <= LARGEST_ERROR:
+                taken.append(view)
         return torch.tensor(taken, dtype=torch.long)
 
     def save(self, path: Path, *, origin: str = "") -> None:

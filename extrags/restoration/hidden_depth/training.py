@@ -27,7 +27,8 @@ from extrags.thresholds import HOLE_ALPHA
 __all__ = ["HiddenDepthConfig", "hidden_depth_loss", "hidden_depth_scores", "train_hidden_depth"]
 
 KNOWN_WEIGHT = 0.05
-"""Of pixels whose depth is known, relative to hidden ones: what is read there is not used."""
+"""Of pixels with known depth, relative to hidden ones. There the log-depth that is judged is the true one:
+what counts are slopes across the border, and the expected error."""
 
 
 class HiddenDepthConfig(StageConfig):
@@ -39,8 +40,10 @@ class HiddenDepthConfig(StageConfig):
     batch: int = Field(8, ge=1, description="views per step")
     learning_rate: float = Field(6e-4, gt=0, description="peak, after the warm-up")
     slope_weight: float = Field(0.5, ge=0, description="of differences between neighbours")
-    error_weight: float = Field(0.1, ge=0, description="of the expected error's likelihood")
-    start: str = Field("bundled", description="the depth completion to start from: bundled, or a file")
+    error_weight: float = Field(
+        0.1, ge=0, description="of the expected error's likelihood; the error is not used yet"
+    )
+    completion: str = Field("bundled", description="the depth completion to start from: bundled, or a file")
     keep: float = Field(0.0, ge=0, le=1, description="share of the starting weights in the result")
     most_seconds: float = Field(math.inf, gt=0, description="the training ends after this time")
     seed: int = Field(0, ge=0)
@@ -55,8 +58,8 @@ def hidden_depth_loss(
 ) -> dict[str, Tensor]:
     """Terms of the loss, as `completion_loss`, of what is hidden.
 
-    What is read meets the rendering where that is known, so that only what differs from there counts: a
-    reconstruction may stand at another scale, or a little beside the truth.
+    What is read meets the truth where the rendering is solid, as it meets the rendering in use, so that only
+    what differs from there counts: a reconstruction may stand at another scale, or a little beside the truth.
 
     Args:
         channels: from `reading_inputs`.
@@ -116,13 +119,9 @@ def train_hidden_depth(
         history.append({"iteration": iteration, **{name: round(mean, 4) for name, mean in means.items()}})
         emit(Progress("pretrain-hidden-depth", iteration, config.iterations))
 
+    half = has_fast_half_precision()
     network = train_completion(
-        bank,
-        settings,
-        copy.deepcopy(start).train(),
-        told=told,
-        half=has_fast_half_precision(),
-        loss=hidden_depth_loss,
+        bank, settings, copy.deepcopy(start).train(), told=told, half=half, loss=hidden_depth_loss
     ).eval()
     if config.keep > 0:
         mix_weights(network, start.state_dict(), config.keep)
@@ -130,6 +129,7 @@ def train_hidden_depth(
         "training": json.loads(config.model_dump_json()),
         "scenes": len(files),
         "examples": len(bank),
+        "half_precision": half,
         "threads": torch.get_num_threads(),
         "history": history[:: max(1, len(history) // 100)],
         "validation_scores": hidden_depth_scores({"before": start, "trained": network}, validation),

@@ -128,6 +128,15 @@ class TestRecording:
         assert sequence.mask[sequence.test].all()
         assert 20 < sequence.rgb[sequence.test].mean() < 235
 
+    def test_without_views_to_restore_it_trains_on_the_same(self, small: CavityConfig) -> None:
+        recording, alone = cavity_recording(small), cavity_recording(small, to_restore=False)
+        whole = recording.sequence
+        assert len(alone.sequence.test) == len(alone.clip) == 0
+        np.testing.assert_array_equal(alone.sequence.rgb, whole.rgb[whole.train])
+        assert whole.depth_mm is not None
+        depth_mm = alone.z_depth_mm(whole.cameras[5])
+        np.testing.assert_array_equal(np.where(np.isfinite(depth_mm), depth_mm, 0), whole.depth_mm[5])
+
     def test_exposures_have_a_mean_of_one_and_targets_exactly_that(self, small: CavityConfig) -> None:
         exposure = np.array(cavity_recording(small).sequence.truth["exposure"])
         assert np.log(exposure[:4]).mean() == pytest.approx(0, abs=1e-6)
