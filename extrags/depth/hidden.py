@@ -114,20 +114,31 @@ def read_depth(
 
 
 def reading_size(size: Sequence[int], longest: int) -> tuple[int, int]:
-    """Height and width with the longest side at most so long."""
+    """Height and width in pixels with the longest side at most so long, in nearly the same proportion.
+
+    Args:
+        size: height and width.
+        longest: the most that the longer of them may be.
+    """
     height, width = (-(-longest * side // max(size)) if longest < max(size) else side for side in size)
     return height, width
 
 
 def shrunk(image: Float[Tensor, "t c h w"], size: tuple[int, int]) -> Float[Tensor, "t c h2 w2"]:
-    """Means over areas; as it is where it has that size."""
+    """Images as means over areas, of another height and width; as they are where they have it."""
     return image if image.shape[-2:] == size else functional.interpolate(image, size, mode="area")
 
 
 def shrunk_intrinsics(
     K: Float[Tensor, "t 3 3"], size: Sequence[int], small: tuple[int, int]
 ) -> Float[Tensor, "t 3 3"]:
-    """Of images of another height and width."""
+    """Pinhole intrinsics in pixels of the same views at another size.
+
+    Args:
+        K: at the size `size`.
+        size: height and width.
+        small: height and width of the other.
+    """
     return torch.tensor([small[1] / size[1], small[0] / size[0], 1.0])[:, None] * K
 
 
@@ -155,7 +166,13 @@ def _read_change(
 def met_where_known(
     found: Float[Tensor, "t h w"], log_depth: Float[Tensor, "t h w"], known: Float[Tensor, "t h w"]
 ) -> Float[Tensor, "t h w"]:
-    """Log-depth that meets another one where that is known: what it is off there is carried inside."""
+    """Log-depth that meets another one where that is known: what it is off there is carried inside.
+
+    Args:
+        found: what is to meet it.
+        log_depth: the other one.
+        known: one where that is known, zero elsewhere.
+    """
     off = push_pull(((log_depth - found) * known)[:, None], known[:, None])
     return found + off[:, 0]
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from extrags.config.base import StageConfig
 from extrags.depth.completion import SEEN, CompletionNetwork, completion_loss
 from extrags.depth.hidden import LONGEST_SIDES_PX, met_where_known, read_depth
-from extrags.depth.pretraining.training import CompletionTraining, ExampleBank, mix_weights, train_completion
+from extrags.depth.pretraining.training import CompletionTraining, ExampleBank, train_completion
 from extrags.errors import ConfigError
 from extrags.events import Progress, emit
 from extrags.restoration.diffusion.precision import has_fast_half_precision
@@ -44,7 +44,6 @@ class HiddenDepthConfig(StageConfig):
         0.1, ge=0, description="of the expected error's likelihood; the error is not used yet"
     )
     completion: str = Field("bundled", description="the depth completion to start from: bundled, or a file")
-    keep: float = Field(0.0, ge=0, le=1, description="share of the starting weights in the result")
     most_seconds: float = Field(math.inf, gt=0, description="the training ends after this time")
     seed: int = Field(0, ge=0)
 
@@ -123,8 +122,6 @@ def train_hidden_depth(
     network = train_completion(
         bank, settings, copy.deepcopy(start).train(), told=told, half=half, loss=hidden_depth_loss
     ).eval()
-    if config.keep > 0:
-        mix_weights(network, start.state_dict(), config.keep)
     record = {
         "training": json.loads(config.model_dump_json()),
         "scenes": len(files),

@@ -183,16 +183,6 @@ class TestTraining:
         assert scores["smooth"]["bias"] == pytest.approx(-scores["smooth"]["error"])
         assert record["examples"] == 8
 
-    def test_the_mean_with_the_start(self, files: list[Path], monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(training_module, "LONGEST_SIDES_PX", (32,))
-        start = load_completion("bundled")
-        assert start is not None
-        config = HiddenDepthConfig(scenes=3, validation_scenes=1, iterations=2, batch=2, keep=1.0)
-        network, _ = train_hidden_depth(files, config, start)
-        assert all(
-            torch.equal(value, start.state_dict()[name]) for name, value in network.state_dict().items()
-        )
-
     def test_scenes_have_to_be_left(self, files: list[Path], tmp_path: Path) -> None:
         start = load_completion("bundled")
         assert start is not None
