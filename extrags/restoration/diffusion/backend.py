@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from extrags.config import CoarseConfig, EnhanceConfig
-from extrags.depth.weights import hidden_digest
+from extrags.depth.weights import hidden_digest, load_hidden
 from extrags.restoration.diffusion.weights import weights_digest
 from extrags.restoration.protocol import Enhancer
 from extrags.scene import Scene
@@ -33,7 +33,7 @@ class EmbeddedBackend:
 
         pretrained(config)
         if config.depth_from_image:
-            hidden_digest()
+            load_hidden()
 
     def digest(self, config: EnhanceConfig) -> str | None:
         """Digest of the weights, also of those that depth is read with; None where there are neither.
