@@ -10,8 +10,12 @@ from typing import Any
 import jaxtyping
 import pytest
 
+from tests.array_checks import check_arrays_alone
+
 # Before torch is loaded: OpenMP threads that spin while they wait starve each other on small machines.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+check_arrays_alone()
 
 SHARING = ("tests/flows",)
 """Packages whose tests share a server and a finished run."""

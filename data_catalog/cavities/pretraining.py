@@ -178,10 +178,13 @@ def _photographed(
         shown = recorder.processor.picture(image, recorder.sensor, float(exposure[k]), rng, clean=False)
         pictures.append(np.where(field[..., None], shown, np.uint8(0)))
     quiet = replace(recorder.sensor, noise=False)
-    for k in range(len(targets)):
-        rng = stream(scene, "noise", 0, k)
-        image = recorder.light(targets[k])
-        pictures.append(recorder.processor.picture(image, quiet, 1.0, rng, clean=True))
+
+    def photographed(camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        # Neither noise nor flaws: nothing is drawn.
+        rng = stream(scene, "noise", 0)
+        return recorder.processor.picture(recorder.light(camera), quiet, 1.0, rng, clean=True)
+
+    pictures += [photographed(targets[k]) for k in range(len(targets))]
     cameras = Cameras.concatenated([train, targets])
     depth = np.stack([z_depth(cavity.rays, cameras[k]) for k in range(len(cameras))])
     mask = np.isfinite(depth)
@@ -205,7 +208,9 @@ def _photographed(
         metric=True,
         truth=truth,
     )
-    return PretrainingRecording(sequence, clip, config.kind, lambda camera: z_depth(cavity.rays, camera))
+    return PretrainingRecording(
+        sequence, clip, config.kind, lambda camera: z_depth(cavity.rays, camera), photographed
+    )
 
 
 def _exposures(

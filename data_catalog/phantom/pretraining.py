@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from data_catalog.phantom.config import GENERATOR_VERSION, PhantomConfig, Setting, stream
 from data_catalog.phantom.imaging import recording_sensor
@@ -71,9 +71,12 @@ def pretraining_recording(index: int, *, to_restore: bool = True) -> Pretraining
         rgb.append(image)
         exposures.append(exposure)
     quiet = replace(sensor, noise=False, drift=0.0)
-    rgb += [
-        phantom.photograph(targets[k], quiet, TRAINS, config.video_frames + k)[0] for k in range(len(targets))
-    ]
+
+    def photographed(camera: Cameras) -> UInt8[np.ndarray, "h w 3"]:
+        # Without noise and drift the number of the frame says nothing.
+        return phantom.photograph(camera, quiet, TRAINS, config.video_frames)[0]
+
+    rgb += [photographed(targets[k]) for k in range(len(targets))]
     cameras = Cameras.concatenated([train, targets])
     depth = np.stack([phantom.z_depth(cameras[k]) for k in range(len(cameras))])
     valid = np.isfinite(depth)
@@ -97,7 +100,7 @@ def pretraining_recording(index: int, *, to_restore: bool = True) -> Pretraining
         truth=truth,
     )
     clip = np.repeat(np.arange(len(targets) // _CLIP_VIEWS), _CLIP_VIEWS)
-    return PretrainingRecording(sequence, clip, "phantom", phantom.z_depth)
+    return PretrainingRecording(sequence, clip, "phantom", phantom.z_depth, photographed)
 
 
 def _target_cameras(phantom: Phantom, rng: np.random.Generator) -> Cameras:

@@ -70,6 +70,12 @@ def add_arguments(parser: Parser) -> None:
         action="store_true",
         help="a third of the cavities wear tissue of real laparoscopy frames, which must be had",
     )
+    parser.add_argument(
+        "--explored",
+        action="store_true",
+        help="the virtual views of trajectories that the explorer chooses are practised on as well, besides "
+        "the clips off the path (those of --hidden-depth always are, and alone)",
+    )
     parser.add_argument("--scenes-only", action="store_true", help="make the scenes, and train nothing")
     parser.add_argument(
         "--scenes",
@@ -316,6 +322,7 @@ def _command(given: argparse.Namespace) -> str:
         f"--{name.replace('_', '-')}"
         for name in (
             "real_textures",
+            "explored",
             "without_perceptual",
             "deterministic",
             "generative",

@@ -36,7 +36,8 @@ def hidden_depth_settings(given: argparse.Namespace) -> HiddenDepthConfig:
     """
     from extrags.restoration.hidden_depth.training import HiddenDepthConfig
 
-    for name in ("generative", "deterministic", "refiner", "without_perceptual", "perceptual_weight"):
+    others = ("generative", "deterministic", "refiner", "explored", "without_perceptual", "perceptual_weight")
+    for name in others:
         if getattr(given, name) not in (None, False):
             raise ConfigError(
                 f"--{name.replace('_', '-')}: this is not for --hidden-depth, which trains a reader of depth"

@@ -31,12 +31,14 @@ class SceneSource:
         index: its number within the family, from 0.
         size_factor: how many times wider and higher pictures of cavities are.
         real_textures: whether some cavities wear tissue of real frames.
+        explored: whether the virtual views of the explorer's trajectories are among those to restore.
     """
 
     family: str
     index: int
     size_factor: int = 1
     real_textures: bool = False
+    explored: bool = False
 
     @property
     def file_name(self) -> str:
@@ -71,6 +73,9 @@ class SceneSource:
             "coarse": quick.coarse.model_dump(mode="json"),
             "references": quick.enhance.references,
         }
+        if self.explored:
+            stages = {name: getattr(quick, name) for name in ("surface", "freespace", "explore")}
+            parts |= {name: stage.model_dump(mode="json") for name, stage in stages.items()}
         return json.dumps(parts, sort_keys=True)
 
     @property
@@ -101,7 +106,9 @@ def scene_sources(given: argparse.Namespace, count: int) -> list[SceneSource]:
     sources = []
     for number in range(count):
         family = given.kinds[number % len(given.kinds)]
-        sources.append(SceneSource(family, made[family], given.size_factor, given.real_textures))
+        sources.append(
+            SceneSource(family, made[family], given.size_factor, given.real_textures, given.explored)
+        )
         made[family] += 1
     return sources
 
@@ -133,7 +140,7 @@ def make_scene(source: SceneSource, file: Path) -> None:
     from extrags.restoration.training_data.pretraining_scenes import make_pretraining_scene
 
     quick = profile_config("quick")
-    scene = make_pretraining_scene(source.recording(), quick.enhance, quick.coarse, source.seed)
+    scene = make_pretraining_scene(source.recording(), quick, source.seed, explored=source.explored)
     scene.save(file, origin=source.origin)
 
 

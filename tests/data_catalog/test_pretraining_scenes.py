@@ -62,6 +62,12 @@ def test_without_views_to_restore_it_trains_on_the_same(recording: PretrainingRe
     assert np.array_equal(np.where(np.isfinite(depth_mm), depth_mm, 0), whole.depth_mm[7])
 
 
+def test_any_view_is_photographed_as_those_to_restore_are(recording: PretrainingRecording) -> None:
+    whole = recording.sequence
+    view = int(whole.test[3])
+    assert np.array_equal(recording.photograph(whole.cameras[view]), whole.rgb[view])
+
+
 def test_what_is_to_be_restored_is_not_trained_on(recording: PretrainingRecording) -> None:
     small = recording.sequence
     assert len(small.train) == 4

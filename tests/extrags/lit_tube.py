@@ -10,6 +10,7 @@ import torch
 from extrags.cameras import Cameras, look_at, pixel_rays
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
+from extrags.restoration.training_data.recordings import PretrainingRecording
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.view_synthesis.gather import gather_references
@@ -49,6 +50,17 @@ def cast_tube(cameras: Cameras, light: NearFieldLight | None) -> tuple[np.ndarra
 def tube_depth_mm(camera: Cameras) -> np.ndarray:
     """True z-depth of one view."""
     return np.asarray(cast_tube(camera, None)[1][0])
+
+
+def tube_picture(camera: Cameras) -> np.ndarray:
+    """8-bit image of one view, lit as the frames are."""
+    return np.rint(cast_tube(camera, tube_light(1))[0][0] * 255).astype(np.uint8)
+
+
+def tube_recording(tube: Tube) -> PretrainingRecording:
+    """The tube as if made for pretraining; its held-out frames are one clip."""
+    clip = np.zeros(len(tube.sequence.test), np.int64)
+    return PretrainingRecording(tube.sequence, clip, "tube", tube_depth_mm, tube_picture)
 
 
 def tube_cameras(

@@ -56,7 +56,8 @@ def small_scene(seed: int) -> PretrainingScene:
 
 def sources(kinds: tuple[str, ...] = ("phantom", "cavities"), count: int = 3) -> list[SceneSource]:
     return scene_sources(
-        Namespace(kinds=list(kinds), first_scene=0, size_factor=1, real_textures=False), count
+        Namespace(kinds=list(kinds), first_scene=0, size_factor=1, real_textures=False, explored=False),
+        count,
     )
 
 
@@ -96,6 +97,7 @@ def test_families_take_turns_and_do_not_share_numbers() -> None:
     assert len({source.seed for source in found}) == 6
     assert len({source.origin for source in found}) == 6
     assert SceneSource("cavities", 0, size_factor=2).origin != SceneSource("cavities", 0).origin
+    assert SceneSource("phantom", 0, explored=True).origin != SceneSource("phantom", 0).origin
 
 
 def test_scenes_alone_train_nothing(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -252,7 +254,9 @@ class TestRefiner:
 
 
 def test_scenes_can_begin_at_a_number() -> None:
-    given = Namespace(kinds=["phantom", "cavities"], first_scene=7, size_factor=1, real_textures=False)
+    given = Namespace(
+        kinds=["phantom", "cavities"], first_scene=7, size_factor=1, real_textures=False, explored=True
+    )
     assert [source.index for source in scene_sources(given, 4)] == [7, 7, 8, 8]
 
 

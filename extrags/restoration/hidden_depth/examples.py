@@ -17,13 +17,10 @@ from extrags.config import PipelineConfig
 from extrags.depth.hidden import SOLID, reading_inputs, reading_size, shrunk, shrunk_intrinsics
 from extrags.depth.pretraining.examples import Examples
 from extrags.errors import CaptureError, WeightsError
-from extrags.exploration import explore
-from extrags.freespace import carve
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.training_data.degradation import Degradation
+from extrags.restoration.training_data.explored_views import explored_cameras
 from extrags.restoration.training_data.recordings import PretrainingRecording
-from extrags.surface import fuse_surface
-from extrags.surface_error import surface_error_mm
 from extrags.training.reconstruction import reconstruct
 from extrags.view_synthesis.conditioning import filled_depth, observe_views
 from extrags.view_synthesis.gamut import Gamut
@@ -34,7 +31,7 @@ __all__ = ["EXAMPLES_VERSION", "HiddenDepthExamples"]
 EXAMPLES_VERSION = 1
 """Raised by hand whenever the same recording and restorer give other examples."""
 EVERY_VIEW = 2
-"""Neighbours on a trajectory show nearly the same: every so many views are taken."""
+"""Of a trajectory, one of so many views is taken."""
 LEAST_HIDDEN, LEAST_KNOWN = 0.02, 0.05
 """Shares of a view that have to be hidden, and known, for it to teach anything."""
 LARGEST_ERROR = 0.3
@@ -83,18 +80,9 @@ class HiddenDepthExamples:
         scene = reconstruct(
             sequence, degradation.settings(config.coarse, seed), stage="pretraining-scene"
         ).scene
-        mesh = fuse_surface(scene, sequence.training_cameras, config.surface)
-        free = carve(
-            scene,
-            mesh,
-            sequence.training_cameras,
-            config.freespace,
-            surface_error_mm=surface_error_mm(mesh, sequence),
-        )
-        trajectories = explore(scene, sequence, config.explore, freespace=free).trajectories
-        if not trajectories:
+        chosen = explored_cameras(scene, sequence, config, every=EVERY_VIEW)
+        if not chosen:
             raise CaptureError(f"{sequence.name}: nothing to explore")
-        chosen = [cameras[np.arange(0, len(cameras), EVERY_VIEW)] for cameras in trajectories]
         cameras = Cameras.concatenated(chosen)
         references = gather_references(scene, sequence, sequence.train)
         layers = observe_views(scene, references, cameras, count=config.enhance.references).layers

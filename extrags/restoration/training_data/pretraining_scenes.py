@@ -17,12 +17,13 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch.nn import functional
 
 from extrags.cameras import Cameras
-from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.config import PipelineConfig
 from extrags.errors import ShapeError, WeightsError
 from extrags.illumination import NearFieldLight
 from extrags.restoration.surface_texture import SurfaceTexture
 from extrags.restoration.training_data.augmentation import unconfirmed
 from extrags.restoration.training_data.degradation import Degradation
+from extrags.restoration.training_data.explored_views import explored_cameras
 from extrags.restoration.training_data.pairs import Pairs, pair_views
 from extrags.restoration.training_data.recordings import PretrainingRecording
 from extrags.sequence import EndoscopicSequence
@@ -38,6 +39,8 @@ PRETRAINING_DATA_VERSION = 4
 """Raised by hand whenever the same scene and settings give other pairs, or files hold something else."""
 REFERENCE_FRAMES = 24
 """Training frames at most that are kept with the pairs."""
+EVERY_EXPLORED = 4
+"""Of a trajectory, one of so many virtual views is paired: rather more scenes than more views of one."""
 FOLLOWING_SHARE = 0.6
 """Share of the clips that are shown what other views have invented."""
 OTHER_KEYFRAMES = 2
@@ -211,15 +214,16 @@ class PretrainingScene:
 
 
 def make_pretraining_scene(
-    recording: PretrainingRecording, config: EnhanceConfig, coarse: CoarseConfig, seed: int
+    recording: PretrainingRecording, config: PipelineConfig, seed: int, *, explored: bool = False
 ) -> PretrainingScene:
     """Spoil and reconstruct a recording, and pair the views to restore with the truth.
 
     Args:
         recording: made for pretraining.
-        config: how many references.
-        coarse: settings of the reconstruction; steps, number of Gaussians and light model are drawn.
+        config: settings of a run; steps, number of Gaussians and light model are drawn.
         seed: of the draws and of the reconstruction.
+        explored: whether there are also the virtual views of the trajectories that the explorer chooses,
+            some of each; each trajectory is a clip.
 
     Raises:
         DivergedError: when the reconstruction does not stay finite.
@@ -227,11 +231,17 @@ def make_pretraining_scene(
     generator = np.random.default_rng([seed, 5])
     degradation = Degradation.random(generator)
     sequence = degradation.applied(recording.sequence, generator)
-    settings = degradation.settings(coarse, seed)
+    settings = degradation.settings(config.coarse, seed)
     scene = reconstruct(sequence.training_part(), settings, stage="pretraining-scene").scene
+    recording = replace(recording, sequence=sequence)
+    if explored and (
+        virtual := explored_cameras(scene, sequence.training_part(), config, every=EVERY_EXPLORED)
+    ):
+        recording = recording.with_views(virtual)
+        sequence = recording.sequence
     references = gather_references(scene, sequence, sequence.train)
     frames = np.asarray(sequence.test, dtype=np.int64)
-    observation = observe_views(scene, references, sequence.cameras[frames], count=config.references)
+    observation = observe_views(scene, references, sequence.cameras[frames], count=config.enhance.references)
     pairs = pair_views(sequence, observation.layers, frames, synthetic=False)
     pairs.validation[:] = False
     clip = np.asarray(recording.clip, dtype=np.int64)

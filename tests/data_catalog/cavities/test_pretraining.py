@@ -136,6 +136,7 @@ class TestRecording:
         assert whole.depth_mm is not None
         depth_mm = alone.z_depth_mm(whole.cameras[5])
         np.testing.assert_array_equal(np.where(np.isfinite(depth_mm), depth_mm, 0), whole.depth_mm[5])
+        np.testing.assert_array_equal(alone.photograph(whole.cameras[5]), whole.rgb[5])
 
     def test_exposures_have_a_mean_of_one_and_targets_exactly_that(self, small: CavityConfig) -> None:
         exposure = np.array(cavity_recording(small).sequence.truth["exposure"])

@@ -9,9 +9,8 @@ from extrags.cameras import rotation_angle_deg
 from extrags.config import CoarseConfig
 from extrags.errors import ShapeError
 from extrags.restoration.training_data.degradation import ITERATIONS, Degradation
-from extrags.restoration.training_data.recordings import PretrainingRecording
 from extrags.sequence import EndoscopicSequence
-from tests.extrags.lit_tube import Tube, tube_depth_mm
+from tests.extrags.lit_tube import Tube, tube_recording
 
 NONE = Degradation(1000, 1.0, True, 0.0, 0.0, "exact", 0.0, 0.0)
 
@@ -87,4 +86,4 @@ def test_settings_follow_the_draw() -> None:
 @pytest.mark.usefixtures("unchecked")
 def test_a_clip_number_for_each_view(tube: Tube) -> None:
     with pytest.raises(ShapeError, match="1 clip numbers for 2 views"):
-        PretrainingRecording(tube.sequence, np.zeros(1, dtype=np.int64), "tube", tube_depth_mm)
+        replace(tube_recording(tube), clip=np.zeros(1, dtype=np.int64))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
@@ -23,9 +22,8 @@ from extrags.restoration.hidden_depth.training import (
     hidden_depth_scores,
     train_hidden_depth,
 )
-from extrags.restoration.training_data.recordings import PretrainingRecording
 from extrags.thresholds import HOLE_ALPHA
-from tests.extrags.lit_tube import Tube, tube_depth_mm
+from tests.extrags.lit_tube import Tube, tube_recording
 
 HEIGHT, WIDTH = 48, 64
 
@@ -49,9 +47,7 @@ def examples(tube: Tube) -> HiddenDepthExamples:
         patch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (150, 200))
         patch.setattr("extrags.restoration.training_data.degradation._FLAWS", {"exact": 1.0})
         patch.setattr("extrags.restoration.training_data.degradation._EXACT_POSES", 1.0)
-        clip = np.zeros(len(tube.sequence.test), np.int64)
-        recording = PretrainingRecording(tube.sequence, clip, "tube", tube_depth_mm)
-        return HiddenDepthExamples.of_recording(recording, restorer(), settings(), 3)
+        return HiddenDepthExamples.of_recording(tube_recording(tube), restorer(), settings(), 3)
 
 
 def half_hidden(seed: int = 0, views: int = 4) -> HiddenDepthExamples:
@@ -106,12 +102,10 @@ class TestExamples:
         self, tube: Tube, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (10, 20))
-        module = "extrags.restoration.hidden_depth.examples.explore"
+        module = "extrags.restoration.training_data.explored_views.explore"
         monkeypatch.setattr(module, lambda *_given, **_named: type("Nothing", (), {"trajectories": ()}))
-        clip = np.zeros(len(tube.sequence.test), np.int64)
-        recording = PretrainingRecording(tube.sequence, clip, "tube", tube_depth_mm)
         with pytest.raises(CaptureError, match="nothing to explore"):
-            HiddenDepthExamples.of_recording(recording, restorer(), settings(), 3)
+            HiddenDepthExamples.of_recording(tube_recording(tube), restorer(), settings(), 3)
 
     def test_the_network_is_shown_what_it_reads_in_use(self) -> None:
         views = half_hidden()

@@ -8,17 +8,24 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.config import CoarseConfig
+from extrags.config import CoarseConfig, profile_config
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.pretraining import PretrainingConfig, _mixed_sampler, pretrain
 from extrags.restoration.training_data.parallel import drawn_in_processes
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, make_pretraining_scene
-from extrags.restoration.training_data.recordings import PretrainingRecording
 from extrags.view_synthesis.references import LightTransfer
-from tests.extrags.lit_tube import Tube, tube_depth_mm
+from tests.extrags.lit_tube import Tube, tube_depth_mm, tube_picture, tube_recording
 from tests.extrags.restoration.conftest import SMALL
 
+QUICK = profile_config("quick")
+RUN = QUICK.model_copy(
+    update={
+        "enhance": SMALL,
+        "coarse": CoarseConfig(max_points=800),
+        "explore": QUICK.explore.model_copy(update={"trajectories": 2, "steps": 5}),
+    }
+)
 TINY = PretrainingConfig(
     scenes=3,
     validation_scenes=1,
@@ -36,9 +43,15 @@ def scene(tube: Tube) -> PretrainingScene:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (10, 20))
         patch.setattr("extrags.restoration.training_data.degradation._WITH_LIGHT", 1.0)
-        clip = np.zeros(len(tube.sequence.test), np.int64)
-        recording = PretrainingRecording(tube.sequence, clip, "tube", tube_depth_mm)
-        return make_pretraining_scene(recording, SMALL, CoarseConfig(max_points=800), 3)
+        return make_pretraining_scene(tube_recording(tube), RUN, 3)
+
+
+@pytest.fixture(scope="module")
+def explored(tube: Tube) -> PretrainingScene:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (150, 200))
+        patch.setattr("extrags.restoration.training_data.degradation._EXACT_POSES", 1.0)
+        return make_pretraining_scene(tube_recording(tube), RUN, 3, explored=True)
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +93,33 @@ class TestPretrainingScene:
     def test_a_scene_without_light_keeps_its_exponent(self, scene: PretrainingScene, tmp_path: Path) -> None:
         replace(scene, transfer=LightTransfer(None, 0.7, 12.0)).save(tmp_path / "dark.safetensors")
         assert PretrainingScene.load(tmp_path / "dark.safetensors").transfer == LightTransfer(None, 0.7, 12.0)
+
+    def test_explored_views_are_clips_of_their_own_and_photographed(
+        self, tube: Tube, explored: PretrainingScene
+    ) -> None:
+        off_the_path = len(tube.sequence.test)
+        assert set(explored.clip[:off_the_path]) == {0}
+        assert explored.clip[off_the_path:].tolist() == [1, 1, 1, 2, 2, 2]
+        pairs = explored.pairs
+        np.testing.assert_array_equal(pairs.frame, 10 + np.arange(len(pairs)))
+        for view in range(off_the_path, len(pairs)):
+            camera = explored.cameras[view]
+            shown = torch.from_numpy(tube_picture(camera)).permute(2, 0, 1) / 255
+            torch.testing.assert_close(pairs.target[view], shown)
+            depth_mm = torch.from_numpy(tube_depth_mm(camera)).float()
+            torch.testing.assert_close(pairs.depth_mm[view, 0], depth_mm)
+        moved = np.abs(np.diff(explored.cameras.world_from_camera[off_the_path:], axis=0))
+        assert (moved.max(axis=(1, 2)) > 0.01).all()
+
+    def test_where_nothing_can_be_explored_the_clips_remain(
+        self, tube: Tube, scene: PretrainingScene, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (10, 20))
+        monkeypatch.setattr("extrags.restoration.training_data.degradation._WITH_LIGHT", 1.0)
+        module = "extrags.restoration.training_data.explored_views.explore"
+        monkeypatch.setattr(module, lambda *_given, **_named: type("Nothing", (), {"trajectories": ()}))
+        found = make_pretraining_scene(tube_recording(tube), RUN, 3, explored=True)
+        assert torch.equal(found.pairs.layers.data, scene.pairs.layers.data)
 
     def test_training_frames_are_kept_as_references(self, tube: Tube, scene: PretrainingScene) -> None:
         train = tube.sequence.train
