@@ -16,7 +16,14 @@ if TYPE_CHECKING:
 
 _PLY_HEADER_BYTES = 1 << 16
 
-__all__ = ["load_npy", "load_npz", "load_ply_vertices", "load_safetensors", "load_state_dict"]
+__all__ = [
+    "load_npy",
+    "load_npz",
+    "load_ply_vertices",
+    "load_safetensors",
+    "load_state_dict",
+    "save_safetensors",
+]
 
 
 def load_npy(file: Path) -> np.ndarray:
@@ -86,6 +93,22 @@ def load_safetensors(file: Path) -> dict[str, Tensor]:
         raise
     except Exception as error:
         raise ValueError(f"no safetensors file, or damaged: {error}") from error
+
+
+def save_safetensors(file: Path, tensors: dict[str, Tensor], metadata: dict[str, str] | None = None) -> None:
+    """Write tensors by name; the file is there whole, or as it was before.
+
+    Args:
+        file: its folder is made.
+        tensors: of any layout.
+        metadata: text beside them.
+    """
+    from safetensors.torch import save_file
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    partial = file.with_suffix(".partial")
+    save_file({name: value.contiguous() for name, value in tensors.items()}, str(partial), metadata)
+    partial.replace(file)
 
 
 def load_state_dict(file: Path) -> dict[str, Tensor]:

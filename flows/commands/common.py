@@ -11,7 +11,7 @@ import logging
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from extrags.errors import ConfigError, ExtragsError, StoreError
 from extrags.redaction import CredentialFilter, without_credentials
@@ -33,9 +33,12 @@ __all__ = [
     "showing",
     "stage_limits",
     "store_root",
+    "training_settings",
     "write_json",
     "write_page",
 ]
+
+Settings = TypeVar("Settings", bound="StageConfig")
 
 
 def parsed_settings(assignments: list[str]) -> dict[str, Any]:
@@ -229,3 +232,25 @@ def further_settings(texts: Sequence[str], model: type[StageConfig]) -> dict[str
             raise ConfigError(f"--set {text}: expected NAME=VALUE with one of {', '.join(sorted(known))}")
         found[name] = known[name].parse(value)
     return found
+
+
+def training_settings(
+    given: argparse.Namespace, model: type[Settings], names: Sequence[str], command: str
+) -> Settings:
+    """Settings of a training: those that have an option of their own, and those that `--set` gives.
+
+    Args:
+        given: the command line; an option that is None keeps the default.
+        model: of the training's settings.
+        names: of the options.
+        command: named in errors.
+
+    Raises:
+        ConfigError: for an unknown setting, or a value out of its range.
+    """
+    values = {name: getattr(given, name) for name in names if getattr(given, name) is not None}
+    values |= further_settings(given.set, model)
+    try:
+        return model(**values)
+    except ValueError as error:
+        raise ConfigError(f"{command}: {error}") from error

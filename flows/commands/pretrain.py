@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
-from flows.commands.common import further_settings, set_up_logging, showing
+from flows.commands.common import set_up_logging, showing, training_settings
 from flows.commands.options import Parser
 from flows.commands.pretrain_scenes import SOURCES, make_scenes, scene_sources
 
@@ -225,26 +225,10 @@ def _settings(given: argparse.Namespace) -> PretrainingConfig:
     """
     from extrags.restoration.diffusion.pretraining import PretrainingConfig
 
-    values = {
-        "scenes": given.scenes,
-        "validation_scenes": given.validation_scenes,
-        "iterations": given.iterations,
-        "batch": given.batch,
-        "learning_rate": given.learning_rate,
-        "perceptual": not given.without_perceptual,
-        "perceptual_weight": given.perceptual_weight,
-        "error_weight": given.error_weight,
-        "deterministic": given.deterministic,
-        "generative": given.generative,
-        "seed": given.seed,
-    }
-    known = {name: value for name, value in values.items() if value is not None} | further_settings(
-        given.set, PretrainingConfig
-    )
-    try:
-        return PretrainingConfig(**known)
-    except ValueError as error:
-        raise ConfigError(f"extrags pretrain: {error}") from error
+    names = ("scenes", "validation_scenes", "iterations", "batch", "learning_rate", "perceptual_weight")
+    further = ("error_weight", "deterministic", "generative", "seed", "perceptual")
+    given = argparse.Namespace(**vars(given), perceptual=not given.without_perceptual)
+    return training_settings(given, PretrainingConfig, (*names, *further), "extrags pretrain")
 
 
 def _told(record: dict[str, Any], folder: str) -> int:

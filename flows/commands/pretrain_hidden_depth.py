@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import CaptureError, ConfigError, DivergedError, ExtragsError
-from flows.commands.common import further_settings
+from flows.commands.common import training_settings
 from flows.commands.pretrain_scenes import in_processes
 
 if TYPE_CHECKING:
@@ -43,12 +43,7 @@ def hidden_depth_settings(given: argparse.Namespace) -> HiddenDepthConfig:
                 f"--{name.replace('_', '-')}: this is not for --hidden-depth, which trains a reader of depth"
             )
     names = ("scenes", "validation_scenes", "iterations", "batch", "learning_rate", "error_weight", "seed")
-    values: dict[str, Any] = {name: getattr(given, name) for name in names}
-    values |= further_settings(given.set, HiddenDepthConfig)
-    try:
-        return HiddenDepthConfig(**{name: value for name, value in values.items() if value is not None})
-    except ValueError as error:
-        raise ConfigError(f"extrags pretrain --hidden-depth: {error}") from error
+    return training_settings(given, HiddenDepthConfig, names, "extrags pretrain --hidden-depth")
 
 
 @dataclass(frozen=True)

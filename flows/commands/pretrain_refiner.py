@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import CaptureError, ConfigError, ExtragsError
-from flows.commands.common import further_settings
+from flows.commands.common import training_settings
 
 if TYPE_CHECKING:
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
@@ -45,12 +45,7 @@ def refiner_settings(given: argparse.Namespace) -> RefinerConfig:
         "perceptual_weight",
         "seed",
     )
-    values: dict[str, Any] = {name: getattr(given, name) for name in names}
-    values |= further_settings(given.set, RefinerConfig)
-    try:
-        return RefinerConfig(**{name: value for name, value in values.items() if value is not None})
-    except ValueError as error:
-        raise ConfigError(f"extrags pretrain --refiner: {error}") from error
+    return training_settings(given, RefinerConfig, names, "extrags pretrain --refiner")
 
 
 @dataclass(frozen=True)
@@ -114,7 +109,6 @@ def examples_of(files: Sequence[Path], start: RefinedRestorer) -> list[Path]:
             except CaptureError as error:
                 logger.warning("%s: left out, %s", file.name, error)
                 continue
-            example.parent.mkdir(exist_ok=True)
             made.save(example)
         found.append(example)
         emit(Progress("refiner-examples", done, len(files)))

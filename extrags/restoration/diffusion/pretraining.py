@@ -19,7 +19,7 @@ from jaxtyping import Float
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from extrags.array_files import load_safetensors
+from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config.base import StageConfig
 from extrags.devices import chosen_device
 from extrags.errors import ConfigError, WeightsError
@@ -193,22 +193,13 @@ def _train(
             training.step(batch)
             now = time.monotonic()
             if checkpoint is not None and now - written > config.checkpoint_seconds:
-                _write_checkpoint(training, checkpoint)
+                save_safetensors(checkpoint, training.state())
                 written = now
             if now - begun > config.most_seconds:
                 break
         following.cancel()
     if checkpoint is not None:
-        _write_checkpoint(training, checkpoint)
-
-
-def _write_checkpoint(training: NetworkTraining, file: Path) -> None:
-    from safetensors.torch import save_file
-
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_suffix(".partial")
-    save_file(training.state(), str(partial))
-    partial.replace(file)
+        save_safetensors(checkpoint, training.state())
 
 
 def _go_on(training: NetworkTraining, file: Path) -> None:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from extrags.array_files import load_safetensors
+from extrags.array_files import load_safetensors, save_safetensors
 from extrags.cameras import Cameras
 from extrags.config import PipelineConfig
 from extrags.depth.hidden import SOLID, reading_inputs, reading_size, shrunk, shrunk_intrinsics
@@ -148,13 +148,7 @@ class HiddenDepthExamples:
             path: the file.
             origin: what the examples were made from, read by `made_from`.
         """
-        from safetensors.torch import save_file
-
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial")
-        tensors = {name: getattr(self, name).contiguous() for name in self.__dataclass_fields__}
-        save_file(tensors, str(partial), {"origin": origin})
-        partial.replace(path)
+        save_safetensors(path, dict(vars(self)), {"origin": origin})
 
     @classmethod
     def load(cls, path: Path) -> HiddenDepthExamples:

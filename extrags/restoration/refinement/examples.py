@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrags.array_files import load_safetensors
+from extrags.array_files import load_safetensors, save_safetensors
 from extrags.errors import CaptureError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import SIZE_MULTIPLE
@@ -92,12 +92,7 @@ class RefinementExamples:
 
     def save(self, path: Path) -> None:
         """Write one safetensors file."""
-        from safetensors.torch import save_file
-
-        partial = path.with_suffix(".partial")
-        tensors = {name: getattr(self, name).contiguous() for name in self.__dataclass_fields__}
-        save_file(tensors, str(partial))
-        partial.replace(path)
+        save_safetensors(path, dict(vars(self)))
 
     @classmethod
     def load(cls, path: Path) -> RefinementExamples:

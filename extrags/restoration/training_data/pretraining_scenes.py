@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float, Int, UInt8
 from torch.nn import functional
 
+from extrags.array_files import save_safetensors
 from extrags.cameras import Cameras
 from extrags.config import PipelineConfig
 from extrags.errors import ShapeError, WeightsError
@@ -115,8 +116,6 @@ class PretrainingScene:
             path: the file.
             origin: what the scene was made from, read by `made_from`.
         """
-        from safetensors.torch import save_file
-
         light = self.transfer.light
         tensors = {
             "layers": self.pairs.layers.data.half(),
@@ -142,14 +141,8 @@ class PretrainingScene:
             "reference_distance": None if light is None else light.reference_distance,
             "texel_mm": None if self.texture is None else self.texture.texel_mm,
         }
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial")
-        save_file(
-            {k: v.contiguous() for k, v in tensors.items()},
-            str(partial),
-            {"scales": json.dumps(scales), "origin": origin, "version": str(PRETRAINING_DATA_VERSION)},
-        )
-        partial.replace(path)
+        about = {"scales": json.dumps(scales), "origin": origin, "version": str(PRETRAINING_DATA_VERSION)}
+        save_safetensors(path, tensors, about)
 
     @staticmethod
     def made_from(path: Path) -> str | None:

@@ -1,0 +1,30 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from extrags.array_files import load_safetensors, save_safetensors
+
+
+def test_tensors_of_any_layout_come_back(tmp_path: Path) -> None:
+    values = torch.arange(6.0).reshape(2, 3)
+    save_safetensors(tmp_path / "new" / "x.safetensors", {"turned": values.T, "half": values.half()})
+    found = load_safetensors(tmp_path / "new" / "x.safetensors")
+    assert torch.equal(found["turned"], values.T)
+    assert found["half"].dtype == torch.float16
+
+
+def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "x.safetensors"
+    save_safetensors(file, {"a": torch.ones(3)})
+
+    def full(tensors: dict[str, torch.Tensor], name: str, metadata: dict[str, str] | None) -> None:
+        Path(name).write_bytes(b"half of it")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr("safetensors.torch.save_file", full)
+    with pytest.raises(OSError, match="no space left"):
+        save_safetensors(file, {"a": torch.zeros(3)})
+    assert torch.equal(load_safetensors(file)["a"], torch.ones(3))
