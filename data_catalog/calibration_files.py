@@ -2,7 +2,8 @@
 
 * OpenCV: YAML, XML or JSON of `cv::FileStorage` with `camera_matrix` and `distortion_coefficients` (0, 4, 5,
   8 or more numbers; with 4 and `fisheye_model: 1` the Kannala-Brandt fisheye), and `image_width` and
-  `image_height`, without which the calibration holds for the images as they are.
+  `image_height`, without which the calibration holds for the images as they are. Numbers are a matrix of
+  OpenCV's, a plain list, or what ROS writes (`rows`, `cols`, `data`, and `distortion_model`).
 * Kalibr: the `camchain.yaml` with the camera `cam0`: pinhole with radtan, equidistant, fov or no distortion.
 * Scaramuzza: `calib_results.txt` of OCamCalib, a polynomial of fourth degree.
 
@@ -30,17 +31,26 @@ from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
 
-__all__ = ["read_calibration", "with_calibration_file"]
+__all__ = ["CALIBRATION_VERSION", "read_calibration", "with_calibration_file"]
+
+CALIBRATION_VERSION = 2
+"""Raised by hand whenever the same file gives another camera."""
 
 _PROPORTION_TOLERANCE = 0.005
 _OPENCV_NAMES = {
     "K": ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K"),
-    "D": ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "D"),
+    "D": (
+        *("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "dist_coeff"),
+        *("distortion_coeffs", "distortion", "dist", "D"),
+    ),
     "width": ("image_width", "image_Width"),
     "height": ("image_height", "image_Height"),
     "fisheye": ("fisheye_model",),
+    "model": ("distortion_model",),
 }
 _OPENCV_COUNTS = (0, 4, 5, 8, 12, 14)
+_ROS_FISHEYES = ("equidistant", "fisheye")
+_ROS_MODELS = ("plumb_bob", "rational_polynomial", *_ROS_FISHEYES)
 _KALIBR_MODELS = {
     "none": ("PINHOLE", 0),
     "radtan": ("OPENCV", 4),
@@ -154,11 +164,19 @@ def _scaled(found: _Described, width: int, height: int, file: Path) -> Lens:
 
 def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
     storage = read_file_storage(text, file)
-    K, D = (_matrix(storage, name) for name in ("K", "D"))
+    K, D = (_matrix(storage, name, file) for name in ("K", "D"))
     width, height = (_whole(storage, name) or size for name, size in (("width", width), ("height", height)))
-    fisheye = bool(_whole(storage, "fisheye"))
-    if K is None or K.shape != (3, 3):
+    fisheye = bool(_whole(storage, "fisheye")) or _ros_model(storage, file) in _ROS_FISHEYES
+    if K is None or K.size != 9:
         raise SourceError("expected a matrix of 3 x 3 numbers", file=file, field="camera_matrix")
+    K = K.reshape(3, 3)
+    unread = [name for name in storage if "dist" in name.lower() and name not in _OPENCV_NAMES["model"]]
+    if D is None and unread:
+        raise SourceError(
+            f"expected this name for the distortion; {unread[0]!r} is not known here",
+            file=file,
+            field="distortion_coefficients",
+        )
     terms = () if D is None else tuple(float(value) for value in D.reshape(-1))
     if len(terms) not in _OPENCV_COUNTS or (fisheye and len(terms) != 4):
         expected = "4" if fisheye else ", ".join(map(str, _OPENCV_COUNTS))
@@ -189,9 +207,39 @@ def _node(storage: Mapping[str, Any], key: str) -> Any:
     return next((storage[name] for name in _OPENCV_NAMES[key] if name in storage), None)
 
 
-def _matrix(storage: Mapping[str, Any], key: str) -> np.ndarray | None:
-    found = _node(storage, key)
-    return found if isinstance(found, np.ndarray) else None
+def _matrix(storage: Mapping[str, Any], key: str, file: Path) -> np.ndarray | None:
+    """Numbers of an entry: a matrix, a list of them or of rows, or what ROS writes; None without the entry.
+
+    Raises:
+        SourceError: there is an entry that is none of these.
+    """
+    name = next((name for name in _OPENCV_NAMES[key] if name in storage), None)
+    if name is None or isinstance(storage[name], np.ndarray):
+        return None if name is None else storage[name]
+    found, shape = storage[name], None
+    try:
+        if isinstance(found, Mapping):
+            shape, found = (int(found["rows"]), int(found["cols"])), found["data"]
+        # A list of numbers in XML.
+        listed = found.split() if isinstance(found, str) else found
+        numbers = np.array(listed, dtype=np.float64)
+        if not np.isfinite(numbers).all():
+            raise ValueError("not all of them are finite")
+        return numbers if shape is None else numbers.reshape(shape)
+    except (KeyError, OverflowError, TypeError, ValueError) as error:
+        raise SourceError(f"expected numbers: {error}", file=file, field=name) from error
+
+
+def _ros_model(storage: Mapping[str, Any], file: Path) -> str | None:
+    """What ROS calls the model of the distortion; None where the file does not say."""
+    model = _node(storage, "model")
+    if model is None:
+        return None
+    if model not in _ROS_MODELS:
+        raise SourceError(
+            f"found {model!r}; expected {', '.join(_ROS_MODELS)}", file=file, field="distortion_model"
+        )
+    return str(model)
 
 
 def _whole(storage: Mapping[str, Any], key: str) -> int:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from data_catalog.c3vd.dataset import C3vdDataset
+from data_catalog.calibration_files import CALIBRATION_VERSION
 from data_catalog.caverns.dataset import CAVERNS
 from data_catalog.checks import check_sequence
 from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
@@ -140,7 +141,7 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
         Plain JSON: for phantom and caverns their settings and generator version; for a folder the reader's
         name and version, and name, size and BLAKE2b digest of each file the reader looks at; for two videos
         under a split manifest the same of both, and the manifest's line. Where the settings name a
-        calibration file, size and digest of it.
+        calibration file, size and digest of it, and the version of what reads it.
 
     Raises:
         SourceError: the folder is not readable as a sequence.
@@ -154,7 +155,8 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
     file = Path(config.calibration).expanduser()
     if not file.is_file():
         raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
-    return found | {"calibration": file_digests([("calibration", file)])}
+    told = {"calibration": file_digests([("calibration", file)]), "calibration_version": CALIBRATION_VERSION}
+    return found | told
 
 
 def _scaled(sequence: EndoscopicSequence, mm_per_unit: float) -> EndoscopicSequence:

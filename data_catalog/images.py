@@ -36,6 +36,8 @@ BITS_PER_SAMPLE = 258
 """Tag of TIFF."""
 COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _MASK_THRESHOLD = 127
+_LOSSY_SUFFIXES = (".jpg", ".jpeg")
+"""Their black is not all of one value: they hold no labels."""
 # Neighbouring depths that differ by more than this share lie on different surfaces.
 _FOLD_STEP = 0.05
 
@@ -99,13 +101,33 @@ def image_size(file: Path, *, frame: object = None) -> tuple[int, int]:
 
 
 def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
-    """Read a mask: white is tissue.
+    """Read a mask: white is tissue, or in an image of two labels the one that is not 0.
 
     Raises:
         SourceNotFoundError: there is no such file.
-        SourceError: the file is truncated or no image.
+        SourceError: the file is truncated or no image, has several values of which none is white, or all that
+            differs is how opaque it is.
     """
-    return np.asarray(_opened(file, frame, "mask", mode="L")) > _MASK_THRESHOLD
+    values = _opened(file, frame, "mask", mode="L")
+    found = np.unique(values)
+    if len(found) == 1 and len(np.unique(_opened(file, frame, "mask", mode="LA")[..., 1])) > 1:
+        raise SourceError(
+            "one colour throughout, and opaque in parts; expected white where tissue is, and black",
+            file=file,
+            frame=frame,
+            field="mask",
+        )
+    if found[-1] > _MASK_THRESHOLD or file.suffix.lower() in _LOSSY_SUFFIXES:
+        return np.asarray(values > _MASK_THRESHOLD)
+    if found[-1] > 1 and (len(found) > 2 or found[0] > 0):
+        raise SourceError(
+            f"{len(found)} values, of which {found[-1]} of 255 is the largest; expected white where tissue "
+            "is, and black, or two labels of which one is 0",
+            file=file,
+            frame=frame,
+            field="mask",
+        )
+    return np.asarray(values > 0)
 
 
 def read_depth(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:

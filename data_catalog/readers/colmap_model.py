@@ -3,11 +3,13 @@
 ::
 
     my_scene/
-        sparse/0/{cameras,images,points3D}.bin      or .txt; also sparse/, colmap/sparse/0/, or beside images/
+        sparse/0/{cameras,images,points3D}.bin      or .txt; also sparse/, colmap/sparse/0/, beside images/;
+                                                    of dense/sparse/, all that follows lies in dense/
         images/NAME                                 as named in the model; also rgb/, or the folder itself
         masks/NAME.png                              optional: COLMAP's camera masks, white is tissue
         stereo/depth_maps/NAME.geometric.bin        optional: COLMAP's depth maps, z-depth in the model's unit
-        train_list.txt, test_list.txt               optional: held-out frames by name, one to a line
+        train_list.txt, test_list.txt               optional: frames by name, one to a line; those in neither
+                                                    of two lists are left out
         length_unit.txt                             optional: `mm`; otherwise the scale is arbitrary
 
 COLMAP's poses are camera-from-world in OpenCV axes with pixel centres at +0.5; they are inverted once on
@@ -31,7 +33,7 @@ from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
-from data_catalog.readers.frame_list import present_frames, split_by_name
+from data_catalog.readers.frame_list import listed_split, present_frames
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
@@ -84,6 +86,12 @@ def _recognises(folder: Path) -> bool:
     return folder.is_dir() and model_folder(folder) is not None
 
 
+def _workspace(folder: Path, model: Path) -> Path:
+    """Where images, masks, depth and lists of a model lie: those of undistorted cameras are in dense/."""
+    dense = folder / "dense"
+    return dense if model.is_relative_to(dense) else folder
+
+
 def _image_root(folder: Path, names: list[str]) -> Path:
     places = [folder / "images", folder / "rgb", folder]
     existing = [place for place in places if place.is_dir()]
@@ -94,6 +102,7 @@ def _files(folder: Path) -> list[Path]:
     model = model_folder(folder)
     if model is None:
         return []
+    folder = _workspace(folder, model)
     fixed = [folder / name for name in (LENGTH_UNIT_FILE, "train_list.txt", "test_list.txt")]
     fixed += [
         model / f"{name}.{suffix}" for name in ("cameras", "images", "points3D") for suffix in ("bin", "txt")
@@ -111,6 +120,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     place = model_folder(folder)
     if place is None:
         raise SourceNotFoundError("no COLMAP model in this folder", file=folder)
+    folder = _workspace(folder, place)
     model = read_model(place)
     pose_file = next(file for file in (place / "images.bin", place / "images.txt") if file.is_file())
     listed = sorted(model.images, key=lambda image: natural_key(image.name))
@@ -123,9 +133,9 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         for image in listed
     }
     present = present_frames(files, config.max_absent_share, listing=pose_file)
-    images = [image for image in listed if image.name in present]
-    recordings = sorted({str(Path(image.name).parent) for image in images}, key=natural_key)
     splits = _splits(folder, listed)
+    images = [image for image in listed if image.name in present and (not splits or image.name in splits)]
+    recordings = sorted({str(Path(image.name).parent) for image in images}, key=natural_key)
     frames = [
         PosedFrame(
             name=image.name,
@@ -152,7 +162,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="colmap",
-    version=3,
+    version=4,
     summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/readers/colmap_model.py",
     recognises=_recognises,
     files=_files,
@@ -310,27 +320,26 @@ def _is_metric(folder: Path) -> bool:
 def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train", "test"]]:
     known = {image.name for image in images}
     file = folder / "test_list.txt"
-    if not file.is_file():
-        return {}
-    held_out = _listed(file) - {""}
-    unknown = sorted(held_out - known, key=natural_key)
+    training, held_out = _listed(folder / "train_list.txt"), _listed(file)
+    unknown = sorted((held_out or set()) - known, key=natural_key)
     if unknown:
         raise SourceError(
-            f"{len(unknown)} of {len(held_out)} held-out images have no pose in the model; take them out "
-            "of the list or register them",
+            f"{len(unknown)} of {len(held_out or ())} held-out images have no pose in the model; take them "
+            "out of the list or register them",
             file=file,
             frame=unknown[0],
             field="split",
         )
-    listed = folder / "train_list.txt"
-    training = _listed(listed) if listed.is_file() else known - held_out
     # The list may name more than the model holds.
-    return split_by_name(known - held_out | (training & held_out), held_out, file=file)
+    return listed_split(known, training & known if training else None, held_out, file=file)
 
 
-def _listed(file: Path) -> set[str]:
+def _listed(file: Path) -> set[str] | None:
+    """Names in a list, one to a line; None where there is no such file."""
+    if not file.is_file():
+        return None
     try:
-        return set(file.read_text(encoding="utf-8").split("\n"))
+        return {line.removesuffix("\r") for line in file.read_text(encoding="utf-8").split("\n")} - {"", "\r"}
     except UnicodeDecodeError as error:
         raise SourceError(f"not a text file: {error}", file=file, field="split") from error
 

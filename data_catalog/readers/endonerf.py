@@ -121,7 +121,7 @@ def _notes(folder: Path) -> tuple[str, ...]:
 
 READER = FolderReader(
     name="endonerf",
-    version=3,
+    version=4,
     summary=f"{POSES_FILE} with images/ (and depth/, masks/) as EndoNeRF and StereoMIS have them",
     recognises=_recognises,
     files=_files,

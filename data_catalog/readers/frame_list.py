@@ -14,7 +14,7 @@ from jaxtyping import Float
 from data_catalog.images import natural_key
 from extrags.errors import SourceError, SourceNotFoundError
 
-__all__ = ["load_frame_list", "matrix_of", "present_frames", "split_by_name"]
+__all__ = ["listed_split", "load_frame_list", "matrix_of", "present_frames"]
 
 logger = logging.getLogger(__name__)
 
@@ -126,14 +126,33 @@ def matrix_of(
     return matrix
 
 
-def split_by_name(
-    training: Collection[str], held_out: Collection[str], *, file: Path
+def listed_split(
+    known: Collection[str],
+    training: Collection[str] | None,
+    held_out: Collection[str] | None,
+    *,
+    file: Path,
 ) -> dict[str, Literal["train", "test"]]:
-    """The part of each frame that a split names.
+    """The part of each frame that lists name; frames that neither of two lists names are left out.
+
+    Args:
+        known: names of all frames.
+        training: names listed to train on; None, without a list, is all that are not held out.
+        held_out: names listed to evaluate on; None, without a list, is all that are not to train on.
+        file: named in messages.
+
+    Returns:
+        Part by name, of the frames that have one; empty where nothing is said.
 
     Raises:
-        SourceError: a frame stands in both parts.
+        SourceError: a frame stands in both lists.
     """
+    if held_out is None:
+        held_out = set(known) - set(known if training is None else training)
+        if not held_out:
+            return {}
+    if training is None:
+        training = set(known) - set(held_out)
     both = sorted(set(held_out) & set(training), key=natural_key)
     if both:
         raise SourceError(
@@ -141,6 +160,15 @@ def split_by_name(
             file=file,
             frame=both[0],
             field="split",
+        )
+    neither = sorted(set(known) - set(held_out) - set(training), key=natural_key)
+    if neither:
+        logger.warning(
+            "%s: %d of %d frames are neither to train on nor to evaluate on and left out; the first is %s",
+            file,
+            len(neither),
+            len(known),
+            neither[0],
         )
     parts: dict[str, Literal["train", "test"]] = dict.fromkeys(held_out, "test")
     return parts | dict.fromkeys(training, "train")

@@ -2,9 +2,9 @@
 
 Images lie in the folder itself, or in `images/` or `rgb/` below it, and are taken in natural order (9 before
 10). Optional beside them: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or
-`field_of_view_deg` (horizontal), in pixels of the files with centres at +0.5; and `mask.png` (white is
-tissue). Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log: the
-sequence's intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A
+`field_of_view_deg` (horizontal), in pixels of the files with centres at +0.5, of a pinhole; and `mask.png`
+(white is tissue). Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the
+log: the sequence's intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A
 calibration file (`ingest.calibration`) may stand in for both. Without a mask, the dark frame round the
 picture is found from all frames: dark everywhere, always, and joined to the image border; so are a round
 picture and burnt-in text (`data_catalog.content`).
@@ -14,7 +14,9 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
@@ -35,6 +37,8 @@ __all__ = ["INTRINSICS_FILE", "READER", "read_intrinsics"]
 logger = logging.getLogger(__name__)
 
 INTRINSICS_FILE = "intrinsics.json"
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+_SIZES = (("width", "height"), ("w", "h"))
 _NOT_FRAMES = ("mask.png",)
 
 
@@ -64,6 +68,10 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     K = read_intrinsics(folder, width, height, guess_is_used=config.calibration is None)
     lens = Lens.pinhole(K, width, height)
     mask_file = folder / "mask.png"
+    if not mask_file.is_file():
+        for place in (folder / "mask", folder / "masks"):
+            if place.is_dir():
+                logger.warning("%s is not read; of plain frames, one mask.png holds for all", place)
     return SourceFrames(
         frames=[
             PosedFrame(file.name, file, lens, mask_file=mask_file if mask_file.is_file() else None)
@@ -98,7 +106,7 @@ class _ContentMask:
 
 READER = FolderReader(
     name="frames",
-    version=5,
+    version=6,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
@@ -136,6 +144,7 @@ def read_intrinsics(
         )
     try:
         content = json.loads(file.read_text())
+        _check_described(content, width, height, file)
         if "K" in content:
             K = np.asarray(content["K"], dtype=np.float64)
         elif "field_of_view_deg" in content:
@@ -160,3 +169,29 @@ def read_intrinsics(
         raise SourceError(f"found shape {K.shape}; expected 3 x 3 numbers", file=file, field="K")
     check_intrinsics(K, width, height, file=file)
     return K
+
+
+def _check_described(content: dict[str, Any], width: int, height: int, file: Path) -> None:
+    """Refuse what would otherwise be passed over: a lens that is no pinhole, and another size.
+
+    Raises:
+        SourceError: names the entry.
+    """
+    for name, value in content.items():
+        is_model = name in ("camera_model", "model") and str(value).upper() not in _PINHOLES
+        is_term = "dist" in name.lower() or re.fullmatch(r"[kp][1-6]", name) is not None
+        if is_model or (is_term and np.any(np.asarray(value) != 0)):
+            raise SourceError(
+                f"{json.dumps(value)}; expected a pinhole here. A lens with distortion is told by a "
+                "calibration file (ingest.calibration)",
+                file=file,
+                field=name,
+            )
+    for names in _SIZES:
+        told = [content.get(name) for name in names]
+        if None not in told and told != [width, height]:
+            raise SourceError(
+                f"for images of {told[0]} x {told[1]} pixels; found {width} x {height}",
+                file=file,
+                field=names[0],
+            )

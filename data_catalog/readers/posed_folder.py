@@ -24,19 +24,22 @@
 
 Camera axes are OpenCV's (x right, y down, z forward), matrices map camera to world, row by row; K is in
 pixels of the files with pixel centres at +0.5. Every image in `rgb/` needs an entry, every entry an image.
-Depth is looked for as `depth/<stem>.npy|.tiff|.tif|.png`, for all frames or for none. Frames without `split`
-are split by holding out every n-th. Nothing is turned or scaled; where depth shows that the poses are in
-other axes, the sequence is refused and the axes that fit are named.
+Depth is looked for as `depth/<name>.npy|.tiff|.tif|.png`, for all frames or for none, and masks as
+`mask/<name>` with the suffix of any image; <name> is the path below `rgb/`, else its last part, without
+suffix. No two frames share a file. Frames without a mask are tissue throughout, which the log says.
+Frames without `split` are split by holding out every n-th. Nothing is turned or scaled; where depth shows
+that the poses are in other axes, the sequence is refused and the axes that fit are named.
 """
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
 from data_catalog.checks import check_intrinsics
 from data_catalog.folder_reader import FolderReader
-from data_catalog.images import colour_files, image_size
+from data_catalog.images import COLOUR_SUFFIXES, colour_files, image_size
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frame_list import load_frame_list, matrix_of
@@ -45,6 +48,8 @@ from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
 
 __all__ = ["POSES_FILE", "READER"]
+
+logger = logging.getLogger(__name__)
 
 POSES_FILE = "poses.json"
 _DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
@@ -60,7 +65,7 @@ def _files(folder: Path) -> list[Path]:
     found = {file}
     for part in ("rgb", "depth", "mask"):
         if (folder / part).is_dir():
-            found |= set((folder / part).iterdir())
+            found |= set((folder / part).rglob("*"))
     # Images may lie elsewhere below the folder.
     for entry in load_frame_list(file, "file")["frames"]:
         found.add(inside(folder, entry["file"], file=file, frame=entry["file"], field="file"))
@@ -73,7 +78,8 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     entries = content["frames"]
     _check_count(folder, entries)
     _check_splits(entries, file)
-    depth_files = _depth_files(folder, entries)
+    names = [entry["file"] for entry in entries]
+    depth_files, mask_files = _depth_files(folder, names), _mask_files(folder, names)
     return SourceFrames(
         frames=[
             PosedFrame(
@@ -83,8 +89,8 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
                 world_from_camera=matrix_of(
                     entry, "world_from_camera", 4, file=file, frame=entry["file"], error=PoseError
                 ),
-                mask_file=_mask_file(folder, entry["file"]),
-                depth_file=depth_files[index] if depth_files else None,
+                mask_file=mask_files[index],
+                depth_file=depth_files[index],
                 recording=int(entry.get("recording", 0)),
                 split=entry.get("split"),
             )
@@ -97,7 +103,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="extrags",
-    version=3,
+    version=4,
     summary=f"{POSES_FILE} with rgb/ (and depth/, mask/), described in data_catalog/readers/posed_folder.py",
     recognises=_recognises,
     files=_files,
@@ -141,22 +147,61 @@ def _check_count(folder: Path, frames: list[dict[str, Any]]) -> None:
         )
 
 
-def _depth_files(folder: Path, frames: list[dict[str, Any]]) -> list[Path]:
+def _beside(folder: Path, part: str, names: list[str], suffixes: tuple[str, ...]) -> list[Path | None]:
+    """The file of each frame below `part`: at the same path as below rgb/, else with the same last part.
+
+    Raises:
+        SourceError: two frames would share a file.
+    """
+    found: list[Path | None] = []
+    owner: dict[Path, str] = {}
+    for name in names:
+        inner = Path(name).relative_to("rgb") if Path(name).is_relative_to("rgb") else Path(name)
+        stems = dict.fromkeys((inner.with_suffix(""), Path(inner.stem)))
+        places = [folder / part / f"{stem}{suffix}" for stem in stems for suffix in suffixes]
+        file = next((place for place in places if place.is_file()), None)
+        if file is not None and owner.setdefault(file, name) != name:
+            raise SourceError(
+                f"this file would belong to {owner[file]} as well; expected one for each at the path of its "
+                f"frame, as {part}/{inner.with_suffix(file.suffix).as_posix()}",
+                file=file,
+                frame=name,
+                field=part,
+            )
+        found.append(file)
+    return found
+
+
+def _depth_files(folder: Path, names: list[str]) -> list[Path | None]:
     if not (folder / "depth").is_dir():
-        return []
-    found = []
-    for entry in frames:
-        stem = Path(entry["file"]).stem
-        candidates = [folder / "depth" / f"{stem}{suffix}" for suffix in _DEPTH_SUFFIXES]
-        existing = next((file for file in candidates if file.is_file()), None)
-        if existing is None:
+        return [None] * len(names)
+    found = _beside(folder, "depth", names, _DEPTH_SUFFIXES)
+    for name, file in zip(names, found, strict=True):
+        if file is None:
             raise SourceNotFoundError(
                 "no depth for this frame; expected it for all frames, or no folder depth/ at all",
-                file=candidates[0],
-                frame=entry["file"],
+                file=folder / "depth" / f"{Path(name).stem}{_DEPTH_SUFFIXES[0]}",
+                frame=name,
                 field="depth",
             )
-        found.append(existing)
+    return found
+
+
+def _mask_files(folder: Path, names: list[str]) -> list[Path | None]:
+    if not (folder / "mask").is_dir():
+        if (folder / "masks").is_dir():
+            logger.warning("%s is not read; masks are looked for in mask/", folder / "masks")
+        return [None] * len(names)
+    found = _beside(folder, "mask", names, COLOUR_SUFFIXES)
+    without = [name for name, file in zip(names, found, strict=True) if file is None]
+    if without:
+        logger.warning(
+            "%s: %d of %d frames have no mask and are tissue throughout; the first is %s",
+            folder / "mask",
+            len(without),
+            len(names),
+            without[0],
+        )
     return found
 
 
@@ -180,8 +225,3 @@ def _lens(folder: Path, entry: dict[str, Any], content: dict[str, Any], file: Pa
     K = matrix_of(entry if "K" in entry else content, "K", 3, file=file, frame=frame)
     check_intrinsics(K, width, height, frame=frame, file=file)
     return Lens.pinhole(K, width, height)
-
-
-def _mask_file(folder: Path, frame: str) -> Path | None:
-    file = folder / "mask" / f"{Path(frame).stem}.png"
-    return file if file.is_file() else None

@@ -81,7 +81,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="sinus",
-    version=1,
+    version=2,
     summary="motion.yaml, structure.ply and images/ of the Hopkins sinus set",
     recognises=_recognises,
     files=_files,

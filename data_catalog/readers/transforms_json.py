@@ -4,8 +4,8 @@ Read: `transform_matrix` (camera to world, OpenGL axes: y up, z backward; turned
 nothing else), `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`, `cx`, `cy`, `w`, `h`, `k1` to `k4`, `p1`,
 `p2`, `camera_model` or `is_fisheye`, each for all frames or in a frame of its own; `file_path` (its suffix
 may be missing; frames without a file are left out, with a warning), `mask_path` (white is tissue),
-`depth_file_path`; `train_filenames`, `test_filenames` and `val_filenames`; `ply_file_path`. Images of
-distorted cameras are resampled to a pinhole.
+`depth_file_path`; `train_filenames`, `test_filenames` and `val_filenames` (frames in none of them are left
+out); `ply_file_path`. Images of distorted cameras are resampled to a pinhole.
 
 Depth is z-depth; a value times `depth_unit_scale_factor` is in the unit of the poses. Where the file does not
 say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). 0 is unknown.
@@ -30,7 +30,7 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, image_size, natural_key, read_depth, save_images
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
-from data_catalog.readers.frame_list import load_frame_list, matrix_of, present_frames, split_by_name
+from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
 from extrags.array_files import load_ply_vertices
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
@@ -81,8 +81,9 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         name = entry["file_path"]
         files[name] = _with_suffix(inside(folder, name, file=file, frame=name, field="file_path"))
     present = present_frames(files, config.max_absent_share, listing=file)
-    entries = [entry for entry in listed if entry["file_path"] in present]
     splits = _splits(content, file)
+    used = present & splits.keys() if splits else present
+    entries = [entry for entry in listed if entry["file_path"] in used]
     folders = sorted({str(Path(entry["file_path"]).parent) for entry in entries}, key=natural_key)
     frames = []
     for entry in entries:
@@ -97,7 +98,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
                 mask_file=_beside(folder, entry, "mask_path", frame),
                 depth_file=_beside(folder, entry, "depth_file_path", frame),
                 recording=folders.index(str(Path(frame).parent)),
-                split=None if splits is None else splits.get(frame, "train"),
+                split=splits.get(frame),
             )
         )
     points, points_rgb = _points(folder, content, file)
@@ -119,7 +120,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="transforms",
-    version=3,
+    version=4,
     summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in "
     "data_catalog/readers/transforms_json.py",
     recognises=_recognises,
@@ -304,8 +305,8 @@ def _depth_factor(content: dict[str, Any], depth_file: Path, file: Path) -> floa
     return factor
 
 
-def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "test"]] | None:
-    """Splits by `file_path`; None where the file names none. Validation frames are held out too."""
+def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "test"]]:
+    """Splits by `file_path`; empty where the file names none. Validation frames are held out too."""
     for key in ("train_filenames", "test_filenames", "val_filenames"):
         named = content.get(key) or []
         if not isinstance(named, list) or not all(isinstance(name, str) for name in named):
@@ -313,16 +314,14 @@ def _splits(content: dict[str, Any], file: Path) -> dict[str, Literal["train", "
     held_out = [
         name for key in ("test_filenames", "val_filenames") for name in content.get(key) or [] if name
     ]
-    if not held_out:
-        return None
     known = {entry["file_path"] for entry in content["frames"]}
-    training = set(content.get("train_filenames") or known - set(held_out))
+    training = content.get("train_filenames") or []
     for listed in [*held_out, *sorted(training, key=natural_key)]:
         if listed not in known:
             raise SourceError(
                 "the split names this frame, but `frames` does not", file=file, frame=listed, field="split"
             )
-    return split_by_name(training, held_out, file=file)
+    return listed_split(known, training or None, held_out or None, file=file)
 
 
 def _points(

@@ -7,7 +7,8 @@ picture's outline and burnt-in text are found. How frames are chosen: `data_cata
 
 Frames are decoded by FFmpeg through PyAV: upright (a rotation in the container is applied), 8 bit a channel
 whatever the depth of the file, at the timestamps of the container, which may be uneven. Pixels that are not
-square (standard definition) stay as they are; the intrinsics say so. OpenCV's own FFmpeg would not do: of
+square (standard definition) stay as they are; the intrinsics say so. Colours of a file that does not name its
+matrix are BT.709 in high definition and BT.601 otherwise, as in players. OpenCV's own FFmpeg would not do: of
 every video whose header says that it is interlaced, OpenCV 5.0 gives empty pictures, without an error.
 """
 
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import FootageFrame, TimeSpan
@@ -37,6 +39,10 @@ logger = logging.getLogger(__name__)
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".mxf", ".y4m")
 _MIN_DECODED = 0.9
 _USUAL_FRAMES_PER_S = 25.0
+_UNSPECIFIED_COLOUR = 2
+"""What FFmpeg says of a matrix of colours that the file does not name."""
+_HIGH_DEFINITION_PX = (1280, 577)
+"""From so many columns, or rows, players take such a matrix for BT.709, below for BT.601."""
 
 
 class VideoFile:
@@ -109,7 +115,7 @@ class VideoFile:
                 if time_s >= span.end_s or (last is not None and number > last):
                     return
                 if time_s in span and (numbers is None or number in numbers):
-                    rgb = np.rot90(frame.to_ndarray(format="rgb24"), self._quarter_turns)
+                    rgb = np.rot90(_colours(frame), self._quarter_turns)
                     yield FootageFrame(number, time_s, np.ascontiguousarray(rgb))
         if numbers is None:
             self._check_whole(count, time_s)
@@ -177,7 +183,7 @@ def _frames(place: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="video",
-    version=3,
+    version=4,
     summary="a video file (mp4, avi, mov, mkv, ...), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,
@@ -205,6 +211,15 @@ def _opened(file: Path, named: Path) -> Iterator[tuple[Any, Any]]:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         yield container, stream
+
+
+def _colours(frame: Any) -> UInt8[np.ndarray, "h w 3"]:
+    """A decoded frame as RGB, by the matrix that the file names, else by the one that players take."""
+    from av.video.reformatter import Colorspace
+
+    large = frame.width >= _HIGH_DEFINITION_PX[0] or frame.height >= _HIGH_DEFINITION_PX[1]
+    guessed = Colorspace.ITU709 if large and frame.colorspace == _UNSPECIFIED_COLOUR else None
+    return np.asarray(frame.reformat(format="rgb24", src_colorspace=guessed).to_ndarray())
 
 
 def _decoded(container: Any, stream: Any) -> Iterator[Any]:

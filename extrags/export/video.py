@@ -94,7 +94,8 @@ def write_video(
 ) -> int:
     """Encode frames as H.264 in MP4, which browsers and players open.
 
-    Sizes are made even, as 4:2:0 colour needs it, by repeating the last row or column.
+    Sizes are made even, as 4:2:0 colour needs it, by repeating the last row or column. Colours are BT.709 of
+    limited range, and the file says so: of what a file does not say, players guess by its size.
 
     Args:
         frames: all of one size.
@@ -112,6 +113,7 @@ def write_video(
     """
     import av
     import av.error
+    from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
     if not 0.1 <= fps <= 1000:
         raise ConfigError(f"{fps:g} frames per second; expected 0.1 to 1000")
@@ -122,6 +124,10 @@ def write_video(
         with av.open(str(file), "w", format="mp4", options={"movflags": "+faststart"}) as container:
             stream = container.add_stream("libx264", rate=rate)
             stream.pix_fmt = "yuv420p"
+            stream.codec_context.colorspace = Colorspace.ITU709
+            stream.codec_context.color_range = ColorRange.MPEG
+            stream.codec_context.color_primaries = ColorPrimaries.BT709
+            stream.codec_context.color_trc = ColorTrc.BT709
             # x264's threads change nothing but the speed; one keeps a shared machine usable.
             stream.options = {"crf": quality, "preset": "medium", "threads": "1"}
             for picture in frames:
@@ -131,7 +137,10 @@ def write_video(
                 if picture.shape[:2] != size:
                     raise ShapeError(f"frame {count} has size {picture.shape[:2]}, the first has {size}")
                 padded = np.pad(picture, ((0, size[0] % 2), (0, size[1] % 2), (0, 0)), mode="edge")
-                for packet in stream.encode(av.VideoFrame.from_ndarray(padded, format="rgb24")):
+                coded = av.VideoFrame.from_ndarray(padded, format="rgb24").reformat(
+                    format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+                )
+                for packet in stream.encode(coded):
                     container.mux(packet)
                 count += 1
             if count == 0:

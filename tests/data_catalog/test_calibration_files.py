@@ -82,6 +82,56 @@ class TestOpenCV:
         expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), K, np.array(terms))[0][:, 0]
         np.testing.assert_allclose(projected(lens, RAYS), expected, atol=1e-9)
 
+    @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+    @pytest.mark.parametrize("name", ["distortion_coefficients", "dist_coeff", "distortion"])
+    def test_a_plain_list_is_distortion_too(self, tmp_path, suffix, name) -> None:
+        path, terms = tmp_path / f"scope.{suffix}", [-0.21, 0.05, 0.002, -0.001, 0.01]
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+        storage.write("camera_matrix", K)
+        storage.startWriteStruct(name, cv2.FILE_NODE_SEQ)
+        for term in terms:
+            storage.write("", term)
+        storage.endWriteStruct()
+        storage.release()
+        expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), K, np.array(terms))[0][:, 0]
+        found = projected(read_calibration(path, WIDTH, HEIGHT), RAYS)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+    @pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+    def test_ros(self, tmp_path, model) -> None:
+        terms = [-0.21, 0.05, 0.002, -0.001, 0.01] if model == "plumb_bob" else [0.03, -0.01, 0.004, -0.001]
+        path = tmp_path / "camera_info.yaml"
+        path.write_text(
+            f"image_width: {WIDTH}\nimage_height: {HEIGHT}\ncamera_name: scope\n"
+            f"camera_matrix:\n  rows: 3\n  cols: 3\n  data: {K.ravel().tolist()}\n"
+            f"distortion_model: {model}\n"
+            f"distortion_coefficients:\n  rows: 1\n  cols: {len(terms)}\n  data: {terms}\n"
+            "rectification_matrix:\n  rows: 3\n  cols: 3\n  data: [1, 0, 0, 0, 1, 0, 0, 0, 1]\n"
+        )
+        if model == "plumb_bob":
+            expected = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), K, np.array(terms))[0][:, 0]
+        else:
+            zeros = np.zeros(3)
+            expected = cv2.fisheye.projectPoints(RAYS[:, None], zeros, zeros, K, np.array(terms))[0][:, 0]
+        found = projected(read_calibration(path, WIDTH, HEIGHT), RAYS)
+        np.testing.assert_allclose(found, expected, atol=1e-9)
+
+    @pytest.mark.parametrize(
+        ("entry", "problem"),
+        [
+            ("lens_distortion: [-0.3, 0.1, 0, 0]", "'lens_distortion' is not known here"),
+            ("distortion_coefficients: none", "expected numbers"),
+            ("distortion_coefficients:", "expected numbers"),
+            ("distortion_coefficients: {rows: 2, cols: 2, data: [0.1]}", "expected numbers"),
+            ("distortion_model: division\ndistortion_coefficients: [0.1, 0, 0, 0]", "found 'division'"),
+        ],
+    )
+    def test_distortion_that_cannot_be_read_is_refused(self, tmp_path, entry, problem) -> None:
+        path = tmp_path / "scope.yml"
+        path.write_text(f"camera_matrix: {K.tolist()}\n{entry}\n")
+        with pytest.raises(SourceError, match=problem):
+            read_calibration(path, WIDTH, HEIGHT)
+
     def test_fisheye(self, tmp_path) -> None:
         terms = [0.03, -0.01, 0.004, -0.001]
         lens = read_calibration(opencv_file(tmp_path / "a.yml", terms, fisheye=True), WIDTH, HEIGHT)

@@ -145,6 +145,20 @@ class TestReading:
         assert found.name == "1"
         assert len(read(tmp_path / "scene")) == 10
 
+    def test_a_dense_workspace_has_its_own_images(self, varied, tmp_path) -> None:
+        """Those beside it are of the cameras before they were undistorted."""
+        write_colmap(varied, tmp_path / "scene" / "dense")
+        beside = tmp_path / "scene" / "images"
+        for file in (tmp_path / "scene" / "dense" / "images").iterdir():
+            image = cv2.imread(str(file))
+            beside.mkdir(exist_ok=True)
+            cv2.imwrite(str(beside / file.name), 255 - image)
+        back = read(tmp_path / "scene")
+        same_frames(back, varied, atol=ROUNDING)
+        np.testing.assert_array_equal(back.rgb, varied.rgb)
+        np.testing.assert_array_equal(back.mask, varied.mask)
+        np.testing.assert_array_equal(back.depth_mm, varied.depth_mm)
+
     def test_images_without_pose_are_left_out_and_said(self, clip, tmp_path, caplog) -> None:
         write_colmap(clip, tmp_path / "scene")
         folder = tmp_path / "scene" / "sparse" / "0"

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from data_catalog.images import read_colour, read_mask
 from extrags.errors import SourceError
@@ -67,3 +68,39 @@ def test_a_tiff_tells_how_many_of_sixteen_bits_it_uses(tmp_path: Path) -> None:
     file = tmp_path / "a.tif"
     file.write_bytes(b"II*\0" + struct.pack("<I", 8 + len(packed)) + packed + directory + bytes(4))
     np.testing.assert_array_equal(read_colour(file)[0, :, 0], [0, 128, 255, 1])
+
+
+class TestMasks:
+    LABELS = np.zeros((20, 30), np.uint8)
+    LABELS[5:, 8:] = 1
+
+    @pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
+    def test_labels_of_nought_and_one(self, tmp_path: Path, kind: type) -> None:
+        labels = self.LABELS.astype(kind)
+        np.testing.assert_array_equal(read_mask(written(tmp_path / "a.tif", labels)), labels > 0)
+
+    def test_all_of_one_label(self, tmp_path: Path) -> None:
+        assert read_mask(written(tmp_path / "a.png", np.ones((20, 30), np.uint8))).all()
+        assert not read_mask(written(tmp_path / "b.png", np.zeros((20, 30), np.uint8))).any()
+
+    def test_a_palette_of_two_colours(self, tmp_path: Path) -> None:
+        image = Image.fromarray(self.LABELS, mode="P")
+        image.putpalette([0, 0, 0, 128, 0, 0])
+        image.save(tmp_path / "a.png")
+        np.testing.assert_array_equal(read_mask(tmp_path / "a.png"), self.LABELS > 0)
+
+    def test_several_labels_are_refused(self, tmp_path: Path) -> None:
+        labels = self.LABELS.copy()
+        labels[15:] = 2
+        with pytest.raises(SourceError, match=r"field mask: 3 values, of which 2 of 255 is the largest"):
+            read_mask(written(tmp_path / "a.png", labels))
+
+    def test_opacity_is_no_mask(self, tmp_path: Path) -> None:
+        image = np.full((20, 30, 4), 255, np.uint8)
+        image[..., 3] = 255 * self.LABELS
+        with pytest.raises(SourceError, match="one colour throughout, and opaque in parts"):
+            read_mask(written(tmp_path / "a.png", image))
+
+    def test_black_of_a_jpeg_is_not_all_of_one_value(self, tmp_path: Path) -> None:
+        noise = np.random.default_rng(0).integers(0, 6, (20, 30), dtype=np.uint8)
+        assert not read_mask(written(tmp_path / "a.jpg", noise)).any()

@@ -142,6 +142,11 @@ class TestFrames:
         assert not sequence.mask[0, :10].any()
         assert sequence.mask[0, 28:32, 38:42].all()  # dark, but not joined to the border
 
+    def test_masks_of_single_frames_are_not_read_and_it_is_said(self, frames, caplog) -> None:
+        (frames / "masks").mkdir()
+        read(frames)
+        assert "masks is not read; of plain frames, one mask.png holds for all" in caplog.text
+
     def test_intrinsics_file(self, frames) -> None:
         (frames / "intrinsics.json").write_text(json.dumps({"fx": 70, "fy": 71, "cx": 41, "cy": 29}))
         sequence = read(frames, IngestConfig(downscale=2))
@@ -154,12 +159,21 @@ class TestFrames:
             ({"fx": 70}, "expected K, or fx"),
             ({"field_of_view_deg": 200}, "200 degrees"),
             ({"K": [[1, 2], [3, 4]]}, "3 x 3"),
+            ({"fx": 70, "fy": 71, "cx": 41, "cy": 29, "k1": -0.3}, r"k1: -0\.3; expected a pinhole"),
+            ({"field_of_view_deg": 80, "dist_coeffs": [0, 0.1]}, r"dist_coeffs: .*ingest\.calibration"),
+            ({"field_of_view_deg": 80, "camera_model": "OPENCV"}, 'camera_model: "OPENCV"; expected a pinh'),
+            ({"field_of_view_deg": 80, "w": 160, "h": 120}, "for images of 160 x 120 pixels; found 80 x 60"),
         ],
     )
     def test_bad_intrinsics(self, frames, content, message) -> None:
         (frames / "intrinsics.json").write_text(json.dumps(content))
         with pytest.raises(SourceError, match=message):
             read(frames)
+
+    def test_a_pinhole_may_be_told_at_length(self, frames) -> None:
+        told = {"fx": 70, "fy": 71, "cx": 41, "cy": 29, "k1": 0, "p2": 0.0, "model": "PINHOLE"}
+        (frames / "intrinsics.json").write_text(json.dumps({**told, "width": 80, "height": 60}))
+        np.testing.assert_allclose(read(frames).K[0], [[70, 0, 41], [0, 71, 29], [0, 0, 1]])
 
     def test_frame_of_another_size(self, frames) -> None:
         Image.fromarray(np.full((50, 80, 3), 99, np.uint8)).save(frames / "frame_3.png")
@@ -201,6 +215,62 @@ class TestPosedFolder:
             Image.fromarray(np.load(file)).save(file.with_suffix(".tiff"))
             file.unlink()
         np.testing.assert_array_equal(read(posed_folder).depth_mm, before)
+
+    def test_masks_below_the_folders_of_their_frames(self, posed_folder, edit_poses) -> None:
+        """Two recordings whose frames have the same names."""
+        for kind in ("rgb", "depth"):
+            for k in range(10):
+                (file,) = (posed_folder / kind).glob(f"{k:04d}.*")
+                place = posed_folder / kind / "ab"[k // 5] / f"{k % 5}{file.suffix}"
+                place.parent.mkdir(exist_ok=True)
+                file.rename(place)
+
+        def moved(content) -> None:
+            for k, entry in enumerate(content["frames"]):
+                entry |= {"file": f"rgb/{'ab'[k // 5]}/{k % 5}.png", "recording": k // 5}
+
+        edit_poses(moved)
+        whole = read(posed_folder)
+        assert whole.mask.mean() > 0.9
+        size = whole.mask.shape[1:]
+        for k in range(10):
+            place = posed_folder / "mask" / "ab"[k // 5] / f"{k % 5}.bmp"
+            place.parent.mkdir(parents=True, exist_ok=True)
+            black = np.zeros(size, np.uint8)
+            black[:, k + 1 :] = 255
+            Image.fromarray(black).save(place)
+        found = read(posed_folder)
+        for k in range(10):
+            assert not found.mask[k, :, : k + 1].any()
+            np.testing.assert_array_equal(found.mask[k, :, k + 1 :], whole.mask[k, :, k + 1 :])
+        np.testing.assert_array_equal(found.depth_mm, whole.depth_mm)
+
+    @pytest.mark.parametrize("kind", ["depth", "mask"])
+    def test_no_two_frames_share_a_file(self, posed_folder, edit_poses, kind) -> None:
+        (posed_folder / "rgb" / "a").mkdir()
+        (posed_folder / "rgb" / "0001.png").rename(posed_folder / "rgb" / "a" / "0000.png")
+        shutil.rmtree(posed_folder / "mask", ignore_errors=True)
+        if kind == "mask":
+            shutil.rmtree(posed_folder / "depth")
+            (posed_folder / "mask").mkdir()
+            size = (48, 40)
+            Image.new("L", size, 255).save(posed_folder / "mask" / "0000.png")
+        edit_poses(lambda content: content["frames"][1].update(file="rgb/a/0000.png"))
+        with pytest.raises(SourceError, match=rf"belong to rgb/0000\.png as well; .* as {kind}/a/0000\."):
+            read(posed_folder)
+
+    def test_masks_that_are_missing_or_elsewhere_are_said(self, posed_folder, caplog) -> None:
+        shutil.rmtree(posed_folder / "mask", ignore_errors=True)
+        size = (48, 40)
+        (posed_folder / "masks").mkdir()
+        Image.new("L", size, 255).save(posed_folder / "masks" / "0000.png")
+        read(posed_folder)
+        assert "masks is not read; masks are looked for in mask/" in caplog.text
+        (posed_folder / "masks").rename(posed_folder / "mask")
+        read(posed_folder)
+        assert (
+            "9 of 10 frames have no mask and are tissue throughout; the first is rgb/0001.png" in caplog.text
+        )
 
     def test_without_depth(self, posed_folder) -> None:
         shutil.rmtree(posed_folder / "depth")

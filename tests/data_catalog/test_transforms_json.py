@@ -167,6 +167,57 @@ class TestReading:
         assert read(folder).test.tolist() == [0, 5]
 
 
+LISTS = [
+    # train, test, held out, left out
+    ([1, 5], [0, 9], [0, 9], [2, 3, 4, 6, 7, 8]),
+    ([0, 1, 2, 3, 4, 5, 6, 7], None, [8, 9], []),
+    (None, [0, 9], [0, 9], []),
+]
+
+
+class TestLists:
+    """What is named to train on, nothing else trains."""
+
+    @pytest.mark.parametrize(("train", "test", "held_out", "left_out"), LISTS)
+    def test_of_transforms(self, folder, edit, caplog, train, test, held_out, left_out) -> None:
+        def lists(content) -> None:
+            names = [entry["file_path"] for entry in content["frames"]]
+            for key, chosen in (("train_filenames", train), ("test_filenames", test)):
+                content[key] = [] if chosen is None else [names[k] for k in chosen]
+
+        names = read(folder).frame_names
+        edit(lists)
+        self.check(read(folder), names, held_out, left_out, caplog.text)
+
+    @pytest.mark.parametrize(("train", "test", "held_out", "left_out"), LISTS)
+    def test_of_colmap(self, clip, tmp_path, caplog, train, test, held_out, left_out) -> None:
+        write_colmap(clip, tmp_path / "scene")
+        names = read(tmp_path / "scene").frame_names
+        for part, chosen in (("train", train), ("test", test)):
+            file = tmp_path / "scene" / f"{part}_list.txt"
+            if chosen is None:
+                file.unlink()
+            else:
+                # As an editor on Windows leaves it.
+                file.write_bytes("".join(f"{names[k]}.png\r\n" for k in chosen).encode())
+        self.check(read(tmp_path / "scene"), names, held_out, left_out, caplog.text)
+
+    def check(self, found, names, held_out, left_out, said) -> None:
+        assert found.frame_names == tuple(name for k, name in enumerate(names) if k not in left_out)
+        assert [found.frame_names[k] for k in found.test] == [names[k] for k in held_out]
+        assert len(found.train) == len(names) - len(held_out) - len(left_out)
+        told = f"{len(left_out)} of {len(names)} frames are neither to train on nor to evaluate on"
+        assert (told in said) == bool(left_out)
+
+    @pytest.mark.parametrize("write", [write_transforms, write_colmap])
+    def test_written_and_read_they_are_the_same(self, write, clip, tmp_path) -> None:
+        sequence = replace(clip, split=Split("manifest", np.array([1, 5]), np.array([0])))
+        write(sequence, tmp_path / "scene")
+        back = read(tmp_path / "scene")
+        assert len(back) == 3
+        assert (back.train.tolist(), back.test.tolist()) == ([1, 2], [0])
+
+
 class TestAbsentFrames:
     """Published scenes list frames that they do not ship."""
 

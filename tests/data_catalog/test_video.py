@@ -7,6 +7,7 @@ import weakref
 from collections.abc import Collection
 from pathlib import Path
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -72,6 +73,36 @@ class TestIntrinsics:
         assert sequence.intrinsics == "given"
         np.testing.assert_allclose(sequence.K[:, 0, 0], 210)
         assert "assuming a horizontal field of view" not in caplog.text
+
+
+class TestColours:
+    """Of files that name their matrix of colours, and of those that do not."""
+
+    @pytest.mark.parametrize(
+        ("size", "matrix", "named"),
+        [
+            ((1280, 720), 1, True),
+            ((1280, 720), 5, True),
+            ((720, 576), 1, True),
+            ((1280, 720), 1, False),
+            ((720, 576), 5, False),
+        ],
+    )
+    def test_what_was_written_is_read(self, tmp_path, size, matrix, named) -> None:
+        file = tmp_path / "a.mp4"
+        colour = np.array((200, 80, 60), np.uint8)
+        with av.open(str(file), "w") as container:
+            stream = container.add_stream("libx264", rate=25, options={"crf": "5"})
+            stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
+            if named:
+                stream.codec_context.colorspace, stream.codec_context.color_range = matrix, 1
+            picture = av.VideoFrame.from_ndarray(np.full((*size[::-1], 3), colour), format="rgb24")
+            coded = picture.reformat(format="yuv420p", dst_colorspace=matrix, dst_color_range=1)
+            for packet in [*stream.encode(coded), *stream.encode(None)]:
+                container.mux(packet)
+        (found,) = VideoFile(file).frames(TimeSpan())
+        # Eight bits of luminance and chrominance.
+        assert np.abs(found.rgb.astype(int) - colour).max() <= 3
 
 
 def calibration_file(folder: Path) -> Path:

@@ -107,3 +107,16 @@ class TestRefused:
     def test_a_folder_that_is_not_there(self, tmp_path: Path) -> None:
         with pytest.raises(StoreError, match=r"none/a\.mp4"):
             write_video(flat(2), tmp_path / "none" / "a.mp4")
+
+
+def test_players_are_told_the_colours(tmp_path: Path) -> None:
+    """Of what is not said they guess by the size: red would be another red from 720 rows on."""
+    picture = np.full((720, 1280, 3), (200, 80, 60), np.uint8)
+    write_video(iter([picture]), tmp_path / "a.mp4")
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        (frame,) = container.decode(video=0)
+        # BT.709 of limited range.
+        assert (frame.colorspace, frame.color_range) == (1, 1)
+        luminance = frame.to_ndarray()[:720]
+    expected = 16 + 219 / 255 * (np.array((0.2126, 0.7152, 0.0722)) @ (200, 80, 60))
+    assert np.abs(luminance - expected).max() < 1.5
