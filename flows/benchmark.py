@@ -171,17 +171,18 @@ def benchmark(
             description=f"{len(cases)} runs",
         )
     )
-    if worse:
-        raise BenchmarkRegressedError(name, worse, report)
     from extrags.metrics.comparison import compare_runs
 
-    return {
+    result = {
         "machine": about,
         "cases": cases,
         "comparison": compare_runs(cases, baseline),
         "regressions": worse,
         "report": report,
     }
+    if worse:
+        raise BenchmarkRegressedError(name, result)
+    return result
 
 
 def check_methods(

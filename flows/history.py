@@ -45,21 +45,31 @@ class Tolerance(BaseModel):
 
     runs: int = Field(5, ge=1, le=100, description="the median of so many last runs is what counts as before")
     at_least: int = Field(2, ge=1, le=100, description="with fewer earlier runs nothing is judged")
-    psnr_db: float = Field(0.3, ge=0, description="PSNR that may be lost, in dB, on the mean over seeds")
-    seconds_share: float = Field(
-        0.3, ge=0, description="share by which run time may grow; runs on the same kind of machine count"
+    psnr_db: float | None = Field(
+        0.3, ge=0, description="PSNR that may be lost, in dB, on the mean over seeds; none: not judged"
+    )
+    seconds_share: float | None = Field(
+        0.3,
+        ge=0,
+        description="share by which run time may grow, on the same kind of machine; none: not judged",
     )
     seconds: float = Field(5.0, ge=0, description="growth of run time that is never too much, in seconds")
 
 
 class BenchmarkRegressedError(ExtragsError, RuntimeError):
-    """A benchmark is worse than its earlier runs; `found` says in what."""
+    """A benchmark is worse than its earlier runs.
 
-    def __init__(self, name: str, found: Sequence[str], report: str) -> None:
-        self.found = list(found)
+    Args:
+        name: of the benchmark.
+        result: what the flow would have returned; its `regressions` say in what it is worse.
+    """
+
+    def __init__(self, name: str, result: dict[str, Any]) -> None:
+        self.result = result
+        self.found: list[str] = result["regressions"]
         super().__init__(
-            f"benchmark {name} is worse than the runs before in {len(found)} respects: {'; '.join(found)}; "
-            f"page: {report}"
+            f"benchmark {name} is worse than the runs before in {len(self.found)} respects: "
+            f"{'; '.join(self.found)}; page: {result['report']}"
         )
 
 
@@ -155,13 +165,15 @@ def regressions(
             continue
         name = next((figure for figure in FIGURES if figure in now["figures"]), None)
         known = [item["figures"][name] for item in good if name in item["figures"]]
-        if name is not None and len(known) >= tolerance.at_least:
+        if name is not None and tolerance.psnr_db is not None and len(known) >= tolerance.at_least:
             was, value = median(known), now["figures"][name]
             if was - value > tolerance.psnr_db:
                 found.append(
                     f"{label}: {name} {value:.2f} dB, {was - value:.2f} dB below the median {was:.2f} of "
                     f"{len(known)} runs (tolerance {tolerance.psnr_db:g} dB)"
                 )
+        if tolerance.seconds_share is None:
+            continue
         local = [groups[group] for groups, mine in zip(before, same, strict=True) if mine and group in groups]
         clock, kind = "processor_seconds", " of processor time"
         timed = [item for item in local if not item["error"]][-tolerance.runs :]

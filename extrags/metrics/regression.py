@@ -108,7 +108,7 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         "rows": [row.to_json() for row in rows],
         "failed": failed,
         "missing": missing,
-        "regressions": [*failed, *worse],
+        "regressions": [*failed, *missing, *worse],
     }
 
 
@@ -227,17 +227,18 @@ def _judge(rows: Sequence[_Row]) -> None:
             row.verdict = "noise"
         if row.worsening == 0.0 and row.before == row.after and (row.low in (None, 0.0)):
             row.verdict = "equal"
+    # Over all that could be judged: to look only at what has changed by enough would be to look at the data
+    # first, and to be content with fewer quantities than were looked at.
+    tested = [row for row in rows if row.p_worse is not None]
     directions: tuple[tuple[str, Verdict, float], ...] = (
         ("p_worse", "worse", 1.0),
         ("p_better", "better", -1.0),
     )
     for attribute, verdict, sign in directions:
-        tested = [row for row in rows if row.verdict == "noise" and abs(row.worsening) >= MATTERS[row.kind]]
-        tested.sort(key=lambda row: float(getattr(row, attribute)))
-        for rank, row in enumerate(tested):
+        for rank, row in enumerate(sorted(tested, key=lambda row: float(getattr(row, attribute)))):
             if getattr(row, attribute) > LEVEL / (len(tested) - rank):
                 break
-            if sign * row.worsening > 0:
+            if sign * row.worsening >= MATTERS[row.kind]:
                 row.verdict = verdict
 
 

@@ -84,7 +84,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def benchmark(given: argparse.Namespace) -> int:
-    """`extrags benchmark`; exit code 1 when a run failed."""
+    """`extrags benchmark`; exit code 1 when a run failed, or is worse than is tolerated."""
     from extrags.config import profile_config
     from extrags.store import Store
     from flows.environment import prepare, without_heartbeat
@@ -101,6 +101,7 @@ def benchmark(given: argparse.Namespace) -> int:
     from flows.benchmark import benchmark as flow
     from flows.benchmark import check_methods
     from flows.estimate import expected_seconds
+    from flows.history import BenchmarkRegressedError
     from flows.progress_display import RunInView, progress_display
     from flows.selection import absolute_manifests, chosen_sequences
     from flows.settings import task_runner
@@ -116,23 +117,28 @@ def benchmark(given: argparse.Namespace) -> int:
     runs = len(chosen_sequences(given.sequences)) * ways
     view = RunInView(runs, expected_seconds(profile_config(profiles[0])), "evaluate", root)
     with temporary_server(), without_heartbeat(), progress_display(showing(given), view):
-        found = flow.with_options(task_runner=task_runner(given.runner))(
-            sequences=absolute_manifests(given.sequences),
-            profiles=profiles,
-            methods=methods,
-            seeds=seeds,
-            settings=given.settings,
-            variants=variants,
-            baseline=given.baseline,
-            store=root,
-            name=given.name,
-            limits=limits,
-            refresh=given.refresh,
-            tolerance=_tolerance(given),
-        )
+        measure = flow.with_options(task_runner=task_runner(given.runner))
+        try:
+            found = measure(
+                sequences=absolute_manifests(given.sequences),
+                profiles=profiles,
+                methods=methods,
+                seeds=seeds,
+                settings=given.settings,
+                variants=variants,
+                baseline=given.baseline,
+                store=root,
+                name=given.name,
+                limits=limits,
+                refresh=given.refresh,
+                tolerance=_tolerance(given),
+            )
+        except BenchmarkRegressedError as error:
+            # Said to Prefect; here what was measured is told, and the exit code is 1.
+            found = error.result
     print_benchmark(found, to_stderr=given.json == "-")
     write_json(found, given.json)
-    return 1 if any(case["error"] for case in found["cases"]) else 0
+    return 1 if found["regressions"] or any(case["error"] for case in found["cases"]) else 0
 
 
 def _tolerance(given: argparse.Namespace) -> Tolerance | None:
@@ -143,15 +149,15 @@ def _tolerance(given: argparse.Namespace) -> Tolerance | None:
     """
     from flows.history import Tolerance
 
-    named = {"psnr_db": given.max_psnr_loss, "seconds_share": given.max_slowdown}
-    wanted = {name: value for name, value in named.items() if value is not None}
-    if not wanted:
+    # What has no limit of its own is not judged.
+    limits = {"psnr_db": given.max_psnr_loss, "seconds_share": given.max_slowdown}
+    if all(value is None for value in limits.values()):
         return None
     if not given.refresh:
         raise ConfigError("--max-psnr-loss and --max-slowdown need --refresh")
-    if any(not value >= 0 for value in wanted.values()):
+    if any(value is not None and not value >= 0 for value in limits.values()):
         raise ConfigError("--max-psnr-loss and --max-slowdown: expected 0 or more")
-    return Tolerance(**wanted)
+    return Tolerance(**limits)
 
 
 def parsed_seeds(given: list[str]) -> list[int]:
@@ -218,6 +224,8 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
         figures = (spread_text(metric, row["figures"].get(metric)) for metric in columns)
         table.add_row(name, row["profile"], row["method"], str(row["n_seeds"]), *figures)
     out.print(table)
+    for words in found["regressions"]:
+        out.print(f"[red]worse: {escape(words)}[/]")
     for case in found["cases"]:
         if case["error"]:
             run = f"{case['sequence']} {case['method']} seed {case['seed']}"

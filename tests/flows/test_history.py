@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,6 +13,7 @@ from extrags.errors import ConfigError
 from extrags.report.benchmark import BenchmarkInputs, build_benchmark_report
 from extrags.store import Store
 from flows.benchmark import benchmark
+from flows.cli import main
 from flows.history import (
     BenchmarkRegressedError,
     Tolerance,
@@ -85,6 +88,13 @@ class TestRegressions:
     def test_nothing_is_judged_by_a_single_run(self) -> None:
         assert regressions(entry(psnr=10, seconds=900), BEFORE[:1], Tolerance()) == []
         assert regressions(entry(psnr=10), BEFORE[:1], Tolerance(at_least=1)) != []
+
+    def test_what_has_no_tolerance_is_not_judged(self) -> None:
+        both = entry(psnr=10, seconds=900)
+        (line,) = regressions(both, BEFORE, Tolerance(seconds_share=None))
+        assert "dB below the median" in line
+        (line,) = regressions(both, BEFORE, Tolerance(psnr_db=None))
+        assert "above the median" in line
 
     def test_the_last_runs_count(self) -> None:
         slow = [entry(day=day, seconds=300) for day in range(6, 9)]
@@ -182,6 +192,7 @@ class TestFlow:
         assert isinstance(error, BenchmarkRegressedError)
         assert len(error.found) == 1
         assert "3.00 dB below the median" in error.found[0]
+        assert error.result["cases"][0]["metrics"] == first["cases"][0]["metrics"]
         # The bits are the same, the seconds are those of now.
         found = history_of(store, "weekly")
         assert len(found) == 5
@@ -193,6 +204,31 @@ class TestFlow:
         again = benchmark(**given)
         assert again["cases"][0]["seconds"] == found[-1]["cases"][0]["seconds"]
         assert len(history_of(store, "weekly")) == 5
+
+    def test_the_command_tells_what_was_measured_when_it_is_worse(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        found: dict[str, Any] = {
+            "machine": {},
+            "cases": [],
+            "comparison": {"paired_datasets": [], "sequences": [], "baseline": "coarse"},
+            "regressions": ["coarse on phantom/0@sparse: 20 s, 90% above the median"],
+            "report": "report.html",
+        }
+
+        def measured(**given: Any) -> dict[str, Any]:
+            # What has no limit of its own is not judged.
+            assert (given["tolerance"].psnr_db, given["tolerance"].seconds_share) == (None, 0.5)
+            raise BenchmarkRegressedError("weekly", found)
+
+        monkeypatch.setattr(
+            "flows.benchmark.benchmark", SimpleNamespace(with_options=lambda **_options: measured)
+        )
+        out = tmp_path / "out.json"
+        arguments = ["benchmark", SEQUENCE, "--methods", "coarse", "--refresh", "--max-slowdown", "0.5"]
+        assert main([*arguments, "--json", str(out), "--store", str(tmp_path / "store")]) == 1
+        assert json.loads(out.read_text()) == found
+        assert "worse: coarse on phantom/0@sparse: 20 s" in capsys.readouterr().out
 
     def test_a_tolerance_needs_a_measurement(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="needs refresh"):
