@@ -14,7 +14,7 @@ __all__ = ["DepthErrors", "depth_errors"]
 
 @dataclass(frozen=True, slots=True)
 class DepthErrors:
-    """Errors over the pixels where both depths are known.
+    """Errors over the pixels where both depths are known; None where none of them is.
 
     Args:
         absrel: mean of |rendered - true| / true.
@@ -24,9 +24,9 @@ class DepthErrors:
         n_pixels: number of pixels with both depths.
     """
 
-    absrel: float
-    rmse: float
-    delta125: float
+    absrel: float | None
+    rmse: float | None
+    delta125: float | None
     coverage: float
     n_pixels: int
 
@@ -47,7 +47,8 @@ def depth_errors(
         mask: pixels that may count; None is all.
 
     Returns:
-        The errors, or None when no pixel counts.
+        The errors, or None when no pixel has a true depth. Where no pixel has a rendered one, the coverage is
+        zero and the others are None.
 
     Raises:
         ShapeError: when the arrays do not fit each other.
@@ -64,15 +65,17 @@ def depth_errors(
     if mask is not None:
         known = known & mask
     both = known & np.isfinite(rendered) & (rendered > 0)
-    n_pixels = int(both.sum())
-    if n_pixels == 0:
+    n_known, n_pixels = int(known.sum()), int(both.sum())
+    if n_known == 0:
         return None
+    if n_pixels == 0:
+        return DepthErrors(None, None, None, 0.0, 0)
     found = rendered[both].astype(np.float64)
     true = truth[both].astype(np.float64)
     return DepthErrors(
         absrel=float(np.mean(np.abs(found - true) / true)),
         rmse=float(np.sqrt(np.mean((found - true) ** 2))),
         delta125=float(np.mean(np.maximum(found / true, true / found) < 1.25)),
-        coverage=n_pixels / int(known.sum()),
+        coverage=n_pixels / n_known,
         n_pixels=n_pixels,
     )

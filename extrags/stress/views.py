@@ -432,7 +432,8 @@ def _metric_values(effort: Effort) -> Iterator[Trial]:
     truth = np.full((1, 8, 8), 2.0, np.float32)
     for unit in SCALES:
         errors = depth_errors(1.1 * truth * unit, truth * unit)
-        yield f"AbsRel of 10 %, times {unit:g}", math.inf if errors is None else abs(errors.absrel - 0.1)
+        share = None if errors is None else errors.absrel
+        yield f"AbsRel of 10 %, times {unit:g}", math.inf if share is None else abs(share - 0.1)
 
 
 def _depth_metrics(effort: Effort) -> Iterator[Trial]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from extrags.metrics.depth import depth_errors
+from extrags.metrics.depth import DepthErrors, depth_errors
 
 
 def test_by_hand() -> None:
@@ -30,8 +30,12 @@ def test_delta_takes_the_ratio_either_way() -> None:
 def test_nothing_to_compare_has_no_value() -> None:
     some = np.ones((2, 3))
     assert depth_errors(some, some, np.zeros((2, 3), dtype=bool)) is None
-    assert depth_errors(0 * some, some) is None
     assert depth_errors(some, np.nan * some) is None
+
+
+def test_where_nothing_was_rendered_nothing_is_covered() -> None:
+    some = np.ones((2, 3))
+    assert depth_errors(0 * some, some) == DepthErrors(None, None, None, 0.0, 0)
 
 
 def test_mask() -> None:

@@ -185,6 +185,16 @@ def test_empty_render_has_depth_coverage_only(sequence: EndoscopicSequence) -> N
     assert result.metrics["depth_absrel"] == pytest.approx(0.1)
 
 
+def test_a_view_in_which_nothing_is_rendered_lowers_the_coverage(sequence: EndoscopicSequence) -> None:
+    clean = renders_of(sequence, TEST)
+    alpha = clean.alpha.copy()
+    alpha[0] = 0.2
+    result = evaluate_views(replace(clean, alpha=alpha), sequence, TEST, None)
+    assert result.metrics["depth_coverage"] == pytest.approx(1 - 1 / len(TEST))
+    assert result.metrics["depth_absrel"] == pytest.approx(0.1)
+    assert (result.per_view[0]["depth_coverage"], result.per_view[0]["depth_absrel"]) == (0, None)
+
+
 def test_what_cannot_be_had_is_null_with_a_reason(sequence: EndoscopicSequence) -> None:
     bare = replace(sequence, depth_mm=None, observed=None)
     result = evaluate_views(renders_of(bare, TEST), bare, TEST, {"alex": "no file"})
