@@ -214,7 +214,7 @@ def _bounds(
     low = high = np.pad(depth, REACH_PX + 1, constant_values=-1)
     yield 0, (low, high)
     window, step = 1, 1
-    while window < 2 * reach and window <= REACH_PX:
+    while window // 2 < reach and window <= REACH_PX:
         for axis in (0, 1):
             low, high = _spread(low, step, axis, np.minimum), _spread(high, step, axis, np.maximum)
         yield window, (low, high)

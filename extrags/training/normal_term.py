@@ -68,13 +68,19 @@ class NormalTerm:
         """Positions and iteration of the last look-up, and the normals found."""
 
     @classmethod
-    def at(cls, points: Float[np.ndarray, "p 3"], config: CoarseConfig) -> NormalTerm:
-        """The term of a reconstruction from starting points, with `extrags.training.starting` normals."""
+    def at(cls, points: Float[np.ndarray, "p 3"], config: CoarseConfig, iterations: int) -> NormalTerm:
+        """The term of a reconstruction from starting points, with `extrags.training.starting` normals.
+
+        Args:
+            points: where it starts from.
+            config: its settings.
+            iterations: of this optimisation, which may be fewer than those of the settings.
+        """
         return cls(
             points,
             surface_normals(points),
             weight=config.normal_weight,
-            start=config.normal_start_share * config.iterations,
+            start=config.normal_start_share * iterations,
             every=config.normal_every,
         )
 

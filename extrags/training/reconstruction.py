@@ -112,7 +112,8 @@ def reconstruct(
     if earlier is not None:
         schedule = continued_schedule(schedule, earlier.iterations)
     if config.normal_weight > 0:
-        schedule = replace(schedule, normals=NormalTerm.at(start.gaussians.means.numpy(), config))
+        points = start.gaussians.means.numpy()
+        schedule = replace(schedule, normals=NormalTerm.at(points, config, schedule.iterations))
     poses = None
     if refines_poses(sequence, config):
         settings = config.pose_refinement

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from extrags.cameras import Cameras
 from extrags.config import FreespaceConfig
 from extrags.freespace.grid import voxel_centers
 from extrags.freespace.visibility import ViewDepths, seen_through, voxel_visibility
+from extrags.gaussians import Gaussians
+from extrags.scene import Scene
 from tests.extrags.exploration.tube import small_freespace, small_tube
 
 
@@ -49,3 +52,23 @@ def test_more_views_that_see_a_voxel_keep_it() -> None:
         seen_by_it = (few >= 0.5) & (alone >= 0.5)
         assert seen_by_it.any()
         assert (more[seen_by_it] >= 0.5).all()
+
+
+def test_a_wall_so_far_away_that_a_block_is_less_than_a_pixel() -> None:
+    focal_px, side_px, far = 60.0, 160, 200.0
+    K = np.array([[focal_px, 0, side_px / 2], [0, focal_px, side_px / 2], [0, 0, 1]])
+    cameras = Cameras(K[None], np.eye(4)[None], side_px, side_px)
+    along = np.arange(-40, 41, 1.0)
+    points = np.stack([*np.meshgrid(along, along), np.full((81, 81), far)], axis=-1).reshape(-1, 3)
+    facing = np.tile([0, 0, 1.0], (len(points), 1))
+    wall = Gaussians.from_points(
+        points, np.full_like(points, 0.5), np.ones(len(points)), opacity=0.99, normals=facing, thickness=0.01
+    )
+    scene, config = Scene(wall, None), FreespaceConfig(top_views=1)
+    views = ViewDepths.rendered(scene, cameras, config)
+    grid = np.array([-8.0, -8.0, far - 12.3]), np.eye(3), 1.0
+    within = np.ones((16, 16, 16), bool)
+    found = seen_through(scene, views, *grid, within, config)
+    shares = voxel_visibility(scene, views.cameras, voxel_centers(16, *grid), config)
+    np.testing.assert_array_equal(found, shares.reshape(within.shape) >= config.occupied_below)
+    assert 0 < found.mean() < 1

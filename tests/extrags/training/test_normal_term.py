@@ -188,7 +188,7 @@ def test_both_steps_take_both_terms(tube_sequence: EndoscopicSequence) -> None:
         densify=DensifyConfig(enabled=False),
         depth_huber_delta=0.2,
         depth_weight=0.2,
-        normals=NormalTerm.at(points, config),
+        normals=NormalTerm.at(points, config, config.iterations),
     )
     without = replace(with_terms, depth_weight=0.0, normals=None)
     losses = {}
@@ -222,7 +222,21 @@ def test_reconstruction_aligns_gaussians(tube_sequence: EndoscopicSequence) -> N
     for config in (plain, held):
         found = reconstruct(tube_sequence, config).scene.gaussians
         start = reconstruct(tube_sequence, config.model_copy(update={"iterations": 1})).scene.gaussians
-        term = NormalTerm.at(start.means.numpy(), held)
+        term = NormalTerm.at(start.means.numpy(), held, held.iterations)
         normals = term._normals_for(found.means, 0)
         losses.append(float(normal_loss(found.quats, found.scales, normals)))
     assert losses[1] < 0.8 * losses[0]
+
+
+def test_its_start_is_a_share_of_the_iterations_that_are_made() -> None:
+    """A scene that is continued has fewer than its settings say."""
+    config = CoarseConfig(iterations=3000, normal_weight=1.0, normal_start_share=0.2, normal_every=10)
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    parameters = {
+        "means": torch.from_numpy(points).float(),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]).expand(20, 4),
+        "scales": torch.zeros(20, 3),
+    }
+    term = NormalTerm.at(points, config, 450)
+    active = [done for done in range(1, 451) if term.penalty(parameters, done - 1) is not None]
+    assert active == list(range(100, 451, 10))
