@@ -189,11 +189,14 @@ def judge_finetuning(
         return Judgement(
             1.0, f"not judged: of {len(frames)} training frames none can be left out (at least {MIN_FRAMES})"
         )
-    arms, left = [], []
+    arms, left, weights_of_arms = [], [], []
+    weighted = coarse.inconsistent_frames == "weight"
     for part, positions in _without_some_frames(
         sequence.at_most_width(settings.max_width), frames, settings.leave_out_every
     ):
         left.append(positions)
+        # Once for the brief reconstruction and all amounts.
+        weights_of_arms.append(frame_weights(part, part.train) if weighted else None)
         start = partial_scene(
             scene,
             replace(part, split=sequence.split),
@@ -202,15 +205,13 @@ def judge_finetuning(
             iterations=max(1, round(settings.iterations_share * coarse.iterations)),
             seed=config.seed,
             stage="finetune-judge",
+            frame_weights=weights_of_arms[-1],
         )
         views = None
         if enhancer is not None:
             small = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
             views = _restored(start, part, small, enhancer, enhance, settings.views, measure)
         arms.append((part, start, views))
-    # Once for all amounts.
-    weighted = coarse.inconsistent_frames == "weight"
-    weights_of_arms = [frame_weights(part, part.train) if weighted else None for part, _, _ in arms]
     brief = config.model_copy(
         update={"iterations": max(1, round(settings.iterations_share * config.iterations))}
     )

@@ -16,10 +16,12 @@ from extrags.config import CoarseConfig
 from extrags.errors import CaptureError
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.training.frame_weights import FrameWeights, weighted_views
+from extrags.training.normal_term import NormalTerm
 from extrags.training.optimise import optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
 from extrags.training.starting import median_depth, starting_gaussians
-from extrags.training.views import epochs, real_views
+from extrags.training.views import epochs
 
 __all__ = ["MIN_FRAMES", "leave_out_folds", "log_exposures", "partial_scene"]
 
@@ -63,6 +65,7 @@ def partial_scene(
     iterations: int,
     seed: int,
     stage: str,
+    frame_weights: FrameWeights | None = None,
 ) -> Scene:
     """A brief reconstruction from the kept frames, under the coarse scene's light.
 
@@ -77,6 +80,7 @@ def partial_scene(
         iterations: optimisation steps.
         seed: of all random sampling.
         stage: named in progress events.
+        frame_weights: what was found of the kept frames; None looks for it, where the settings weigh frames.
 
     Raises:
         DivergedError: when the optimisation does not stay finite.
@@ -85,7 +89,13 @@ def partial_scene(
     if light is not None:
         light = replace(light, log_exposure=log_exposures(scene, sequence, kept))
     brief = coarse.model_copy(
-        update={"iterations": iterations, "sh_every": max(1, iterations // 3), "seed": seed}
+        update={
+            "iterations": iterations,
+            "sh_every": max(1, iterations // 3),
+            "seed": seed,
+            # What would only be reported is not looked for.
+            "inconsistent_frames": "weight" if coarse.inconsistent_frames == "weight" else "ignore",
+        }
     )
     start = starting_gaussians(
         sequence,
@@ -96,9 +106,11 @@ def partial_scene(
         seed=brief.seed,
         thickness=brief.thickness,
     )
-    views = [view.to(scene.device) for view in real_views(sequence, kept)]
+    views = [view.to(scene.device) for view in weighted_views(sequence, kept, brief, frame_weights)[0]]
     order = epochs(len(views), np.random.default_rng(brief.seed))
     schedule = coarse_schedule(brief, scene_extent(sequence, kept), median_depth(sequence, kept), stage)
+    if brief.normal_weight > 0:
+        schedule = replace(schedule, normals=NormalTerm.at(start.means.numpy(), brief, iterations))
     footprint = smallest_footprint(coarse, sequence.cameras[kept])
     begin = Scene(start.to(scene.device), light)
     return optimise(begin, lambda _: views[next(order)], schedule, footprint=footprint).scene
