@@ -130,7 +130,7 @@ class CheckpointEnhancer(PreparedEnhancer):
         for number, span in enumerate(spans):
             chosen = slice(span.start, span.stop)
             lead = ranked_references(clip.reference[chosen])[:1]
-            window = np.concatenate([self.views.images(lead), images[chosen]])
+            window = np.concatenate([self.views.images(lead, clip, chosen), images[chosen]])
             covered = np.concatenate([np.zeros_like(holes[:1]), holes[chosen]])
             path = np.concatenate(
                 [self.views.world_from_camera[lead], clip.cameras.world_from_camera[chosen]]

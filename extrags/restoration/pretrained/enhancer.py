@@ -115,14 +115,14 @@ class PretrainedEnhancer(PreparedEnhancer):
         for number, span in enumerate(spans):
             chosen = slice(span.start, span.stop)
             ranked = ranked_references(clip.reference[chosen])
-            lead = self.views.images(ranked[:1])
+            lead = self.views.images(ranked[:1], clip, chosen)
             frames = np.concatenate([lead, base[chosen]])
             holes = np.concatenate([np.zeros((1, *unknown.shape[1:]), bool), unknown[chosen]])
             count = valid_frame_count(len(frames), rule.frame_step)
             window = Window(
                 padded_to(canvas.placed(frames), count),
                 padded_to(canvas.placed_mask(holes), count),
-                canvas.placed(self.views.images(ranked[: settings.reference_images])),
+                canvas.placed(self.views.images(ranked[: settings.reference_images], clip, chosen)),
             )
             restored = adapter.restore(window, window_seed(self.seed, clip.index, number))
             parts.append(restored[1 : 1 + len(span)])

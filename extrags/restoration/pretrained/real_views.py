@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 
 from extrags.errors import ShapeError
+from extrags.restoration.protocol import Clip
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.zarr_io import new_group, open_group, read_array, write_array, write_frames
@@ -32,9 +33,22 @@ class RealViews:
     def __len__(self) -> int:
         return len(self.rgb)
 
-    def images(self, index: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n h w 3"]:
-        """Chosen frames in [0, 1]."""
-        return np.asarray(self.rgb[index], dtype=np.float32) / np.float32(255)
+    def images(
+        self, index: Int[np.ndarray, "n"], clip: Clip, chosen: slice = slice(None)
+    ) -> Float[np.ndarray, "n h w 3"]:
+        """Chosen frames in [0, 1], at the mean exposure of the views that they are to be continued into.
+
+        Args:
+            index: of the frames.
+            clip: whose views these are.
+            chosen: which of its views.
+        """
+        frames = np.asarray(self.rgb[index], dtype=np.float32) / np.float32(255)
+        if clip.exposure is None:
+            return frames
+        transfer, gain = clip.transfer, float(np.mean(clip.exposure[chosen]))
+        signal = transfer.invert_response(torch.from_numpy(frames))
+        return np.asarray(transfer.apply_response(gain * signal).detach().clamp(0, 1).numpy())
 
     @classmethod
     def gather(cls, scene: Scene, sequence: EndoscopicSequence) -> RealViews:

@@ -6,12 +6,14 @@ import importlib.util
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, EnhanceConfig, PretrainedConfig
@@ -138,6 +140,20 @@ class TestInputs:
         again = RealViews.load(tmp_path / "views")
         assert np.array_equal(again.rgb, views.rgb)
         assert np.array_equal(again.world_from_camera, views.world_from_camera)
+
+    def test_real_views_are_shown_at_the_exposure_of_the_clip(self, tube: Tube, clip: Clip) -> None:
+        views = RealViews.gather(tube.scene, tube.sequence)
+        as_they_are = views.images(np.array([1, 3]), clip)
+        np.testing.assert_allclose(as_they_are, views.rgb[[1, 3]] / 255, atol=1e-6)
+        exposure = np.linspace(0.5, 1.5, len(clip)).astype(np.float32)
+        darker = replace(clip, exposure=exposure)
+        light = clip.transfer.light
+        assert light is not None
+        signal = light.invert_response(torch.from_numpy(as_they_are))
+        for chosen in (slice(0, 2), slice(None)):
+            expected = light.apply_response(float(exposure[chosen].mean()) * signal).clamp(0, 1)
+            found = views.images(np.array([1, 3]), darker, chosen)
+            np.testing.assert_allclose(found, expected.numpy(), atol=1e-6)
 
 
 class TestSettings:
