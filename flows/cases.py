@@ -12,8 +12,8 @@ from typing import Any, Literal
 from extrags import __version__
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
-from extrags.pipeline import StageName
-from extrags.store import Store, digest_of, write_record
+from extrags.pipeline import STAGES, StageName
+from extrags.store import Store, digest_of, read_records, write_record
 from flows.estimate import expected_seconds
 from flows.methods import METHODS, check_not_pinned, method_config, pinned_settings
 from flows.outcome import SequenceOutcome, StageRow
@@ -177,7 +177,18 @@ def selected(
     records = outcome_records(Store(root))
     if only == "failed":
         return [case for case in cases if records.get(case.record, {}).get("status") == "failed"]
-    return [case for case in cases if case.record not in records and _would_run(case, root, until)]
+
+    def came_so_far(case: SequenceCase) -> bool:
+        record = records.get(case.record)
+        return record is not None and (
+            record["status"] == "failed" or not _is_earlier(record["until"], until)
+        )
+
+    return [case for case in cases if not came_so_far(case) and _would_run(case, root, until)]
+
+
+def _is_earlier(until: str, than: str) -> bool:
+    return until in STAGES and than in STAGES and STAGES.index(until) < STAGES.index(than)
 
 
 def _would_run(case: SequenceCase, root: str, until: StageName) -> bool:
@@ -208,9 +219,15 @@ def record_outcome(
 ) -> None:
     """Leave in the store how a run of a case ended, in place of how the one before did.
 
+    A run that was to end earlier than that one, and did, leaves its record as it is: a plan has no figures to
+    put in the place of those of a finished run.
+
     Raises:
-        StoreError: when it cannot be written.
+        StoreError: when it cannot be read or written.
     """
+    before = read_records(store, case.record).get(case.record)
+    if before is not None and outcome.status != "failed" and _is_earlier(until, before["until"]):
+        return
     failed = next((row for row in outcome.stages if row.state == "failed"), None)
     work = known_work(case.sequence, config)
     if work is None and "ingest" in outcome.refs:

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from extrags.store.artefacts import Store
-from extrags.store.manifest import Manifest
+from extrags.store.manifest import Manifest, stage_of
 from extrags.store.runs import Run, active_runs, forget, runs_of
 
 __all__ = ["Policy", "Removal", "SequenceUsage", "apply_policy", "planned_removals", "usage"]
@@ -37,7 +37,7 @@ class Policy:
         older_than_s: not used for so long.
         max_bytes: the least recently used, until the store is no larger.
         keep_last: of each sequence, what only runs before its last so many runs used; a run that found the
-            same artefacts as a former one counts once.
+            same artefacts as a former one counts once, one that did not come to its figures not at all.
         unreachable: what none of the runs that are kept used: settings that were tried and left.
         with_inputs: also what kept artefacts were made from.
     """
@@ -246,14 +246,25 @@ def _last_time(run: Run, contents: _Contents) -> str:
 
 
 def _last_runs(runs: list[Run], count: int | None) -> tuple[list[Run], list[Run]]:
-    """The last runs of each sequence, and the former ones."""
+    """The last runs of each sequence, and the former ones.
+
+    Of runs that were taken to their figures so many count, and those that ended early are kept with the ones
+    after which they came: a plan, an evaluation of other images or a failure takes the place of none.
+    """
     if count is None:
         return runs, []
     by_sequence: dict[str, list[Run]] = defaultdict(list)
     for run in runs:
         by_sequence[run.sequence].append(run)
-    kept = [run for each in by_sequence.values() for run in each[len(each) - min(count, len(each)) :]]
+    kept = []
+    for each in by_sequence.values():
+        whole = [place for place, run in enumerate(each) if _has_figures(run)] or list(range(len(each)))
+        kept += each[whole[-min(count, len(whole))] :]
     return kept, [run for run in runs if run not in kept]
+
+
+def _has_figures(run: Run) -> bool:
+    return any(stage_of(key) in {"evaluate", *FINAL_STAGES} for key in run.keys)
 
 
 def _made(manifest: Manifest) -> float:

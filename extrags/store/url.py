@@ -241,22 +241,42 @@ class UrlBackend:
 
     def write_record(self, name: str, text: bytes) -> None:
         """Write `records/<name>` with one put, which replaces one that is there."""
-        self.fs.pipe_file(f"{self.prefix}/{RECORDS}/{name}", text)
+        with self._as_store_errors(f"the record {name} cannot be written"):
+            self.fs.pipe_file(f"{self.prefix}/{RECORDS}/{name}", text)
 
     def read_records(self, prefix: str) -> dict[str, bytes]:
         """Records by name, of those whose name begins so."""
         place = f"{self.prefix}/{RECORDS}"
-        names = sorted(name for name, _ in self._children(place) if name.startswith(prefix))
-        if not names:
-            return {}
-        # All at once: on an object store each costs a round trip.
-        found = self.fs.cat([f"{place}/{name}" for name in names], on_error="omit")
-        return {str(path).rsplit("/", 1)[-1]: text for path, text in found.items()}
+        with self._as_store_errors("the records cannot be read"):
+            names = sorted(name for name, _ in self._children(place) if name.startswith(prefix))
+            if not names:
+                return {}
+            # All at once: on an object store each costs a round trip.
+            found = self.fs.cat([f"{place}/{name}" for name in names], on_error="return")
+            texts = {}
+            for path, text in found.items():
+                # What is gone was removed meanwhile; what cannot be read is there.
+                if isinstance(text, FileNotFoundError):
+                    continue
+                if isinstance(text, Exception):
+                    raise text
+                texts[str(path).rsplit("/", 1)[-1]] = text
+        return texts
 
     def remove_record(self, name: str) -> None:
         """Remove `records/<name>`, if it is there."""
-        with suppress(FileNotFoundError):
+        with self._as_store_errors(f"the record {name} cannot be removed"), suppress(FileNotFoundError):
             self.fs.rm_file(f"{self.prefix}/{RECORDS}/{name}")
+
+    @contextmanager
+    def _as_store_errors(self, what: str) -> Iterator[None]:
+        """Each fsspec backend raises its own kinds (botocore's are not OSErrors)."""
+        try:
+            yield
+        except StoreError:
+            raise
+        except Exception as error:
+            raise StoreError(f"{what}, store {self.url}: {error}") from error
 
     def commit(self, scratch: Path, manifest: Manifest, *, renew: bool = False) -> Manifest:
         """Upload the files, then the manifest.

@@ -130,6 +130,21 @@ class TestRuns:
             age(three, name, -0.001)
         assert planned(three, keep_last=1) == ["judged1", "judged2", "final1", "final2"]
 
+    def test_a_run_that_ended_early_takes_the_place_of_none(self, store: Store) -> None:
+        """A plan, or a failure, after a run to the end; then another run to the end."""
+        for number, days in ((0, 30), (1, 20)):
+            ingest = put(store, f"ingest{number}", days=days)
+            figures = put(store, ("evaluate", "report")[number], days=days - 1, scene=ingest)
+            with recorded_run(store, "phantom/0") as record:
+                assert record is not None
+                record.add(Path(ref.uri).name for ref in (ingest, figures))
+            early = put(store, f"early{number}", days=days - 2, scene=ingest)
+            with recorded_run(store, "phantom/0") as record:
+                assert record is not None
+                record.add(Path(ref.uri).name for ref in (ingest, early))
+        assert set(planned(store, keep_last=1)) == {"ingest0", "evaluate", "early0"}
+        assert planned(store, keep_last=2) == []
+
     def test_what_no_run_used_is_unreachable(self, three: Store) -> None:
         put(three, "tried", days=1)
         assert planned(three, unreachable=True) == ["tried"]

@@ -6,12 +6,15 @@ import json
 import subprocess
 import sys
 import threading
+import uuid
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from extrags.errors import StoreError
 from extrags.store import Store, in_work, read_records, write_record
+from extrags.store.url import UrlBackend
 
 HOLDS = """
 import sys, time
@@ -61,6 +64,45 @@ class TestRecords:
         store.backend.write_record("outcome.c.json", b"3")
         assert list(read_records(store)) == ["outcome.a"]
         assert "outcome.b.json" in caplog.text
+
+    def test_one_that_cannot_be_read_is_not_taken_for_gone(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Retention would remove what that run has used."""
+        store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path / "cache")
+        for name in ("run-a", "run-b", "run-c"):
+            write_record(store, name, {"n": 1})
+        assert isinstance(store.backend, UrlBackend)
+        read = store.backend.fs.cat_file
+
+        def failing(path: str, *given: Any, **more: Any) -> bytes:
+            if "run-b" in path:
+                raise problem
+            return bytes(read(path, *given, **more))
+
+        monkeypatch.setattr(
+            type(store.backend.fs), "cat_file", lambda _, *given, **more: failing(*given, **more)
+        )
+        problem: Exception = TimeoutError("no answer")
+        with pytest.raises(StoreError, match=r"records cannot be read.*no answer"):
+            read_records(store)
+        problem = FileNotFoundError("removed meanwhile")
+        assert list(read_records(store)) == ["run-a", "run-c"]
+
+    def test_any_failure_to_write_is_one_of_the_store(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        class EndpointConnectionError(Exception):
+            """As botocore's: no OSError."""
+
+        def failing(*_given: object, **_more: object) -> None:
+            raise EndpointConnectionError("no route")
+
+        store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path / "cache")
+        assert isinstance(store.backend, UrlBackend)
+        monkeypatch.setattr(type(store.backend.fs), "pipe_file", failing)
+        with pytest.raises(StoreError, match=r"outcome\.a.* cannot be written.*no route"):
+            write_record(store, "outcome.a", {})
 
     @pytest.mark.parametrize("name", ["", "../x", "a/b", "a b"])
     def test_names_are_no_paths(self, store: Store, name: str) -> None:

@@ -106,6 +106,25 @@ class TestOnly:
         Store(store).rm("coarse*")
         assert selected(cases, "changed", store, "coarse") == cases
 
+    def test_a_plan_leaves_the_record_of_a_finished_run(self, tmp_path: Path) -> None:
+        store, of = str(tmp_path), case()
+        leave(store, of, StageRow("evaluate", "ran"), until="report")
+        leave(store, of, until="assess")
+        (record,) = outcome_records(Store(store)).values()
+        assert record["until"] == "report"
+        leave(store, of, StageRow("coarse", "failed", reason="no"), status="failed", until="assess")
+        (record,) = outcome_records(Store(store)).values()
+        assert (record["until"], record["status"]) == ("assess", "failed")
+        leave(store, of, until="report")
+        (record,) = outcome_records(Store(store)).values()
+        assert (record["until"], record["status"]) == ("report", "ok")
+
+    def test_who_was_only_planned_is_missing(self, tmp_path: Path) -> None:
+        store, of = str(tmp_path), case("phantom/1@sparse")
+        leave(store, of, until="assess")
+        assert selected([of], "missing", store, "assess") == []
+        assert selected([of], "missing", store, "report") == [of]
+
     def test_a_matrix_keeps_its_runs_apart(self, tmp_path: Path) -> None:
         store = str(tmp_path)
         points = [case(changed={"coarse.iterations": number}) for number in (60, 90)]
