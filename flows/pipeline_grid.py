@@ -23,6 +23,7 @@ from extrags.errors import ConfigError
 from extrags.store import digest_of
 from flows.budgets import Budget, reaching
 from flows.history import SAME_MACHINE
+from flows.selection import Chosen
 
 __all__ = ["FORMAT", "Cell", "cells_of", "in_own_process", "run_cell", "run_grid"]
 
@@ -43,7 +44,7 @@ class Cell:
         profile: name.
         budget: its name.
         changed: overrides of the budget that reach the method.
-        settings: overrides of all runs.
+        settings: overrides of all runs, and of those of its sequence.
         seed: of all stages.
         repeat: number of the repeat, from 0.
     """
@@ -64,7 +65,7 @@ class Cell:
 
 
 def cells_of(
-    sequences: Sequence[str],
+    sequences: Sequence[Chosen],
     methods: Sequence[str],
     budgets: Sequence[tuple[str, Sequence[Budget]]],
     seeds: Sequence[int],
@@ -74,12 +75,12 @@ def cells_of(
     """The cells of a grid in the order in which they run; settings that no method takes are found here.
 
     Args:
-        sequences: names.
+        sequences: names, with settings that a manifest gives them.
         methods: names.
         budgets: of each profile.
         seeds: of all stages.
         repeats: how often everything is measured, each time from an empty store.
-        settings: overrides of all runs.
+        settings: overrides of all runs; those of a sequence come on top of them.
 
     Returns:
         Cells without repetitions: a budget that changes only what a method leaves out is the method's
@@ -91,7 +92,7 @@ def cells_of(
     from flows.methods import METHODS, method_config, pinned_settings
 
     found: dict[str, Cell] = {}
-    for repeat, sequence, (profile, inside), seed, method in product(
+    for repeat, chosen, (profile, inside), seed, method in product(
         range(repeats), sequences, budgets, seeds, methods
     ):
         if method not in METHODS:
@@ -104,8 +105,9 @@ def cells_of(
                 if name not in pinned
             }
             name = ", ".join(f"{key}={value}" for key, value in changed.items()) or "profile"
-            method_config(method, profile, {**settings, **changed}, seed)
-            cell = Cell(sequence, method, profile, name, changed, settings, seed, repeat)
+            own = {**settings, **chosen.settings}
+            method_config(method, profile, {**own, **changed}, seed)
+            cell = Cell(chosen.name, method, profile, name, changed, own, seed, repeat)
             found.setdefault(cell.key, cell)
     return list(found.values())
 

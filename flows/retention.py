@@ -21,7 +21,8 @@ from prefect.client.schemas.objects import StateType
 from prefect.exceptions import ObjectNotFound
 from pydantic import Field
 
-import flows.wiring  # noqa: F401  (registers every stage with its version)
+import flows.wiring  # noqa: F401  (registers the stages of a run with their versions)
+import tasks.benchmark  # noqa: F401  (and that of a benchmark's page)
 from extrags.errors import StoreError
 from extrags.store import Store
 from extrags.store.retention import Policy, apply_policy, planned_removals

@@ -27,6 +27,7 @@ _OF_SAVINGS = (
     "enhance.folds",
     "enhance.fold_iterations",
     "enhance.max_width",
+    "finetune.growth",
     "finetune.judge.enabled",
     "finetune.judge.iterations_share",
 )

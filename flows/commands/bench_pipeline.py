@@ -87,7 +87,7 @@ def pipeline(given: argparse.Namespace) -> int:
         for profile in items(given.profiles)
     ]
     cells = cells_of(
-        [item.name for item in chosen_sequences(given.sequences)],
+        chosen_sequences(given.sequences),
         items(given.methods),
         budgets,
         parsed_seeds(given.seeds),

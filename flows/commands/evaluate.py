@@ -60,11 +60,13 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
     from extrags.metrics.folder import read_renders
     from extrags.metrics.protocol import evaluate_views
     from extrags.sequence import EndoscopicSequence
+    from flows.methods import METHODS
     from flows.runners import DirectRunner
     from flows.wiring import SequenceRun
     from tasks.weights import lpips_by_net, lpips_weights
 
-    run = SequenceRun(given.sequence, config, root, DirectRunner(root), given.profile)
+    left_out = METHODS[given.method].leave_out
+    run = SequenceRun(given.sequence, config, root, DirectRunner(root), given.profile, leave_out=left_out)
     outcome = run.run("ingest")
     if outcome.error is not None:
         raise outcome.error

@@ -155,6 +155,7 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "finetune.judge.enabled": ("plan", "finetune-judge"),
     "finetune.judge.iterations_share": ("plan", "finetune-judge"),
     "finetune.judge.*": ("finetune-judge",),
+    "finetune.growth": ("plan", "finetune-judge", "finetune"),
     "finetune.keep_scene": ("plan", "finetune-judge", "finetune"),
     "finetune.iterations": ("plan", "finetune-judge", "finetune"),
     "finetune.*": ("finetune-judge", "finetune"),

@@ -12,6 +12,7 @@ from extrags.errors import ConfigError
 from flows.budgets import Budget
 from flows.cli import main
 from flows.pipeline_grid import Cell, cells_of, run_cell, run_grid
+from flows.selection import Chosen
 from tests.flows.tiny import SEQUENCE, TINY
 
 SMALL = {**TINY, "ingest.max_frames": 8}
@@ -20,27 +21,40 @@ BUDGETS = [Budget("few", {"coarse.iterations": 10}), Budget("more", {"coarse.ite
 
 def cells(repeats: int = 1, **settings: Any) -> list[Cell]:
     return cells_of(
-        ["phantom/0@sparse"], ["coarse"], [("quick", BUDGETS)], [0], repeats, {**SMALL, **settings}
+        [Chosen("phantom/0@sparse")], ["coarse"], [("quick", BUDGETS)], [0], repeats, {**SMALL, **settings}
     )
 
 
 class TestCells:
     def test_budgets_that_do_not_reach_a_method_are_one_cell(self) -> None:
         budgets = [Budget("a", {"finetune.iterations": 5}), Budget("b", {"finetune.iterations": 6})]
-        found = cells_of([SEQUENCE], ["coarse", "extrags"], [("quick", budgets)], [0], 1, {})
+        found = cells_of([Chosen(SEQUENCE)], ["coarse", "extrags"], [("quick", budgets)], [0], 1, {})
         assert [(cell.method, cell.budget) for cell in found] == [
             ("coarse", "profile"),
             ("extrags", "finetune.iterations=5"),
             ("extrags", "finetune.iterations=6"),
         ]
 
+    def test_settings_of_a_manifest_hold_for_their_sequence(self) -> None:
+        chosen = [Chosen(SEQUENCE, {"coarse.iterations": 77}), Chosen("phantom/1@sparse")]
+        found = cells_of(chosen, ["coarse"], [("quick", [Budget()])], [0], 1, {"coarse.max_points": 900})
+        assert [cell.settings for cell in found] == [
+            {"coarse.max_points": 900, "coarse.iterations": 77},
+            {"coarse.max_points": 900},
+        ]
+
     def test_wrong_settings_are_found_before_anything_runs(self) -> None:
         with pytest.raises(ConfigError):
             cells_of(
-                [SEQUENCE], ["coarse"], [("quick", [Budget("x", {"coarse.iterations": -1})])], [0], 1, {}
+                [Chosen(SEQUENCE)],
+                ["coarse"],
+                [("quick", [Budget("x", {"coarse.iterations": -1})])],
+                [0],
+                1,
+                {},
             )
         with pytest.raises(ConfigError, match="no method 'magic'"):
-            cells_of([SEQUENCE], ["magic"], [("quick", [Budget()])], [0], 1, {})
+            cells_of([Chosen(SEQUENCE)], ["magic"], [("quick", [Budget()])], [0], 1, {})
 
 
 class TestGrid:

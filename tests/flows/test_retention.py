@@ -123,6 +123,16 @@ class TestCommand:
         assert sorted(item["key"] for item in found["artefacts"]) == before
         assert store.keys() == []
 
+    def test_pages_of_former_versions_go(self, store: Store) -> None:
+        key = "benchmark-report-v0-0123456789abcdef"
+        with store.slot(stage="benchmark-report", version=0, key=key, label="weekly"):
+            pass
+        place = Path(store.root) / "artefacts" / key
+        os.utime(place, (time.time() - 40 * 86400,) * 2)
+        assert main(["cache", "gc", "--store", store.root]) == 0
+        assert not place.exists()
+        assert any(item.stage == "report" for item in store.ls())
+
     def test_max_size(self, store: Store, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["cache", "gc", "--max-size", "4MiB", "--store", store.root]) == 0
         assert 0 < sum(item.bytes for item in store.ls()) <= 4 << 20
