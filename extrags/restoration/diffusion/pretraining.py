@@ -225,14 +225,26 @@ def _mixed_sampler(
         for index, file in enumerate(files)
         if index % processes == number
     ]
+    smallest = min(samplers, key=lambda sampler: sampler.side_px)
+    if smallest.side_px < max(sampler.side_px for sampler in samplers):
+        raise ConfigError(
+            f"crop={config.crop}: images of some scenes are too small for it, and a batch has crops of one "
+            f"size; set crop={smallest.side_px}"
+        )
     seed = config.seed + iteration + 1_000_003 * number
     return MixedSampler(samplers, batch=config.batch, seed=seed).draw
 
 
 def _sampler(file: Path, config: PretrainingConfig, number: int, iteration: int) -> CropSampler:
     scene = PretrainingScene.load(file)
-    # In half precision, as in the file: in full precision a hundred scenes would take ten gigabytes.
-    pairs = replace(scene.pairs, layers=Layers(scene.pairs.layers.data.half()))
+    # In half precision, as in the file: in full precision a hundred scenes would take twenty gigabytes.
+    pairs = replace(
+        scene.pairs,
+        layers=Layers(scene.pairs.layers.data.half()),
+        target=scene.pairs.target.half(),
+        weight=scene.pairs.weight.half(),
+        depth_mm=scene.pairs.depth_mm.half(),
+    )
     return CropSampler(
         pairs,
         scene.transfer,

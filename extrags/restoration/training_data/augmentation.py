@@ -146,6 +146,11 @@ class CropSampler:
         self._generator = np.random.default_rng([seed, 2])
         self._order: list[int] = []
 
+    @property
+    def side_px(self) -> int:
+        """Of its crops, which is smaller than asked for where the images are."""
+        return self._side
+
     def draw(self) -> Batch:
         """The next batch."""
         crops, patches = [], []
@@ -177,9 +182,9 @@ class CropSampler:
         window = (..., slice(top, top + self._side), slice(left, left + self._side))
         # Many scenes are kept in half precision; crops are not. The copy is changed below.
         layers = Layers(pairs.layers.data[index : index + 1][window].clone().float())
-        clean = pairs.target[index : index + 1][window]
-        weight = pairs.weight[index : index + 1][window]
-        depth = pairs.depth_mm[index : index + 1][window]
+        clean, weight, depth = (
+            part[index : index + 1][window].float() for part in (pairs.target, pairs.weight, pairs.depth_mm)
+        )
         for name in ("rendered", "nearest", "blend", "invented"):
             layers.get(name).mul_(gain).clamp_(0, 1)
         clean = (clean * gain).clamp(0, 1)

@@ -14,6 +14,7 @@ from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.pretraining import PretrainingConfig, _mixed_sampler, pretrain
 from extrags.restoration.training_data.parallel import drawn_in_processes
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, make_pretraining_scene
+from extrags.view_synthesis.conditioning import Layers
 from extrags.view_synthesis.references import LightTransfer
 from tests.extrags.lit_tube import Tube, tube_depth_mm, tube_picture, tube_recording
 from tests.extrags.restoration.conftest import SMALL
@@ -193,6 +194,23 @@ class TestPretraining:
         other = short.model_copy(update={"channels": (16, 16, 16)})
         with pytest.raises(WeightsError, match=r"checkpoint\.safetensors: not a checkpoint of this training"):
             pretrain(files, other, checkpoint=checkpoint)
+
+    def test_crops_of_several_sizes_are_refused(
+        self, scene: PretrainingScene, files: list[Path], tmp_path: Path
+    ) -> None:
+        """Images of 64 x 48 pixels, and of 64 x 40."""
+        pairs = scene.pairs
+        lower = replace(
+            pairs,
+            layers=Layers(pairs.layers.data[..., :40, :]),
+            target=pairs.target[..., :40, :],
+            weight=pairs.weight[..., :40, :],
+            depth_mm=pairs.depth_mm[..., :40, :],
+        )
+        small = tmp_path / "small.safetensors"
+        replace(scene, pairs=lower, references=scene.references).save(small)
+        with pytest.raises(ConfigError, match=r"crop=48: images of some scenes are too small.*set crop=40"):
+            pretrain([files[0], small, files[1]], TINY.model_copy(update={"crop": 48}))
 
     def test_more_processes_than_scenes_are_refused(self, files: list[Path]) -> None:
         with pytest.raises(ConfigError, match="drawing_processes=3: there are 2 scenes"):
