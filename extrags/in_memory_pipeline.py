@@ -151,7 +151,7 @@ class InMemoryPipeline(Pipeline):
         return self.result.sequence.world_from_camera is not None
 
     def has_depth(self) -> bool:
-        """Whether any training frame of the source has depth."""
+        """Whether any training frame of the source has depth, in the unit of the poses."""
         return self.result.sequence.training_depth_known
 
     def training_frame_count(self) -> int:

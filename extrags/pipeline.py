@@ -179,7 +179,7 @@ class Pipeline(ABC):
 
     @abstractmethod
     def has_depth(self) -> bool:
-        """Whether any training frame of the source has depth."""
+        """Whether any training frame of the source has depth, in the unit of the poses."""
 
     @abstractmethod
     def training_frame_count(self) -> int:

@@ -105,8 +105,8 @@ class SequenceRun(CachedStages):
         return bool(self._manifest("sequence").counts["has_poses"])
 
     def has_depth(self) -> bool:
-        """Whether any training frame of the source has depth."""
-        return bool(self._manifest("ingest").counts["has_depth"])
+        """Whether any training frame of the source has depth, in the unit of the poses."""
+        return bool(self._manifest("sequence").counts["has_depth"])
 
     def training_frame_count(self) -> int:
         """Number of training frames."""

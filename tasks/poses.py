@@ -14,7 +14,7 @@ def estimating_settings(config: PosesConfig) -> PosesConfig:
     return config.model_copy(update={"replace_given": False})
 
 
-@stage("poses", version=6)
+@stage("poses", version=7)
 def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
     """Estimate poses; writes `sequence/` without the frames that could not be registered, and `poses.json`.
 
@@ -35,6 +35,7 @@ def poses(slot: Slot, sequence: Ref, config: PosesConfig) -> None:
         train=len(posed.train),
         test=len(posed.test),
         dropped=len(unposed) - len(posed),
+        has_depth=int(posed.training_depth_known),
         method=estimate.method,
         scale=posed.scale_words,
         summary=estimate.summary,

@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
@@ -197,7 +197,7 @@ def estimate_depth(
             network = network.to(device)
             log_depth, error, stereo = _completed(network, frames, small, stereo, config, settings, told)
         log_depth = sharpened(log_depth, error, frames)
-    depth, expected = _at_full_size(sequence, log_depth, error)
+    depth, expected = _at_full_size(sequence, frames.mask, log_depth, error)
     confirmed = (stereo.agrees * stereo.seen > 0) & frames.mask
     median = median_of_frames(
         lambda: (image[mask] for image, mask in zip(expected, sequence.mask, strict=True))
@@ -455,15 +455,40 @@ def _predicted(monocular: MonocularPredictor, sequence: EndoscopicSequence, fram
 
 
 def _at_full_size(
-    sequence: EndoscopicSequence, log_depth: Float[Tensor, "f h w"], error: Float[Tensor, "f h w"]
+    sequence: EndoscopicSequence,
+    known: Bool[Tensor, "f h w"],
+    log_depth: Float[Tensor, "f h w"],
+    error: Float[Tensor, "f h w"],
 ) -> tuple[Float[np.ndarray, "f h0 w0"], Float[np.ndarray, "f h0 w0"]]:
-    """Depth and its expected error at the pixels of the frames, one frame after the other."""
+    """Depth and its expected error at the pixels of the frames, one frame after the other.
+
+    Args:
+        sequence: the frames in full size.
+        known: pixels of the smaller ones that show tissue throughout: others say nothing of depth, and those
+            of full size beside them take it from the nearest that do.
+        log_depth: of the smaller ones.
+        error: expected of it.
+    """
     depth, expected = FrameStack(len(sequence)), FrameStack(len(sequence))
-    for mask, own_log_depth, own_error in zip(sequence.mask, log_depth, error, strict=True):
+    for index, mask in enumerate(sequence.mask):
+        own_log_depth, own_error = log_depth[index], error[index]
+        if own_log_depth.shape != mask.shape:
+            own_log_depth, own_error = _continued(known[index], own_log_depth, own_error)
         depth.append(np.where(mask, np.exp(_enlarged(own_log_depth, mask.shape)), 0).astype(np.float32))
         bounded = np.clip(_enlarged(own_error, mask.shape), CERTAIN, HOPELESS)
         expected.append(np.where(mask, bounded, 0).astype(np.float32))
     return depth.array, expected.array
+
+
+def _continued(known: Bool[Tensor, "h w"], *images: Float[Tensor, "h w"]) -> list[Float[Tensor, "h w"]]:
+    """Images with the nearest known pixel's value at the others."""
+    from scipy.ndimage import distance_transform_edt
+
+    if bool(known.all()) or not bool(known.any()):
+        return list(images)
+    rows, columns = distance_transform_edt(~known.cpu().numpy(), return_distances=False, return_indices=True)
+    at = torch.from_numpy(rows).to(known.device), torch.from_numpy(columns).to(known.device)
+    return [image[at] for image in images]
 
 
 def _enlarged(image: Float[Tensor, "h w"], size: tuple[int, ...]) -> Float[np.ndarray, "h0 w0"]:

@@ -213,6 +213,9 @@ def multi_view_stereo(
     sure &= frames.mask & (frames.rgb.amax(dim=1) < SATURATED)
     fits = fit_shading(brightness, depth.log(), sure, recording)
     prior, monocular_fits = shading_prior(fits, brightness, recording), []
+    if not settings.shading:
+        # Not only without weight: what completes stereo would look at it.
+        prior = DepthPrior(prior.log_depth, torch.full_like(prior.scatter, torch.inf))
     if monocular is not None:
         monocular_fits = fit_monocular(monocular, depth.log(), sure, recording)
         other = DepthPrior(*aligned(monocular_fits, monocular, recording))

@@ -48,6 +48,8 @@ class PoseEstimate:
         truth_per_unit: length of one unit of the poses in the unit of withheld true depth; None where no
             depth is withheld or the poses are metric. The evaluation compares with the truth by it; no
             pose and no point depends on it.
+        depth_factor: from the unit of the sequence's own depth to that of the poses; None where it is not
+            known: that depth cannot be used with them.
         scale_source: what makes the estimate metric, if anything does.
         calibration: of the lens, where the sequence's intrinsics were a guess; None where they were given.
     """
@@ -61,6 +63,7 @@ class PoseEstimate:
     metric: bool
     report: dict[str, Any]
     truth_per_unit: float | None = None
+    depth_factor: float | None = 1.0
     scale_source: ScaleSource = "source"
     calibration: LensCalibration | None = None
 
@@ -102,6 +105,7 @@ class PoseEstimate:
             "registered": [bool(found) for found in self.registered],
             "mean_reprojection_px": self.mean_reprojection_px,
             "truth_per_unit": self.truth_per_unit,
+            "depth_factor": self.depth_factor,
             "against_given": errors,
             **self.report,
         }
@@ -146,7 +150,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     """
     config = PosesConfig() if config is None else config
     # COLMAP and the alignment are told of pinholes; poses are those of the frames.
-    sequence = sequence.as_pinhole()
+    native, sequence = sequence.lens is not None, sequence.as_pinhole()
     if not sequence.training_depth_known:
         # Held-out frames may have depth for the evaluation alone.
         sequence = replace(sequence, depth_mm=None)
@@ -157,7 +161,7 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
         )
     if config.fallback == "rgbd":
         return _by_depth(sequence, config, None)
-    unknown_lens = _estimates_lens(sequence, config)
+    unknown_lens = _estimates_lens(sequence, config, native=native)
     # The lenses that are tried have one focal length.
     seen = sequence.with_square_pixels() if unknown_lens else sequence
     job = _job(seen, config, unknown_lens=unknown_lens)
@@ -216,10 +220,14 @@ def _job(sequence: EndoscopicSequence, config: PosesConfig, *, unknown_lens: boo
     )
 
 
-def _estimates_lens(sequence: EndoscopicSequence, config: PosesConfig) -> bool:
+def _estimates_lens(sequence: EndoscopicSequence, config: PosesConfig, *, native: bool) -> bool:
     if config.refine_intrinsics == "never":
         return False
     if config.refine_intrinsics == "auto" and sequence.intrinsics != "guessed":
+        return False
+    if native:
+        # What is estimated would be the lens of the pinhole that the frames are looked at through.
+        _LOG.warning("%s: the frames are those of a lens that is known; it is kept", sequence.name)
         return False
     if np.ptp(sequence.K, axis=0).any():
         _LOG.warning("%s: the frames have several cameras; their intrinsics are kept", sequence.name)
@@ -239,11 +247,14 @@ def _from_colmap(
     scale_source: ScaleSource = "source"
     seen = (result.observed_frame, result.observed_point, result.observed_px)
     scale = truth = None
-    if sequence.depth_mm is not None and sequence.metric:
+    depth_factor: float | None = 1.0
+    if sequence.depth_mm is not None:
+        # In the unit of the source, which may be any.
         scale = depth_scale(poses, points, *seen, sequence.depth_mm, sequence.mask)
+        depth_factor = None if scale is None else 1.0
     elif sequence.true_depth_mm is not None and config.working_distance_mm is None:
         truth = depth_scale(poses, points, *seen, sequence.true_depth_mm, sequence.mask)
-    if scale is not None:
+    if scale is not None and sequence.metric:
         mm_per_unit, scale_source = scale.mm_per_unit, "depth"
         report["scale"] = asdict(scale)
     elif config.working_distance_mm is not None:
@@ -252,9 +263,21 @@ def _from_colmap(
             "working_distance",
         )
         report["scale"] = {"mm_per_unit": mm_per_unit, "working_distance_mm": config.working_distance_mm}
-    if mm_per_unit is not None:
-        poses[:, :3, 3] *= mm_per_unit
-        points = points * mm_per_unit
+        if scale is not None:
+            depth_factor = mm_per_unit / scale.mm_per_unit
+    length = mm_per_unit
+    if length is None and scale is not None:
+        # Of no known unit, but of one with the depth; what is true of the source is in it as well.
+        length, truth = scale.mm_per_unit, replace(scale, mm_per_unit=1.0)
+    if length is not None:
+        poses[:, :3, 3] *= length
+        points = points * length
+    if depth_factor is None:
+        _LOG.warning(
+            "%s: too little of the depth lies where the poses have points: its unit is not that of the "
+            "poses, and it is left out",
+            sequence.name,
+        )
     return PoseEstimate(
         method="colmap",
         world_from_camera=poses,
@@ -266,6 +289,7 @@ def _from_colmap(
         report=report,
         scale_source=scale_source,
         truth_per_unit=None if truth is None else truth.mm_per_unit,
+        depth_factor=depth_factor,
     )
 
 
@@ -332,7 +356,8 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
     """The sequence with poses and points, without the frames that did not register.
 
     Frames keep their names; the split is renumbered. `truth` is kept and told that the world is another
-    (`world`). Where true depth was withheld, it is brought to the unit of the poses, for the evaluation.
+    (`world`). Depth is brought to the unit of the poses, that which was withheld for the evaluation as well,
+    and left out where nothing tells that unit.
     Where a lens was estimated, `K` is that of its pinhole, and frames of a distorted lens are resampled to it
     (`extrags.poses.with_calibration`).
 
@@ -360,6 +385,12 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         unit = estimate.truth_per_unit
         return stacked(((depth[frame] / unit).astype(depth.dtype) for frame in kept), len(kept))
 
+    def of_own(depth: np.ndarray | None) -> Any:
+        factor = estimate.depth_factor
+        if depth is None or factor is None or factor == 1:
+            return None if factor is None else of_kept(depth)
+        return stacked(((depth[frame] * factor).astype(depth.dtype) for frame in kept), len(kept))
+
     split = sequence.split
     hidden = not sequence.training_depth_known
     posed = replace(
@@ -367,7 +398,7 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         rgb=of_kept(sequence.rgb),
         K=sequence.K[kept],
         mask=of_kept(sequence.mask),
-        depth_mm=of_truth(sequence.depth_mm) if hidden else of_kept(sequence.depth_mm),
+        depth_mm=of_truth(sequence.depth_mm) if hidden else of_own(sequence.depth_mm),
         withheld_depth_mm=of_truth(sequence.withheld_depth_mm),
         recording=of_kept(sequence.recording),
         observed=of_kept(sequence.observed),

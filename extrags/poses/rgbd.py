@@ -38,6 +38,8 @@ PLACES = 12
 """Placed frames with which a frame without a good start is matched."""
 LINKS = 4
 """Frames a new frame is aligned with; the joint adjustment uses more."""
+BEGINNINGS = 5
+"""Frames that a model is begun with, one after another, while most frames cannot be joined to it."""
 JOINT_ROUNDS = 8
 JOINT_OVERLAP = 0.3
 POINTS = 4000
@@ -80,6 +82,16 @@ def align_by_depth(sequence: EndoscopicSequence, config: PosesConfig) -> RgbdAli
     return _Alignment(sequence, config).run()
 
 
+@dataclass(frozen=True)
+class _Model:
+    """Frames that were joined to one another, and what is known of those that were tried."""
+
+    placed: dict[int, Posed]
+    model: list[int]
+    fits: dict[int, Agreement]
+    recognised: dict[int, int]
+
+
 class _Alignment:
     def __init__(self, sequence: EndoscopicSequence, config: PosesConfig) -> None:
         self.sequence, self.config = sequence, config
@@ -106,10 +118,7 @@ class _Alignment:
             raise CaptureError(
                 f"{self.sequence.name}: none of {len(train)} training frames has enough depth to be aligned"
             )
-        first = waiting.pop(0)
-        self.placed[first] = Posed(self.views[first], np.eye(4))
-        self.model.append(first)
-        self._place_all(waiting, grows=True)
+        self._build_model(waiting)
         residual = self._adjust_jointly()
         self._prepare(test)
         self._place_all([frame for frame in test if frame in self.views], grows=False)
@@ -119,6 +128,31 @@ class _Alignment:
             poses[frame] = posed.world_from_camera
         points, colours = self._surface()
         return RgbdAlignment(poses, points, colours, self._account(residual))
+
+    def _build_model(self, frames: list[int]) -> None:
+        """Place training frames, beginning with the first; where most cannot be joined to it, with another.
+
+        It may show something else, or nothing: the largest model counts, as among COLMAP's.
+        """
+        largest: _Model | None = None
+        left = frames
+        for _ in range(BEGINNINGS):
+            first, *others = left
+            self.placed, self.model = {first: Posed(self.views[first], np.eye(4))}, [first]
+            self.fits, self.recognised = {}, {}
+            self._place_all(others, grows=True)
+            found = _Model(self.placed, self.model, self.fits, self.recognised)
+            if largest is None or len(found.model) > len(largest.model):
+                largest = found
+            left = [frame for frame in left if frame not in self.placed]
+            if len(left) <= len(largest.model):
+                break
+        assert largest is not None
+        self.placed, self.model = largest.placed, largest.model
+        self.fits, self.recognised = largest.fits, largest.recognised
+        if left is not frames and (others := [frame for frame in frames if frame not in self.placed]):
+            # Those that were joined to a smaller one have not been tried.
+            self._place_all(others, grows=True)
 
     def _prepare(self, frames: list[int]) -> None:
         for frame in frames:

@@ -96,6 +96,19 @@ def test_same_bits_and_nothing_of_held_out_frames_in_the_model(
     np.testing.assert_array_equal(again.points, found[0].points)
 
 
+def test_a_first_frame_of_something_else_is_left_out(sequence: EndoscopicSequence) -> None:
+    """As it would be in the middle: the largest model counts."""
+    rng = np.random.default_rng(0)
+    rgb, depth = sequence.rgb.copy(), np.array(sequence.depth_mm)
+    height, width = depth.shape[1:]
+    rgb[0] = rng.normal(90, 6, (height, width, 3)).clip(0, 255)
+    depth[0] = 55 + np.linspace(0, 60, width) + rng.normal(0, 0.05, (height, width))
+    found = align_by_depth(replace(sequence, rgb=rgb, depth_mm=depth), CONFIG)
+    placed = np.isfinite(found.world_from_camera).all((1, 2))
+    assert not placed[0]
+    assert placed[1:].sum() >= 6
+
+
 def test_without_texture_the_shape_may_do(sequence: EndoscopicSequence) -> None:
     """A room seen into its corners is known by its walls alone."""
     room = room_sequence(5, width=200, height=150, holdout_every=9)
