@@ -18,6 +18,8 @@ from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
 from data_catalog.detail import DetailSize, source_detail
 from data_catalog.folders import FolderDataset
 from data_catalog.phantom.dataset import PHANTOM
+from data_catalog.readers.dicom import DICOM_SUFFIXES
+from data_catalog.readers.video import VIDEO_SUFFIXES
 from data_catalog.specular import with_specular
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
@@ -182,12 +184,17 @@ def _dataset(source: Source) -> Dataset:
 
 
 def _unknown(name: str) -> UnknownSequenceError:
+    place = Path(name).expanduser()
+    if place.exists():
+        return UnknownSequenceError(f"{name} is a file or folder, and no name of the catalogue")
+    if place.suffix.lower() in (*VIDEO_SUFFIXES, *DICOM_SUFFIXES) or name.startswith((".", "/", "~")):
+        return UnknownSequenceError(f"no such file or folder: {place.absolute()}")
     listed = list_sequences()
     known = [item.name for item in listed] + [item.folder for item in listed if item.folder is not None]
     near = get_close_matches(name, known, n=1, cutoff=0.5)
     hint = f" Did you mean {near[0]}?" if near else ""
     return UnknownSequenceError(
-        f"no sequence {name!r} in the catalogue and no such folder.{hint} "
-        f"Known: {', '.join(dataset.spelling for dataset in DATASETS)} (all of them: extrags data list), "
-        "or the path of a folder"
+        f"no sequence {name!r} in the catalogue and no such file or folder.{hint} "
+        f"Known: {', '.join(dataset.spelling for dataset in DATASETS)} (extrags data list), "
+        "or the path of a folder or a video"
     )

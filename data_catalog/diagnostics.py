@@ -252,6 +252,19 @@ def _intrinsics(sequence: EndoscopicSequence) -> Iterator[Finding]:
             return
 
 
+def _count(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    from extrags.poses.estimate import MIN_TRAINING_FRAMES
+
+    train, test = len(sequence.train), len(sequence.test)
+    if sequence.world_from_camera is None and train < MIN_TRAINING_FRAMES:
+        yield Finding(
+            kind="error",
+            topic="number of frames",
+            sentence=f"{train} of {train + test} frames are to train on (ingest.holdout_every holds out the "
+            f"others); poses cannot be estimated from fewer than {MIN_TRAINING_FRAMES}: give more frames",
+        )
+
+
 def _poses(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Cameras that stand still, repeat or jump."""
     if sequence.world_from_camera is None:
@@ -429,6 +442,7 @@ _CHECKS: tuple[Callable[[EndoscopicSequence], Iterator[Finding]], ...] = (
     _exposure,
     _masks,
     _intrinsics,
+    _count,
     _poses,
     _points,
     _epipolar,

@@ -16,7 +16,8 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     """Print a table of results, one row per sequence."""
     out = console(error=True)
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("sequence", "status", "stages"):
+    table.add_column("sequence", overflow="fold")
+    for column in ("status", "stages"):
         table.add_column(column)
     columns = table_figures(*(tree for outcome in run.sequences for tree in outcome.metrics.values()))[:4]
     for name in columns:
@@ -47,9 +48,9 @@ def print_outcomes(run: DatasetOutcome, seconds: float) -> None:
     print_failures(run)
     for outcome in run.sequences:
         if outcome.report:
-            out.print(f"report: {outcome.report}", soft_wrap=True)
+            out.print(f"report: {outcome.report}", soft_wrap=True, markup=False)
     if run.report and len(run.sequences) > 1:
-        out.print(f"all together: {run.report}", soft_wrap=True)
+        out.print(f"all together: {run.report}", soft_wrap=True, markup=False)
     out.print(f"{seconds:.1f} s in all")
 
 
@@ -75,7 +76,7 @@ def print_plan(outcome: SequenceOutcome) -> None:
     """The scene plan, decision by decision."""
     out = console()
     plan = outcome.plan or {"decisions": [], "measurements": {}}
-    table = Table(box=None, pad_edge=False, header_style="bold", title=f"plan for {outcome.name}")
+    table = Table(box=None, pad_edge=False, header_style="bold", title=f"plan for {escape(outcome.name)}")
     for column in ("stage", "runs", "budget", "saves s", "because"):
         table.add_column(column, justify="right" if column == "saves s" else "left")
     for line in plan["decisions"]:

@@ -14,7 +14,7 @@ __all__ = ["RunEstimate", "SequenceEstimate", "expected_seconds"]
 
 OTHER_SECONDS: dict[str, float] = {"poses": 20.0, "depth": 30.0, "report": 4.0}
 """Of processor time: tasks whose cost no model knows, for a recording of the phantom. Poses and depth grow
-with the pixels of all frames."""
+with the pixels of all frames, for depth as far as it looks at them (`depth.max_width`)."""
 RESTORATION = {"enhance-keyframes": 0.1, "enhance-restore": 0.8, "enhance": 0.1}
 """Shares of its tasks in the time of the restoration, which is modelled as one."""
 
@@ -38,7 +38,10 @@ def expected_seconds(
     """
     model, work = packaged_model(), usual_work(config) if work is None else work
     usual = usual_work(config)
-    larger = work.pixels * work.frames / (usual.pixels * usual.frames)
+    larger = {
+        "poses": work.pixels * work.frames / (usual.pixels * usual.frames),
+        "depth": _pixels_of_depth(work) * work.train / (_pixels_of_depth(usual) * usual.train),
+    }
     found: dict[StageName, dict[str, float]] = {}
     for stage in STAGES:
         repeats = task_repeats(stage, measured_scenes=2, restored=1)
@@ -47,11 +50,17 @@ def expected_seconds(
             if task in model.time and stage not in OTHER_SECONDS:
                 seconds = times * model.predict(task, work).seconds
             else:
-                seconds = OTHER_SECONDS.get(task, 0.0) * (1.0 if stage == "report" else larger)
+                seconds = OTHER_SECONDS.get(task, 0.0) * larger.get(stage, 1.0)
             for part, share in (RESTORATION if task == "enhance" else {task: 1.0}).items():
                 tasks[part] = share * seconds
         found[stage] = tasks
     return found
+
+
+def _pixels_of_depth(work: Workload) -> float:
+    """Of an image as depth is estimated from it."""
+    share = 1.0 if work.width is None else min(1.0, work.config.depth.max_width / float(work.width))
+    return float(work.pixels) * share**2
 
 
 @dataclass

@@ -78,7 +78,9 @@ def _write_obj(colored: ColoredMesh, path: Path) -> None:
     mesh, uv = colored.mesh, colored.uv
     lines = ["# extrags; v: x y z red green blue"]
     if colored.texture is not None:
-        picture, material = path.with_suffix(".png"), path.with_suffix(".mtl")
+        # Both formats end a name at white space.
+        beside = path.with_name("_".join(path.stem.split()) or "surface")
+        picture, material = (beside.with_name(f"{beside.name}{suffix}") for suffix in (".png", ".mtl"))
         picture.write_bytes(_png(colored.texture))
         material.write_text(
             f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture.name}\n",

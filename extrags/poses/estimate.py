@@ -157,7 +157,8 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     if len(sequence.train) < MIN_TRAINING_FRAMES:
         raise CaptureError(
             f"{sequence.name}: poses need at least {MIN_TRAINING_FRAMES} training frames, "
-            f"found {len(sequence.train)}"
+            f"found {len(sequence.train)} beside {len(sequence.test)} that are held out "
+            "(ingest.holdout_every); give more frames"
         )
     if config.fallback == "rgbd":
         return _by_depth(sequence, config, None)

@@ -9,6 +9,7 @@ import io
 import re
 import textwrap
 import threading
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -37,6 +38,10 @@ COARSE_COLOR = "#8794a3"
 FINAL_COLOR = "#0b6e75"
 WORSE_COLOR = "#b4481e"
 METHOD_COLORS = (FINAL_COLOR, "#c2702a", "#6b4ea0", "#3d7dbd", "#9a3b5b", "#7a7f2a")
+METHOD_MARKS = ("o", "s", "^", "D")
+"""Of methods that share a colour."""
+LEGEND_COLUMNS = 4
+LONGEST_NAME = 41
 INK = "#1d2733"
 QUIET = "#5b6774"
 RULE = "#d9dee4"
@@ -46,6 +51,7 @@ _STYLE_LOCK = threading.Lock()
 _STYLE: Any = {
     "font.family": "DejaVu Sans",  # ships with matplotlib: the same everywhere
     "font.size": 9.0,
+    "text.parse_math": False,  # names of sequences may have any letters
     "axes.edgecolor": RULE,
     "axes.labelcolor": QUIET,
     "axes.titlecolor": INK,
@@ -256,7 +262,7 @@ def sequences_chart(
         left.scatter(
             coarse, row, s=18, facecolor="white", edgecolor=COARSE_COLOR, linewidth=1.4, label="coarse"
         )
-        left.set_yticks(row, names)
+        left.set_yticks(row, [_shortened(name) for name in names])
         left.set_ylim(-0.6, len(names) - 0.4)
         left.grid(axis="x")
         left.set_title("PSNR on held-out views (dB)")
@@ -280,6 +286,14 @@ def sequences_chart(
         for place, name in enumerate(names)
     ]
     return chart.with_numbers("sequences", header, rows)
+
+
+def _shortened(name: str) -> str:
+    """A name that leaves room for the axes; its beginning and its end tell the most."""
+    if len(name) <= LONGEST_NAME:
+        return name
+    half = (LONGEST_NAME - 1) // 2
+    return f"{name[:half]}…{name[-half:]}"
 
 
 def method_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
@@ -309,7 +323,11 @@ def methods_chart(
         figure = _figure(9.6, max(2.6, 1.0 + (0.1 + 0.13 * len(colors)) * len(groups)))
         left, right = figure.subplots(1, 2, width_ratios=[1.6, 1])
         row = np.arange(len(groups))[::-1]
+        taken: Counter[str] = Counter()
         for place, (method, color) in enumerate(colors.items()):
+            # There are fewer colours than methods may be.
+            mark = METHOD_MARKS[taken[color] % len(METHOD_MARKS)]
+            taken[color] += 1
             # Methods of a group stand below each other; their runs share a height.
             height = (0.5 - (place + 0.5) / len(colors)) * 0.7
             for index, group in enumerate(groups):
@@ -318,18 +336,25 @@ def methods_chart(
                     continue
                 at = np.full(found.size, row[index] + height)
                 left.hlines(at[0], found.min(), found.max(), color=color, linewidth=2.2, alpha=0.35)
-                left.scatter(found, at, s=14, color=color, alpha=0.8, linewidth=0)
+                left.scatter(found, at, s=14, color=color, alpha=0.8, linewidth=0, marker=mark)
                 left.scatter([found.mean()], at[:1], s=40, marker="|", color=color, linewidth=1.8)
                 took = np.asarray(seconds[method][group], dtype=np.float64)
-                right.scatter(took, found, s=16, color=color, alpha=0.8, linewidth=0)
-            left.scatter([], [], s=22, color=color, label=method)
-        left.set_yticks(row, list(groups))
+                right.scatter(took, found, s=16, color=color, alpha=0.8, linewidth=0, marker=mark)
+            left.scatter([], [], s=22, color=color, label=method, marker=mark)
+        left.set_yticks(row, [_shortened(group) for group in groups])
         left.set_ylim(-0.6, len(groups) - 0.4)
         left.grid(axis="x")
         left.set_title(title)
-        left.legend(
-            ncols=len(colors), loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.1, handletextpad=0.1
-        )
+        if len(colors) <= LEGEND_COLUMNS:
+            left.legend(
+                ncols=len(colors),
+                loc="lower right",
+                bbox_to_anchor=(1, 1),
+                borderaxespad=0.1,
+                handletextpad=0.1,
+            )
+        else:
+            figure.legend(ncols=LEGEND_COLUMNS, loc="outside lower center", handletextpad=0.1)
         right.set_title("The same by run time")
         right.set_xlabel("seconds")
         right.set_xlim(left=0)

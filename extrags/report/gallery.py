@@ -77,7 +77,7 @@ def build_gallery(
     # An image is bounded by the length of its base64.
     each = largest_bytes * 4 // (3 * IMAGES_OF_A_RUN * len(runs))
     folder.mkdir(parents=True, exist_ok=True)
-    parts = [_head(title, command), *(_strip(run, folder, each) for run in runs)]
+    parts = [_head(title, command), *(_strip(run, folder, each, place) for place, run in enumerate(runs))]
     page = folder / "index.md"
     page.write_text("\n".join(parts), encoding="utf-8")
     return page
@@ -93,10 +93,11 @@ def _head(title: str, command: str) -> str:
     )
 
 
-def _strip(run: GalleryRun, folder: Path, largest_bytes: int) -> str:
+def _strip(run: GalleryRun, folder: Path, largest_bytes: int, number_of_run: int) -> str:
     """A section: words, a held-out view, a virtual view."""
     sequence = run.sequence
-    name = file_name(sequence.name)
+    # Numbered: different sequences may have the same letters, or be of the same name.
+    name = f"{number_of_run:03d}_{file_name(sequence.name)}".rstrip("_")
     kinds = [kind for kind in KINDS if kind in run.rgb]
     metrics = shown_metrics(*(run.results[kind]["metrics"] for kind in kinds))
     place = _median_view(run.results["final" if "final" in kinds else kinds[0]])

@@ -21,7 +21,8 @@ from extrags.scene import Scene
 __all__ = ["read_ply_scene", "write_ply_scene"]
 
 _MARK = b"comment extrags_light "
-_HEADER_BYTES = 1 << 20
+_LINE_BYTES = 200
+_HEADER_BYTES = 1 << 22
 
 
 def write_ply_scene(scene: Scene, path: Path) -> None:
@@ -40,9 +41,12 @@ def write_ply_scene(scene: Scene, path: Path) -> None:
     # A linear response has a shoulder of zero, whose logarithm JSON cannot say.
     values["shoulder"] = math.exp(values.pop("log_shoulder"))
     values["reference_distance"] = scene.light.reference_distance
-    line = _MARK + json.dumps(values, allow_nan=False).encode("ascii") + b"\n"
+    text = json.dumps(values, allow_nan=False, separators=(",", ":")).encode("ascii")
+    # In several lines: readers keep a line of the header in a buffer of about a thousand bytes.
+    parts = (text[start : start + _LINE_BYTES] for start in range(0, len(text), _LINE_BYTES))
+    lines = b"".join(_MARK + part + b"\n" for part in parts)
     head, end, body = path.read_bytes().partition(b"element vertex")
-    path.write_bytes(head + line + end + body)
+    path.write_bytes(head + lines + end + body)
 
 
 def read_ply_scene(path: Path) -> Scene:
@@ -55,8 +59,8 @@ def read_ply_scene(path: Path) -> Scene:
     gaussians = Gaussians.read_ply(path)
     with path.open("rb") as stream:
         header = stream.read(_HEADER_BYTES).partition(b"end_header")[0]
-    line = next((line for line in header.splitlines() if line.startswith(_MARK)), None)
-    return Scene(gaussians, None if line is None else _light(line.removeprefix(_MARK), path))
+    parts = [line.removeprefix(_MARK) for line in header.splitlines() if line.startswith(_MARK)]
+    return Scene(gaussians, _light(b"".join(parts), path) if parts else None)
 
 
 _SHAPES: dict[str, tuple[int, ...] | None] = {

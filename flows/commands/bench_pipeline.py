@@ -107,7 +107,8 @@ def pipeline(given: argparse.Namespace) -> int:
         from flows.terminal import console
 
         console().print(table, markup=False, soft_wrap=True)
-        console().print(f"results: {folder / 'results.json'}, {folder / 'fronts.svg'}", soft_wrap=True)
+        told = f"results: {folder / 'results.json'}, {folder / 'fronts.svg'}"
+        console().print(told, soft_wrap=True, markup=False)
     write_json(found, given.json)
     return 1 if any(case["error"] for case in found["cases"]) else 0
 

@@ -53,7 +53,9 @@ def add_arguments(parser: Parser) -> None:
         help="a further method: coarse, or METHOD, with other settings; repeatable",
     )
     parser.add_argument(
-        "--baseline", metavar="METHOD", help="what the others are compared with (default: 3dgs)"
+        "--baseline",
+        metavar="METHOD",
+        help="what the others are compared with (default: 3dgs where it is a method, else the first)",
     )
     parser.add_argument("--seeds", nargs="+", default=["0"], metavar="N", help="e.g. 0,1,2 (default: 0)")
     parser.add_argument(
@@ -230,7 +232,7 @@ def print_benchmark(found: dict[str, Any], *, to_stderr: bool) -> None:
         if case["error"]:
             run = f"{case['sequence']} {case['method']} seed {case['seed']}"
             out.print(f"[red]{escape(run)} failed in {escape(case['error'])}[/]")
-    out.print(f"report: {found['report']}", soft_wrap=True)
+    out.print(f"report: {found['report']}", soft_wrap=True, markup=False)
 
 
 def _table(title: str) -> Table:

@@ -107,7 +107,7 @@ def ls(given: argparse.Namespace) -> int:
         out = console()
         out.print(table)
         total = size_text(sum(item.bytes for item in manifests))
-        out.print(f"{len(manifests)} artefacts, {total}, in {store.root}")
+        out.print(f"{len(manifests)} artefacts, {total}, in {store.root}", markup=False)
     rows = [
         item.model_dump(mode="json", exclude={"contents"}) | {"damaged": item.key in damaged}
         for item in manifests
@@ -142,7 +142,7 @@ def verify(given: argparse.Namespace) -> int:
                 cells = (damage.stage, what, damage.key, *([place or ""] if given.repair else []))
                 table.add_row(*map(escape, cells))
             out.print(table)
-        out.print(f"{len(damaged)} of {checked} artefacts damaged in {store.root}")
+        out.print(f"{len(damaged)} of {checked} artefacts damaged in {store.root}", markup=False)
         if damaged and not given.repair:
             out.print("with --repair they are set aside, and the next run makes them anew")
         elif damaged:
@@ -217,7 +217,7 @@ def usage(given: argparse.Namespace) -> int:
         out = console()
         out.print(table)
         total = f"{sum(row.artefacts for row in rows)} artefacts, {sum(row.files for row in rows)} files"
-        out.print(f"{total}, {size_text(sum(row.bytes for row in rows))}, in {store.root}")
+        out.print(f"{total}, {size_text(sum(row.bytes for row in rows))}, in {store.root}", markup=False)
     write_json([asdict(row) for row in rows], given.json)
     return 0
 

@@ -121,11 +121,27 @@ def finished_run(given: argparse.Namespace, until: StageName, otherwise: str = "
     except NotInStoreError as error:
         raise StoreError(
             f"{given.sequence} with these settings is not finished in {root}; run it first{otherwise} "
-            f"({error})"
+            f"({error}){_on_record(root, given.sequence)}"
         ) from error
     if outcome.status == "failed":
         raise outcome.error or ExtragsError(f"{outcome.name} failed")
     return run
+
+
+def _on_record(root: str, sequence: str) -> str:
+    """What settings finished runs of a sequence had, for who has left some out; empty without such runs."""
+    from extrags.store import Store
+    from flows.outcome_records import outcome_records
+
+    found: dict[str, None] = {}
+    for record in outcome_records(Store(root)).values():
+        if record["sequence"] == sequence and record["status"] == "ok" and record.get("report"):
+            method = "" if record["method"] == "extrags" else f" --method {record['method']}"
+            seed = "" if record["seed"] is None else f" --seed {record['seed']}"
+            found[f"--profile {record['profile']}{method}{seed}"] = None
+    if not found:
+        return ""
+    return f". Finished runs of it had {', '.join(found)}: give the same, and the same further settings"
 
 
 def stage_limits(given: argparse.Namespace) -> StageLimits:

@@ -126,7 +126,7 @@ def show(given: argparse.Namespace) -> int:
                 table.add_row(f"[bold]{name}[/]", _figure(name, value))
         console().print(table)
         if given.picture:
-            console().print(f"picture: {given.picture}", soft_wrap=True)
+            console().print(f"picture: {given.picture}", soft_wrap=True, markup=False)
     write_json({**described, "measured": measured}, given.json)
     return 0
 

@@ -118,5 +118,6 @@ def _print(found: dict[str, Any]) -> None:
     if surface:
         out.print("surface: " + ", ".join(f"{name} {value:.3f}" for name, value in surface.items()))
     for name, reason in found["reasons"].items():
-        out.print(f"[dim]no {name}: {reason}[/]", soft_wrap=True)
-    out.print(f"{found['sequence']}: {found['n_views']} views, protocol {found['protocol']}")
+        out.print(f"no {name}: {reason}", soft_wrap=True, style="dim", markup=False)
+    told = f"{found['sequence']}: {found['n_views']} views, protocol {found['protocol']}"
+    out.print(told, markup=False)

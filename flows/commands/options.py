@@ -6,10 +6,12 @@ Nothing heavy is imported here: the settings are loaded for the verbs that have 
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import shutil
 import textwrap
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from extrags.errors import ConfigError, did_you_mean
@@ -102,10 +104,24 @@ def add_store(parser: Parser) -> None:
     )
 
 
+def _writable(target: str) -> str:
+    """A file to be written at the end: what is wrong with its place is said before hours of work."""
+    place = Path(target).expanduser().absolute()
+    nearest = next(folder for folder in place.parents if folder.exists())
+    if target != "-" and place.is_dir():
+        raise argparse.ArgumentTypeError(f"{target} is a folder; expected a file")
+    if target != "-" and not (nearest.is_dir() and os.access(nearest, os.W_OK)):
+        raise argparse.ArgumentTypeError(f"{target} cannot be written: nothing can be made in {nearest}")
+    return target
+
+
 def add_json(parser: Parser) -> None:
     """`--json`."""
     parser.add_argument(
-        "--json", metavar="FILE|-", help="write the results as JSON to a file or to standard output"
+        "--json",
+        metavar="FILE|-",
+        type=_writable,
+        help="write the results as JSON to a file or to standard output",
     )
 
 

@@ -199,7 +199,7 @@ def pretrain(given: argparse.Namespace) -> int:
         else:
             files = make_scenes(folder, sources, given.workers)
         if given.scenes_only:
-            console().print(f"{len(files)} scenes in {folder}")
+            console().print(f"{len(files)} scenes in {folder}", markup=False)
             return 0
         if given.threads is not None:
             torch.set_num_threads(given.threads)
@@ -237,7 +237,7 @@ def _told(record: dict[str, Any], folder: str) -> int:
     out = console()
     for method, scores in record["validation_scores"].items():
         out.print(f"{method:12} " + "  ".join(f"{name} {value}" for name, value in scores.items()))
-    out.print(f"written to {folder}")
+    out.print(f"written to {folder}", markup=False)
     return 0
 
 

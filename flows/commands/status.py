@@ -11,6 +11,9 @@ from flows.commands.common import store_root, write_json
 from flows.commands.options import Parser, add_json, add_store
 
 if TYPE_CHECKING:
+    from rich.console import JustifyMethod
+    from rich.table import Table
+
     from flows.store_status import StoreStatus
 
 __all__ = ["add_arguments", "size_text", "status"]
@@ -24,6 +27,9 @@ MARKS = {
 }
 SHORT = 3
 """Letters of a stage's name above its column."""
+LEFT, RIGHT = ("sequence", "run", "state", "ended"), ("seconds", "PSNR", "size")
+LEAST_FIRST = ("ended", "size", "seconds", "PSNR")
+"""What a terminal that is too narrow does not show."""
 
 
 def add_arguments(parser: Parser) -> None:
@@ -65,6 +71,7 @@ def status(given: argparse.Namespace) -> int:
 
 def _print(found: StoreStatus) -> None:
     from rich.markup import escape
+    from rich.measure import Measurement
     from rich.table import Table
 
     from extrags.pipeline import STAGES
@@ -72,27 +79,42 @@ def _print(found: StoreStatus) -> None:
     from flows.terminal import console
 
     out = console()
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
-    table.add_column("sequence", overflow="fold")
-    table.add_column("run")
+    columns: dict[str, list[str]] = {"sequence": [escape(row.sequence) for row in found.rows]}
+    if any(row.variant for row in found.rows):
+        columns["run"] = [escape(row.variant) for row in found.rows]
     for stage in STAGES:
-        table.add_column(stage[:SHORT], justify="center", no_wrap=True)
-    for column in ("state", "seconds", "PSNR", "size", "ended"):
-        table.add_column(column, justify="left" if column in ("state", "ended") else "right", no_wrap=True)
-    for row in found.rows:
-        marks = [MARKS[row.stages[stage].state] if stage in row.stages else "" for stage in STAGES]
-        psnr = "" if row.psnr is None else f"{row.psnr:.2f}"
-        table.add_row(
-            escape(row.sequence),
-            escape(row.variant),
-            *marks,
-            row.state,
-            f"{row.seconds:.0f}" if row.seconds else "",
-            psnr,
-            size_text(row.bytes) if row.bytes else "",
-            row.ended[:16],
-        )
-    out.print(table)
+        columns[stage[:SHORT]] = [
+            MARKS[row.stages[stage].state] if stage in row.stages else "" for row in found.rows
+        ]
+    columns["state"] = [row.state for row in found.rows]
+    columns["seconds"] = [f"{row.seconds:.0f}" if row.seconds else "" for row in found.rows]
+    columns["PSNR"] = ["" if row.psnr is None else f"{row.psnr:.2f}" for row in found.rows]
+    columns["size"] = [size_text(row.bytes) if row.bytes else "" for row in found.rows]
+    columns["ended"] = [row.ended[:16] for row in found.rows]
+
+    def table_of(shown: dict[str, list[str]]) -> Table:
+        table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold")
+        for name in shown:
+            justify: JustifyMethod = "left" if name in LEFT else "right" if name in RIGHT else "center"
+            table.add_column(name, justify=justify, no_wrap=True)
+        for cells in zip(*shown.values(), strict=True):
+            table.add_row(*cells)
+        return table
+
+    # In a narrow terminal names and stages stay; the others are in the JSON.
+    unlimited = out.options.update(max_width=10_000)
+    for name in LEAST_FIRST:
+        if Measurement.get(out, unlimited, table_of(columns)).maximum <= out.width:
+            break
+        columns.pop(name)
+    if Measurement.get(out, unlimited, table_of(columns)).maximum <= out.width:
+        out.print(table_of(columns))
+    else:
+        for place, row in enumerate(found.rows):
+            where = f"{row.sequence} ({row.variant})" if row.variant else row.sequence
+            marks = "".join(columns[stage[:SHORT]][place] or " " for stage in STAGES)
+            out.print(f"{where}: {row.state}", markup=False, soft_wrap=True)
+            out.print(f"  {marks}")
     for row in found.rows:
         if row.reason:
             where = f"{row.sequence} ({row.variant})" if row.variant else row.sequence
@@ -103,6 +125,7 @@ def _print(found: StoreStatus) -> None:
         f"{len(found.rows)} runs: {counts}; {duration(took)} in all, {size_text(found.bytes)}; "
         f"{found.artefacts} artefacts in {found.store}, {found.unrecorded} of them of other runs",
         soft_wrap=True,
+        markup=False,
     )
     legend = "   ".join(f"{mark} {state}" for state, mark in MARKS.items())
     out.print(f"[dim]{legend}[/]")

@@ -7,6 +7,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from extrags.errors import UnknownSequenceError
 from extrags.pipeline import STAGES
@@ -89,6 +90,24 @@ def test_the_command(store: Store, tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["status", "--store", str(tmp_path / "none")]) == 1
     assert "there is no store" in capsys.readouterr().err
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("width", [40, 80, 200])
+def test_names_are_there_however_narrow_the_terminal(
+    store: Store, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, width: int
+) -> None:
+    monkeypatch.setattr("flows.terminal.console", lambda *_given, **_named: Console(width=width))
+    assert main(["status", "--store", store.root]) == 0
+    said = capsys.readouterr().out
+    assert SEQUENCE in said
+    assert ("ended" in said) == (width == 200)
+
+
+def test_a_store_with_brackets_in_its_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place = tmp_path / "run[" / "old]"
+    place.mkdir(parents=True)
+    assert main(["status", "--store", str(place)]) == 0
+    assert "run[/old]" in capsys.readouterr().out.replace("\n", "")
 
 
 def test_every_sequence_with_a_record_has_a_row(store: Store) -> None:

@@ -105,6 +105,13 @@ class TestFiles:
         assert len(mesh.faces) == len(colored.mesh.triangles)
         assert agreement(mesh, baked, tube.sequence.training_cameras[::3]) > LEAST_DB
 
+    def test_obj_whose_name_has_a_space(self, colored: ColoredMesh, tmp_path: Path) -> None:
+        """Of the names in OBJ and MTL white space is the end."""
+        write_mesh(colored, tmp_path / "my scene.obj")
+        assert {file.name for file in tmp_path.iterdir()} == {"my scene.obj", "my_scene.mtl", "my_scene.png"}
+        assert "mtllib my_scene.mtl\n" in (tmp_path / "my scene.obj").read_text()
+        assert "map_Kd my_scene.png\n" in (tmp_path / "my_scene.mtl").read_text()
+
     def test_ply(self, colored: ColoredMesh, baked: Scene, tube: Tube, tmp_path: Path) -> None:
         write_mesh(colored, tmp_path / "a.ply")
         mesh = trimesh.load(tmp_path / "a.ply", process=False)

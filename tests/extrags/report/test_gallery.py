@@ -33,7 +33,7 @@ def built(runs: list[GalleryRun], folder: Path, largest_bytes: int = 400_000) ->
 def test_every_image_is_there_with_words(run: GalleryRun, tmp_path: Path) -> None:
     text = built([run], tmp_path)
     images = re.findall(r"!\[(.+?)\]\((.+?)\)", text)
-    assert {file for _, file in images} == {file.name for file in tmp_path.glob("tube*")}
+    assert {file for _, file in images} == {file.name for file in tmp_path.glob("*.png")}
     assert len(images) == 5 + 6
     for alt, file in images:
         assert len(alt) > 10
@@ -52,15 +52,27 @@ def test_the_view_is_the_median_one(run: GalleryRun, tmp_path: Path) -> None:
     assert "PSNR 20.00 dB" in text
     assert "PSNR 22.50 dB" in text
     assert "Means of 5 held-out views, coarse → final: PSNR 20.00 → 22.50 dB" in text
-    shown = np.asarray(Image.open(tmp_path / "tube_0_sparse_view_1.png"))
+    shown = np.asarray(Image.open(tmp_path / "000_tube_0_sparse_view_1.png"))
     assert (shown == run.sequence.rgb[8]).all()
 
 
 def test_what_no_frame_saw_is_tinted(run: GalleryRun, tmp_path: Path) -> None:
     built([run], tmp_path)
-    shown = np.asarray(Image.open(tmp_path / "tube_0_sparse_view_4.png")).astype(int)
+    shown = np.asarray(Image.open(tmp_path / "000_tube_0_sparse_view_4.png")).astype(int)
     tinted = shown[..., 0] > shown[..., 2] + 20
     assert (tinted == ~run.sequence.observed[8]).all()
+
+
+def test_runs_of_one_name_have_pictures_of_their_own(run: GalleryRun, tmp_path: Path) -> None:
+    """Folders of the same name, or names without a letter that a file may have."""
+    other = replace(run, sequence=replace(run.sequence, rgb=255 - run.sequence.rgb))
+    for name in (run.sequence.name, "患者一"):
+        both = [replace(one, sequence=replace(one.sequence, name=name)) for one in (run, other)]
+        folder = tmp_path / str(len(name))
+        images = re.findall(r"!\[.+?\]\((.+?)\)", built(both, folder))
+        assert len(set(images)) == len(images) == 2 * (5 + 6)
+        truths = [np.asarray(Image.open(folder / file)) for file in images if file.endswith("view_1.png")]
+        assert (truths[0] == 255 - truths[1]).all()
 
 
 def test_without_virtual_views_or_final_scene(run: GalleryRun, tmp_path: Path) -> None:

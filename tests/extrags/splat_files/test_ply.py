@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import open3d
 import pytest
 import torch
 from plyfile import PlyData
@@ -24,9 +26,11 @@ def lit(lit: Scene) -> Scene:
 
 def changed(path: Path, **values: object) -> None:
     """Other numbers in the light of a file."""
-    head, mark, rest = path.read_bytes().partition(b"comment extrags_light ")
-    text, end, body = rest.partition(b"\n")
-    light = {**json.loads(text), **values}
+    mark = b"comment extrags_light "
+    head, *parts = path.read_bytes().split(mark)
+    last, end, body = parts.pop().partition(b"\n")
+    light = {**json.loads(b"".join([*(part.rstrip(b"\n") for part in parts), last])), **values}
+    # In one line, as files had it before.
     path.write_bytes(head + mark + json.dumps(light).encode() + end + body)
 
 
@@ -40,6 +44,27 @@ class TestLight:
             assert torch.allclose(back.light.parameters()[name], value, rtol=1e-6), name
         assert back.light.reference_distance == lit.light.reference_distance
         assert psnr(back, lit, views) > 100
+
+    def test_lines_of_the_header_are_short_however_many_frames_there_are(
+        self, lit: Scene, tmp_path: Path
+    ) -> None:
+        """Readers keep a line in a buffer of about a thousand bytes."""
+        assert lit.light is not None
+        exposures = torch.linspace(-1, 1, 500)
+        write_ply_scene(Scene(lit.gaussians, replace(lit.light, log_exposure=exposures)), tmp_path / "a.ply")
+        header = (tmp_path / "a.ply").read_bytes().partition(b"end_header")[0]
+        assert max(len(line) for line in header.splitlines()) < 256
+        back = read_ply_scene(tmp_path / "a.ply").light
+        assert back is not None
+        torch.testing.assert_close(back.log_exposure, exposures)
+        cloud = open3d.io.read_point_cloud(str(tmp_path / "a.ply"))
+        assert len(cloud.points) == len(lit.gaussians)
+
+    def test_a_file_with_all_of_it_in_one_line_is_read(self, lit: Scene, tmp_path: Path) -> None:
+        write_ply_scene(lit, tmp_path / "a.ply")
+        changed(tmp_path / "a.ply")
+        assert (tmp_path / "a.ply").read_bytes().count(b"extrags_light") == 1
+        assert read_ply_scene(tmp_path / "a.ply").light is not None
 
     def test_other_programs_pass_over_it(self, lit: Scene, tmp_path: Path) -> None:
         write_ply_scene(lit, tmp_path / "a.ply")
