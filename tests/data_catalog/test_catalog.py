@@ -47,6 +47,15 @@ class TestNames:
         with pytest.raises(UnknownSequenceError, match=f"Did you mean {near}"):
             describe(wrong)
 
+    @pytest.mark.parametrize("name", ["exam.mp4", "./exam", "/nowhere/exam", "scan.dcm"])
+    def test_a_path_that_is_none_is_said_to_be_none(self, name) -> None:
+        with pytest.raises(UnknownSequenceError, match=r"^no such file or folder: /"):
+            describe(name)
+
+    def test_a_path_is_no_name(self, posed_folder) -> None:
+        with pytest.raises(UnknownSequenceError, match="is a file or folder, and no name of the catalogue"):
+            describe(str(posed_folder))
+
     def test_unknown_setting_names_the_known_ones(self) -> None:
         with pytest.raises(UnknownSequenceError, match="'spars'; known: sparse, distanced"):
             resolve("phantom/3@spars")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from data_catalog.checks import check_depth_scale, check_sequence
 from data_catalog.diagnostics import diagnose
@@ -33,6 +34,20 @@ class TestRightSources:
     def test_unknown_names_are_not_findings(self) -> None:
         with pytest.raises(UnknownSequenceError):
             inspect("phantm/1")
+
+    @pytest.mark.parametrize(("frames", "wrong"), [(2, True), (3, True), (4, False)])
+    def test_too_few_frames_for_poses_are_an_error(self, tmp_path, frames, wrong) -> None:
+        """One in eight is held out, the first among them."""
+        rng = np.random.default_rng(0)
+        for number in range(frames):
+            Image.fromarray(rng.integers(0, 255, (40, 48, 3), dtype=np.uint8)).save(
+                tmp_path / f"{number}.png"
+            )
+        found = [item for item in inspect(str(tmp_path)).findings if item.topic == "number of frames"]
+        assert bool(found) == wrong
+        for item in found:
+            assert item.kind == "error"
+            assert f"{frames - 1} of {frames} frames are to train on" in item.sentence
 
     def test_assumptions_are_notes(self, shared_data) -> None:
         found = inspect(shared_data / "sinus_hopkins" / "images", IngestConfig(downscale=8, max_frames=6))

@@ -40,6 +40,15 @@ class TestEstimate:
             assert sum(large[stage].values()) > 1.5 * sum(small[stage].values())
         assert large["freespace"] == small["freespace"]
 
+    def test_depth_looks_at_frames_of_a_bounded_width(self) -> None:
+        config = profile_config("balanced")
+        depths = [
+            sum(expected_seconds(config, replace(usual_work(config), pixels=p, width=w))["depth"].values())
+            for p, w in ((160 * 128, 160), (256 * 144, 256), (1920 * 1080, 1920))
+        ]
+        assert depths[1] == pytest.approx(depths[0] * 256 * 144 / (160 * 128))
+        assert depths[2] == pytest.approx(depths[1])
+
     def test_nothing_is_said_before_something_ran(self) -> None:
         estimate = SequenceEstimate(EXPECTED)
         estimate.receive(step("ingest"), 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.splat_files import read_ply_scene
 from extrags.store import Store
+from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.outcome import SequenceOutcome
 from tests.extrags.splat_files import decoders
@@ -45,6 +47,20 @@ def export(finished: Finished, *arguments: str) -> int:
 def frames(finished: Finished) -> EndoscopicSequence:
     store, outcome = finished
     return Store(store).load(EndoscopicSequence, outcome.refs["sequence"])
+
+
+def test_settings_of_a_finished_run_are_named_where_others_were_given(
+    finished: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    store, outcome = finished
+    shutil.copytree(Path(store) / "artefacts", tmp_path / "artefacts")
+    case = SequenceCase(SEQUENCE, profile="quick", settings=TINY)
+    record_outcome(Store(tmp_path), case, outcome, "report", case.config())
+    given = ["export", SEQUENCE, "--to", "ply", "--output", str(tmp_path / "a.ply"), "--store", str(tmp_path)]
+    assert main(given) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "run it first" in said
+    assert "Finished runs of it had --profile quick: give the same, and the same further settings" in said
 
 
 def final_scene(finished: Finished) -> Scene:

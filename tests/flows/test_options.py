@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from extrags.config import PipelineConfig
+from flows.cli import main
 from flows.commands.options import Parser, add_settings
 
 
@@ -38,3 +40,13 @@ def test_a_value_by_either_way(name: str, text: str) -> None:
 def test_a_list_in_json() -> None:
     found = settings("--set", 'evaluate.lpips_nets=["alex","vgg"]')
     assert PipelineConfig().with_overrides(found).evaluate.lpips_nets == ("alex", "vgg")
+
+
+@pytest.mark.parametrize("verb", [["data", "list"], ["bench", "raster"]])
+def test_where_no_json_can_be_written_is_said_before_anything_runs(
+    verb: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("")
+    for target, problem in ((tmp_path, "is a folder"), (tmp_path / "file" / "x.json", "cannot be written")):
+        assert main([*verb, "--json", str(target)]) == 2
+        assert problem in capsys.readouterr().err
