@@ -108,9 +108,14 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
         SourceError: the file is truncated or no image, has several values of which none is white, or all that
             differs is how opaque it is.
     """
-    values = _opened(file, frame, "mask", mode="L")
+    from PIL import Image
+
+    with _image_errors(file, frame, "mask"), Image.open(file) as image:
+        image.load()
+        values = np.asarray(image.convert("L"))
+        opacity = image.convert("LA").getchannel("A") if image.has_transparency_data else None
     found = np.unique(values)
-    if len(found) == 1 and len(np.unique(_opened(file, frame, "mask", mode="LA")[..., 1])) > 1:
+    if len(found) == 1 and opacity is not None and len(np.unique(opacity)) > 1:
         raise SourceError(
             "one colour throughout, and opaque in parts; expected white where tissue is, and black",
             file=file,

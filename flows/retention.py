@@ -21,8 +21,6 @@ from prefect.client.schemas.objects import StateType
 from prefect.exceptions import ObjectNotFound
 from pydantic import Field
 
-import flows.wiring  # noqa: F401  (registers the stages of a run with their versions)
-import tasks.benchmark  # noqa: F401  (and that of a benchmark's page)
 from extrags.errors import StoreError
 from extrags.store import Store
 from extrags.store.retention import Policy, apply_policy, planned_removals
@@ -31,7 +29,7 @@ from flows.parameters import StoreRoot
 from flows.settings import run_store
 from tasks.locks import sweep_locks
 from tasks.run_page import artifact_key, attempt
-from tasks.stage import stage_versions
+from tasks.stage import all_stage_versions
 
 __all__ = ["prune_flow_runs", "retention"]
 
@@ -77,7 +75,7 @@ def retention(
     if not place.exists():
         raise StoreError(f"there is no store {store}")
     with run_lease(store):
-        leftovers = place.gc(stage_versions(), dry_run=dry_run)
+        leftovers = place.gc(all_stage_versions(), dry_run=dry_run)
         if not dry_run:
             leftovers += sweep_locks(place.locks)
         policy = Policy(

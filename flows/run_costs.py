@@ -239,12 +239,11 @@ def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record]
     Raises:
         StoreError: when the store cannot be read.
     """
-    # All stages, so that their present versions are known; here, because this loads Prefect.
-    import flows.wiring  # noqa: F401
-    from tasks.stage import stage_versions
+    # Here, because this loads Prefect.
+    from tasks.stage import all_stage_versions
 
     manifests = {manifest.key: manifest for manifest in store.ls()}
-    versions = stage_versions()
+    versions = all_stage_versions()
     modelled = {task for tasks in STAGE_TASKS.values() for task in tasks}
     elapsed, processor = [], []
     for manifest in manifests.values():

@@ -18,6 +18,8 @@ import functools
 import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from importlib import import_module
+from pkgutil import iter_modules
 from typing import Any, Concatenate, ParamSpec
 
 from prefect import Task
@@ -38,7 +40,15 @@ from tasks.progress import reporting
 from tasks.run_log import run_log
 from tasks.run_page import stage_page
 
-__all__ = ["ArtefactRecords", "StageKey", "at", "stage", "stage_key", "stage_versions"]
+__all__ = [
+    "ArtefactRecords",
+    "StageKey",
+    "all_stage_versions",
+    "at",
+    "stage",
+    "stage_key",
+    "stage_versions",
+]
 
 P = ParamSpec("P")
 
@@ -259,6 +269,15 @@ def stage_key(task: Task[..., Ref], inputs: Mapping[str, Any]) -> str:
 def stage_versions() -> dict[str, int]:
     """Current version of every stage that has been imported."""
     return dict(_versions)
+
+
+def all_stage_versions() -> dict[str, int]:
+    """Current version of every stage there is; imports all modules of this package."""
+    import tasks
+
+    for module in iter_modules(tasks.__path__):
+        import_module(f"tasks.{module.name}")
+    return stage_versions()
 
 
 def _refreshing() -> bool:

@@ -268,8 +268,8 @@ def _from_colmap(
             depth_factor = mm_per_unit / scale.mm_per_unit
     length = mm_per_unit
     if length is None and scale is not None:
-        # Of no known unit, but of one with the depth; what is true of the source is in it as well.
-        length, truth = scale.mm_per_unit, replace(scale, mm_per_unit=1.0)
+        # Of no known unit, but of one with the depth.
+        length = scale.mm_per_unit
     if length is not None:
         poses[:, :3, 3] *= length
         points = points * length

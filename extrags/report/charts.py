@@ -27,6 +27,7 @@ __all__ = [
     "gain_chart",
     "history_chart",
     "method_colors",
+    "method_marks",
     "methods_chart",
     "pairs_chart",
     "sequences_chart",
@@ -303,6 +304,16 @@ def method_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
     return {baseline: COARSE_COLOR, **colors}
 
 
+def method_marks(colors: Mapping[str, str]) -> dict[str, str]:
+    """A mark of each method, by which those that share a colour differ: there are fewer colours than methods."""
+    taken: Counter[str] = Counter()
+    marks = {}
+    for method, color in colors.items():
+        marks[method] = METHOD_MARKS[taken[color] % len(METHOD_MARKS)]
+        taken[color] += 1
+    return marks
+
+
 def methods_chart(
     groups: Sequence[str],
     values: Mapping[str, Mapping[str, Sequence[float]]],
@@ -323,11 +334,9 @@ def methods_chart(
         figure = _figure(9.6, max(2.6, 1.0 + (0.1 + 0.13 * len(colors)) * len(groups)))
         left, right = figure.subplots(1, 2, width_ratios=[1.6, 1])
         row = np.arange(len(groups))[::-1]
-        taken: Counter[str] = Counter()
+        marks = method_marks(colors)
         for place, (method, color) in enumerate(colors.items()):
-            # There are fewer colours than methods may be.
-            mark = METHOD_MARKS[taken[color] % len(METHOD_MARKS)]
-            taken[color] += 1
+            mark = marks[method]
             # Methods of a group stand below each other; their runs share a height.
             height = (0.5 - (place + 0.5) / len(colors)) * 0.7
             for index, group in enumerate(groups):

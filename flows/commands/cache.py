@@ -243,12 +243,10 @@ def gc(given: argparse.Namespace) -> int:
     if policy.keep_last is not None and policy.keep_last < 1:
         raise ConfigError(f"--keep-last {policy.keep_last}: expected 1 or more")
     store = _existing_store(given)
-    import flows.wiring  # noqa: F401  (registers the stages of a run with their versions)
-    import tasks.benchmark  # noqa: F401  (and that of a benchmark's page)
     from tasks.locks import sweep_locks
-    from tasks.stage import stage_versions
+    from tasks.stage import all_stage_versions
 
-    leftovers = store.gc(stage_versions(), dry_run=given.dry_run)
+    leftovers = store.gc(all_stage_versions(), dry_run=given.dry_run)
     if not given.dry_run:
         leftovers += sweep_locks(store.locks)
     removed = []

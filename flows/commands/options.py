@@ -106,11 +106,13 @@ def add_store(parser: Parser) -> None:
 
 def _writable(target: str) -> str:
     """A file to be written at the end: what is wrong with its place is said before hours of work."""
+    if target == "-":
+        return target
     place = Path(target).expanduser().absolute()
-    nearest = next(folder for folder in place.parents if folder.exists())
-    if target != "-" and place.is_dir():
+    if place.is_dir():
         raise argparse.ArgumentTypeError(f"{target} is a folder; expected a file")
-    if target != "-" and not (nearest.is_dir() and os.access(nearest, os.W_OK)):
+    nearest = next(folder for folder in place.parents if folder.exists())
+    if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
         raise argparse.ArgumentTypeError(f"{target} cannot be written: nothing can be made in {nearest}")
     return target
 

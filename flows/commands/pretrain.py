@@ -38,7 +38,7 @@ def add_arguments(parser: Parser) -> None:
         "--scenes-folder",
         default=".extrags/pretraining",
         metavar="FOLDER",
-        help="where pretraining scenes are kept, 30 to 120 MB each (default: %(default)s)",
+        help="where pretraining scenes are kept, 30 to 150 MB each (default: %(default)s)",
     )
     parser.add_argument(
         "--kinds",

@@ -12,7 +12,7 @@ from extrags.pipeline import STAGES, StageName
 from flows.estimate import RunEstimate, SequenceEstimate, expected_seconds
 from flows.workloads import usual_work
 from tasks.progress import StageProgress
-from tasks.stage import stage_versions
+from tasks.stage import all_stage_versions
 
 EXPECTED: dict[StageName, dict[str, float]] = {
     stage: {"ingest": {"ingest": 12.0}, "coarse": {"coarse": 18.0}}.get(stage, tasks)
@@ -28,7 +28,7 @@ class TestEstimate:
     def test_every_stage_is_expected_and_its_tasks_exist(self) -> None:
         assert tuple(EXPECTED) == STAGES
         named = {task for tasks in EXPECTED.values() for task in tasks}
-        assert named <= set(stage_versions())
+        assert named <= set(all_stage_versions())
 
     def test_larger_frames_take_longer_where_pixels_count(self) -> None:
         config = profile_config("balanced")

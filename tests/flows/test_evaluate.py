@@ -69,6 +69,14 @@ class TestEvaluate:
         assert found["reasons"]["surface"] == "a folder of renders holds no surface"
         assert len(found["per_view"]) == found["n_views"] > 1
 
+    def test_renders_beside_a_method_that_leaves_stages_out(
+        self, finished: tuple[str, SequenceOutcome], folders: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store, _ = finished
+        more = ["--renders", str(folders / "renders"), "--method", "oracle", "--json", "-"]
+        assert main(["evaluate", SEQUENCE, *settled(store), *more]) == 0
+        assert json.loads(capsys.readouterr().out)["n_views"] == 14
+
     def test_a_finished_run(
         self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:

@@ -237,7 +237,7 @@ def _mixed_sampler(
 
 def _sampler(file: Path, config: PretrainingConfig, number: int, iteration: int) -> CropSampler:
     scene = PretrainingScene.load(file)
-    # In half precision, as in the file: in full precision a hundred scenes would take twenty gigabytes.
+    # In half precision, as in the file: all scenes are held at once.
     pairs = replace(
         scene.pairs,
         layers=Layers(scene.pairs.layers.data.half()),

@@ -5,7 +5,7 @@ import base64
 import numpy as np
 import pytest
 
-from extrags.report.charts import METHOD_COLORS, method_colors, methods_chart, sequences_chart
+from extrags.report.charts import METHOD_COLORS, method_colors, method_marks, methods_chart, sequences_chart
 from extrags.report.downloads import Chart
 
 
@@ -23,8 +23,9 @@ def test_any_number_of_methods_can_be_told_apart(count: int) -> None:
     colors = method_colors(methods, methods[0])
     chart = methods_chart(groups, drawn, drawn, colors, "PSNR (dB)")
     assert len(numbers(chart)) == 2 * count * len(groups)
-    # As many marks as methods that share a colour.
     assert (len(set(colors.values())) < count) == (count > len(METHOD_COLORS) + 1)
+    marks = method_marks(colors)
+    assert len({(colors[method], marks[method]) for method in methods}) == count
 
 
 def test_names_may_be_long_and_have_any_letters() -> None:
