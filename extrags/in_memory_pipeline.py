@@ -167,9 +167,11 @@ class InMemoryPipeline(Pipeline):
         return 0 if self.result.exploration is None else self.result.exploration.n_virtual
 
     def ingest(self) -> None:
-        """The sequence was read by the caller; the device is looked at before anything is made."""
+        """The sequence was read by the caller; device and kernels are looked at before anything is made."""
         from extrags.placement import check_device, run_device
+        from extrags.raster import native_isa
 
+        native_isa()  # refuses an EXTRAGS_ISA that is not usable
         check_device(self.config)
         self._device = run_device(self.config)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection
 
 from extrags.config import PipelineConfig
@@ -23,9 +24,15 @@ def preflight(config: PipelineConfig, until: str, leave_out: Collection[str] = (
         WeightsError: when weights are not there; says how to get them.
         MissingDependencyError: when a package is not there; says how to install it.
         SourceNotFoundError: when there is no such file as `imported.scene`.
-        ConfigError: when settings do not fit each other, the model or the machine.
+        ConfigError: when settings do not fit each other, the model or the machine, or EXTRAGS_ISA names an
+            instruction set that is not usable here.
         ExtragsError: when the code a checkpoint needs does not start.
     """
+    # Only where it is set: asking the kernels loads torch, which looking up a deployment must not.
+    if os.environ.get("EXTRAGS_ISA"):
+        from extrags.raster import native_isa
+
+        native_isa()
     config = config.with_run_device()
     if STAGES.index(until) >= STAGES.index("coarse"):
         from extrags.placement import check_device

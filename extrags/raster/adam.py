@@ -14,6 +14,9 @@ from extrags.raster import native
 
 __all__ = ["Joined", "SelectiveAdam"]
 
+GRADIENT_MAX = 1e18
+"""Gradients are held to this size either way: both moments stay finite, and their ratio bounds the step."""
+
 
 @dataclass(frozen=True)
 class Joined:
@@ -30,7 +33,8 @@ class SelectiveAdam:
     A step updates only the rows flagged visible; other rows keep their values, moments and step counts, and
     cost no time. The bias correction of a row counts that row's own steps, so a row that is first visible
     late, or was added by densification, starts at step one. With all rows visible the result equals
-    `torch.optim.Adam`. Results are deterministic and independent of the number of threads.
+    `torch.optim.Adam` for gradients up to `GRADIENT_MAX`; larger ones count as that. Results are
+    deterministic and independent of the number of threads.
 
     Joined parameters are stored in one array, so that kernels that take them together need no copy. They
     remain separate parameters with their own names, learning rates, moments and leaf tensors.
@@ -124,10 +128,15 @@ class SelectiveAdam:
                 the name of the joined array. A parameter without a gradient is unchanged.
 
         Raises:
-            ShapeError: when `visible` does not have one flag per row.
+            ShapeError: when `visible` does not have one flag per row, or a gradient not the shape of what it
+                belongs to.
         """
-        if visible is not None and visible.shape != self.steps.shape:
-            raise ShapeError(f"visible has shape {tuple(visible.shape)}, expected {tuple(self.steps.shape)}")
+        if visible is not None and (visible.shape != self.steps.shape or visible.dtype != torch.bool):
+            raise ShapeError(
+                f"visible is {visible.dtype} {tuple(visible.shape)}, expected torch.bool "
+                f"{tuple(self.steps.shape)}"
+            )
+        self._check_shapes(gradients or {})
         self.steps += 1 if visible is None else visible
         self._taken += 1
         if self._taken >= len(self._bias[0]):
@@ -156,6 +165,15 @@ class SelectiveAdam:
         if quick:
             native.adam_step(quick, self.steps, visible, self._bias, self.betas, self.eps)
 
+    def _check_shapes(self, gradients: Mapping[str, Tensor]) -> None:
+        joined = {name: array.values for name, array in self.joined.items()}
+        for name, value in {**self.parameters, **joined}.items():
+            gradient = gradients.get(name)
+            if gradient is not None and gradient.shape != value.shape:
+                raise ShapeError(
+                    f"the gradient of {name} has shape {tuple(gradient.shape)}, expected {tuple(value.shape)}"
+                )
+
     def _step_torch(
         self,
         value: Tensor,
@@ -169,7 +187,7 @@ class SelectiveAdam:
         rows = slice(None) if visible is None else visible
         shape = (-1, *([1] * (value.ndim - 1)))
         count = self.steps[rows].to(value.dtype).reshape(shape)
-        g = gradient[rows]
+        g = gradient[rows].clamp(-GRADIENT_MAX, GRADIENT_MAX)
         m = beta1 * first[rows] + (1 - beta1) * g
         v = beta2 * second[rows] + (1 - beta2) * g * g
         first[rows], second[rows] = m, v

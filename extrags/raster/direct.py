@@ -20,7 +20,7 @@ from extrags.errors import NonFiniteError, ShapeError
 from extrags.radial_lens import RadialLens
 from extrags.raster import native
 from extrags.raster.loss import huber_depth_gradient
-from extrags.raster.rendering import Rendering, nonfinite_error
+from extrags.raster.rendering import Rendering, check_near, nonfinite_error
 
 __all__ = ["DirectStep", "Target"]
 
@@ -240,13 +240,17 @@ class DirectStep:
             pose: fill `viewmat_gradient` too.
 
         Raises:
-            NonFiniteError: when a parameter, activated, holds a NaN or an infinity.
+            NonFiniteError: when a parameter, activated, the light or the pose holds a NaN or an infinity.
+            ShapeError: when `near` is not finite and positive, or as `rendered_frame`.
         """
         kernels = native.compiled_kernels()
         torch.exp(self._values["scales"], out=self._linear["scales"])
         torch.sigmoid(self._values["opacities"], out=self._linear["opacities"])
-        if light is not None and kernels.first_nonfinite(light) >= 0:
-            raise nonfinite_error("light", torch.from_numpy(light)[None])
+        check_near(near)
+        # Poses that are refined are written into the target after it was made.
+        for name, values in (("viewmats", target.viewmat), ("light", light)):
+            if values is not None and kernels.first_nonfinite(values) >= 0:
+                raise nonfinite_error(name, torch.from_numpy(values)[None])
         images = self._images_of(target)
         camera = kernels.Camera(
             viewmat=target.viewmat,
@@ -257,7 +261,7 @@ class DirectStep:
             light=light,
             lens=target.lens,
         )
-        frame = kernels.render(self._gaussians, camera, images.filled, degree=sh_degree, check=True)
+        frame = native.rendered_frame(self._gaussians, camera, images.filled, degree=sh_degree, check=True)
         if frame is None:
             raise self._nonfinite_error(kernels)
         loss, image_gradients = images.loss_and_gradients(

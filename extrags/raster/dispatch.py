@@ -14,7 +14,7 @@ from torch import Tensor
 from extrags.errors import ConfigError, MissingDependencyError
 from extrags.radial_lens import RadialLens
 from extrags.raster.light import CameraLight
-from extrags.raster.native import native_isa, rasterize_native
+from extrags.raster.native import missing_kernels_error, native_isa, rasterize_native
 from extrags.raster.reference import rasterize_reference
 from extrags.raster.rendering import (
     RasterInputs,
@@ -104,7 +104,7 @@ def rasterize(
         The images and the optional outputs requested; see `Rendering` for shapes and meaning.
 
     Raises:
-        ShapeError: when shapes, dtypes or devices do not fit together.
+        ShapeError: when shapes, dtypes or devices do not fit together, or a size is out of range.
         NonFiniteError: when an input holds a NaN or an infinity; names the array and the entry.
         ConfigError: when the chosen backend cannot take these tensors.
         MissingDependencyError: when the chosen backend is not installed.
@@ -141,7 +141,7 @@ def _chosen(backend: Backend, means: Tensor) -> str:
         raise ConfigError(f"backend is {backend!r}, expected auto, native, gsplat or reference")
     if backend == "native":
         if native_isa() is None:
-            raise MissingDependencyError("the native kernels are not built: pip install extrags")
+            raise missing_kernels_error()
         if not plain:
             raise ConfigError(
                 f"backend native takes float32 CPU tensors, got {means.dtype} on {means.device}"
@@ -158,4 +158,4 @@ def _chosen(backend: Backend, means: Tensor) -> str:
 
 @cache
 def _warn_once() -> None:
-    logger.warning("the native kernels are not built: using the slow reference rasteriser")
+    logger.warning("using the slow reference rasteriser: %s", missing_kernels_error())

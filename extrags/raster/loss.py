@@ -215,6 +215,8 @@ def huber_depth_gradient(
     # slope * (difference - slope / 2) is x^2 / 2 where nothing is clipped, delta (|x| - delta / 2) elsewhere.
     per_pixel = slope * (difference - slope / 2)
     if confidence is not None:
+        # What is not compared may have any confidence, NaN too.
+        confidence = np.where(valid, confidence, 0)
         per_pixel, slope = per_pixel * confidence, slope * confidence
     loss = float(per_pixel.sum(dtype=np.float64)) / count
     np.multiply(slope, np.float32(weight / (count * scale)), out=gradient)

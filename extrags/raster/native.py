@@ -14,23 +14,31 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from extrags.errors import ConfigError, MissingDependencyError
+from extrags.cores import usable_cores
+from extrags.errors import ConfigError, MissingDependencyError, ShapeError
 from extrags.raster.rendering import RasterInputs, RasterOptions, Rendering, nonfinite_error
 
+_kernels: ModuleType | None = None
+_import_error: ImportError | None = None
 try:
     import extrags.raster._native as _compiled
-except ImportError:  # not built: the reference rasteriser still works
-    _kernels: ModuleType | None = None
+except ImportError as error:  # the reference rasteriser still works
+    _import_error = error.with_traceback(None)
 else:
     _kernels = _compiled
+    # By themselves the kernels count the cores of this process, but not what a container may take of them.
+    if usable_cores() < _compiled.num_threads():
+        _compiled.set_num_threads(usable_cores())
 
 __all__ = [
     "adam_step",
     "compiled_kernels",
     "l1_ssim_loss_native",
+    "missing_kernels_error",
     "native_isa",
     "num_threads",
     "rasterize_native",
+    "rendered_frame",
     "set_native_isa",
     "set_num_threads",
     "usable_isas",
@@ -42,8 +50,14 @@ def native_isa() -> str | None:
 
     The fastest one the processor supports is chosen at import; the environment variable EXTRAGS_ISA
     overrides it.
+
+    Raises:
+        ConfigError: when EXTRAGS_ISA names one that this processor cannot run.
     """
-    return None if _kernels is None else str(_kernels.isa())
+    try:
+        return None if _kernels is None else str(_kernels.isa())
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
 
 
 def usable_isas() -> list[str]:
@@ -66,7 +80,7 @@ def set_native_isa(name: str) -> None:
 def set_num_threads(n: int) -> None:
     """Set the maximum number of threads of the kernels; results do not depend on it.
 
-    The default is the number of cores this process may use, at most 8.
+    The default is the number of cores this process may use (`extrags.cores`), at most 8.
 
     Raises:
         ConfigError: when n is not 1 to 64.
@@ -85,11 +99,47 @@ def compiled_kernels() -> ModuleType:
     """The compiled module itself, for benchmarks.
 
     Raises:
-        MissingDependencyError: when it is not built.
+        MissingDependencyError: when it is not built, or the system cannot load it.
     """
     if _kernels is None:
-        raise MissingDependencyError("the native kernels are not built: pip install extrags")
+        raise missing_kernels_error()
     return _kernels
+
+
+def missing_kernels_error() -> MissingDependencyError:
+    """The error that says why there are no compiled kernels; its cause is that of the import."""
+    if isinstance(_import_error, ModuleNotFoundError) and _import_error.name == "extrags.raster._native":
+        why = (
+            "the native kernels are not built: pip install extrags builds them where there is a C++17 "
+            "compiler (GCC 12, Clang 14 or later)"
+        )
+    else:
+        why = f"the native kernels are built but cannot be loaded: {_import_error}"
+    error = MissingDependencyError(why)
+    error.__cause__ = _import_error
+    return error
+
+
+def rendered_frame(gaussians: Any, camera: Any, images: Any, *, degree: int, check: bool = False) -> Any:
+    """One camera's forward pass by the kernels.
+
+    Args:
+        gaussians: the kernels' struct of the scene.
+        camera: that of the camera.
+        images: that of the images, which are filled.
+        degree: of the harmonics.
+        check: look for NaN and infinities in the scene.
+
+    Returns:
+        The kernels' frame; None where the check found some.
+
+    Raises:
+        ShapeError: when the Gaussians cover too many tiles of the image for the kernels to number.
+    """
+    try:
+        return compiled_kernels().render(gaussians, camera, images, degree=degree, check=check)
+    except OverflowError as error:
+        raise ShapeError(str(error)) from error
 
 
 def rasterize_native(inputs: RasterInputs, options: RasterOptions) -> Rendering:
@@ -240,7 +290,7 @@ class _Rasterize(torch.autograd.Function):
                 visibility_max=_of_camera(call.visibility_max, index),
                 visibility_sum=_of_camera(call.visibility_sum, index),
             )
-            frame = kernels.render(gaussians.of_camera(index), camera, images, degree=options.sh_degree)
+            frame = rendered_frame(gaussians.of_camera(index), camera, images, degree=options.sh_degree)
             if call.query_points is not None and call.transmittance is not None:
                 frame.query(call.query_points, call.transmittance[index])
             if differentiable:

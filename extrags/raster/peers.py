@@ -59,7 +59,7 @@ def check_peers(peers: list[str]) -> None:
     if unknown:
         raise ConfigError(f"unknown peers {', '.join(unknown)}; expected {', '.join(PEERS)}")
     if {"native", "direct"} & set(peers) and native.native_isa() is None:
-        raise ConfigError("peers native and direct need the compiled kernels: pip install extrags")
+        raise ConfigError(f"peers native and direct are not available: {native.missing_kernels_error()}")
     if "gsplat" in peers and "gsplat" not in available_backends():
         raise ConfigError("peer gsplat needs a CUDA device and the package gsplat")
 

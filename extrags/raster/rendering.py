@@ -129,8 +129,7 @@ def checked_inputs(
         raise ShapeError(f"means has dtype {means.dtype}, expected a floating-point dtype")
     if not (1 <= width <= 32768 and 1 <= height <= 32768):
         raise ShapeError(f"image size {width}x{height}, expected 1 to 32768 pixels a side")
-    if not (near > 0 and math.isfinite(near)):
-        raise ShapeError(f"near is {near}, expected a finite positive distance")
+    check_near(near)
     n = means.shape[0]
     c = inputs.viewmats.shape[0] if inputs.viewmats.ndim == 3 else -1
     if (inputs.sh is None) == (inputs.colors is None):
@@ -164,6 +163,16 @@ def checked_inputs(
         if value.device != means.device:
             raise ShapeError(f"{name} is on {value.device}, means is on {means.device}")
     return inputs, degree
+
+
+def check_near(near: float) -> None:
+    """Check the distance of the near plane.
+
+    Raises:
+        ShapeError: when it is not finite and positive.
+    """
+    if not (near > 0 and math.isfinite(near)):
+        raise ShapeError(f"near is {near}, expected a finite positive distance")
 
 
 def check_finite(inputs: RasterInputs) -> None:

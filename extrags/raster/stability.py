@@ -78,7 +78,7 @@ def bench_stability(axes: Sequence[str] | None = None, *, threads: int = 1) -> d
     if unknown:
         raise ConfigError(f"unknown axes {', '.join(unknown)}; expected {', '.join([*AXES, REFUSED])}")
     if native.native_isa() is None:
-        raise ConfigError("the stability of the native kernels needs them built: pip install extrags")
+        raise ConfigError(str(native.missing_kernels_error()))
     before = native.num_threads(), torch.get_num_threads()
     use_threads("native", threads)
     try:

@@ -60,12 +60,12 @@ def stability(given: argparse.Namespace) -> int:
     # Read when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     from extrags.raster.bench import machine
-    from extrags.raster.native import native_isa
+    from extrags.raster.native import missing_kernels_error, native_isa
     from extrags.stress import ROWS, Effort, run_rows
     from extrags.stress.rows import with_threads
 
     if native_isa() is None:
-        raise ConfigError("the stability of the native kernels needs them built: pip install extrags")
+        raise ConfigError(str(missing_kernels_error()))
     effort = Effort(given.scenes, given.iterations, given.gaussians)
     quiet = given.json == "-"
     rows = with_threads(

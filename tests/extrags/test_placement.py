@@ -101,6 +101,15 @@ class TestRefusals:
         with pytest.raises(ConfigError, match="device=cuda"):
             InMemoryPipeline(tube.sequence, config(device="cuda")).run_stages("coarse")
 
+    def test_an_instruction_set(self, tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
+        def refused() -> None:
+            raise ConfigError("EXTRAGS_ISA")
+
+        monkeypatch.setattr("extrags.raster.native_isa", refused)
+        monkeypatch.setattr(InMemoryPipeline, "coarse", lambda self: pytest.fail("something was made"))
+        with pytest.raises(ConfigError, match="EXTRAGS_ISA"):
+            InMemoryPipeline(tube.sequence, config()).run_stages("coarse")
+
 
 class TestPlacements:
     def test_on_a_gpu(self, machine: Any) -> None:

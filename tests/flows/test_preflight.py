@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ import pytest
 
 from extrags.config import EnhanceConfig
 from extrags.errors import ConfigError, WeightsError
+from extrags.raster.native import usable_isas
 from extrags.store import Ref, Store
 from flows.benchmark import benchmark
 from flows.cli import main
@@ -97,6 +100,24 @@ class TestSentences:
         code, said = run("evaluate.lpips_weights=no/such.npz")
         assert code == 1
         assert "no/such.npz" in said
+
+    def test_an_instruction_set(self, tmp_path: Path) -> None:
+        """In a process of its own: the kernels read the variable once."""
+        command = "import sys; from flows.cli import main; sys.exit(main(sys.argv[1:]))"
+        given = ["run", SEQUENCE, "--profile", "quick", "--until", "poses", "--store", str(tmp_path)]
+        told = subprocess.run(
+            [sys.executable, "-c", command, *given],
+            capture_output=True,
+            text=True,
+            check=False,
+            env={**os.environ, "EXTRAGS_ISA": "sse9"},
+        )
+        assert told.returncode == 2
+        assert told.stderr == (
+            "extrags: EXTRAGS_ISA: instruction set 'sse9' is not usable here, expected one of "
+            f"{', '.join(usable_isas())}\n"
+        )
+        assert not list(tmp_path.glob("artefacts/*"))
 
 
 class TestWhatIsLookedFor:

@@ -1,13 +1,16 @@
 // Adam over arrays that share their rows; the rule is in adam.py.
 
+constexpr float kAdamGradientMax = 1e18f;
+
 struct AdamFactors {
   Vec beta1, beta2, rest1, rest2, scale, eps;
 };
 
-EXTRAGS_INLINE void adam_vector(const AdamFactors& f, Vec step, Vec g, Vec* p, Vec* m, Vec* v) {
+EXTRAGS_INLINE void adam_vector(const AdamFactors& f, Vec step, Vec gradient, Vec* p, Vec* m, Vec* v) {
+  // Where one is NaN, both operations give their second argument: it is to be seen, not to become a number.
+  const Vec g = min(Vec(kAdamGradientMax), max(Vec(-kAdamGradientMax), gradient));
   *m = fma(f.beta1, *m, f.rest1 * g);
-  // Held below infinity, where a huge gradient would leave it for good.
-  *v = min(fma(f.beta2, *v, f.rest2 * g * g), Vec(3e38f));
+  *v = fma(f.beta2, *v, f.rest2 * g * g);
   *p = *p - step * *m / fma(sqrt(*v), f.scale, f.eps);
 }
 

@@ -54,6 +54,9 @@ struct GaussianArrays {
 
   Scene scene(int degree) const {
     const int coefficients = sh ? static_cast<int>(sh->shape(1)) : 0;
+    if (degree < 0 || degree > 3) {
+      throw std::invalid_argument("degree is " + std::to_string(degree) + ", expected 0 to 3");
+    }
     expect(!sh || (degree + 1) * (degree + 1) <= coefficients, "sh");
     return Scene{static_cast<int>(count()), means.data(), quats.data(), scales.data(), opacities.data(),
                  data_or_null(sh), coefficients, degree, data_or_null(colors)};

@@ -137,15 +137,17 @@ static void bin_tile(View* view, int tile, int slot, const TileFrame& t) {
     const int first = static_cast<int>(16 * group), rows = t.count - first < 16 ? t.count - first : 16;
     block_masks(locals + first, rows, static_cast<float>(t.x0), static_cast<float>(t.y0), masks + group, groups);
   }
-  uint32_t total = 0;
+  uint64_t listed = 0;
   for (int block = 0; block < kBlocks; ++block) {
-    starts[block] = total;
+    starts[block] = static_cast<uint32_t>(listed);
     if (block % kSide >= t.blocks_x || block / kSide >= t.blocks_y) continue;
     const uint16_t* of_block = masks + groups * block;
     for (size_t group = 0; group < groups; ++group) {
-      total += static_cast<uint32_t>(__builtin_popcount(of_block[group]));
+      listed += static_cast<uint32_t>(__builtin_popcount(of_block[group]));
     }
   }
+  check_countable(listed, "a Gaussian and a block of a tile");
+  const uint32_t total = static_cast<uint32_t>(listed);
   starts[kBlocks] = total;
   Buffer* buffer = static_cast<Buffer*>(view->tile_entries.data) + tile;
   reserve(buffer, (sizeof(uint32_t) + sizeof(uint16_t)) * (static_cast<size_t>(total) + 16));

@@ -71,7 +71,8 @@ EXTRAGS_INLINE uint16_t* entry_hits(uint32_t* entries, uint32_t total) {
   return reinterpret_cast<uint16_t*>(entries + total + 16);
 }
 
-// Composites the blocks of a tile front to back. Entries no pixel used are dropped from the lists.
+// Composites the blocks of a tile front to back. Entries that no pixel composited or ended at are dropped from
+// the lists.
 template <bool kMedian, bool kVisibility>
 static void composite_tile(View* view, const Images* out, int tile, const TileFrame& t, float* visibility) {
   const uint32_t* starts = static_cast<const uint32_t*>(view->block_starts.data) + static_cast<size_t>(tile) * (kBlocks + 1);
@@ -111,6 +112,9 @@ static void composite_tile(View* view, const Images* out, int tile, const TileFr
           hit = without(hit, done);
           if (!any(hit)) {
             if (!any(gt(finished, threshold))) break;
+            // No pixel composites it, but queries must find where this one ended.
+            hits[kept] = 0;
+            entries[kept++] = local;
             continue;
           }
         }

@@ -38,7 +38,8 @@ static void sum_depths(void* data, int task, int) {
   for (int64_t i = begin; i < end; i += 16) {
     const int lanes = end - i < 16 ? static_cast<int>(end - i) : 16;
     const DepthVector v = compare_depths(*c.images, i, lanes);
-    total = total + abs(v.difference) * confidence_at(*c.images, i, lanes);
+    // What is not compared may have any confidence, NaN too.
+    total = total + keep(v.valid, abs(v.difference) * confidence_at(*c.images, i, lanes));
     count += __builtin_popcount(to_bits(v.valid));
   }
   c.sums[task] = static_cast<double>(sum(total));

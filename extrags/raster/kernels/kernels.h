@@ -113,7 +113,7 @@ struct View {
   Buffer keys;         // DepthKey [pairs], per tile
   Buffer locals;       // Record [pairs], per tile, nearest first
   Buffer block_starts;  // uint32 [tiles, blocks + 1]: where a block's entries start in its tile
-  Buffer block_kept;    // uint32 [tiles, blocks]: entries that some pixel composited
+  Buffer block_kept;    // uint32 [tiles, blocks]: entries that some pixel composited or ended at
   Buffer finals;        // float [tiles, blocks, 16]: final transmittance
   Buffer lasts;         // float [tiles, blocks, 16]: how many kept entries a pixel went through
   Buffer tile_entries;  // Buffer [tiles]: indices into the tile's locals, per block, and `entry_hits`

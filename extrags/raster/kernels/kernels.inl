@@ -208,7 +208,13 @@ static void forward(View* view, const Scene* scene, const Images* images) {
   for (int chunk = 0; chunk < view->chunks; ++chunk) {
     for (size_t tile = 0; tile < tiles; ++tile) starts[tile + 1] += counts[chunk * tiles + tile];
   }
-  for (size_t tile = 0; tile < tiles; ++tile) starts[tile + 1] += starts[tile];
+  // The projection's own numbers of pairs wrap where there are too many; they are not used then.
+  uint64_t listed_pairs = 0;
+  for (size_t tile = 0; tile < tiles; ++tile) {
+    listed_pairs += starts[tile + 1];
+    starts[tile + 1] = static_cast<uint32_t>(listed_pairs);
+  }
+  check_countable(listed_pairs, "a Gaussian and a tile");
   // A running sum down the chunks, row by row: a column at a time would miss the caches at every step.
   reserve(&view->scratch[0], sizeof(uint32_t) * tiles);
   uint32_t* next = static_cast<uint32_t*>(view->scratch[0].data);

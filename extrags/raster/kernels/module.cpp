@@ -9,6 +9,8 @@
 #include <nanobind/stl/variant.h>
 #include <nanobind/stl/vector.h>
 
+#include <pthread.h>
+
 #include <algorithm>
 #include <cstdlib>
 #include <cstring>
@@ -46,18 +48,20 @@ std::vector<const KernelTable*> usable_tables() {
   return tables;
 }
 
-const KernelTable* find_table(const std::string& name) {
+// `source` begins the message: where a name that is not usable comes from.
+const KernelTable* find_table(const std::string& name, const std::string& source = "") {
   std::string names;
   for (const KernelTable* table : usable_tables()) {
     if (name == table->name) return table;
     names += names.empty() ? table->name : std::string(", ") + table->name;
   }
-  throw std::invalid_argument("instruction set '" + name + "' is not usable here, expected one of " + names);
+  throw std::invalid_argument(source + "instruction set '" + name + "' is not usable here, expected one of " +
+                              names);
 }
 
 const KernelTable* initial_table() {
   const char* wanted = std::getenv("EXTRAGS_ISA");
-  return wanted != nullptr && *wanted != '\0' ? find_table(wanted) : usable_tables().front();
+  return wanted != nullptr && *wanted != '\0' ? find_table(wanted, "EXTRAGS_ISA: ") : usable_tables().front();
 }
 
 const KernelTable*& active() {
@@ -165,7 +169,7 @@ void frame_query(Frame& frame, const In& points, Out transmittance) {
                        transmittance.data());
 }
 
-// How many (Gaussian, block) entries were composited
+// How many (Gaussian, block) entries some pixel composited or ended at
 int64_t frame_entries(const Frame& frame) {
   const View* view = frame.view.get();
   const uint32_t* kept = static_cast<const uint32_t*>(view->block_kept.data);
@@ -229,10 +233,10 @@ struct StereoMemory {
   Buffer scratch[kMaxThreads]{};
 };
 
-StereoMemory& stereo_memory() {
-  static StereoMemory* const memory = new StereoMemory;  // outlives all calls
-  return *memory;
-}
+StereoMemory* stereo_memory = new StereoMemory;  // outlives all calls
+
+// A thread that a forked child does not have may have held the mutex, and left the buffers half changed.
+void renew_stereo_memory() { stereo_memory = new StereoMemory; }
 
 // Brightness, mask, 3 x 3 matrix from pixels of the reference, offset
 using SourceTuple = std::tuple<In, In, In, In>;
@@ -262,7 +266,7 @@ void sweep(const In& reference, const In& mask, const In& base, const In& ratios
                            static_cast<int>(packed.size()), kept, radius, reference.data(), mask.data(),
                            base.data(), ratios.data(), packed.data(), cost.data()};
   nb::gil_scoped_release release_gil;
-  StereoMemory& memory = stereo_memory();
+  StereoMemory& memory = *stereo_memory;
   const std::lock_guard<std::mutex> lock(memory.mutex);
   active()->sweep(&images, memory.scratch);
 }
@@ -277,13 +281,23 @@ void semi_global(const In& cost, const In& grey, float small_step, float jump, f
                        static_cast<int>(cost.shape(0)), cost.data(), grey.data(), small_step, jump, edge,
                        position.data(), lowest.data(), margin.data()};
   nb::gil_scoped_release release_gil;
-  StereoMemory& memory = stereo_memory();
+  StereoMemory& memory = *stereo_memory;
   const std::lock_guard<std::mutex> lock(memory.mutex);
   active()->semi_global(&job, &memory.volume, memory.scratch);
 }
 
 // Values, gradients, first and second moments, learning rate or one per column
-using AdamTuple = std::tuple<Out, In, Out, Out, std::variant<float, std::vector<float>>>;
+using AdamTuple = std::tuple<nb::object, In, nb::object, nb::object, std::variant<float, std::vector<float>>>;
+
+// An array that is changed in place. An argument of type `Out` would be converted where it does not fit, and the
+// copy changed instead.
+Out in_place(const nb::object& array, const char* what) {
+  Out found;
+  if (!nb::try_cast<Out>(array, found, false)) {
+    throw std::invalid_argument(std::string(what) + " must be float32, contiguous and writable");
+  }
+  return found;
+}
 
 void adam(const std::vector<AdamTuple>& parameters, const Counts& steps, const In& bias1, const In& bias2,
           std::optional<Flags> visible, double beta1, double beta2, float eps) {
@@ -291,7 +305,9 @@ void adam(const std::vector<AdamTuple>& parameters, const Counts& steps, const I
   std::vector<AdamArray> arrays;
   std::vector<std::vector<float>> column_rates;
   column_rates.reserve(parameters.size());
-  for (const auto& [values, gradients, first, second, rate] : parameters) {
+  for (const auto& [values_given, gradients, first_given, second_given, rate] : parameters) {
+    const Out values = in_place(values_given, "values"), first = in_place(first_given, "first moments"),
+              second = in_place(second_given, "second moments");
     const size_t size = values.size();
     expect(rows > 0 && size % rows == 0, "values");
     expect(gradients.size() == size && first.size() == size && second.size() == size, "gradients or moments");
@@ -334,6 +350,7 @@ int64_t first_nonfinite(const In& values) {
 }  // namespace
 
 NB_MODULE(_native, m) {
+  pthread_atfork(nullptr, nullptr, renew_stereo_memory);
   // Frames may well be alive, in graphs nobody walked back, when the interpreter ends.
   nb::set_leak_warnings(false);
   m.doc() = "Compiled kernels of extrags.raster; use them through extrags.raster.";
@@ -382,7 +399,7 @@ NB_MODULE(_native, m) {
       .def("backward", &frame_backward, nb::arg("gaussians"), nb::arg("images"), nb::arg("gradients"),
            nb::arg("camera"), nb::kw_only(), nb::arg("add") = false,
            "Fill the gradients, or add to those of the Gaussians' own arrays.")
-      .def("entries", &frame_entries, "How many (Gaussian, 4 x 4 pixel block) entries were composited.")
+      .def("entries", &frame_entries, "How many (Gaussian, 4 x 4 pixel block) entries some pixel composited or ended at.")
       .def("seconds", &frame_seconds,
            "Of the projection, the tiles, the tiles backward and the projection backward.")
       .def("query", &frame_query, nb::arg("points"), nb::arg("transmittance").noconvert());

@@ -13,6 +13,8 @@
 #include <exception>
 #include <mutex>
 #include <new>
+#include <stdexcept>
+#include <string>
 #include <thread>
 #include <vector>
 
@@ -49,6 +51,12 @@ void reserve(Buffer* buffer, size_t bytes) {
 void release(Buffer* buffer) {
   std::free(buffer->data);
   *buffer = Buffer{nullptr, 0};
+}
+
+void check_countable(uint64_t count, const char* entries) {
+  if (count <= UINT32_MAX) return;
+  throw std::overflow_error(std::to_string(count) + " pairs of " + entries + ", and the kernels take at most " +
+                            std::to_string(UINT32_MAX) + ": take fewer or smaller Gaussians, or a smaller image");
 }
 
 namespace {

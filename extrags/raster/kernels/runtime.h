@@ -24,6 +24,10 @@ void advise_huge_pages(void* data, size_t bytes);
 void reserve(Buffer* buffer, size_t bytes);
 void release(Buffer* buffer);
 
+// Entries of a list are numbered in 32 bits. Throws std::overflow_error, which says what `entries` are, where
+// there are more; to be called before memory is reserved for them.
+void check_countable(uint64_t count, const char* entries);
+
 constexpr int kMaxThreads = 64;
 
 using Task = void (*)(void* context, int task, int slot);

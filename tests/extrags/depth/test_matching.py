@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -18,6 +20,7 @@ from extrags.raster.native import compiled_kernels
 from extrags.raster.native import set_num_threads as set_threads
 from extrags.stress.inputs import plane_views
 from tests.extrags.depth.planes import inside_sphere, on, tilted_plane
+from tests.extrags.forked_child import exit_code_of_child
 
 ISAS = raster_native.usable_isas()
 
@@ -98,6 +101,35 @@ def test_a_reference_without_sources_costs_the_same_everywhere(isa: str) -> None
     frames, _depth = tilted_plane()
     case = {**_case(), "sources": torch.full((2, 4), -1)}
     assert torch.equal(native.matching_cost(frames, **case), torch.ones(2, 7, *frames.size))
+
+
+def test_a_forked_child_does_not_wait_for_a_thread_of_its_parent() -> None:
+    kernels, generator = compiled_kernels(), np.random.default_rng(3)
+
+    def job(*shape: int) -> list[np.ndarray]:
+        cost = generator.random(shape, dtype=np.float32)
+        return [cost, *(cost[0].copy() for _ in range(4))]
+
+    def work(arrays: list[np.ndarray]) -> None:
+        cost, grey, *images = arrays
+        kernels.semi_global(cost, grey, 0.1, 0.3, 0.15, *images)
+
+    large, small, again = job(64, 500, 500), job(4, 6, 5), job(4, 6, 5)
+    again[:2] = small[:2]
+    work(small)
+    thread = threading.Thread(target=work, args=(large,))
+    started = time.monotonic()
+    thread.start()
+    time.sleep(0.05)
+
+    def same_in_the_child() -> bool:
+        work(again)
+        return all(np.array_equal(one, other) for one, other in zip(small, again, strict=True))
+
+    held = thread.is_alive()
+    assert exit_code_of_child(same_in_the_child, deadline_s=10) == 0
+    thread.join()
+    assert held, f"the parent's thread was done after {time.monotonic() - started} s: nothing was tested"
 
 
 @pytest.mark.parametrize("shape", [(5, 9, 7), (12, 1, 6), (33, 8, 1), (16, 21, 34)])

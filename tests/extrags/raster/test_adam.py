@@ -1,10 +1,11 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from extrags.errors import ConfigError, ShapeError
-from extrags.raster import SelectiveAdam, set_num_threads
+from extrags.raster import SelectiveAdam, native, set_num_threads
 
 RATES = {"means": 1e-3, "opacities": 5e-2, "sh": 2e-3}
 
@@ -147,6 +148,66 @@ def test_huge_gradients_do_not_poison_the_state(isa: str) -> None:
         assert bool(adam.second_moments["means"].isfinite().all())
 
 
+def test_huge_gradients_move_no_further_than_large_ones(isa: str) -> None:
+    moved = []
+    for size in (1e18, 1e20, 3e38, float("inf")):
+        for dtype in (torch.float32, torch.float64):
+            adam = SelectiveAdam({"means": torch.zeros(6, 3, dtype=dtype)}, {"means": 1e-3})
+            adam.step(gradients={"means": torch.full((6, 3), size, dtype=dtype)})
+            moved.append(adam.parameters["means"].float())
+    for other in moved:
+        torch.testing.assert_close(other, torch.full((6, 3), -1e-3), rtol=1e-5, atol=0)
+
+
+def test_a_gradient_that_is_not_a_number_stays_visible(isa: str) -> None:
+    for dtype in (torch.float32, torch.float64):
+        adam = SelectiveAdam({"means": torch.zeros(6, 3, dtype=dtype)}, {"means": 1e-3})
+        gradient = torch.ones(6, 3, dtype=dtype)
+        gradient[4, 1] = float("nan")
+        adam.step(gradients={"means": gradient})
+        assert torch.equal(adam.parameters["means"].isnan(), gradient.isnan())
+
+
+@pytest.mark.parametrize("wrong", [(3, 4), (4, 1), (3,), (12,)])
+def test_gradients_have_the_shape_of_their_parameter(wrong: tuple[int, ...], unchecked: None) -> None:
+    adam = SelectiveAdam({"means": torch.zeros(4, 3)}, {"means": 0.1})
+    with pytest.raises(ShapeError, match=r"gradient of means has shape .*, expected \(4, 3\)"):
+        adam.step(gradients={"means": torch.ones(wrong)})
+    assert int(adam.steps.sum()) == 0
+
+
+def test_gradients_of_joined_parameters_have_the_shape_of_the_whole(unchecked: None) -> None:
+    adam = SelectiveAdam(_split_parameters(6, 4), JOINED_RATES, joined=JOINED)
+    with pytest.raises(ShapeError, match=r"gradient of sh has shape \(6, 3, 4\), expected \(6, 4, 3\)"):
+        adam.step(gradients={"sh": torch.ones(6, 3, 4)})
+
+
+@pytest.mark.parametrize("wrong", ["strides", "dtype", "read-only"])
+@pytest.mark.parametrize("place", [0, 2, 3])
+def test_the_kernel_refuses_arrays_it_could_change_a_copy_of_only(place: int, wrong: str) -> None:
+    arrays = [np.zeros((8, 3), dtype=np.float32) for _ in range(4)]
+    if wrong == "strides":
+        arrays[place] = np.zeros((8, 6), dtype=np.float32)[:, :3]
+    elif wrong == "dtype":
+        arrays[place] = np.zeros((8, 3))
+    else:
+        arrays[place].flags.writeable = False
+    bias = np.ones(10, dtype=np.float32)
+    with pytest.raises(ValueError, match="must be float32, contiguous and writable"):
+        native.compiled_kernels().adam(
+            [(*arrays, 0.1)], np.ones(8, dtype=np.int32), bias, bias, None, 0.9, 0.999, 1e-8
+        )
+
+
+def test_one_row_of_joined_parameters_is_stepped() -> None:
+    """Slices of one row are contiguous, whatever strides they have."""
+    adam = SelectiveAdam(_split_parameters(1, 4), JOINED_RATES, joined=JOINED)
+    before = adam.joined["sh"].values.clone()
+    _set_gradients(adam.parameters, 0)
+    adam.step()
+    assert bool((adam.joined["sh"].values != before).all())
+
+
 def test_errors(unchecked: None) -> None:
     parameters = _parameters(5)
     with pytest.raises(ConfigError, match="no learning rate for sh"):
@@ -154,8 +215,10 @@ def test_errors(unchecked: None) -> None:
     with pytest.raises(ShapeError, match="number of rows"):
         SelectiveAdam({**parameters, "means": torch.zeros(4, 3)}, RATES)
     adam = SelectiveAdam(parameters, RATES)
-    with pytest.raises(ShapeError, match="visible has shape"):
+    with pytest.raises(ShapeError, match=r"visible is torch.bool \(4,\), expected torch.bool \(5,\)"):
         adam.step(torch.ones(4, dtype=torch.bool))
+    with pytest.raises(ShapeError, match=r"visible is torch.uint8 \(5,\)"):
+        adam.step(torch.ones(5, dtype=torch.uint8))
     with pytest.raises(ShapeError, match="mask has shape"):
         adam.keep(torch.ones(4, dtype=torch.bool))
     with pytest.raises(ShapeError, match="rows of"):

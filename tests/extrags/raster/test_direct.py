@@ -7,7 +7,7 @@ import torch
 from extrags.errors import NonFiniteError, ShapeError
 from extrags.raster import l1_ssim_loss, native, rasterize, set_num_threads
 from extrags.raster.direct import DirectStep, Target
-from extrags.raster.loss import inverse_depth_loss
+from extrags.raster.loss import huber_depth_gradient, inverse_depth_loss
 from tests.extrags.raster.scenes import relative_l2
 
 NAMES = ("means", "quats", "scales", "opacities", "sh")
@@ -139,6 +139,32 @@ def test_a_nonfinite_gaussian_out_of_sight_is_named() -> None:
     assert np.isfinite(direct.run(_target(), sh_degree=0))
 
 
+def test_a_nonfinite_pose_is_named() -> None:
+    """Poses that are refined are written into a target that has been checked."""
+    direct, target = DirectStep(), _target()
+    direct.bind(_parameters())
+    target.viewmat[1, 3] = float("nan")
+    with pytest.raises(NonFiniteError, match=r"viewmats\[0, 1, 3\] is nan"):
+        direct.run(target, sh_degree=0, pose=True)
+
+
+@pytest.mark.parametrize("near", [0.0, -1.0, float("nan"), float("inf")])
+def test_the_near_plane_is_checked(near: float) -> None:
+    direct = DirectStep()
+    direct.bind(_parameters())
+    with pytest.raises(ShapeError, match="near is"):
+        direct.run(_target(), sh_degree=0, near=near)
+
+
+@pytest.mark.parametrize("degree", [-1, -(2**31), 2, 4])
+def test_degrees_without_coefficients_are_refused(degree: int) -> None:
+    direct = DirectStep()
+    direct.bind(_parameters(coefficients=25 if degree == 4 else 4))
+    told = "sh has an unexpected size" if degree == 2 else f"degree is {degree}, expected 0 to 3"
+    with pytest.raises(ValueError, match=told):
+        direct.run(_target(), sh_degree=degree)
+
+
 def test_targets_are_checked(unchecked: None) -> None:
     rgb, eye = torch.zeros(4, 5, 3), np.eye(3)
     with pytest.raises(ShapeError, match="rgb has shape"):
@@ -205,6 +231,24 @@ def test_depth_confidence_scales_each_pixel(isa: str) -> None:
     assert compared == depth.numel()
     assert loss == pytest.approx(0.4 * float(expected.detach()), rel=1e-6)
     assert relative_l2(torch.from_numpy(gradient), depth.grad.double()) < 1e-6  # type: ignore[union-attr]
+
+
+def test_confidence_counts_only_where_depths_are_compared(isa: str) -> None:
+    depth, alpha, confidence = (np.ones((1, 4), dtype=np.float32) for _ in range(3))
+    target = np.array([[1.1, 0, 0, 1.2]], dtype=np.float32)
+    unknown = np.where(target > 0, confidence, np.float32(np.nan))
+    results = []
+    for weights in (confidence, unknown):
+        for delta in (None, 0.05):
+            gradient = np.empty_like(depth)
+            images = depth, alpha, target, gradient
+            if delta is None:
+                found = native.compiled_kernels().inverse_depth(*images, 1.0, 1.0, confidence=weights)
+            else:
+                found = huber_depth_gradient(*images, scale=1.0, delta=delta, weight=1.0, confidence=weights)
+            results.append((*found, *gradient[0].tolist()))
+    assert results[:2] == results[2:]
+    assert results[0][0] > 0
 
 
 def test_the_first_nonfinite_value_is_found_in_a_long_array(isa: str, threads: None) -> None:

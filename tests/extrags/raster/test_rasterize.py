@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
-import signal
 import subprocess
 import sys
 import threading
-import time
-import warnings
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
@@ -18,6 +18,7 @@ from torch import Tensor
 
 from extrags.errors import ConfigError, MissingDependencyError, NonFiniteError, ShapeError
 from extrags.raster import Rendering, available_backends, native, rasterize, set_num_threads
+from tests.extrags.forked_child import exit_code_of_child
 from tests.extrags.raster.scenes import RasterScene, relative_l2, same_transmittance, tube, weighted_sum
 
 IMAGES = ("rgb", "alpha", "depth", "means2d", "radius_px")
@@ -203,6 +204,45 @@ def test_strided_inputs_are_welcome() -> None:
     assert torch.equal(strided.render("native").rgb, scene.render("native").rgb)
 
 
+@pytest.mark.parametrize("backend", ["native", "reference"])
+def test_a_query_ends_where_its_pixel_does(backend: str, isa: str) -> None:
+    """Also where no other pixel of the block composites the Gaussian that ends it."""
+    focal, centre = 100.0, 2.0
+    gaussians = []
+
+    def put(column: float, row: float, depth: float, size_px: float, opacity: float) -> None:
+        mean = [(column - centre) / focal * depth, (row - centre) / focal * depth, depth]
+        gaussians.append((mean, [size_px * depth / focal] * 3, opacity))
+
+    # The neighbours of pixel (0, 0) have ended when the Gaussian comes that ends it; pixel (3, 3) is open.
+    for layer in range(6):
+        for column, row in ((1.5, 0.5), (0.5, 1.5), (1.5, 1.5)):
+            put(column, row, 1 + 0.1 * layer, 0.01, 0.9985)
+    put(0.5, 0.5, 2.0, 0.01, 0.9985)
+    for depth in (3.0, 3.1, 3.2, 3.3, 3.4):
+        put(2.0, 2.0, depth, 50.0, 0.5)
+    means, scales, opacities = (torch.tensor(column) for column in zip(*gaussians, strict=True))
+    n = len(means)
+    rendering = rasterize(
+        means,
+        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        scales,
+        opacities,
+        None,
+        torch.eye(4)[None],
+        torch.tensor([[[focal, 0, centre], [0, focal, centre], [0, 0, 1]]]),
+        4,
+        4,
+        colors=torch.ones(n, 3),
+        query_points=torch.tensor([[(0.5 - centre) / focal * 5, (0.5 - centre) / focal * 5, 5.0]]),
+        backend=backend,  # type: ignore[arg-type]
+    )
+    assert rendering.transmittance is not None
+    assert float(rendering.alpha[0, 3, 3]) > 0.9
+    left = 1 - float(rendering.alpha[0, 0, 0])
+    assert float(rendering.transmittance[0, 0]) == pytest.approx(left, abs=1e-6)
+
+
 def test_without_gradients_nothing_is_kept() -> None:
     scene = tube(100, 30, 20).to(torch.float32, gradients=True)
     with torch.no_grad():
@@ -299,7 +339,90 @@ def test_environment_chooses_the_instruction_set() -> None:
     assert _in_a_new_process(code, EXTRAGS_ISA="portable").stdout.strip() == "portable"
     failed = _in_a_new_process(code, EXTRAGS_ISA="sse9")
     assert failed.returncode != 0
-    assert "'sse9' is not usable here" in failed.stderr
+    said = "ConfigError: EXTRAGS_ISA: instruction set 'sse9' is not usable here, expected one of "
+    assert said + ", ".join(native.usable_isas()) in failed.stderr
+
+
+def test_more_pairs_than_the_kernels_can_number_are_refused() -> None:
+    """In a process of its own: it would end with a segmentation fault."""
+    code = """
+import torch
+from extrags.raster import rasterize
+
+side = 4096
+n = 2**32 // (side // 32) ** 2 + 1  # one Gaussian more than 2^32 pairs with tiles; all cover the image
+K = torch.tensor([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1]])
+gaussians = torch.tensor([[0.0, 0, 1]]), torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 50.0)
+gaussians = (*(value.repeat(n, 1) for value in gaussians), torch.full((n,), 0.5))
+rasterize(*gaussians, None, torch.eye(4)[None], K[None], side, side, colors=torch.ones(n, 3))
+"""
+    failed = _in_a_new_process(code)
+    assert failed.returncode == 1
+    assert failed.stderr.splitlines()[-1].startswith(
+        "extrags.errors.ShapeError: 4294983680 pairs of a Gaussian and a tile, and the kernels take at most "
+        "4294967295: "
+    )
+
+
+@pytest.fixture
+def imported_with(monkeypatch: pytest.MonkeyPatch) -> Callable[[ImportError], ModuleType]:
+    """A second copy of `extrags.raster.native`, imported where the kernels raise an error."""
+
+    def imported(error: ImportError) -> ModuleType:
+        class Refusing:
+            @staticmethod
+            def find_spec(name: str, path: object = None, target: object = None) -> None:
+                if name == "extrags.raster._native":
+                    raise error
+
+        monkeypatch.delitem(sys.modules, "extrags.raster._native")
+        monkeypatch.setattr(sys, "meta_path", [Refusing, *sys.meta_path])
+        spec = importlib.util.spec_from_file_location("native_again", native.__file__)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, "native_again", module)
+        spec.loader.exec_module(module)
+        return module
+
+    return imported
+
+
+class TestWithoutKernels:
+    NOT_THERE = ModuleNotFoundError("No module named '_native'", name="extrags.raster._native")
+
+    def test_not_built(self, imported_with: Callable[[ImportError], ModuleType]) -> None:
+        module = imported_with(self.NOT_THERE)
+        assert module.native_isa() is None
+        with pytest.raises(
+            MissingDependencyError, match=r"not built: pip install extrags .* C\+\+17 compiler"
+        ):
+            module.set_num_threads(1)
+
+    @pytest.mark.parametrize(
+        "error",
+        [
+            ImportError("libstdc++.so.6: version `GLIBCXX_3.4.99' not found"),
+            ModuleNotFoundError("No module named 'other'", name="other"),
+        ],
+    )
+    def test_built_but_not_loadable(
+        self, error: ImportError, imported_with: Callable[[ImportError], ModuleType]
+    ) -> None:
+        module = imported_with(error)
+        assert module.native_isa() is None
+        with pytest.raises(MissingDependencyError, match="built but cannot be loaded: ") as caught:
+            module.set_num_threads(1)
+        assert str(error) in str(caught.value)
+        assert caught.value.__cause__ is error
+
+    @pytest.mark.usefixtures("unchecked")
+    def test_the_backend_says_so(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(native, "_kernels", None)
+        monkeypatch.setattr(native, "_import_error", self.NOT_THERE)
+        with pytest.raises(MissingDependencyError, match="the native kernels are not built") as caught:
+            tube(10, 8, 8).render("native")
+        assert caught.value.__cause__ is self.NOT_THERE
 
 
 def test_a_forked_child_has_threads_of_its_own(threads: None) -> None:
@@ -307,20 +430,8 @@ def test_a_forked_child_has_threads_of_its_own(threads: None) -> None:
     set_num_threads(2)
     scene = tube(2000, 130, 101)
     expected = scene.render("native").rgb.numpy().tobytes()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)  # that a process with threads forks is the point
-        child = os.fork()
-    if child == 0:
-        # Compared as bytes: torch's own threads do not survive a fork either.
-        os._exit(0 if scene.render("native").rgb.numpy().tobytes() == expected else 1)
-    deadline = time.monotonic() + 60
-    while (done := os.waitpid(child, os.WNOHANG))[0] == 0:
-        if time.monotonic() > deadline:
-            os.kill(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            pytest.fail("the child hangs")
-        time.sleep(0.01)
-    assert os.waitstatus_to_exitcode(done[1]) == 0
+    # Compared as bytes: torch's own threads do not survive a fork either.
+    assert exit_code_of_child(lambda: scene.render("native").rgb.numpy().tobytes() == expected) == 0
 
 
 def test_backends_that_work_here() -> None:
