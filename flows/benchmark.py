@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Annotated, Any
 
@@ -18,11 +19,12 @@ from extrags.store import Store, digest_of
 from flows.damage import again_after_damage
 from flows.history import (
     BenchmarkRegressedError,
+    Judgement,
     Tolerance,
     append_history,
     history_entry,
     history_of,
-    regressions,
+    judge,
     trend,
 )
 from flows.leases import run_lease
@@ -37,12 +39,14 @@ from flows.runners import PrefectRunner, Runner
 from flows.selection import chosen_sequences
 from flows.sequence import open_store
 from flows.settings import run_store
-from flows.tables import benchmark_markdown, regressions_markdown
+from flows.tables import benchmark_markdown, judgement_markdown
 from flows.wiring import run_sequence
 from tasks.evaluate import METRICS_FILE
 from tasks.run_page import artifact_key, attempt
 
 __all__ = ["Case", "benchmark", "case_of", "check_methods", "run_method"]
+
+log = logging.getLogger(__name__)
 
 NOT_COUNTED = frozenset({"evaluate", "report"})
 """Stages that are not part of a method's run time."""
@@ -57,6 +61,8 @@ class Case:
     profile: str
     seed: int
     outcome: SequenceOutcome
+    asked: str = ""
+    """Digest of the method and settings that were asked for, without profile, seed and defaults."""
     settings: str = ""
     """Digest of all settings but the seed."""
 
@@ -71,7 +77,9 @@ def benchmark(
         "coarse",
         "extrags",
     ],
-    seeds: Annotated[list[int], Field(min_length=1, description="one run per seed")] = [0],  # noqa: B006
+    seeds: Annotated[
+        list[Annotated[int, Field(ge=0)]], Field(min_length=1, description="one run per seed")
+    ] = [0],  # noqa: B006
     settings: Annotated[
         Settings, Field(description="overrides for all runs; they do not reach what a method pins")
     ] = None,
@@ -110,7 +118,8 @@ def benchmark(
     Returns:
         `{machine, cases: [{method, profile, sequence, setting, seed, seconds, spent_seconds,
         processor_seconds, peak_mib, metrics, ...}],
-        comparison, regressions, report}`; `metrics` is None for a failed run, whose `error` says why.
+        comparison, regressions, not_judged, report}`; `metrics` is None for a failed run, whose `error`
+        says why. `regressions` and `not_judged` are those of `flows.history.Judgement`, in words.
         `comparison` is
         `extrags.metrics.comparison.compare_runs`; beside `report` stand `per_view.json` and
         `comparison.json`.
@@ -126,15 +135,22 @@ def benchmark(
         raise ConfigError("a tolerance needs refresh: what is taken from the store is as good as it was")
     baseline = check_methods(methods, variants or {}, baseline)
     store = run_store(store)
-    chosen = chosen_sequences(sequences)
+    chosen = [
+        replace(item, settings={**(settings or {}), **item.settings}) for item in chosen_sequences(sequences)
+    ]
     open_store(store)
     runner = PrefectRunner(store, refresh, limits)
     wanted = [*methods, *(variants or {})]
-    for method in wanted:
-        for profile in profiles:
-            # Invalid settings and missing models affect all runs: report them before the first run.
-            config = _config_of(method, profile, settings, variants or {}, 0)
-            preflight(config, "evaluate", METHODS[_variant(method, variants or {})[0]].leave_out)
+    # Invalid settings and missing models are reported before the first run, once for all sequences alike.
+    unlike = {digest_of(item.settings): item for item in chosen}.values()
+    for item, profile, method in product(unlike, profiles, wanted):
+        try:
+            for seed in seeds:
+                config = _config_of(method, profile, item.settings, variants or {}, seed)
+        except ConfigError as error:
+            shared = item.settings == (settings or {})
+            raise ConfigError(str(error) if shared else f"{item.name}: {error}") from error
+        preflight(config, "evaluate", METHODS[_variant(method, variants or {})[0]].leave_out)
     words = {method: summary_of(method, variants or {}) for method in wanted}
     # Here and below, because they load torch and the kernels, which looking up a deployment must not.
     from extrags.raster.bench import machine
@@ -142,31 +158,43 @@ def benchmark(
     about = machine()
     earlier = history_of(Store(store), name) if refresh else []
 
-    def run_all() -> tuple[list[dict[str, Any]], dict[str, Any], list[str], str]:
+    def run_all() -> tuple[list[dict[str, Any]], dict[str, Any], Judgement, str]:
         page.restart()
         found = []
         for item, profile, seed, method in product(chosen, profiles, seeds, wanted):
-            own = {**(settings or {}), **item.settings} or None
-            case = run_method(method, item.name, profile, seed, own, store, runner, variants=variants)
+            case = run_method(
+                method,
+                item.name,
+                profile,
+                seed,
+                item.settings,
+                store,
+                runner,
+                variants=variants,
+                memory_limit_gb=limits.memory_gb,
+            )
             page.sequence_ended(case.outcome, store)
             found.append(case)
         cases = [case_of(case) for case in found]
-        entry = history_entry(name, cases, [case.settings for case in found], about)
-        worse = [] if tolerance is None else regressions(entry, earlier, tolerance)
-        history = {"trend": trend([*earlier, entry]), "regressions": worse} if refresh else {}
+        digests = [{"asked": case.asked, "settings": case.settings} for case in found]
+        entry = history_entry(name, cases, digests, about)
+        judgement = Judgement() if tolerance is None else judge(entry, earlier, tolerance)
+        history = {"trend": trend([*earlier, entry]), **asdict(judgement)} if refresh else {}
         outcomes = [case.outcome for case in found]
         report = benchmark_page(outcomes, cases, words, baseline, name, runner, history)
-        return cases, entry, worse, report
+        return cases, entry, judgement, report
 
     runs = len(chosen) * len(profiles) * len(seeds) * len(wanted)
     with run_lease(store), run_page(name, config, "evaluate", sequences=runs) as page:
-        cases, entry, worse, report = again_after_damage(Store(store), run_all)
+        cases, entry, judgement, report = again_after_damage(Store(store), run_all)
         page.link(report, artifact_key("report", name), f"Report of {name}")
     if refresh:
         append_history(Store(store), entry)
+    for line in judgement.not_judged:
+        log.warning("not judged: %s", line)
     attempt(
         lambda: create_markdown_artifact(
-            benchmark_markdown(cases, baseline) + regressions_markdown(worse),
+            benchmark_markdown(cases, baseline) + judgement_markdown(judgement),
             key=artifact_key("benchmark", name),
             description=f"{len(cases)} runs",
         )
@@ -177,10 +205,10 @@ def benchmark(
         "machine": about,
         "cases": cases,
         "comparison": compare_runs(cases, baseline),
-        "regressions": worse,
+        **asdict(judgement),
         "report": report,
     }
-    if worse:
+    if judgement.regressions:
         raise BenchmarkRegressedError(name, result)
     return result
 
@@ -242,14 +270,16 @@ def run_method(
     runner: Runner,
     *,
     variants: dict[str, dict[str, Any]] | None = None,
+    memory_limit_gb: float | None = None,
 ) -> Case:
     """Run one case, or take it from the store. The error of a failed stage is in the outcome, not raised.
 
     Raises:
         ConfigError: for an unknown method or setting.
     """
-    base, _ = _variant(method, variants or {})
+    base, changed = _variant(method, variants or {})
     config = _config_of(method, profile, settings, variants or {}, seed)
+    asked = digest_of([base, settings or {}, changed])
     outcome = run_sequence(
         sequence,
         config,
@@ -258,9 +288,10 @@ def run_method(
         profile=profile,
         until="evaluate",
         leave_out=METHODS[base].leave_out or None,
+        memory_limit_gb=memory_limit_gb,
     )
     # Seeds are repetitions of the same: their means are compared over time.
-    return Case(method, profile, seed, outcome, digest_of(config.with_seed(0)))
+    return Case(method, profile, seed, outcome, asked, digest_of(config.with_seed(0)))
 
 
 def case_of(case: Case) -> dict[str, Any]:

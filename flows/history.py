@@ -10,6 +10,7 @@ import datetime
 import re
 import secrets
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from statistics import fmean, median
 from typing import Any
 
@@ -23,11 +24,12 @@ from extrags.store import Store, digest_of, read_records, write_record
 __all__ = [
     "SAME_MACHINE",
     "BenchmarkRegressedError",
+    "Judgement",
     "Tolerance",
     "append_history",
     "history_entry",
     "history_of",
-    "regressions",
+    "judge",
     "trend",
 ]
 
@@ -56,6 +58,19 @@ class Tolerance(BaseModel):
     seconds: float = Field(5.0, ge=0, description="growth of run time that is never too much, in seconds")
 
 
+@dataclass(frozen=True)
+class Judgement:
+    """What came of holding a benchmark against its earlier runs, in words.
+
+    Args:
+        regressions: what is worse; each names method, sequence and figures.
+        not_judged: what too few earlier runs can be compared with, and how many there are.
+    """
+
+    regressions: list[str] = field(default_factory=list)
+    not_judged: list[str] = field(default_factory=list)
+
+
 class BenchmarkRegressedError(ExtragsError, RuntimeError):
     """A benchmark is worse than its earlier runs.
 
@@ -74,14 +89,18 @@ class BenchmarkRegressedError(ExtragsError, RuntimeError):
 
 
 def history_entry(
-    name: str, cases: Sequence[Mapping[str, Any]], settings: Sequence[str], machine: Mapping[str, Any]
+    name: str,
+    cases: Sequence[Mapping[str, Any]],
+    digests: Sequence[Mapping[str, str]],
+    machine: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What is kept of a run of a benchmark.
 
     Args:
         name: of the benchmark.
         cases: its runs as JSON (`flows.benchmark.case_of`).
-        settings: digest of all settings of each.
+        digests: `{asked, settings}` of each: digest of what was asked for, and of all
+            settings that this came to.
         machine: `extrags.raster.bench.machine`.
     """
     return {
@@ -93,7 +112,7 @@ def history_entry(
         "cases": [
             {
                 **{key: case[key] for key in ("method", "profile", "sequence", "setting", "seed", "error")},
-                "settings": digest,
+                **digest,
                 "seconds": case["seconds"],
                 "processor_seconds": case.get("processor_seconds"),
                 "peak_mib": case["peak_mib"],
@@ -103,7 +122,7 @@ def history_entry(
                     if (value := figure_of(case["metrics"], figure)) is not None
                 },
             }
-            for case, digest in zip(cases, settings, strict=True)
+            for case, digest in zip(cases, digests, strict=True)
         ],
     }
 
@@ -136,39 +155,42 @@ def _prefix(name: str) -> str:
     return f"benchmark.{re.sub(r'[^a-z0-9]+', '-', name.lower())}.{digest_of(name)[:8]}."
 
 
-def regressions(
-    entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolerance: Tolerance
-) -> list[str]:
-    """What is worse in a run than in those before, in words; each names method, sequence and figures.
+def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolerance: Tolerance) -> Judgement:
+    """Hold a run against those before.
 
     Compared is the mean over seeds of each method on each sequence, with the median of the last
-    `tolerance.runs` runs that had the same settings: PSNR of all of them, run time of those on the same
-    kind of machine. Run time is processor time where enough of these runs have measured it, since other work
-    on the machine hardly changes it; elapsed time otherwise. A case that fails now and did not before is
-    worse, too.
+    `tolerance.runs` runs that asked for the same settings and had these seeds: PSNR of all of them, run
+    time of those on the same kind of machine. Run time is processor time where enough of these runs have
+    measured it, since other work on the machine hardly changes it; elapsed time otherwise. A case that fails
+    now and did not before is worse, too.
 
     Args:
         entry: of the run.
         earlier: entries of the runs before, the oldest first.
         tolerance: how much may be lost.
     """
-    found = []
-    before = [_groups(item) for item in earlier]
+    found = Judgement()
+    remark = f"of {len(earlier)} earlier runs comparable (at least {tolerance.at_least})"
+    before = [_comparable(item, entry) for item in earlier]
     same = [_same_machine(item, entry) for item in earlier]
-    for group, now in _groups(entry).items():
+    for group, now in _comparable(entry, entry).items():
         label = _label(group)
         past = [groups[group] for groups in before if group in groups][-tolerance.runs :]
         good = [item for item in past if not item["error"]]
         if now["error"]:
             if len(good) >= tolerance.at_least:
-                found.append(f"{label} fails: {now['error']}")
+                found.regressions.append(f"{label} fails: {now['error']}")
+            else:
+                found.not_judged.append(f"{label}: failure, {len(good)} {remark}")
             continue
         name = next((figure for figure in FIGURES if figure in now["figures"]), None)
         known = [item["figures"][name] for item in good if name in item["figures"]]
-        if name is not None and tolerance.psnr_db is not None and len(known) >= tolerance.at_least:
+        if tolerance.psnr_db is not None and len(known) < tolerance.at_least:
+            found.not_judged.append(f"{label}: {name or 'PSNR'}, {len(known)} {remark}")
+        elif tolerance.psnr_db is not None:
             was, value = median(known), now["figures"][name]
             if was - value > tolerance.psnr_db:
-                found.append(
+                found.regressions.append(
                     f"{label}: {name} {value:.2f} dB, {was - value:.2f} dB below the median {was:.2f} of "
                     f"{len(known)} runs (tolerance {tolerance.psnr_db:g} dB)"
                 )
@@ -181,10 +203,12 @@ def regressions(
         if now[clock] is None or len(times) < tolerance.at_least:
             clock, kind = "seconds", ""
             times = [item[clock] for item in timed]
-        if len(times) >= tolerance.at_least:
+        if len(times) < tolerance.at_least:
+            found.not_judged.append(f"{label}: run time, {len(times)} {remark}")
+        else:
             was, value = median(times), now[clock]
             if value - was > max(tolerance.seconds_share * was, tolerance.seconds):
-                found.append(
+                found.regressions.append(
                     f"{label}: {value:.1f} s{kind}, {value / was - 1:.0%} above the median {was:.1f} s of "
                     f"{len(times)} runs (tolerance {tolerance.seconds_share:.0%})"
                 )
@@ -196,19 +220,18 @@ def trend(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
     Returns:
         `{when, commit, version, methods: {METHOD: {psnr, seconds}}}` of each entry: means over sequences
-        and seeds, over those sequences and settings that the last entry has as well; None where there are
-        none. Run times of other kinds of machines are left out.
+        and seeds, over those sequences, settings and seeds that the last entry has as well; None where
+        there are none. Run times of other kinds of machines are left out.
     """
     if not entries:
         return []
     last = entries[-1]
-    wanted = set(_groups(last))
     drawn = []
     for entry in entries:
         methods: dict[str, dict[str, float | None]] = {}
         by_method: dict[str, list[dict[str, Any]]] = {}
-        for group, values in _groups(entry).items():
-            if group in wanted and not values["error"]:
+        for group, values in _comparable(entry, last).items():
+            if not values["error"]:
                 by_method.setdefault(group[0], []).append(values)
         for method, values_of in by_method.items():
             psnr = [
@@ -226,26 +249,45 @@ def trend(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return drawn
 
 
-def _groups(entry: Mapping[str, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
-    """Means over the seeds of each method, profile, sequence and settings (the seed apart)."""
-    grouped: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
-    for case in entry["cases"]:
-        group = tuple(
-            str(case[key] or "") for key in ("method", "profile", "sequence", "setting", "settings")
-        )
-        grouped.setdefault(group, []).append(case)
+def _comparable(entry: Mapping[str, Any], run: Mapping[str, Any]) -> dict[tuple[str, ...], dict[str, Any]]:
+    """Means of an entry over the seeds of a run, for each method, profile and sequence of that run.
+
+    What the entry does not have with the same settings and every one of these seeds is left out.
+    """
+    cases = {(_group(case), case["seed"]): case for case in entry["cases"]}
+    grouped: dict[tuple[str, ...], list[Mapping[str, Any] | None]] = {}
+    for asked in run["cases"]:
+        case = cases.get((_group(asked), asked["seed"]))
+        same = case is not None and _same_settings(case, asked)
+        grouped.setdefault(_group(asked), []).append(case if same else None)
     return {
-        group: {
-            "error": next((case["error"] for case in cases if case["error"]), ""),
-            "seconds": fmean(case["seconds"] for case in cases),
-            "processor_seconds": _mean([case.get("processor_seconds") for case in cases]),
-            "figures": {
-                name: fmean(case["figures"][name] for case in cases)
-                for name in FIGURES
-                if all(name in case["figures"] for case in cases)
-            },
-        }
-        for group, cases in grouped.items()
+        group: _means([case for case in cases_of if case is not None])
+        for group, cases_of in grouped.items()
+        if None not in cases_of
+    }
+
+
+def _group(case: Mapping[str, Any]) -> tuple[str, ...]:
+    return tuple(str(case[key] or "") for key in ("method", "profile", "sequence", "setting"))
+
+
+def _same_settings(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    # Not all settings, or a release with another default or one setting more would not be judged. Entries of
+    # earlier versions have their digest alone.
+    key = "asked" if "asked" in one and "asked" in other else "settings"
+    return bool(one[key] == other[key])
+
+
+def _means(cases: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    return {
+        "error": next((case["error"] for case in cases if case["error"]), ""),
+        "seconds": fmean(case["seconds"] for case in cases),
+        "processor_seconds": _mean([case.get("processor_seconds") for case in cases]),
+        "figures": {
+            name: fmean(case["figures"][name] for case in cases)
+            for name in FIGURES
+            if all(name in case["figures"] for case in cases)
+        },
     }
 
 
@@ -256,7 +298,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def _label(group: tuple[str, ...]) -> str:
-    method, profile, sequence, setting, _ = group
+    method, profile, sequence, setting = group
     return f"{method} ({profile}) on {sequence}{f'@{setting}' if setting else ''}"
 
 

@@ -78,7 +78,7 @@ def benchmark_page(
         baseline: method the others are compared with.
         name: title.
         runner: how artefacts are made.
-        history: `{trend, regressions}` (`flows.history`).
+        history: `{trend, regressions, not_judged}` (`flows.history`).
 
     Returns:
         Where it stands.

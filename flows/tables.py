@@ -7,6 +7,7 @@ from typing import Any
 
 from extrags.metrics.registry import Figure, figures, metric_named
 from extrags.pipeline import HELD_OUT_TRAINED_ON
+from flows.history import Judgement
 from flows.outcome import SequenceOutcome
 
 __all__ = [
@@ -15,8 +16,8 @@ __all__ = [
     "difference_figures",
     "difference_text",
     "figure",
+    "judgement_markdown",
     "markdown_table",
-    "regressions_markdown",
     "sequence_markdown",
     "spread_text",
     "table_figures",
@@ -98,11 +99,14 @@ def dataset_markdown(outcomes: Sequence[SequenceOutcome]) -> str:
     return markdown_table(["sequence", "status", "seconds", *columns, "problem"], rows)
 
 
-def regressions_markdown(found: Sequence[str]) -> str:
-    """What is worse than in earlier runs of a benchmark; empty where nothing is."""
-    if not found:
-        return ""
-    return "\n## Worse than before\n\n" + "\n".join(f"* {line}" for line in found) + "\n"
+def judgement_markdown(found: Judgement) -> str:
+    """What is worse than in earlier runs of a benchmark, and what was not judged; empty where nothing is."""
+    parts = (("Worse than before", found.regressions), ("Not judged", found.not_judged))
+    return "".join(
+        f"\n## {title}\n\n" + "\n".join(f"* {line}" for line in lines) + "\n"
+        for title, lines in parts
+        if lines
+    )
 
 
 def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:

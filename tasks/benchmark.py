@@ -50,7 +50,7 @@ def benchmark_report(
         renders: its renders.
         views: rows of pictures per pair at most.
         rows: `{seconds, peak_mib}` of each run.
-        history: `{trend, regressions}`: see `BenchmarkInputs`; empty where nothing is on record.
+        history: `{trend, regressions, not_judged}`: see `BenchmarkInputs`; empty where nothing is on record.
     """
     from extrags.metrics.comparison import compare_runs
     from extrags.metrics.protocol import RenderedViews
@@ -84,6 +84,7 @@ def benchmark_report(
             views=views,
             history=history.get("trend", ()),
             regressions=history.get("regressions", ()),
+            not_judged=history.get("not_judged", ()),
         )
     )
     (slot.path / PAGE).write_text(page, encoding="utf-8")

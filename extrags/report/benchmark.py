@@ -58,6 +58,7 @@ class BenchmarkInputs:
         history: `{when, commit, version, methods: {METHOD: {psnr, seconds}}}` of its runs over time, the
             oldest first and this one last.
         regressions: what is worse than in the runs before, in words.
+        not_judged: what too few runs before can be compared with, in words.
     """
 
     name: str
@@ -69,6 +70,7 @@ class BenchmarkInputs:
     made: str = field(default="")
     history: Sequence[Mapping[str, Any]] = ()
     regressions: Sequence[str] = ()
+    not_judged: Sequence[str] = ()
 
 
 def build_benchmark_report(inputs: BenchmarkInputs) -> str:
@@ -115,6 +117,7 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
         difference_chart=_difference_chart(comparison["paired_sequences"], columns, inputs.baseline),
         figure_charts=_figure_charts(measured, columns, inputs),
         regressions=inputs.regressions,
+        not_judged=inputs.not_judged,
         history=inputs.history,
         trend_chart=_trend_chart(inputs),
         pictures=[

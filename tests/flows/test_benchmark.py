@@ -11,10 +11,13 @@ from typing import Any
 import pytest
 from prefect.artifacts import Artifact
 
+from extrags.config import profile_config
 from extrags.errors import ConfigError
 from extrags.store import Store
-from flows.benchmark import benchmark, check_methods, summary_of
+from flows.benchmark import Case, benchmark, check_methods, run_method, summary_of
+from flows.limits import StageLimits
 from flows.outcome import SequenceOutcome
+from flows.runners import DirectRunner
 from flows.tables import difference_text, spread_text
 from tests.flows.damaging import flip_bit
 from tests.flows.tiny import SEQUENCE, TINY
@@ -141,6 +144,71 @@ class TestAgain:
                 variants={"x": {"coarse.iteration": 1}},
                 store=str(tmp_path / "store"),
             )
+
+    @pytest.mark.parametrize(
+        ("settings", "seeds", "message"),
+        [
+            (
+                {"coarse.iteration": 1},
+                [0],
+                r"^phantom/1@sparse: no setting .* did you mean coarse\.iterations",
+            ),
+            ({}, [0, -1], "^the seed is -1"),
+        ],
+    )
+    def test_so_does_one_of_a_later_run(
+        self,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        settings: dict[str, Any],
+        seeds: list[int],
+        message: str,
+    ) -> None:
+        begun: list[str] = []
+        monkeypatch.setattr("flows.benchmark.run_lease", begun.append)
+        manifest = tmp_path / "sequences.json"
+        manifest.write_text(json.dumps([SEQUENCE, {"sequence": "phantom/1@sparse", "settings": settings}]))
+        with pytest.raises(ConfigError, match=message):
+            benchmark.fn(
+                sequences=[f"@{manifest}"], methods=["coarse"], seeds=seeds, store=str(tmp_path / "store")
+            )
+        assert begun == []
+
+    def test_a_sequence_over_the_memory_limit_is_refused(self, finished: tuple[str, SequenceOutcome]) -> None:
+        found = benchmark(
+            sequences=[SEQUENCE],
+            methods=["coarse"],
+            settings=TINY,
+            store=finished[0],
+            name="little memory",
+            limits=StageLimits(memory_gb=0.001),
+        )
+        assert "more than the limit of 0.001 GB" in found["cases"][0]["error"]
+
+
+def test_what_was_asked_for_is_told_from_all_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flows.benchmark.run_sequence", lambda name, *_args, **_more: SequenceOutcome(name))
+
+    def case(
+        settings: dict[str, Any] | None = None, variant: dict[str, Any] | None = None, seed: int = 0
+    ) -> Case:
+        method = "coarse" if variant is None else "x"
+        variants = {"x": variant or {}}
+        return run_method(method, SEQUENCE, "quick", seed, settings, "", DirectRunner(""), variants=variants)
+
+    plain, again = case(), case({}, seed=1)
+    assert (again.asked, again.settings) == (plain.asked, plain.settings)
+    # A default that is asked for is no other setting; a method leaves out stages, whatever their settings.
+    default = {"coarse.iterations": profile_config("quick").coarse.iterations}
+    asked = [plain, case(default), case(variant=default), case(variant={**default, "method": "extrags"})]
+    assert len({item.asked for item in asked}) == 4
+    assert {item.settings for item in asked} == {plain.settings}
+    monkeypatch.setattr(
+        "flows.settings.profile_config",
+        lambda name: profile_config(name).with_overrides({"coarse.iterations": 7}),
+    )
+    assert case().asked == plain.asked
+    assert case().settings != plain.settings
 
 
 class TestNames:

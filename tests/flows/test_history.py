@@ -16,13 +16,15 @@ from flows.benchmark import benchmark
 from flows.cli import main
 from flows.history import (
     BenchmarkRegressedError,
+    Judgement,
     Tolerance,
     append_history,
     history_entry,
     history_of,
-    regressions,
+    judge,
     trend,
 )
+from flows.tables import judgement_markdown
 from tests.flows.tiny import SEQUENCE, TINY
 
 MACHINE = {
@@ -41,7 +43,8 @@ def entry(
     *,
     day: int = 1,
     machine: dict[str, Any] | None = None,
-    settings: str = "a",
+    asked: str = "a",
+    settings: str = "all",
     seeds: tuple[int, ...] = (0, 1),
 ) -> dict[str, Any]:
     cases = [
@@ -58,7 +61,9 @@ def entry(
         }
         for seed in seeds
     ]
-    made = history_entry("weekly", cases, [settings] * len(cases), {**MACHINE, **(machine or {})})
+    made = history_entry(
+        "weekly", cases, [{"asked": asked, "settings": settings}] * len(cases), {**MACHINE, **(machine or {})}
+    )
     return {**made, "when": f"2026-01-{day:02d}T04:00:00+00:00"}
 
 
@@ -76,40 +81,82 @@ class TestRegressions:
             (entry(psnr=19.5), ["coarse (quick) on phantom/0@sparse: observed.psnr 21.50 dB, 0.53 dB below"]),
             (entry(seconds=140), ["coarse (quick) on phantom/0@sparse: 140.5 s, 40% above the median 100.5"]),
             (entry(psnr=None), ["coarse (quick) on phantom/0@sparse fails: coarse: it diverged"]),
-            # Other settings are another benchmark.
-            (entry(psnr=10, seconds=900, settings="b"), []),
+            # Who asks for other settings asks for another benchmark.
+            (entry(psnr=10, seconds=900, asked="b"), []),
+            # As a release does that changes a default, or adds a setting.
+            (entry(psnr=19.5, settings="all and one"), ["coarse (quick) on phantom/0@sparse: observed.psnr"]),
         ],
     )
     def test_against_the_median_of_the_runs_before(self, now: dict[str, Any], worse: list[str]) -> None:
-        found = regressions(now, BEFORE, Tolerance())
+        found = judge(now, BEFORE, Tolerance()).regressions
         assert len(found) == len(worse)
         assert all(line.startswith(begin) for line, begin in zip(found, worse, strict=True))
 
     def test_nothing_is_judged_by_a_single_run(self) -> None:
-        assert regressions(entry(psnr=10, seconds=900), BEFORE[:1], Tolerance()) == []
-        assert regressions(entry(psnr=10), BEFORE[:1], Tolerance(at_least=1)) != []
+        assert judge(entry(psnr=10, seconds=900), BEFORE[:1], Tolerance()).regressions == []
+        assert judge(entry(psnr=10), BEFORE[:1], Tolerance(at_least=1)).regressions != []
+
+    def test_what_was_not_judged_is_told_with_how_many_could_be_compared(self) -> None:
+        label = "coarse (quick) on phantom/0@sparse"
+        assert judge(entry(), BEFORE, Tolerance()).not_judged == []
+        assert judge(entry(), BEFORE[:1], Tolerance()).not_judged == [
+            f"{label}: observed.psnr, 1 of 1 earlier runs comparable (at least 2)",
+            f"{label}: run time, 1 of 1 earlier runs comparable (at least 2)",
+        ]
+        other = [entry(day=day, asked="b", machine={"cores": 64}) for day in (6, 7)]
+        elsewhere = [entry(day=day, machine={"cores": 64}) for day in (8, 9)]
+        assert judge(entry(), [*other, *elsewhere], Tolerance()).not_judged == [
+            f"{label}: run time, 0 of 4 earlier runs comparable (at least 2)"
+        ]
+        assert judge(entry(psnr=None), other, Tolerance()).not_judged == [
+            f"{label}: failure, 0 of 2 earlier runs comparable (at least 2)"
+        ]
+        assert judge(entry(), [], Tolerance(psnr_db=None, seconds_share=None)).not_judged == []
+
+    def test_entries_of_earlier_versions_count_while_all_settings_are_the_same(self) -> None:
+        old = [dict(item) for item in BEFORE]
+        for item in old:
+            item["cases"] = [
+                {key: value for key, value in case.items() if key != "asked"} for case in item["cases"]
+            ]
+        assert len(judge(entry(psnr=19), old, Tolerance()).regressions) == 1
+        found = judge(entry(psnr=19, settings="all and one"), old, Tolerance())
+        assert found.regressions == []
+        assert "observed.psnr, 0 of 5 earlier runs comparable" in found.not_judged[0]
+
+    def test_only_the_same_seeds_are_compared(self) -> None:
+        # Each seed is a second longer than the one before.
+        tolerance = Tolerance(seconds=0, seconds_share=0.005)
+        many = [entry(day=day, seeds=(0, 1, 2, 30)) for day in (1, 2)]
+        assert judge(entry(seeds=(30,)), many, tolerance) == Judgement()
+        (line,) = judge(entry(seeds=(2,), seconds=101), many, tolerance).regressions
+        assert "103.0 s, 1% above the median 102.0 s" in line
+        few = [entry(day=day, seeds=(0,)) for day in (1, 2)]
+        found = judge(entry(psnr=10, seeds=(0, 1)), few, tolerance)
+        assert found.regressions == []
+        assert len(found.not_judged) == 2
 
     def test_what_has_no_tolerance_is_not_judged(self) -> None:
         both = entry(psnr=10, seconds=900)
-        (line,) = regressions(both, BEFORE, Tolerance(seconds_share=None))
+        (line,) = judge(both, BEFORE, Tolerance(seconds_share=None)).regressions
         assert "dB below the median" in line
-        (line,) = regressions(both, BEFORE, Tolerance(psnr_db=None))
+        (line,) = judge(both, BEFORE, Tolerance(psnr_db=None)).regressions
         assert "above the median" in line
 
     def test_the_last_runs_count(self) -> None:
         slow = [entry(day=day, seconds=300) for day in range(6, 9)]
-        assert regressions(entry(seconds=300), [*BEFORE, *slow], Tolerance(runs=3)) == []
-        assert regressions(entry(seconds=300), [*BEFORE, *slow], Tolerance(runs=8)) != []
+        assert judge(entry(seconds=300), [*BEFORE, *slow], Tolerance(runs=3)).regressions == []
+        assert judge(entry(seconds=300), [*BEFORE, *slow], Tolerance(runs=8)).regressions != []
 
     def test_run_times_of_other_machines_say_nothing_errors_do(self) -> None:
         elsewhere = [entry(day=day, machine={"processor": "another"}) for day in range(1, 6)]
-        assert regressions(entry(seconds=900), elsewhere, Tolerance()) == []
-        assert len(regressions(entry(psnr=19, seconds=900), elsewhere, Tolerance())) == 1
+        assert judge(entry(seconds=900), elsewhere, Tolerance()).regressions == []
+        assert len(judge(entry(psnr=19, seconds=900), elsewhere, Tolerance()).regressions) == 1
 
     def test_short_runs_may_vary_by_seconds(self) -> None:
         quick = [entry(day=day, seconds=4) for day in range(1, 6)]
-        assert regressions(entry(seconds=8), quick, Tolerance()) == []
-        assert regressions(entry(seconds=8), quick, Tolerance(seconds=1)) != []
+        assert judge(entry(seconds=8), quick, Tolerance()).regressions == []
+        assert judge(entry(seconds=8), quick, Tolerance(seconds=1)).regressions != []
 
 
 class TestRecords:
@@ -137,6 +184,14 @@ class TestRecords:
         ]
         assert trend([]) == []
 
+    def test_the_trend_is_over_the_seeds_of_the_last_run(self) -> None:
+        entries = [entry(day=1, seeds=(0, 1, 2)), entry(day=2, seeds=(0,)), entry(day=3, seeds=(2,))]
+        assert [item["methods"].get("coarse") for item in trend(entries)] == [
+            {"psnr": 22.0, "seconds": 102.0},
+            None,
+            {"psnr": 22.0, "seconds": 102.0},
+        ]
+
 
 def test_the_page_shows_trend_and_regressions() -> None:
     runs = [
@@ -155,20 +210,26 @@ def test_the_page_shows_trend_and_regressions() -> None:
         "baseline": "coarse",
         "methods": {"coarse": "c"},
     }
-    page = build_benchmark_report(BenchmarkInputs(**given, history=history, regressions=["it is <slower>"]))
+    judged: dict[str, Any] = {"regressions": ["it is <slower>"], "not_judged": ["x: <run time>"]}
+    page = build_benchmark_report(BenchmarkInputs(**given, history=history, **judged))
     assert "2 runs that measured anew, from 2026-01-01 (extrags " in page
     assert "PSNR and run time of each method over 2 runs" in page
     assert "it is &lt;slower&gt;" in page
-    assert page == build_benchmark_report(
-        BenchmarkInputs(**given, history=history, regressions=["it is <slower>"])
-    )
+    assert "x: &lt;run time&gt;" in page
+    assert page == build_benchmark_report(BenchmarkInputs(**given, history=history, **judged))
     assert "a trend takes two" in build_benchmark_report(BenchmarkInputs(**given, history=history[:1]))
     assert 'id="history"' not in build_benchmark_report(BenchmarkInputs(**given))
 
 
+def test_the_table_has_what_is_worse_and_what_was_not_judged() -> None:
+    assert judgement_markdown(Judgement()) == ""
+    found = judgement_markdown(Judgement(["slower"], ["x: run time"]))
+    assert found == "\n## Worse than before\n\n* slower\n\n## Not judged\n\n* x: run time\n"
+
+
 @pytest.mark.usefixtures("prefect_server")
 class TestFlow:
-    def test_measured_anew_kept_and_judged(self, tmp_path: Path) -> None:
+    def test_measured_anew_kept_and_judged(self, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
         store = Store(tmp_path / "store")
         given: dict[str, Any] = {
             "sequences": [SEQUENCE],
@@ -180,18 +241,23 @@ class TestFlow:
         first = benchmark(**given, refresh=True)
         made = {item.key: (item.started, item.seconds) for item in store.ls("coarse*")}
         assert first["regressions"] == []
+        assert first["not_judged"] == []  # Without a tolerance.
         # Were the runs before much better, the next one would be a regression: its run fails.
         (last,) = history_of(store, "weekly")
         for case in last["cases"]:
             case["figures"] = {name: value + 3 for name, value in case["figures"].items()}
+        elsewhere = {**last, "machine": {**last["machine"], "cores": 1000}}
         for day in (1, 2, 3):
-            append_history(store, {**last, "when": f"2026-01-{day:02d}T00:00:00+00:00"})
+            append_history(store, {**elsewhere, "when": f"2026-01-{day:02d}T00:00:00+00:00"})
         state = benchmark(**given, refresh=True, tolerance=Tolerance(seconds=600), return_state=True)
         assert state.is_failed()
         error = state.result(raise_on_failure=False)
         assert isinstance(error, BenchmarkRegressedError)
         assert len(error.found) == 1
         assert "3.00 dB below the median" in error.found[0]
+        (words,) = error.result["not_judged"]
+        assert "run time, 1 of 4 earlier runs comparable" in words
+        assert f"not judged: {words}" in caplog.text
         assert error.result["cases"][0]["metrics"] == first["cases"][0]["metrics"]
         # The bits are the same, the seconds are those of now.
         found = history_of(store, "weekly")
@@ -200,6 +266,7 @@ class TestFlow:
         assert {item.key: (item.started, item.seconds) for item in store.ls("coarse*")} != made
         page = str(error).rpartition("page: ")[2]
         assert "5 runs that measured anew" in Path(page).read_text()
+        assert words in Path(page).read_text()
         # From the store: nothing is measured, nothing is added.
         again = benchmark(**given)
         assert again["cases"][0]["seconds"] == found[-1]["cases"][0]["seconds"]

@@ -120,6 +120,7 @@ class TestSchema:
             ("dataset", {"methods": ["nerf"]}),
             ("dataset", {"only": "broken"}),
             ("benchmark", {"variants": {"dim": {"coarse.lite": 1}}}),
+            ("benchmark", {"seeds": [0, -1]}),
             ("benchmark", {"tolerance": {"psnr": 1}}),
             ("benchmark", {"tolerance": {"psnr_db": -1}}),
         ):
