@@ -32,6 +32,7 @@ from flows.sequence import open_store, reconstruct_sequence
 from flows.settings import run_store, task_runner
 from flows.tables import dataset_markdown
 from flows.workloads import known_work
+from tasks.progress import stages_interrupted
 from tasks.run_page import artifact_key, attempt
 
 __all__ = ["reconstruct_dataset"]
@@ -142,13 +143,20 @@ def reconstruct_dataset(
         if at_once == 1:
             outcomes = [reconstruct(case) for case in cases]
         else:
-            with ThreadPoolExecutor(max_workers=at_once) as pool:
+            pool = ThreadPoolExecutor(max_workers=at_once)
+            try:
                 # Flow and observer are in context variables, which threads do not inherit.
                 futures = {
                     item.case.title: pool.submit(copy_context().run, reconstruct, item.case)
                     for item in longest_first(expected)
                 }
                 outcomes = [futures[case.title].result() for case in cases]
+            except BaseException:
+                # SIGTERM or Ctrl-C, say: what has begun ends at its next event, and nothing else begins.
+                with stages_interrupted():
+                    pool.shutdown(cancel_futures=True)
+                raise
+            pool.shutdown()
         report = None
         if until == "report":
             label = profile_label(profile, method if methods is None else ", ".join(methods))

@@ -14,6 +14,17 @@ from extrags.errors import ConfigError
 __all__ = ["FILE", "Declared", "declared_deployments", "usual_file"]
 
 FILE = "prefect.yaml"
+SERVED = (
+    "name",
+    "entrypoint",
+    "description",
+    "tags",
+    "parameters",
+    "schedules",
+    "concurrency_limit",
+    "work_pool",
+)
+"""Fields of a deployment that `extrags serve` goes by; of `work_pool`, the environment of the runs."""
 
 
 @dataclass(frozen=True)
@@ -21,30 +32,41 @@ class Declared:
     """One deployment of the file.
 
     Args:
+        file: where it is declared.
         name: `nightly`.
         entrypoint: module path of its flow, `flows.dataset.reconstruct_dataset`.
         parameters: of its runs.
         cron: when it runs, if on a schedule.
         timezone: of the schedule.
-        limit: of its runs at the same time; further ones wait.
+        concurrency_limit: number of its runs at the same time, and what becomes of further ones; as Prefect
+            has it.
         description: what it is.
         tags: of the deployment.
+        environment: variables that its runs are to find.
+        unserved: names of what it asks for beside all that: for a work pool, not for `extrags serve`.
     """
 
+    file: Path
     name: str
     entrypoint: str
     parameters: dict[str, Any] = field(default_factory=dict)
     cron: str | None = None
     timezone: str = "UTC"
-    limit: int | None = None
+    concurrency_limit: dict[str, Any] = field(default_factory=dict)
     description: str = ""
     tags: tuple[str, ...] = ()
+    environment: dict[str, str] = field(default_factory=dict)
+    unserved: tuple[str, ...] = ()
+
+    def error(self, what: str) -> ConfigError:
+        """That something is wrong with it."""
+        return ConfigError(f"{self.file}: deployment {self.name}: {what}")
 
     def flow(self) -> Any:
-        """Its flow.
+        """Its flow, which has all of its parameters.
 
         Raises:
-            ConfigError: for an entrypoint that is no flow of an installed module.
+            ConfigError: for an entrypoint that is no flow of an installed module, or an unknown parameter.
         """
         from prefect import Flow
 
@@ -52,11 +74,13 @@ class Declared:
         try:
             found = getattr(import_module(module), name)
         except (ImportError, AttributeError, ValueError) as error:
-            raise ConfigError(
-                f"deployment {self.name}: {self.entrypoint!r} is no flow of an installed module"
-            ) from error
+            raise self.error(f"{self.entrypoint!r} is no flow of an installed module") from error
         if not isinstance(found, Flow):
-            raise ConfigError(f"deployment {self.name}: {self.entrypoint!r} is no flow")
+            raise self.error(f"{self.entrypoint!r} is no flow")
+        known = list(found.parameters.properties)
+        for parameter in self.parameters:
+            if parameter not in known:
+                raise self.error(f"parameters.{parameter}: {found.name} has {', '.join(known)}")
         return found
 
 
@@ -95,19 +119,33 @@ def _declared(entry: Any, file: Path) -> Declared:
         isinstance(entry.get(name), str) for name in ("name", "entrypoint")
     ):
         raise ConfigError(f"{file}: a deployment needs a name and an entrypoint")
+    place = f"{file}: deployment {entry['name']}"
     schedules = entry.get("schedules") or [{}]
     if len(schedules) > 1 or not set(schedules[0]) <= {"cron", "timezone", "active"}:
-        raise ConfigError(
-            f"{file}: deployment {entry['name']}: expected one schedule at most, with cron and timezone"
-        )
+        raise ConfigError(f"{place}: expected one schedule at most, with cron and timezone")
     limit = entry.get("concurrency_limit")
+    limit = limit if isinstance(limit, dict) else {"limit": limit}
+    variables = _fields(_fields(entry, "work_pool", place), "job_variables", place)
+    others = {name: value for name, value in entry.items() if name not in SERVED}
+    others |= {f"work_pool.job_variables.{name}": value for name, value in variables.items() if name != "env"}
     return Declared(
+        file=file,
         name=entry["name"],
         entrypoint=entry["entrypoint"],
-        parameters=entry.get("parameters") or {},
+        parameters=_fields(entry, "parameters", place),
         cron=schedules[0].get("cron"),
         timezone=schedules[0].get("timezone", "UTC"),
-        limit=limit.get("limit") if isinstance(limit, dict) else limit,
+        concurrency_limit={name: value for name, value in limit.items() if value is not None},
         description=entry.get("description", ""),
         tags=tuple(entry.get("tags") or ()),
+        environment={name: str(value) for name, value in _fields(variables, "env", place).items()},
+        # `prefect deploy` writes fields without a value.
+        unserved=tuple(name for name, value in others.items() if value not in (None, "", [], {})),
     )
+
+
+def _fields(entry: dict[str, Any], name: str, place: str) -> dict[str, Any]:
+    found = entry.get(name) or {}
+    if not isinstance(found, dict):
+        raise ConfigError(f"{place}: {name}: expected fields with values")
+    return found

@@ -8,6 +8,7 @@ from itertools import takewhile
 from statistics import median
 
 from extrags.config import PipelineConfig
+from extrags.cores import usable_cores
 from extrags.errors import ConfigError
 from extrags.pipeline import STAGES, StageName
 from extrags.run_costs import Workload
@@ -16,7 +17,6 @@ from flows.cases import SequenceCase
 from flows.estimate import expected_seconds
 from flows.methods import METHODS
 from flows.outcome_records import OutcomeRecord, outcome_records
-from flows.settings import usable_cores
 from flows.workloads import catalogue_work
 from tasks.progress import duration_text
 

@@ -50,7 +50,7 @@ from extrags.store import Store
 if TYPE_CHECKING:
     from prefect.client.schemas.objects import State
 
-__all__ = ["FLOWS", "HEARTBEAT", "run_lease", "second_look_seconds", "settle_dead_runs"]
+__all__ = ["FLOWS", "HEARTBEAT", "is_inner_run", "run_lease", "second_look_seconds", "settle_dead_runs"]
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ MISSED_BEATS = 3
 PENDING_HOURS = 1.0
 """A run that has been about to start for so long was lost with its worker."""
 FORGOTTEN_DAYS = 30.0
-"""Leases of runs that no server here knows are removed after this time."""
+"""Leases that nobody holds are removed after this time, whatever the server knows of their runs."""
 PAGE = 200
 """Runs asked for at once, as many as Prefect gives."""
 
@@ -76,6 +76,13 @@ class _Lease:
     path: Path
     flow_run: UUID
     host: str
+
+
+def is_inner_run() -> bool:
+    """Whether another flow run has started the current one, as a dataset does its sequences."""
+    context = FlowRunContext.get()
+    run = None if context is None else context.flow_run
+    return run is not None and run.parent_task_run_id is not None
 
 
 @contextmanager
@@ -94,8 +101,8 @@ def run_lease(root: str) -> Iterator[None]:
     folder = Store(root).state / "leases"
     descriptor = _take(folder, context.flow_run)
     try:
-        if context.flow_run.parent_task_run_id is None:
-            # The runs inside a run need not look again.
+        # The runs inside a run need not look again.
+        if not is_inner_run():
             _settle_beside_the_run(root)
         yield
     finally:
@@ -235,16 +242,23 @@ def _settle(client: SyncPrefectClient, run: FlowRun, reason: str) -> bool:
 
 
 def _forget(client: SyncPrefectClient, lease: _Lease) -> None:
-    """Remove the lease of a run that has ended; one that this server does not know may be another's."""
+    """Remove the lease of a run that has ended, on any machine, or that is old.
+
+    A run that this server does not know may be another server's, which settles it by its lease.
+    """
     try:
-        client.read_flow_run(lease.flow_run)
-    except ObjectNotFound:
-        with suppress(FileNotFoundError):
-            written = datetime.datetime.fromtimestamp(lease.path.stat().st_mtime, datetime.UTC)
-            if _age_seconds(written) < FORGOTTEN_DAYS * 86400:
-                return
-    if lease.host == _host():
-        lease.path.unlink(missing_ok=True)
+        written = datetime.datetime.fromtimestamp(lease.path.stat().st_mtime, datetime.UTC)
+    except FileNotFoundError:
+        return
+    if _age_seconds(written) < FORGOTTEN_DAYS * 86400:
+        try:
+            run = client.read_flow_run(lease.flow_run)
+        except ObjectNotFound:
+            return
+        # That its lease is free says nothing elsewhere: locks may hold per machine.
+        if lease.host != _host() and not (run.state is not None and run.state.is_final()):
+            return
+    lease.path.unlink(missing_ok=True)
 
 
 # The files.

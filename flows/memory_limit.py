@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Collection, Mapping
 from typing import Any
 
 from extrags.config import PipelineConfig
+from extrags.cores import usable_cores
 from extrags.errors import ConfigError
 from extrags.memory_estimate import FrameSize, MemoryEstimate, estimate_memory, fitting_settings
 from extrags.pipeline import STAGES, StageName
@@ -45,7 +45,7 @@ def check_memory(
         ConfigError: when the estimate exceeds the limit; names settings that fit.
     """
     size = FrameSize(int(counts["frames"]), int(counts["train"]), int(counts["width"]), int(counts["height"]))
-    threads = len(os.sched_getaffinity(0))
+    threads = usable_cores()
     given = {stage for stage in ("poses", "depth") if counts.get(f"has_{stage}")}
     given -= {"poses"} if config.poses.replace_given else set()
     leave_out = {*leave_out, *given}

@@ -14,7 +14,7 @@ from extrags.pipeline import StageName
 from extrags.store import Store
 from extrags.store.runs import file_killed
 from flows.cases import SequenceCase, record_outcome_quietly
-from flows.leases import run_lease
+from flows.leases import is_inner_run, run_lease
 from flows.limits import DEFAULT_LIMITS, StageLimits
 from flows.methods import METHODS, MethodName, profile_label
 from flows.outcome import SequenceFailedError, SequenceOutcome
@@ -101,11 +101,16 @@ def reconstruct_sequence(
 def open_store(root: str) -> Store:
     """Open the store of a run, check that it can be written, and remove leftovers of killed runs.
 
+    A run inside another one leaves them: that has just removed them, and on an object store it takes a
+    request for every artefact.
+
     Raises:
         StoreError: when it cannot be written. Prefect itself would run everything and keep nothing.
     """
     store = Store(root)
     store.check_writable()
+    if is_inner_run():
+        return store
     for name in [*store.sweep(), *sweep_locks(store.locks), *file_killed(store)]:
         log.info("removed what a killed run left: %s", name)
     return store

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from extrags.config import PipelineConfig, profile_config
+from extrags.cores import usable_cores
 from extrags.data_directories import DATA_VARIABLE, user_directories
 from extrags.errors import ConfigError
 
@@ -16,7 +17,6 @@ __all__ = [
     "pipeline_config",
     "run_store",
     "task_runner",
-    "usable_cores",
 ]
 
 DEFAULT_STORE = ".extrags"
@@ -105,8 +105,3 @@ def task_runner(name: str, at_once: int = 1) -> Any:
 
         return ClusterTaskRunner(address or None, usable_cores(), at_once)
     raise ConfigError(f"no task runner {name!r}; expected threads, dask or dask:ADDRESS")
-
-
-def usable_cores() -> int:
-    """Cores this process may use."""
-    return len(os.sched_getaffinity(0))

@@ -28,6 +28,7 @@ __all__ = [
     "observed",
     "rate_text",
     "reporting",
+    "stages_interrupted",
 ]
 
 log = logging.getLogger("extrags.progress")
@@ -87,6 +88,21 @@ def observed(observer: Observer) -> Iterator[None]:
 def interrupt_stages() -> None:
     """Make every stage of this process end by KeyboardInterrupt at its next event, and say nothing more."""
     _interrupted.set()
+
+
+@contextmanager
+def stages_interrupted() -> Iterator[None]:
+    """In this block the stages of this process end as by `interrupt_stages`; those that start after it run.
+
+    For a process that may outlive its run, such as a notebook's.
+    """
+    for_good = _interrupted.is_set()
+    interrupt_stages()
+    try:
+        yield
+    finally:
+        if not for_good:
+            _interrupted.clear()
 
 
 def notify(progress: StageProgress) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 import pytest
 import yaml
+from prefect.utilities.templating import apply_values
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 DOCKERFILE = REPOSITORY / "deploy" / "Dockerfile"
@@ -143,17 +144,40 @@ class TestFile:
         assert not re.search(r"(?i)password|token|secret|_key\b", DOCKERFILE.read_text())
 
 
+def pod_of_the_kubernetes_pool(**job_variables: Any) -> dict[str, Any]:
+    """What a run of the pool is, as Prefect fills in the template."""
+    template = json.loads((REPOSITORY / "deploy" / "kubernetes-job-template.json").read_text())
+    properties = template["variables"]["properties"]
+    defaults = {name: about["default"] for name, about in properties.items() if "default" in about}
+    job = apply_values(template["job_configuration"]["job_manifest"], {**defaults, **job_variables})
+    pod: dict[str, Any] = job["spec"]["template"]["spec"]
+    return pod
+
+
 def test_the_template_of_the_kubernetes_pool() -> None:
     template = json.loads((REPOSITORY / "deploy" / "kubernetes-job-template.json").read_text())
     variables = template["variables"]["properties"]
     used = set(re.findall(r"\{\{ (\w+) \}\}", json.dumps(template["job_configuration"])))
     assert used == set(variables)
-    spec: dict[str, Any] = template["job_configuration"]["job_manifest"]["spec"]["template"]["spec"]
+    spec = pod_of_the_kubernetes_pool()
     (container,) = spec["containers"]
     assert {item["name"] for item in container["volumeMounts"]} == {item["name"] for item in spec["volumes"]}
     _, final = stages()
     assert str(spec["securityContext"]["runAsUser"]) == final.of("USER")[0]
     assert {item["mountPath"] for item in container["volumeMounts"]} >= set(json.loads(final.of("VOLUME")[0]))
+    assert {"name": "store", "persistentVolumeClaim": {"claimName": "extrags-store"}} in spec["volumes"]
+
+
+def test_a_kubernetes_run_with_an_object_store_needs_no_claim_for_it() -> None:
+    told = (REPOSITORY / "docs" / "deployments.md").read_text()
+    (line,) = [line for line in told.splitlines() if '"emptyDir"' in line]
+    given = json.loads(line)
+    spec = pod_of_the_kubernetes_pool(**given)
+    (container,) = spec["containers"]
+    assert {"name": "EXTRAGS_STORE", "value": given["store"]} in container["env"]
+    assert "://" in given["store"]
+    claims = [item["persistentVolumeClaim"] for item in spec["volumes"] if "persistentVolumeClaim" in item]
+    assert [claim["claimName"] for claim in claims] == ["extrags-data"]
 
 
 @pytest.mark.slow

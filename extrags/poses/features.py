@@ -6,7 +6,6 @@ Nothing here imports pycolmap: it is handed in by the process that has it (see `
 from __future__ import annotations
 
 import json
-import os
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from extrags.cores import usable_cores
 from extrags.poses.job import PoseJob, PoseJobResult
 from extrags.poses.matching import mutual_matches
 from extrags.poses.pairs import Pair
@@ -170,7 +170,7 @@ def _write_matches(pycolmap: Any, folder: Path, pairs: list[Pair]) -> None:
         frames = sorted({frame for pair in pairs for frame in pair})
         ids = {frame: database.read_image_with_name(image_name(frame)).image_id for frame in frames}
         features = {frame: database.read_descriptors(number).data for frame, number in ids.items()}
-        with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
+        with ThreadPoolExecutor(usable_cores()) as threads:
             found = threads.map(lambda pair: mutual_matches(features[pair[0]], features[pair[1]]), pairs)
             for (i, j), matches in zip(pairs, found, strict=True):
                 database.write_matches(ids[i], ids[j], matches.astype(np.uint32))

@@ -164,14 +164,34 @@ class UrlBackend:
 
     def drop_copy(self, manifest: Manifest) -> bool:
         """Remove the local copy of an artefact, to be downloaded again; whether there was one."""
-        aside = self.scratch / f"{manifest.key}.{secrets.token_hex(4)}.removed"
+        return self._drop(self._copy_of(manifest).name)
+
+    def _drop(self, copy: str) -> bool:
+        aside = self.scratch / f"{copy}.{secrets.token_hex(4)}.removed"
         self.scratch.mkdir(parents=True, exist_ok=True)
         try:
-            self._copy_of(manifest).rename(aside)
+            (self.local / copy).rename(aside)
         except FileNotFoundError:
             return False
         shutil.rmtree(aside, ignore_errors=True)
         return True
+
+    def _copies(self) -> list[tuple[str, str]]:
+        """Names of all local copies, sorted, each with its key."""
+        names = sorted(os.listdir(self.local)) if self.local.is_dir() else []
+        return [(name, name.rpartition(".")[0]) for name in names]
+
+    def _drop_copies(self, key: str, *, but: str = "") -> None:
+        """Remove the local copies of a key, but for the one of that name."""
+        for name, of in self._copies():
+            if of == key and name != but:
+                self._drop_unless_refused(name)
+
+    def _drop_unless_refused(self, copy: str) -> bool:
+        """As `_drop`; a copy of another user stays, since it takes room and does no other harm."""
+        with suppress(OSError):
+            return self._drop(copy)
+        return False
 
     def damaged_sizes(self, manifest: Manifest) -> Damage | None:
         """Whether files are missing, truncated or too many; with a local copy, that is what is looked at."""
@@ -302,12 +322,14 @@ class UrlBackend:
         except Exception as error:
             # As above.
             raise StoreError(f"the store {self.url} cannot be written: {error}") from error
+        self._drop_copies(manifest.key, but=self._copy_of(manifest).name)
         return manifest
 
     def discard(self, key: str) -> bool:
         """Remove an artefact: its manifest first, so that it disappears atomically, then the files it names.
 
         Files of other attempts stay, because another process may be uploading them; `sweep` removes them.
+        Local copies go as well: those of this machine here, others by the `sweep` of theirs.
         """
         place = f"{self.prefix}/{key}"
         try:
@@ -316,6 +338,7 @@ class UrlBackend:
             attempts = [name for name, kind in self._children(place) if kind == "directory"]
         else:
             if manifest is None:
+                self._drop_copies(key)
                 return False
             attempts = [manifest.data]
         with suppress(FileNotFoundError):
@@ -324,6 +347,7 @@ class UrlBackend:
             with suppress(FileNotFoundError):
                 self.fs.rm(f"{place}/{attempt}", recursive=True)
         self._remove_empty(place)
+        self._drop_copies(key)
         return True
 
     def _remove_empty(self, place: str) -> None:
@@ -338,15 +362,22 @@ class UrlBackend:
     def sweep(self, older_than_hours: float, *, dry_run: bool = False) -> list[str]:
         """Remove local leftovers, and remote attempts without a manifest older than `older_than_hours`.
 
-        Only the age of remote files is known, not whether their writer is still running.
+        Only the age of remote files is known, not whether their writer is still running. Local leftovers
+        are scratch directories, and copies of what is no longer in the store, whoever has removed it.
         """
         removed = sweep_directories(self.scratch, dry_run=dry_run)
+        # Listed before the store is: what is copied meanwhile stays.
+        copies = self._copies()
+        stored, unreadable = set(), set()
         limit = datetime.datetime.now(datetime.UTC) - datetime.timedelta(hours=older_than_hours)
         for key in self.names():
             try:
                 manifest = self.read_manifest(key)
             except DamagedArtefactError:
+                unreadable.add(key)
                 continue  # Which attempt it named is not known; `set_aside` moves them all.
+            if manifest is not None:
+                stored.add(self._copy_of(manifest).name)
             for attempt, kind in self._children(f"{self.prefix}/{key}"):
                 if kind != "directory" or (manifest is not None and attempt == manifest.data):
                     continue
@@ -355,6 +386,9 @@ class UrlBackend:
                     if not dry_run:
                         self.fs.rm(place, recursive=True)
                     removed.append(f"{key}/{attempt}")
+        for name, key in copies:
+            if name not in stored and key not in unreadable and (dry_run or self._drop_unless_refused(name)):
+                removed.append(f"{self.local.name}/{name}")
         return removed
 
     def _children(self, place: str) -> list[tuple[str, str]]:

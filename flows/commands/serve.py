@@ -80,7 +80,28 @@ def _deployment(declared: Declared, *, schedules: bool) -> Any:
     from prefect.client.schemas.objects import ConcurrencyLimitConfig
     from prefect.client.schemas.schedules import CronSchedule
     from prefect.types.entrypoint import EntrypointType
+    from pydantic import ValidationError
 
+    if declared.unserved:
+        raise declared.error(
+            f"extrags serve cannot go by {', '.join(declared.unserved)}; use a work pool, or leave it out"
+        )
+    for name, value in declared.environment.items():
+        if os.environ.get(name) != value:
+            raise declared.error(
+                f"work_pool.job_variables.env.{name}: all runs of extrags serve have its own environment, "
+                "where that has another value; set it there, or use a work pool"
+            )
+    limit = declared.concurrency_limit
+    unknown = sorted(set(limit).difference(ConcurrencyLimitConfig.model_fields))
+    if unknown:
+        raise declared.error(f"concurrency_limit.{unknown[0]} is no field of Prefect")
+    try:
+        concurrency = ConcurrencyLimitConfig.model_validate(limit) if limit else None
+    except ValidationError as error:
+        fault = error.errors()[0]
+        place = ".".join(("concurrency_limit", *map(str, fault["loc"])))
+        raise declared.error(f"{place}: {fault['msg']}") from error
     when = (
         []
         if declared.cron is None
@@ -96,7 +117,7 @@ def _deployment(declared: Declared, *, schedules: bool) -> Any:
         parameters=declared.parameters,
         description=declared.description or None,
         tags=list(declared.tags),
-        concurrency_limit=None if declared.limit is None else ConcurrencyLimitConfig(limit=declared.limit),
+        concurrency_limit=concurrency,
         # Found wherever a run's process is started, unlike a path.
         entrypoint_type=EntrypointType.MODULE_PATH,
     )

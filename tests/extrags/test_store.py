@@ -335,6 +335,37 @@ class TestUrl:
         assert sorted(store.sweep(older_than_hours=0.0)) == ["toy-v1-aa/loser", "toy-v1-bb/attempt"]
         assert store.verify(ref)
 
+    def test_local_copies_go_with_what_they_are_copies_of(self, tmp_path: Path) -> None:
+        store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)
+        removed, kept = store.open(put(store, "toy-v1-aa")), store.open(put(store, "toy-v1-ab"))
+        assert store.rm("toy-v1-aa") == ["toy-v1-aa"]
+        assert (removed.exists(), kept.exists()) == (False, True)
+        changed = store.open(put(store, "toy-v1-ab", "changed"))
+        assert (kept.exists(), changed.exists()) == (False, True)
+        assert store.gc({"toy": 2}) == ["artefacts/toy-v1-ab"]
+        assert not changed.exists()
+
+    def test_copies_of_what_another_machine_removed_are_swept(self, tmp_path: Path) -> None:
+        url = f"memory://{uuid.uuid4().hex}"
+        store, other = Store(url, cache=tmp_path / "here"), Store(url, cache=tmp_path / "there")
+        removed, replaced, damaged, kept = (
+            store.open(put(store, f"toy-v1-{name}")) for name in ("removed", "replaced", "damaged", "kept")
+        )
+        other.rm("toy-v1-removed")
+        put(other, "toy-v1-replaced", "changed")
+        backend = store.backend
+        backend.fs.pipe_file(f"{backend.prefix}/toy-v1-damaged/{MANIFEST}", b"{")  # type: ignore[union-attr]
+        gone = [f"artefacts/{path.name}" for path in (removed, replaced)]
+        assert store.gc(dry_run=True) == gone
+        assert removed.exists()
+        assert store.sweep() == gone
+        assert not removed.exists()
+        assert not replaced.exists()
+        # Which copy a damaged manifest stood for is not known.
+        assert damaged.exists()
+        assert kept.exists()
+        assert store.sweep() == []
+
     def test_damage_is_seen_on_reading(self, tmp_path: Path) -> None:
         store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)
         ref = put(store)

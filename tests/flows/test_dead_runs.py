@@ -16,9 +16,10 @@ from uuid import UUID, uuid4
 
 import pytest
 from prefect.client.orchestration import get_client
-from prefect.client.schemas.objects import FlowRun, StateType
+from prefect.client.schemas.objects import FlowRun, State, StateType
+from prefect.exceptions import ObjectNotFound
 from prefect.settings import PREFECT_API_URL
-from prefect.states import Pending
+from prefect.states import Completed, Pending, Scheduled
 
 import flows.leases
 from extrags.store import Store
@@ -173,6 +174,61 @@ def test_a_lease_that_another_machine_wrote_says_nothing(
     monkeypatch.undo()
     silent(monkeypatch, run, last_beat_s=1.0)
     assert settle_dead_runs(str(tmp_path)) == ([], set())
+
+
+DAY_S = 86400.0
+
+
+@pytest.mark.parametrize(
+    ("state", "here", "days", "kept"),
+    [
+        (Completed(), False, 0, False),
+        (Completed(), True, 0, False),
+        (Scheduled(), False, 0, True),
+        (Scheduled(), True, 0, False),
+        (Scheduled(), False, 31, False),
+        (None, False, 0, True),
+        (None, True, 0, True),
+        (None, False, 31, False),
+        (None, True, 31, False),
+    ],
+    ids=lambda value: value.name if isinstance(value, State) else str(value),
+)
+def test_leases_of_runs_that_ended_go_wherever_they_ran(
+    state: State[Any] | None,
+    here: bool,
+    days: float,
+    kept: bool,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    """None is a run that this server does not know: another one may."""
+    run = FlowRun(flow_id=uuid4(), state=state)
+    if not here:
+        monkeypatch.setattr(flows.leases, "_host", lambda: "another")
+    descriptor = flows.leases._take(tmp_path / "leases", run)
+    assert descriptor is not None
+    os.close(descriptor)
+    monkeypatch.undo()
+    (lease,) = (tmp_path / "leases").iterdir()
+    os.utime(lease, (time.time() - days * DAY_S,) * 2)
+
+    class Client:
+        def __enter__(self) -> Client:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            """Nothing to close."""
+
+        def read_flow_run(self, _: UUID) -> FlowRun:
+            if state is None:
+                raise ObjectNotFound(LookupError())
+            return run
+
+    monkeypatch.setattr(flows.leases, "_unended", lambda _: iter([]))
+    monkeypatch.setattr(flows.leases, "get_client", lambda **_: Client())
+    assert settle_dead_runs(str(tmp_path)) == ([], set())
+    assert lease.exists() is kept
 
 
 def test_a_run_that_never_started_is_dead_after_an_hour(

@@ -35,7 +35,8 @@ class TestFile:
         assert found["nightly"].cron == "0 2 * * *"
         assert found["weekly"].parameters["refresh"] is True
         for item in every:
-            assert item.limit == 1
+            assert item.concurrency_limit == {"limit": 1, "collision_strategy": "ENQUEUE"}
+            assert item.unserved == ()
             assert ":" not in item.entrypoint, "a path is found from a checkout alone"
             assert item.flow().name
             # Its worker knows the store; a default of this side would be a place where it was started.
@@ -50,6 +51,7 @@ class TestFile:
             ("a: 1", "declares no deployments"),
             ("deployments: [{name: x}]", "a name and an entrypoint"),
             ("deployments: [{name: x, entrypoint: a.b, schedules: [{interval: 3}]}]", "one schedule at most"),
+            ("deployments: [{name: x, entrypoint: a.b, work_pool: y}]", "deployment x: work_pool: expected"),
         ],
     )
     def test_a_wrong_one_is_refused(self, text: str, message: str, tmp_path: Path) -> None:
@@ -73,15 +75,66 @@ class TestServe:
         assert main(["serve", "--limit", "0"]) == 2
 
     @pytest.mark.parametrize("schedules", [False, True])
-    def test_what_it_serves(self, schedules: bool) -> None:
+    def test_what_it_serves(self, schedules: bool, monkeypatch: pytest.MonkeyPatch) -> None:
         from flows.commands.serve import _deployment
 
+        monkeypatch.setenv("OMP_WAIT_POLICY", "passive")
         made = {item.name: item for item in declared_deployments(usual_file())}
         nightly = _deployment(made["nightly"], schedules=schedules)
         assert [item.active for item in nightly.schedules] == [schedules]
         assert nightly.entrypoint == "flows.dataset.reconstruct_dataset"
         assert nightly.concurrency_limit == 1
         assert _deployment(made["one"], schedules=schedules).schedules == []
+
+    def test_what_the_file_says_of_further_runs_and_of_the_environment(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("EXTRAGS_STORE", "/data/special")
+        served = served_from(
+            tmp_path,
+            "concurrency_limit: {limit: 2, collision_strategy: CANCEL_NEW}",
+            "work_pool: {name: local, job_variables: {env: {EXTRAGS_STORE: /data/special}}}",
+            "version: null",
+        )
+        assert served.concurrency_limit == 2
+        assert served.concurrency_options.collision_strategy == "CANCEL_NEW"
+        assert served_from(tmp_path, "concurrency_limit: 3").concurrency_limit == 3
+        assert served_from(tmp_path, "concurrency_limit: {limit: null}").concurrency_limit is None
+
+    @pytest.mark.parametrize(
+        ("line", "field"),
+        [
+            (
+                "work_pool: {job_variables: {env: {EXTRAGS_STORE: /other}}}",
+                r"job_variables\.env\.EXTRAGS_STORE",
+            ),
+            ("work_pool: {job_variables: {image: extrags}}", r"work_pool\.job_variables\.image"),
+            ("version: 3", "version"),
+            (
+                "concurrency_limit: {limit: 1, collision_strategy: DROP}",
+                r"concurrency_limit\.collision_strategy",
+            ),
+            ("concurrency_limit: {limit: 1, strategy: ENQUEUE}", r"concurrency_limit\.strategy"),
+            ("parameters: {sequence: phantom/0, settingz: {}}", r"parameters\.settingz: .*settings"),
+        ],
+    )
+    def test_what_it_cannot_go_by_is_refused(
+        self, line: str, field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("EXTRAGS_STORE", "/data/special")
+        with pytest.raises(ConfigError, match=rf"own\.yaml: deployment mine: .*{field}"):
+            served_from(tmp_path, line)
+
+
+def served_from(folder: Path, *lines: str) -> Any:
+    """The deployment that `extrags serve` makes of a file of one's own."""
+    from flows.commands.serve import _deployment
+
+    fields = ["name: mine", "entrypoint: flows.sequence.reconstruct_sequence", *lines]
+    file = folder / "own.yaml"
+    file.write_text("\n".join(["deployments:", "  -", *(f"    {line}" for line in fields)]))
+    (declared,) = declared_deployments(file)
+    return _deployment(declared, schedules=False)
 
 
 @contextmanager

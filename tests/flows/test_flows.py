@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 import pytest
 import yaml
 from prefect.artifacts import Artifact
+from prefect.client.schemas.objects import FlowRun
+from prefect.context import FlowRunContext
 from prefect.flows import Flow, load_flow_from_entrypoint
+from prefect.task_runners import ThreadPoolTaskRunner
 
+import extrags.cores
+import flows.dataset
+import tasks.progress
 from extrags.errors import ConfigError, StoreError
 from extrags.pipeline import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
 from flows.outcome import DatasetFailedError, SequenceFailedError, SequenceOutcome
-from flows.sequence import reconstruct_sequence
+from flows.sequence import open_store, reconstruct_sequence
 from flows.settings import pipeline_config, task_runner
 from tasks.run_page import artifact_key
 from tests.flows.tiny import GIVEN, SEQUENCE, TINY
@@ -127,6 +135,43 @@ class TestDataset:
             assert [outcome.status for outcome in failure.outcome.sequences] == ["failed", "failed"]
 
 
+def test_an_interrupted_dataset_begins_no_more_sequences(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted = threading.Event()
+    monkeypatch.setattr(tasks.progress, "_interrupted", interrupted)
+    sequences = [f"phantom/{number}@sparse" for number in range(6)]
+    begun, told = [], []
+
+    def one(*, sequence: str, **_: object) -> None:
+        begun.append(sequence)
+        if sequence == sequences[0]:
+            raise KeyboardInterrupt
+        told.append(interrupted.wait(5))
+        raise KeyboardInterrupt
+
+    class Started:
+        def with_options(self, **_: object) -> Any:
+            return one
+
+    monkeypatch.setattr(flows.dataset, "reconstruct_sequence", Started())
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct_dataset.fn(sequences, store=str(tmp_path), until="ingest", at_once=2)
+    # The thread of the first may have begun another before it was known.
+    assert len(begun) <= 3
+    assert all(told)
+    assert not interrupted.is_set(), "further runs of this process are not interrupted"
+
+
+@pytest.mark.parametrize("inner", [False, True])
+def test_leftovers_are_looked_for_by_the_outer_run_alone(inner: bool, tmp_path: Path) -> None:
+    (tmp_path / "scratch" / "left").mkdir(parents=True)
+    run = FlowRun(flow_id=uuid4(), parent_task_run_id=uuid4() if inner else None)
+    with FlowRunContext.model_construct(flow_run=run):
+        open_store(str(tmp_path))
+    assert (tmp_path / "scratch" / "left").exists() is inner
+
+
 class TestParameters:
     def test_seed_reaches_every_stage(self) -> None:
         config = pipeline_config("quick", None, 7)
@@ -139,6 +184,13 @@ class TestParameters:
     def test_unknown_runners_are_refused(self, name: str) -> None:
         with pytest.raises(ConfigError, match="no task runner"):
             task_runner(name)
+
+    def test_threads_are_no_more_than_a_containers_quota(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "cpu.max").write_text("50000 100000")
+        monkeypatch.setattr(extrags.cores, "CONTROL_GROUP", tmp_path)
+        assert task_runner("threads") == ThreadPoolTaskRunner(max_workers=1)
 
 
 def deployments() -> list[dict[str, Any]]:
