@@ -113,7 +113,7 @@ def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:
     with _image_errors(file, frame, "mask"), Image.open(file) as image:
         image.load()
         values = np.asarray(image.convert("L"))
-        opacity = image.convert("LA").getchannel("A") if image.has_transparency_data else None
+        opacity = np.asarray(image.convert("LA"))[..., 1] if image.has_transparency_data else None
     found = np.unique(values)
     if len(found) == 1 and opacity is not None and len(np.unique(opacity)) > 1:
         raise SourceError(

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from data_catalog.catalog import list_sequences
 from extrags.errors import SourceNotFoundError, UnknownSequenceError
 
-__all__ = ["Matched", "is_pattern", "matching_names"]
+__all__ = ["Matched", "is_named", "is_pattern", "matching_names"]
 
 _NEAR = 3
 
@@ -31,6 +31,11 @@ class Matched(NamedTuple):
 def is_pattern(text: str) -> bool:
     """Whether a text is a pattern over names: it has `*`, `?` or `[`, and no such path exists."""
     return re.search(r"[*?\[]", text) is not None and not Path(text).expanduser().exists()
+
+
+def is_named(name: str, pattern: str) -> bool:
+    """Whether a text names a sequence, exactly or as a pattern: the folder of one may have brackets."""
+    return name == pattern or fnmatchcase(name, pattern)
 
 
 def matching_names(pattern: str) -> Matched:

@@ -69,18 +69,24 @@ class SequenceCase:
         return f"{self.sequence} [{self.variant}]" if self.variant else self.sequence
 
     @property
+    def distinguishing(self) -> dict[str, Any]:
+        """Settings whose runs stand beside each other: those of a matrix, and the scene that is imported."""
+        imported = {name: self.settings[name] for name in ("imported.scene",) if self.settings.get(name)}
+        return {**imported, **self.changed}
+
+    @property
     def record(self) -> str:
         """Name of the record of its last run.
 
-        Settings that are the same for all runs of a sequence are not part of it: who mends them runs the
-        same case again.
+        Other settings that are the same for all runs of a sequence are not part of it: who mends them runs
+        the same case again.
         """
         identity = {
             "sequence": self.sequence,
             "method": self.method,
             "profile": self.profile,
             "seed": self.seed,
-            "variant": dict(self.changed),
+            "variant": self.distinguishing,
         }
         return f"{OUTCOME}{digest_of(identity)}"
 
@@ -240,7 +246,8 @@ def record_outcome(
         "method": case.method,
         "profile": case.profile,
         "seed": case.seed,
-        "variant": dict(case.changed),
+        "variant": case.distinguishing,
+        "settings": dict(case.settings),
         "until": until,
         "status": outcome.status,
         "stage": None if failed is None else failed.stage,

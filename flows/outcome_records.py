@@ -5,17 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.store import Store, read_records
 
-__all__ = ["OUTCOME", "OutcomeRecord", "outcome_records", "setting_text"]
+__all__ = ["OUTCOME", "OutcomeRecord", "held_out_trained_on", "outcome_records", "setting_text"]
 
 OUTCOME = "outcome."
 """Begin of the names of these records."""
 
 OutcomeRecord = dict[str, Any]
-"""`{sequence, method, profile, seed, variant, until, status, stage, reason, ended, seconds, config, size,
-stages, metrics, report, extrags}` of the last run of a case that came to an end: its size is that of
-`extrags.run_costs.Workload`. Of each stage
+"""`{sequence, method, profile, seed, variant, settings, until, status, stage, reason, ended, seconds, config,
+size, stages, metrics, report, extrags}` of the last run of a case that came to an end: its size is that of
+`extrags.run_costs.Workload`. `settings` are those that were given (records of earlier versions lack them). Of
+each stage
 `{stage, state, reason, made_seconds, expected_cpu_s, artefacts: {KEY: BYTES}}`: seconds that it took, and
 those of processor time that the cost model expects on its reference machine."""
 
@@ -27,6 +29,11 @@ def outcome_records(store: Store) -> dict[str, OutcomeRecord]:
         StoreError: when the store cannot be read.
     """
     return read_records(store, OUTCOME)
+
+
+def held_out_trained_on(record: OutcomeRecord) -> bool:
+    """Whether a run trained on the held-out frames that its figures are of."""
+    return any(stage["reason"].startswith(HELD_OUT_TRAINED_ON) for stage in record["stages"])
 
 
 def setting_text(settings: Mapping[str, Any]) -> str:

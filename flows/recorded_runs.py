@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from data_catalog.patterns import is_named
 from extrags.errors import ConfigError, StoreError
+from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.leaderboard import BoardRow
 from extrags.store import Manifest, Ref, Store
-from flows.outcome_records import OutcomeRecord, outcome_records, setting_text
+from flows.outcome_records import OutcomeRecord, held_out_trained_on, outcome_records, setting_text
 
 if TYPE_CHECKING:
     from extrags.report.gallery import GalleryRun
     from extrags.report.run_comparison import ComparedRun
+    from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "RecordedRun",
@@ -168,6 +171,7 @@ def compared_run(store: Store, run: RecordedRun, name: str, target: str = "") ->
     from extrags.metrics.protocol import RenderedViews
     from extrags.report.run_comparison import ComparedRun
     from extrags.report.run_tables import plain_value
+    from extrags.sequence import EndoscopicSequence
     from tasks.evaluate import METRICS_FILE
     from tasks.report import PAGE
 
@@ -176,6 +180,7 @@ def compared_run(store: Store, run: RecordedRun, name: str, target: str = "") ->
     if renders is None or metrics is None:
         raise StoreError(f"{run.sequence}: the page {run.report.key} was made without an evaluation")
     settings = _flat(run.report.config["config"])
+    frames = run.ref(store, "sequence")
     stages = [] if run.record is None else run.record["stages"]
     page = store.find(run.report.key)
     return ComparedRun(
@@ -185,7 +190,18 @@ def compared_run(store: Store, run: RecordedRun, name: str, target: str = "") ->
         settings={key: plain_value(value) for key, value in settings.items()},
         seconds=sum(float(stage["made_seconds"]) for stage in stages) if stages else None,
         link="" if page is None else _address(f"{page.uri}/{PAGE}", target),
+        held_out_trained_on=run.record is not None and held_out_trained_on(run.record),
+        held_out="" if frames is None else _held_out(store.load(EndoscopicSequence, frames)),
     )
+
+
+def _held_out(sequence: EndoscopicSequence) -> str:
+    """Digest of the images and masks of the held-out frames."""
+    digest = hashlib.sha256()
+    for frame in sequence.test:
+        digest.update(sequence.rgb[frame].tobytes())
+        digest.update(sequence.mask[frame].tobytes())
+    return digest.hexdigest()
 
 
 def last_runs(
@@ -209,7 +225,7 @@ def last_runs(
     found: dict[str, RecordedRun] = {}
     for record in sorted(outcome_records(store).values(), key=lambda item: str(item["ended"])):
         sequence = str(record["sequence"])
-        if patterns and not any(fnmatchcase(sequence, pattern) for pattern in patterns):
+        if not _matches(sequence, patterns):
             continue
         key = _key_of(record) if record["status"] == "ok" and _wanted(record, methods, profiles, ()) else None
         manifest = None if key is None else _manifest(store, key)
@@ -247,7 +263,16 @@ def gallery_run(store: Store, run: RecordedRun) -> GalleryRun:
         method=traits.get("method", ""),
         profile=traits.get("profile", ""),
         pseudo=None if enhance is None else store.load(PseudoViews, enhance),
+        held_out=_knowledge(run),
     )
+
+
+def _knowledge(run: RecordedRun) -> str:
+    """What is to be said of a scene that may have seen the held-out frames; empty of one that has not."""
+    if run.record is not None and held_out_trained_on(run.record):
+        return HELD_OUT_TRAINED_ON.capitalize()
+    imported = run.report.config["config"].get("imported", {}).get("scene")
+    return "The scene is imported: whether it has seen the held-out frames is not known" if imported else ""
 
 
 def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> list[BoardRow]:
@@ -264,7 +289,7 @@ def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> 
     rows = []
     for record in outcome_records(store).values():
         sequence = str(record["sequence"])
-        if patterns and not any(fnmatchcase(sequence, pattern) for pattern in patterns):
+        if not _matches(sequence, patterns):
             continue
         seed, tree = record["seed"], record["metrics"]
         rows.append(
@@ -279,10 +304,15 @@ def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> 
                 ended=str(record["ended"]),
                 seconds=sum(float(stage["made_seconds"]) for stage in record["stages"]),
                 metrics=tree.get("final") or tree.get("coarse"),
+                held_out_trained_on=held_out_trained_on(record),
                 link=_address(record["report"], target) if record["report"] else "",
             )
         )
     return sorted(rows, key=lambda row: (row.sequence, row.method, row.profile, row.seed, row.settings))
+
+
+def _matches(sequence: str, patterns: Sequence[str]) -> bool:
+    return not patterns or any(is_named(sequence, pattern) for pattern in patterns)
 
 
 def _wanted(

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from typing import Any, Literal
 
+from data_catalog.patterns import is_named
 from extrags.errors import ExtragsError
 from extrags.metrics.comparison import figure_of
 from extrags.pipeline import STAGES
@@ -185,7 +185,7 @@ def _names(
     names: dict[str, None] = {}
     for pattern in patterns:
         # A sequence may be in the store although its data are not on this machine.
-        found = [name for name in known if fnmatchcase(name, pattern)]
+        found = [name for name in known if is_named(name, pattern)]
         try:
             found += [item.name for item in chosen_sequences([pattern])]
         except ExtragsError:

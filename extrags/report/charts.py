@@ -305,7 +305,7 @@ def method_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
 
 
 def method_marks(colors: Mapping[str, str]) -> dict[str, str]:
-    """A mark of each method, by which those that share a colour differ: there are fewer colours than methods."""
+    """A mark of each method, by which those that share a colour differ."""
     taken: Counter[str] = Counter()
     marks = {}
     for method, color in colors.items():

@@ -41,6 +41,7 @@ class GalleryRun:
         method: of the run.
         profile: of its settings.
         pseudo: its virtual views; None where there are none.
+        held_out: what is to be said of a scene that has seen held-out frames, or may have; else empty.
     """
 
     sequence: EndoscopicSequence
@@ -49,6 +50,7 @@ class GalleryRun:
     method: str = ""
     profile: str = ""
     pseudo: PseudoLike | None = None
+    held_out: str = ""
 
 
 def build_gallery(
@@ -88,8 +90,8 @@ def _head(title: str, command: str) -> str:
         f"# {title}\n\nMade by\n\n```bash\n{command}\n```\n\n"
         "Of each run stand here the held-out view whose PSNR is the median of all, and the middle one of its "
         "virtual views: none is picked by its looks. Figures below an image are those of this view alone. "
-        "No stage has seen the held-out frame. Orange in *never observed* is surface that no training frame "
-        "saw: what the scenes show there is invented.\n"
+        "Unless said otherwise, no stage has seen the held-out frames. Orange in *never observed* is surface "
+        "that no training frame saw: what the scenes show there is invented.\n"
     )
 
 
@@ -126,7 +128,7 @@ def _strip(run: GalleryRun, folder: Path, largest_bytes: int, number_of_run: int
         cells.append(ImageCell(error.image, "Error, final", error.alt))
         said["Error, final"] = f"{table.scales[0].low} dark to {table.scales[0].high} pale"
     said["Truth"] = f"frame {sequence.frame_name(frame)}"
-    lines = [f"## {sequence.name}\n", _summary(run, kinds, metrics) + "\n"]
+    lines = [f"## {_plain(sequence.name)}\n", _summary(run, kinds, metrics) + "\n"]
     lines.append(_table(cells, said, folder, f"{name}_view"))
     if run.pseudo is not None and len(run.pseudo.rendered):
         virtual = virtual_rows(run.pseudo, sequence, 1, largest_bytes)
@@ -148,7 +150,8 @@ def _summary(run: GalleryRun, kinds: Sequence[str], metrics: Sequence[Metric]) -
             figures = " → ".join(number(value, metric.digits) for value in values)
             changes.append(f"{metric.label} {figures} {metric.unit}".strip())
     scenes = " → ".join(LABELS[kind].lower() for kind in kinds)
-    return f"{text}Means of {views} held-out views, {scenes}: {', '.join(changes)}."
+    said = f" {run.held_out}." if run.held_out else ""
+    return f"{text}Means of {views} held-out views, {scenes}: {', '.join(changes)}.{said}"
 
 
 def _figures(view: Mapping[str, Any], metrics: Sequence[Metric]) -> str:

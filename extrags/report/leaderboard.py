@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 from typing import Any, Literal
 
 from extrags.metrics.comparison import figure_of
 from extrags.metrics.registry import Figure, figures
+from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.downloads import Cell, csv_uri
 from extrags.report.page import rendered_page
 from extrags.report.wording import count, described_metrics, duration, number
@@ -32,6 +33,7 @@ class BoardRow:
         seconds: its stages took.
         metrics: of the final scene, as the `metrics` of an `EvaluationResult`; None without.
         link: address of its page; empty for none.
+        held_out_trained_on: its scene has seen the frames that its figures are of.
     """
 
     sequence: str
@@ -45,6 +47,7 @@ class BoardRow:
     seconds: float | int = 0.0
     metrics: Mapping[str, Any] | None = None
     link: str = ""
+    held_out_trained_on: bool = False
 
     @property
     def dataset(self) -> str:
@@ -80,6 +83,7 @@ def build_leaderboard(rows: Sequence[BoardRow], *, name: str = "Leaderboard") ->
         "leaderboard.html.j2",
         name=name,
         summary=_summary(rows),
+        warning=_warning(rows),
         facts=[
             ("Runs", count(len(rows))),
             ("Sequences", count(len({row.sequence for row in rows}))),
@@ -116,6 +120,11 @@ def _summary(rows: Sequence[BoardRow]) -> str:
     )
 
 
+def _warning(rows: Sequence[BoardRow]) -> str:
+    columns = _distinct(row.column for row in rows if row.held_out_trained_on)
+    return f"{HELD_OUT_TRAINED_ON} in {', '.join(columns)}, which is never marked as best." if columns else ""
+
+
 def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, Any] | None:
     """A figure of one profile, sequences by methods; None where no run has it."""
     values: dict[tuple[str, str], list[float]] = {}
@@ -126,6 +135,7 @@ def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, 
     if not values:
         return None
     methods = _distinct(method for _, method in values)
+    ceilings = {row.column for row in rows if row.held_out_trained_on}
     sequences = _distinct(sequence for sequence, _ in values)
     datasets = {row.sequence: row.dataset for row in rows}
     means = {place: fmean(found) for place, found in values.items()}
@@ -143,7 +153,7 @@ def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, 
                 "dataset": datasets[sequence],
                 "cells": [
                     {**cell, "note": note}
-                    for cell, note in zip(_cells(cells, figure), deviations, strict=True)
+                    for cell, note in zip(_cells(cells, figure, ceilings), deviations, strict=True)
                 ],
             }
         )
@@ -156,13 +166,17 @@ def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, 
         "methods": methods,
         "lines": lines,
         "complete": len(complete),
-        "means": _cells({method: overall.get(method) for method in methods}, figure) if overall else [],
+        "means": _cells({method: overall.get(method) for method in methods}, figure, ceilings)
+        if overall
+        else [],
     }
 
 
-def _cells(values: Mapping[str, float | None], figure: Figure) -> list[dict[str, Any]]:
-    """Figures of a row, the best of them marked where there are several."""
-    known = [value for value in values.values() if value is not None]
+def _cells(
+    values: Mapping[str, float | None], figure: Figure, ceilings: Collection[str]
+) -> list[dict[str, Any]]:
+    """Figures of a row by method; the best marked where there are several, `ceilings` apart."""
+    known = [value for method, value in values.items() if value is not None and method not in ceilings]
     best = (max(known) if figure.higher_is_better else min(known)) if len(known) > 1 else None
     return [
         {
@@ -171,9 +185,10 @@ def _cells(values: Mapping[str, float | None], figure: Figure) -> list[dict[str,
             # Nobody is better by what is not shown.
             "best": best is not None
             and value is not None
+            and method not in ceilings
             and round(value, figure.digits) == round(best, figure.digits),
         }
-        for value in values.values()
+        for method, value in values.items()
     ]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from extrags.errors import ConfigError, ShapeError
 from extrags.metrics.registry import Metric
+from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.charts import METHOD_COLORS, drawing_style, svg_image
 from extrags.report.downloads import Cell, Chart, csv_uri, file_name
 from extrags.report.encode import as_uint8
@@ -47,6 +48,8 @@ class ComparedRun:
         settings: values by dotted name, as they are to be shown.
         seconds: its stages took; None where nobody has measured.
         link: address of its own page; empty for none.
+        held_out_trained_on: its scene has seen these views.
+        held_out: digest of the images and masks that its figures are of; empty where it is not known.
     """
 
     name: str
@@ -55,6 +58,8 @@ class ComparedRun:
     settings: Mapping[str, str] = field(default_factory=dict)
     seconds: float | None = None
     link: str = ""
+    held_out_trained_on: bool = False
+    held_out: str = ""
 
 
 def build_run_comparison(sequence: EndoscopicSequence, runs: Sequence[ComparedRun], *, views: int = 6) -> str:
@@ -79,6 +84,13 @@ def build_run_comparison(sequence: EndoscopicSequence, runs: Sequence[ComparedRu
                 f"{sequence.name}: the run {run.name} has renders of shape {run.rgb.shape}, "
                 f"expected {expected}: its held-out frames or its image size are others"
             )
+    frames = [sequence.frame_name(int(frame)) for frame in sequence.test]
+    for run in runs:
+        own = [view.get("name", name) for view, name in zip(run.result["per_view"], frames, strict=True)]
+        if own != frames or (run.held_out and run.held_out != runs[0].held_out):
+            other = next((pair for pair in zip(own, frames, strict=True) if pair[0] != pair[1]), None)
+            said = "other images or masks" if other is None else f"{other[0]} in place of {other[1]}"
+            raise ShapeError(f"{sequence.name}: the run {run.name} has other held-out frames: {said}")
     trees = [run.result["metrics"] for run in runs]
     metrics = shown_metrics(*trees)
     pictured = runs[:MOST_PICTURED]
@@ -106,13 +118,20 @@ def _summary(runs: Sequence[ComparedRun]) -> str:
     values = [metric_of(run.result["metrics"], "psnr") for run in runs]
     views = len(runs[0].result["per_view"])
     text = f"{len(runs)} runs on the same {views} held-out views."
-    known = [(value, run.name) for value, run in zip(values, runs, strict=True) if value is not None]
+    ceilings = [run.name for run in runs if run.held_out_trained_on]
+    if ceilings:
+        text += f" {HELD_OUT_TRAINED_ON} in {', '.join(ceilings)}."
+    known = [
+        (value, run.name)
+        for value, run in zip(values, runs, strict=True)
+        if value is not None and not run.held_out_trained_on
+    ]
     if not known:
         return text
     best, name = max(known, key=lambda item: item[0])
     text += f" The highest PSNR is that of {name}, {number(best, 2)} dB"
     first = values[0]
-    if first is None or name == runs[0].name:
+    if first is None or name == runs[0].name or runs[0].held_out_trained_on:
         return text + "."
     return f"{text}, {number(best - first, 2)} dB above {runs[0].name}."
 
@@ -132,10 +151,14 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
     for path, label in REGIONS:
         for metric in metrics:
             values = [metric_of(run.result["metrics"], *path, metric.key) for run in runs]
-            known = [value for value in values if value is not None]
-            if not known:
+            if all(value is None for value in values):
                 continue
-            best = max(known) if metric.higher_is_better else min(known)
+            known = [
+                value
+                for value, run in zip(values, runs, strict=True)
+                if value is not None and not run.held_out_trained_on
+            ]
+            best = max(known, default=None) if metric.higher_is_better else min(known, default=None)
             rows.append(
                 {
                     "pixels": label,
@@ -143,19 +166,21 @@ def _figures(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> list[dic
                     "cells": [
                         {
                             "value": number(value, metric.digits),
-                            "best": len(known) > 1 and _same(value, best, metric.digits),
+                            "best": len(known) > 1
+                            and not run.held_out_trained_on
+                            and _same(value, best, metric.digits),
                             "change": compare(metric, values[0], value) if place else None,
                         }
-                        for place, value in enumerate(values)
+                        for place, (value, run) in enumerate(zip(values, runs, strict=True))
                     ],
                 }
             )
     return rows
 
 
-def _same(value: float | None, best: float, digits: int) -> bool:
+def _same(value: float | None, best: float | None, digits: int) -> bool:
     """Whether both are written alike: nobody is better by what is not shown."""
-    return value is not None and round(value, digits) == round(best, digits)
+    return value is not None and best is not None and round(value, digits) == round(best, digits)
 
 
 def _figures_csv(runs: Sequence[ComparedRun], metrics: Sequence[Metric]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,7 +14,7 @@ from flows.commands.common import items, set_up_logging, store_root
 from flows.commands.options import Parser, add_store
 
 if TYPE_CHECKING:
-    from extrags.report.gallery import GalleryRun
+    from flows.outcome_records import OutcomeRecord
 
 DEFAULT_METHOD = "extrags"
 
@@ -84,7 +85,7 @@ def gallery(given: argparse.Namespace) -> int:
             runs,
             Path(given.out),
             title=given.name,
-            command=_commands(runs, given.out),
+            command=_commands([run.record for run in chosen if run.record is not None], given),
             largest_bytes=1000 * given.kb,
         )
     except OSError as error:
@@ -93,13 +94,33 @@ def gallery(given: argparse.Namespace) -> int:
     return 0
 
 
-def _commands(runs: Sequence[GalleryRun], folder: str) -> str:
+def _commands(runs: Sequence[OutcomeRecord], given: argparse.Namespace) -> str:
     """What makes the runs and their gallery, for another machine: without a place of this one."""
     made: dict[str, list[str]] = {}
     for run in runs:
-        method = "" if run.method == DEFAULT_METHOD else f" --method {run.method}"
-        made.setdefault(f"{method} --profile {run.profile}", []).append(shlex.quote(run.sequence.name))
+        made.setdefault(_options(run), []).append(_place(run["sequence"]))
     lines = [f"extrags run {' '.join(names)}{how}" for how, names in made.items()]
-    names = [shlex.quote(run.sequence.name) for run in runs]
-    out = "" if Path(folder).is_absolute() else f" --out {shlex.quote(Path(folder).as_posix())}"
-    return "\n".join([*lines, f"extrags gallery {' '.join(names)}{out}"])
+    filters = "".join(
+        f" --{name} {' '.join(items(chosen))}"
+        for name, chosen in (("methods", given.methods), ("profiles", given.profiles))
+        if chosen
+    )
+    out = "" if Path(given.out).is_absolute() else f" --out {shlex.quote(Path(given.out).as_posix())}"
+    names = " ".join(_place(run["sequence"]) for run in runs)
+    return "\n".join([*lines, f"extrags gallery {names}{filters}{out}"])
+
+
+def _options(run: OutcomeRecord) -> str:
+    method = "" if run["method"] == DEFAULT_METHOD else f" --method {run['method']}"
+    seed = "" if run["seed"] is None else f" --seed {run['seed']}"
+    settings = {**run.get("settings", {}), **run["variant"]}
+    more = [
+        f" --set {name}={_place(value) if isinstance(value, str) else shlex.quote(json.dumps(value))}"
+        for name, value in settings.items()
+    ]
+    return f"{method} --profile {run['profile']}{seed}{''.join(more)}"
+
+
+def _place(text: str) -> str:
+    """A name or path as a word of a shell; of one that this machine alone knows, its last part."""
+    return shlex.quote(Path(text).name if Path(text).is_absolute() else text)

@@ -31,6 +31,13 @@ def leave(store: str, of: SequenceCase, *stages: StageRow, status: Any = "ok", u
     record_outcome(Store(store), of, outcome, until, of.config())
 
 
+def test_a_run_of_an_imported_scene_stands_beside_the_sequence_own() -> None:
+    own, imported = case(), SequenceCase(SEQUENCE, profile="quick", settings={"imported.scene": "their.ply"})
+    assert own.record != imported.record
+    assert own.record == SequenceCase(SEQUENCE, profile="quick").record
+    assert imported.distinguishing == {"imported.scene": "their.ply"}
+
+
 class TestMatrix:
     def test_every_combination(self) -> None:
         points = matrix_points({"coarse.iterations": [500, 1000], "coarse.seed": [0, 1]})

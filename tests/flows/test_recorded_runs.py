@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 
 from extrags.errors import ConfigError, StoreError
-from extrags.store import Store
+from extrags.store import Store, write_record
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.outcome import SequenceOutcome
+from flows.outcome_records import OUTCOME, outcome_records
 from flows.recorded_runs import RecordedRun, board_rows, chosen_runs, compared_run, last_runs, run_names
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
@@ -156,7 +157,8 @@ def test_gallery_from_the_command_line(
     assert main(["gallery", "phantom/*", "--store", store.root, "--out", str(folder)]) == 0
     assert capsys.readouterr().out.strip() == str(folder / "index.md")
     text = (folder / "index.md").read_text(encoding="utf-8")
-    assert f"extrags run {SEQUENCE} --profile quick\nextrags gallery {SEQUENCE}\n" in text
+    made = f"extrags run {SEQUENCE} --profile quick --seed 0 --set report.held_out_views=2"
+    assert f"{made}\nextrags gallery {SEQUENCE}\n" in text
     assert str(tmp_path) not in text
     assert "Virtual view" in text
 
@@ -178,3 +180,12 @@ def test_mistakes_are_one_sentence(
     said = capsys.readouterr().err
     assert message in said
     assert said.count("\n") == 1
+
+
+def test_a_name_with_brackets_is_no_pattern(store: Store, tmp_path: Path) -> None:
+    copied = Store(str(tmp_path / "store"))
+    shutil.copytree(store.root, copied.root)
+    record = next(iter(outcome_records(copied).values()))
+    write_record(copied, f"{OUTCOME}bracketed", {**record, "sequence": "scans/a [x]"})
+    assert [row.sequence for row in board_rows(copied, ["scans/a [x]"])] == ["scans/a [x]"]
+    assert board_rows(copied, ["scans/a [y]"]) == []

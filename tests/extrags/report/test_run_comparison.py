@@ -103,3 +103,26 @@ def test_runs_of_other_views_are_refused(inputs: ReportInputs, runs: list[Compar
     fewer = replace(runs[1], rgb=np.asarray(runs[1].rgb)[:-1])
     with pytest.raises(ShapeError, match="the run extrags has renders"):
         build_run_comparison(inputs.sequence, [runs[0], fewer])
+
+
+def test_runs_of_other_held_out_frames_are_refused(inputs: ReportInputs, runs: list[ComparedRun]) -> None:
+    views = [dict(view) for view in runs[1].result["per_view"]]
+    for view, frame in zip(views, inputs.sequence.test, strict=True):
+        view["name"] = inputs.sequence.frame_name(int(frame))
+    views[-1]["name"] = "another"
+    other = replace(runs[1], result={**runs[1].result, "per_view": views})
+    with pytest.raises(ShapeError, match="extrags has other held-out frames: another in place of"):
+        build_run_comparison(inputs.sequence, [runs[0], other])
+    first, second = (replace(run, held_out=run.name) for run in runs)
+    with pytest.raises(ShapeError, match="other images or masks"):
+        build_run_comparison(inputs.sequence, [first, second])
+
+
+def test_a_run_that_has_seen_the_views_is_no_competitor(
+    inputs: ReportInputs, runs: list[ComparedRun]
+) -> None:
+    seen = replace(runs[1], name="oracle", held_out_trained_on=True)
+    text = Page(build_run_comparison(inputs.sequence, [runs[0], seen], views=1)).text
+    assert "held-out frames were trained on in oracle" in text
+    assert "The highest PSNR is that of 3dgs, 20.00 dB." in text
+    assert "22.50 best" not in text
