@@ -136,7 +136,7 @@ class _Alignment:
         """
         largest: _Model | None = None
         left = frames
-        for beginning in range(BEGINNINGS):
+        for _ in range(BEGINNINGS):
             first, *others = left
             self.placed, self.model = {first: Posed(self.views[first], np.eye(4))}, [first]
             self.fits, self.recognised = {}, {}
@@ -150,9 +150,9 @@ class _Alignment:
         assert largest is not None
         self.placed, self.model = largest.placed, largest.model
         self.fits, self.recognised = largest.fits, largest.recognised
-        if beginning > 0 and (others := [frame for frame in frames if frame not in self.placed]):
-            # Those that were joined to another model have not been tried with this one.
-            self._place_all(others, grows=True)
+        if len(self.placed) + len(left) < len(frames):
+            # Those that were joined to a smaller one have not been tried with this.
+            self._place_all([frame for frame in frames if frame not in self.placed], grows=True)
 
     def _prepare(self, frames: list[int]) -> None:
         for frame in frames:
