@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 from extrags.metrics.comparison import figure_of
 from extrags.metrics.registry import Figure, figures
-from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.downloads import Cell, csv_uri
 from extrags.report.page import rendered_page
 from extrags.report.wording import count, described_metrics, duration, number
@@ -122,7 +121,9 @@ def _summary(rows: Sequence[BoardRow]) -> str:
 
 def _warning(rows: Sequence[BoardRow]) -> str:
     columns = _distinct(row.column for row in rows if row.held_out_trained_on)
-    return f"{HELD_OUT_TRAINED_ON} in {', '.join(columns)}, which is never marked as best." if columns else ""
+    if not columns:
+        return ""
+    return f"Held-out frames were trained on in {', '.join(columns)}, which is never marked as best."
 
 
 def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, Any] | None:

@@ -10,7 +10,6 @@ import numpy as np
 
 from extrags.errors import ConfigError, ShapeError
 from extrags.metrics.registry import Metric
-from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.charts import METHOD_COLORS, drawing_style, svg_image
 from extrags.report.downloads import Cell, Chart, csv_uri, file_name
 from extrags.report.encode import as_uint8
@@ -120,7 +119,7 @@ def _summary(runs: Sequence[ComparedRun]) -> str:
     text = f"{len(runs)} runs on the same {views} held-out views."
     ceilings = [run.name for run in runs if run.held_out_trained_on]
     if ceilings:
-        text += f" {HELD_OUT_TRAINED_ON} in {', '.join(ceilings)}."
+        text += f" Held-out frames were trained on in {', '.join(ceilings)}."
     known = [
         (value, run.name)
         for value, run in zip(values, runs, strict=True)

@@ -105,5 +105,5 @@ def test_no_runs_no_tables() -> None:
 def test_what_has_seen_the_views_is_never_the_best() -> None:
     seen = replace(row("phantom/0@sparse", "oracle", 30.0), held_out_trained_on=True)
     page = Page(build_leaderboard([row("phantom/0@sparse", "extrags", 25.0), seen]))
-    assert "held-out frames were trained on in oracle, which is never marked as best" in page.text
+    assert "Held-out frames were trained on in oracle, which is never marked as best" in page.text
     assert "30.00 best" not in page.text

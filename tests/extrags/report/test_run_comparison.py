@@ -123,6 +123,6 @@ def test_a_run_that_has_seen_the_views_is_no_competitor(
 ) -> None:
     seen = replace(runs[1], name="oracle", held_out_trained_on=True)
     text = Page(build_run_comparison(inputs.sequence, [runs[0], seen], views=1)).text
-    assert "held-out frames were trained on in oracle" in text
+    assert "Held-out frames were trained on in oracle" in text
     assert "The highest PSNR is that of 3dgs, 20.00 dB." in text
     assert "22.50 best" not in text
