@@ -28,6 +28,7 @@ __all__ = [
     "chosen_runs",
     "compared_run",
     "gallery_run",
+    "held_out_digest",
     "last_runs",
     "run_names",
 ]
@@ -171,7 +172,6 @@ def compared_run(store: Store, run: RecordedRun, name: str, target: str = "") ->
     from extrags.metrics.protocol import RenderedViews
     from extrags.report.run_comparison import ComparedRun
     from extrags.report.run_tables import plain_value
-    from extrags.sequence import EndoscopicSequence
     from tasks.evaluate import METRICS_FILE
     from tasks.report import PAGE
 
@@ -180,7 +180,6 @@ def compared_run(store: Store, run: RecordedRun, name: str, target: str = "") ->
     if renders is None or metrics is None:
         raise StoreError(f"{run.sequence}: the page {run.report.key} was made without an evaluation")
     settings = _flat(run.report.config["config"])
-    frames = run.ref(store, "sequence")
     stages = [] if run.record is None else run.record["stages"]
     page = store.find(run.report.key)
     return ComparedRun(
@@ -191,12 +190,11 @@ def compared_run(store: Store, run: RecordedRun, name: str, target: str = "") ->
         seconds=sum(float(stage["made_seconds"]) for stage in stages) if stages else None,
         link="" if page is None else _address(f"{page.uri}/{PAGE}", target),
         held_out_trained_on=run.record is not None and held_out_trained_on(run.record),
-        held_out="" if frames is None else _held_out(store.load(EndoscopicSequence, frames)),
     )
 
 
-def _held_out(sequence: EndoscopicSequence) -> str:
-    """Digest of the images and masks of the held-out frames."""
+def held_out_digest(sequence: EndoscopicSequence) -> str:
+    """Digest of the images and masks of the held-out frames, by which runs are told to be of the same."""
     digest = hashlib.sha256()
     for frame in sequence.test:
         digest.update(sequence.rgb[frame].tobytes())

@@ -71,7 +71,7 @@ def build_run_comparison(sequence: EndoscopicSequence, runs: Sequence[ComparedRu
 
     Raises:
         ConfigError: for fewer than two runs, or two of the same name.
-        ShapeError: when the renders of a run are not of these held-out frames.
+        ShapeError: when the renders of a run are not of these held-out frames, or these frames have changed.
     """
     names = [run.name for run in runs]
     if len(runs) < 2 or len(set(names)) < len(names):
@@ -84,12 +84,17 @@ def build_run_comparison(sequence: EndoscopicSequence, runs: Sequence[ComparedRu
                 f"expected {expected}: its held-out frames or its image size are others"
             )
     frames = [sequence.frame_name(int(frame)) for frame in sequence.test]
+    truths = {run.held_out for run in runs if run.held_out}
     for run in runs:
         own = [view.get("name", name) for view, name in zip(run.result["per_view"], frames, strict=True)]
-        if own != frames or (run.held_out and run.held_out != runs[0].held_out):
-            other = next((pair for pair in zip(own, frames, strict=True) if pair[0] != pair[1]), None)
-            said = "other images or masks" if other is None else f"{other[0]} in place of {other[1]}"
-            raise ShapeError(f"{sequence.name}: the run {run.name} has other held-out frames: {said}")
+        other = next((pair for pair in zip(own, frames, strict=True) if pair[0] != pair[1]), None)
+        if other is not None:
+            raise ShapeError(
+                f"{sequence.name}: the run {run.name} has other held-out frames: {other[0]} in place of "
+                f"{other[1]}"
+            )
+    if len(truths) > 1:
+        raise ShapeError(f"{sequence.name}: images or masks of the held-out frames differ between the runs")
     trees = [run.result["metrics"] for run in runs]
     metrics = shown_metrics(*trees)
     pictured = runs[:MOST_PICTURED]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 
 from extrags.errors import ConfigError
 from flows.commands.common import items, set_up_logging, store_root, write_page
@@ -63,7 +64,7 @@ def compare(given: argparse.Namespace) -> int:
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     store = Store(store_root(given))
     prepare(store.state, debug=given.debug)
-    from flows.recorded_runs import chosen_runs, compared_run, run_names
+    from flows.recorded_runs import chosen_runs, compared_run, held_out_digest, run_names
 
     runs = chosen_runs(
         store,
@@ -75,12 +76,20 @@ def compare(given: argparse.Namespace) -> int:
     from extrags.report.run_comparison import build_run_comparison
     from extrags.sequence import EndoscopicSequence
 
-    shown = [
-        compared_run(store, run, name, given.output) for run, name in zip(runs, run_names(runs), strict=True)
-    ]
-    frames = runs[0].ref(store, "sequence")
-    if frames is None:
+    refs = [run.ref(store, "sequence") for run in runs]
+    first = refs[0]
+    if first is None:
         raise ConfigError(f"{runs[0].sequence}: its page {runs[0].report.key} knows no frames")
-    page = build_run_comparison(store.load(EndoscopicSequence, frames), shown, views=given.views)
+    sequence = store.load(EndoscopicSequence, first)
+    # Most runs share their frames, which may be gigabytes.
+    digests = {first: held_out_digest(sequence)}
+    for ref in refs:
+        if ref is not None and ref not in digests:
+            digests[ref] = held_out_digest(store.load(EndoscopicSequence, ref))
+    shown = [
+        replace(compared_run(store, run, name, given.output), held_out="" if ref is None else digests[ref])
+        for run, ref, name in zip(runs, refs, run_names(runs), strict=True)
+    ]
+    page = build_run_comparison(sequence, shown, views=given.views)
     print(write_page(page, given.output))
     return 0
