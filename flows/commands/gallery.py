@@ -7,10 +7,10 @@ import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError, StoreError
-from flows.commands.common import items, set_up_logging, store_root
+from flows.commands.common import items, parsed_settings, set_up_logging, store_root
 from flows.commands.options import Parser, add_store
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ def _commands(runs: Sequence[OutcomeRecord], given: argparse.Namespace) -> str:
     """What makes the runs and their gallery, for another machine: without a place of this one."""
     made: dict[str, list[str]] = {}
     for run in runs:
-        made.setdefault(_options(run), []).append(_place(run["sequence"]))
+        made.setdefault(_options(run), []).append(shlex.quote(_without_folders(run["sequence"])))
     lines = [f"extrags run {' '.join(names)}{how}" for how, names in made.items()]
     filters = "".join(
         f" --{name} {' '.join(items(chosen))}"
@@ -106,7 +106,7 @@ def _commands(runs: Sequence[OutcomeRecord], given: argparse.Namespace) -> str:
         if chosen
     )
     out = "" if Path(given.out).is_absolute() else f" --out {shlex.quote(Path(given.out).as_posix())}"
-    names = " ".join(_place(run["sequence"]) for run in runs)
+    names = " ".join(shlex.quote(_without_folders(run["sequence"])) for run in runs)
     return "\n".join([*lines, f"extrags gallery {names}{filters}{out}"])
 
 
@@ -114,13 +114,19 @@ def _options(run: OutcomeRecord) -> str:
     method = "" if run["method"] == DEFAULT_METHOD else f" --method {run['method']}"
     seed = "" if run["seed"] is None else f" --seed {run['seed']}"
     settings = {**run.get("settings", {}), **run["variant"]}
-    more = [
-        f" --set {name}={_place(value) if isinstance(value, str) else shlex.quote(json.dumps(value))}"
-        for name, value in settings.items()
-    ]
-    return f"{method} --profile {run['profile']}{seed}{''.join(more)}"
+    more = "".join(f" --set {shlex.quote(_assignment(name, value))}" for name, value in settings.items())
+    return f"{method} --profile {run['profile']}{seed}{more}"
 
 
-def _place(text: str) -> str:
-    """A name or path as a word of a shell; of one that this machine alone knows, its last part."""
-    return shlex.quote(Path(text).name if Path(text).is_absolute() else text)
+def _assignment(name: str, value: Any) -> str:
+    """A setting as `--set` reads it: words have no quotes unless they would be read as something else."""
+    if isinstance(value, str):
+        value = _without_folders(value)
+        if parsed_settings([f"{name}={value}"])[name] == value:
+            return f"{name}={value}"
+    return f"{name}={json.dumps(value)}"
+
+
+def _without_folders(text: str) -> str:
+    """A name, or a path; of one that this machine alone knows its last part."""
+    return Path(text).name if Path(text).is_absolute() else text

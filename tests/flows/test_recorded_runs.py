@@ -3,20 +3,35 @@
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from extrags.errors import ConfigError, StoreError
+from extrags.pipeline import HELD_OUT_TRAINED_ON
+from extrags.sequence import EndoscopicSequence
 from extrags.store import Store, write_record
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
+from flows.commands.common import parsed_settings
+from flows.commands.gallery import _options
 from flows.outcome import SequenceOutcome
 from flows.outcome_records import OUTCOME, outcome_records
-from flows.recorded_runs import RecordedRun, board_rows, chosen_runs, compared_run, last_runs, run_names
+from flows.recorded_runs import (
+    RecordedRun,
+    board_rows,
+    chosen_runs,
+    compared_run,
+    gallery_run,
+    held_out_digest,
+    last_runs,
+    run_names,
+)
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
@@ -189,3 +204,67 @@ def test_a_name_with_brackets_is_no_pattern(store: Store, tmp_path: Path) -> Non
     write_record(copied, f"{OUTCOME}bracketed", {**record, "sequence": "scans/a [x]"})
     assert [row.sequence for row in board_rows(copied, ["scans/a [x]"])] == ["scans/a [x]"]
     assert board_rows(copied, ["scans/a [y]"]) == []
+
+
+@pytest.mark.parametrize(
+    ("reason", "config", "said"),
+    [
+        ("", {}, ""),
+        (HELD_OUT_TRAINED_ON, {}, "Oracle: held-out frames were trained on"),
+        ("", {"imported": {"scene": "their.ply"}}, "The scene is imported: whether it has seen the held-out"),
+    ],
+)
+def test_what_a_scene_has_seen_is_said(reason: str, config: dict[str, Any], said: str, store: Store) -> None:
+    run = chosen_runs(store, [SEQUENCE])[0]
+    assert run.record is not None
+    manifest = run.report.model_copy(update={"config": {"config": config}})
+    seen = RecordedRun(manifest, {**run.record, "stages": [{"stage": "coarse", "reason": reason}]})
+    shown = gallery_run(store, seen).held_out
+    assert shown.startswith(said)
+    assert bool(shown) == bool(said)
+
+
+def test_boards_know_what_has_seen_held_out_frames(store: Store, tmp_path: Path) -> None:
+    copied = Store(str(tmp_path / "store"))
+    shutil.copytree(store.root, copied.root)
+    name, record = next(item for item in outcome_records(copied).items() if item[1]["status"] == "ok")
+    assert not any(row.held_out_trained_on for row in board_rows(copied))
+    stages = [{**stage, "reason": HELD_OUT_TRAINED_ON} for stage in record["stages"]]
+    write_record(copied, name, {**record, "stages": stages})
+    assert [row.held_out_trained_on for row in board_rows(copied)].count(True) == 1
+
+
+def test_frames_are_told_by_what_they_show(store: Store) -> None:
+    ref = chosen_runs(store, [SEQUENCE])[0].ref(store, "sequence")
+    assert ref is not None
+    sequence = store.load(EndoscopicSequence, ref)
+    before = held_out_digest(sequence)
+    train, test = int(sequence.train[0]), int(sequence.test[0])
+    rgb = sequence.rgb.copy()
+    rgb[train] ^= 1
+    assert held_out_digest(replace(sequence, rgb=rgb)) == before
+    rgb[test, 0, 0, 0] ^= 1
+    assert held_out_digest(replace(sequence, rgb=rgb)) != before
+    mask = sequence.mask.copy()
+    mask[test, 0, 0] ^= True
+    assert held_out_digest(replace(sequence, mask=mask)) != before
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (3, "a.b=3"),
+        ([1, 2], "'a.b=[1, 2]'"),
+        ("classical", "a.b=classical"),
+        ("/home/me/their scene.ply", "'a.b=their scene.ply'"),
+        # A word that YAML would read as something else.
+        ("no", """'a.b="no"'"""),
+    ],
+)
+def test_settings_are_written_as_they_are_read(value: Any, said: str) -> None:
+    run = {"sequence": "x", "method": "extrags", "profile": "quick", "seed": None, "variant": {}}
+    options = _options({**run, "settings": {"a.b": value}})
+    assert options == f" --profile quick --set {said}"
+    (assignment,) = shlex.split(options)[3:]
+    read = parsed_settings([assignment])["a.b"]
+    assert read == (Path(value).name if isinstance(value, str) else value)
