@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import cloudpickle
@@ -140,6 +142,15 @@ def test_one_name_has_one_version() -> None:
     assert stage_versions()["toy-double"] == 3
     with pytest.raises(ConfigError, match="two versions of stage toy-double"):
         stage("toy-double", version=4)(lambda slot: None)
+
+
+def test_all_stages_are_those_of_every_module() -> None:
+    """In a process of its own, in which nothing has imported any."""
+    command = "from tasks.stage import all_stage_versions; print(*all_stage_versions())"
+    told = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True)
+    assert {"ingest", "benchmark-report", "uc-nerf", "import-scene", "continued-coarse"} <= set(
+        told.stdout.split()
+    )
 
 
 def test_unknown_arguments_are_refused(tmp_path: Path) -> None:
