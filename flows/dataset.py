@@ -143,20 +143,19 @@ def reconstruct_dataset(
         if at_once == 1:
             outcomes = [reconstruct(case) for case in cases]
         else:
-            pool = ThreadPoolExecutor(max_workers=at_once)
-            try:
-                # Flow and observer are in context variables, which threads do not inherit.
-                futures = {
-                    item.case.title: pool.submit(copy_context().run, reconstruct, item.case)
-                    for item in longest_first(expected)
-                }
-                outcomes = [futures[case.title].result() for case in cases]
-            except BaseException:
-                # SIGTERM or Ctrl-C, say: what has begun ends at its next event, and nothing else begins.
-                with stages_interrupted():
-                    pool.shutdown(cancel_futures=True)
-                raise
-            pool.shutdown()
+            with ThreadPoolExecutor(max_workers=at_once) as pool:
+                try:
+                    # Flow and observer are in context variables, which threads do not inherit.
+                    futures = {
+                        item.case.title: pool.submit(copy_context().run, reconstruct, item.case)
+                        for item in longest_first(expected)
+                    }
+                    outcomes = [futures[case.title].result() for case in cases]
+                except BaseException:
+                    # SIGTERM or Ctrl-C, say: what has begun ends at its next event, and nothing else begins.
+                    with stages_interrupted():
+                        pool.shutdown(cancel_futures=True)
+                    raise
         report = None
         if until == "report":
             label = profile_label(profile, method if methods is None else ", ".join(methods))

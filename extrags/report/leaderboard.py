@@ -176,7 +176,10 @@ def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, 
 def _cells(
     values: Mapping[str, float | None], figure: Figure, ceilings: Collection[str]
 ) -> list[dict[str, Any]]:
-    """Figures of a row by method; the best marked where there are several, `ceilings` apart."""
+    """Figures of a row by method; the best marked where there are several.
+
+    `ceilings` are methods whose scenes have seen the held-out frames: they are no competitors.
+    """
     known = [value for method, value in values.items() if value is not None and method not in ceilings]
     best = (max(known) if figure.higher_is_better else min(known)) if len(known) > 1 else None
     return [

@@ -399,7 +399,8 @@ NB_MODULE(_native, m) {
       .def("backward", &frame_backward, nb::arg("gaussians"), nb::arg("images"), nb::arg("gradients"),
            nb::arg("camera"), nb::kw_only(), nb::arg("add") = false,
            "Fill the gradients, or add to those of the Gaussians' own arrays.")
-      .def("entries", &frame_entries, "How many (Gaussian, 4 x 4 pixel block) entries some pixel composited or ended at.")
+      .def("entries", &frame_entries,
+           "How many (Gaussian, 4 x 4 pixel block) entries some pixel composited or ended at.")
       .def("seconds", &frame_seconds,
            "Of the projection, the tiles, the tiles backward and the projection backward.")
       .def("query", &frame_query, nb::arg("points"), nb::arg("transmittance").noconvert());
