@@ -40,7 +40,7 @@ def leave_out_folds(
 
     Args:
         frames: the training frames.
-        folds: number of folds.
+        folds: number of folds; there are no more of them than frames, since each leaves out at least one.
 
     Raises:
         CaptureError: with fewer than four frames.
@@ -50,6 +50,7 @@ def leave_out_folds(
             f"{len(frames)} training frames are too few to leave some out and train a restorer on (at least "
             f"{MIN_FRAMES} are needed); set enhance.backend to classical"
         )
+    folds = min(folds, len(frames))
     parts = max(folds, 2) if folds != 1 else 3
     blocks = min(BLOCKS_PER_FOLD * parts, len(frames))
     owner = np.arange(len(frames)) * blocks // len(frames) % parts

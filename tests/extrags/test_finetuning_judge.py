@@ -21,6 +21,7 @@ from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.restored_renders import RESTORED_SHARE, RestoredShares, restored_shares
 from extrags.sequence import EndoscopicSequence
 from extrags.training.frame_weights import FrameWeights, frame_weights
+from extrags.training.leave_out import MIN_FRAMES
 from tests.extrags.lit_tube import Tube, tube_cameras
 
 COARSE = CoarseConfig(iterations=60, max_points=300, densify=DensifyConfig(max_gaussians=500))
@@ -204,6 +205,16 @@ def test_a_few_left_out_frames_do_not_judge_alone(tube: Tube, monkeypatch: pytes
     assert set(few.left_out) < set(more.left_out)
     assert more.trials[0].gain_db == pytest.approx(0)
     assert more.trials[0].coarse_psnr_db == pytest.approx(27.5)
+
+
+def test_the_fewest_frames_that_can_be_judged(tube: Tube) -> None:
+    """Four, of which one in five is left out: every trial leaves out one, and none leaves out nothing."""
+    split = replace(tube.sequence.split, train=tube.sequence.train[:MIN_FRAMES])
+    few = replace(tube, scene=replace(tube.scene, light=None), sequence=replace(tube.sequence, split=split))
+    every_fifth = FINETUNE.judge.model_copy(update={"leave_out_every": 5})
+    found = judged(few, None, FINETUNE.model_copy(update={"judge": every_fifth, "iterations": 5}))
+    assert found.left_out == (0, 1, 2, 3)
+    assert np.isfinite(found.trials[0].gain_db)
 
 
 def test_off_or_too_few_frames_keep_everything(tube: Tube) -> None:

@@ -124,13 +124,14 @@ def make_pairs(
         CaptureError: with fewer than four training frames.
     """
     parts = []
-    frames = None if most is None else max(1, most // (2 * config.folds))
-    for fold in range(config.folds):
+    folds = len(leave_out_folds(np.asarray(sequence.train, dtype=np.int64), config.folds))
+    frames = None if most is None else max(1, most // (2 * folds))
+    for fold in range(folds):
         parts.append(fold_pairs(scene, sequence, config, coarse, fold, most_frames=frames))
-        emit(Progress("enhance-pairs", fold + 1, config.folds + 1))
+        emit(Progress("enhance-pairs", fold + 1, folds + 1))
     if config.synthetic_views > 0:
         parts.append(synthetic_pairs(scene, sequence, config))
-    emit(Progress("enhance-pairs", config.folds + 1, config.folds + 1))
+    emit(Progress("enhance-pairs", folds + 1, folds + 1))
     return Pairs.concatenated(parts)
 
 
