@@ -155,9 +155,11 @@ def random_walk(moves: Moves, cameras: Cameras, n_views: int, seed: int) -> list
     rng = np.random.default_rng([seed, 1])
     clips: list[Clip] = []
     starts = moves.starts(cameras)
-    failed, left = 0, n_views
+    # In a row: of some starts that can be left, others that cannot take their turn again and again.
+    turn, failed, left = 0, 0, n_views
     while left > 0 and failed < len(starts):
-        anchor = starts[(len(clips) + failed) % len(starts)]
+        anchor = starts[turn % len(starts)]
+        turn += 1
         poses = [cameras.world_from_camera[anchor]]
         while len(poses) < min(moves.config.length, left + 1):
             possible = moves.possible(poses[-1])
@@ -167,6 +169,7 @@ def random_walk(moves: Moves, cameras: Cameras, n_views: int, seed: int) -> list
         if len(poses) == 1:
             failed += 1
             continue
+        failed = 0
         clips.append(Clip(anchor, np.stack(poses)))
         left -= len(poses) - 1
     return clips

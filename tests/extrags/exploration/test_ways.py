@@ -79,6 +79,15 @@ class TestRandomWalk:
         assert all(np.array_equal(a.poses, b.poses) for a, b in zip(first, again, strict=True))
         assert not all(np.array_equal(a.poses, b.poses) for a, b in zip(first, other, strict=True))
 
+    def test_a_start_that_cannot_be_left_ends_nothing(self) -> None:
+        poses = training().world_from_camera.copy()
+        poses[2, 2, 3] = 25.0  # in unknown space
+        cameras = Cameras(training().K, poses, training().width, training().height)
+        assert len(MOVES.possible(poses[2])) == 0
+        clips = random_walk(MOVES, cameras, 30, seed=1)
+        assert sum(len(clip.views) for clip in clips) == 30
+        assert [clip.anchor for clip in clips] == [1, 0] * 5
+
     def test_where_nothing_can_move_there_is_no_clip(self) -> None:
         stuck = replace(MOVES.space, occupancy=np.full((SIZE,) * 3, UNKNOWN, dtype=np.uint8))
         assert random_walk(replace(MOVES, space=stuck), training(), 9, 0) == []
