@@ -8,6 +8,7 @@ from dataclasses import replace
 from extrags.cameras import Cameras
 from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, EnhanceConfig
+from extrags.errors import ShapeError
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.backends import train_enhancer
 from extrags.restoration.clips import choose_views, make_pseudo_observations
@@ -49,10 +50,12 @@ def restore(
         ExtragsError: as `extrags.restoration.backends.train_enhancer`.
     """
     config = EnhanceConfig() if config is None else config
+    trajectories = [cameras for cameras in trajectories if len(cameras) > 1]
+    if not trajectories:
+        raise ShapeError(f"{sequence.name}: no trajectory has a view beyond its start; nothing to restore")
     if enhancer is None:
         enhancer = train_enhancer(scene, sequence, config, CoarseConfig() if coarse is None else coarse)
     measure = PerceptualDifference.available() if measure is None else measure
-    trajectories = [cameras for cameras in trajectories if len(cameras) > 1]
     parts = list(restored_batches(scene, sequence, trajectories, enhancer, config, measure))
     return PseudoViews.concatenated(parts).quantised()
 

@@ -18,7 +18,7 @@ from extrags.metrics.lpips import Lpips
 from extrags.pseudo_views import PseudoViews
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.clips import choose_views, keep_known, make_pseudo_observations, render_clips
-from extrags.restoration.trajectories import restore_batch
+from extrags.restoration.trajectories import restore, restore_batch
 from extrags.view_synthesis.conditioning import observe_views
 from tests.extrags.lit_tube import Tube, tube_cameras
 
@@ -148,6 +148,13 @@ class TestPseudoObservations:
         # The same views: what they show agrees with the larger ones, averaged.
         blocks = whole.restored.reshape(len(whole), cameras.height // 2, 2, cameras.width // 2, 2, 3)
         assert np.abs(small.restored - blocks.mean(axis=(2, 4))).mean() < 0.05
+
+    @pytest.mark.parametrize("lengths", [(), (1,), (1, 1)])
+    def test_without_any_virtual_view(self, tube: Tube, lengths: tuple[int, ...]) -> None:
+        """Told before a restorer is made, which takes long."""
+        starts = [tube_cameras(length) for length in lengths]
+        with pytest.raises(ShapeError, match="test/tube: no trajectory"):
+            restore(tube.scene, tube.sequence, starts, EnhanceConfig(backend="classical"))
 
     def test_sizes_are_checked(self, pseudo: PseudoViews) -> None:
         with pytest.raises((ShapeError, TypeCheckError), match="alpha"):
