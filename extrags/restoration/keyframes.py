@@ -57,7 +57,8 @@ class Keyframes(Storable):
         depth_mm: z-depth without gaps, [K, H, W].
         unknown: share of a pixel, in steps of 1/255, that neither the scene nor real views gave, [K, H, W].
         exposure: gain of each view, [K].
-        view: trajectory of each, and its position there, [K, 2].
+        view: trajectory of each, and its position among the views of it that are restored: without the real
+            start, and thinned where there are more than `enhance.max_views`, [K, 2].
 
     Raises:
         ShapeError: when the arrays do not fit each other.
