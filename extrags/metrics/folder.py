@@ -2,12 +2,15 @@
 
 The images show the held-out frames of a sequence. They are matched by name (`b_0010.png` for the frame
 `b_0010`) if every file name is that of a frame; otherwise by number: as many files as held-out frames, sorted
-by the numbers in their names, for the frames in the order of the recording.
+by the numbers in their names, for the frames in the order of the split. Frames named with their folders may
+stand in folders of these names (`left/0010.png`), and must where held-out frames of different folders share a
+name.
 """
 
 from __future__ import annotations
 
 import re
+from collections import Counter
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -42,13 +45,12 @@ def read_renders(
         depth_step_mm: unit of integer depth images; not needed for floating-point ones.
 
     Returns:
-        The renders in the order of `sequence.test`. Alpha is 1; without depth maps depth is 0, which means
-        unknown.
+        The renders in the order of `sequence.test`. Alpha is 1; without depth maps they have no depth.
 
     Raises:
         SourceNotFoundError: for a folder that does not exist or holds no images, and for held-out frames
             without an image; names them.
-        SourceError: for a file that cannot be read or matches no held-out frame.
+        SourceError: for a file that cannot be read or matches no held-out frame, or could be of several.
         ShapeError: for an image of another size; names the file and both sizes.
         NonFiniteError: for depth that holds NaN or infinity.
         ConfigError: for integer depth without its step.
@@ -59,37 +61,40 @@ def read_renders(
     if depth_folder is not None:
         files = _files_of(depth_folder, sequence, DEPTH_SUFFIXES, "depth map")
         depth = np.stack([_depth(file, shape, depth_step_mm) for file in files])
-    return RenderedViews(np.stack(rgb), np.ones((len(rgb), *shape), dtype=np.float32), depth, None)
+    return RenderedViews(
+        np.stack(rgb),
+        np.ones((len(rgb), *shape), dtype=np.float32),
+        depth,
+        None,
+        has_depth=depth_folder is not None,
+    )
 
 
 def _files_of(folder: Path, sequence: EndoscopicSequence, suffixes: frozenset[str], kind: str) -> list[Path]:
     """One file per held-out frame, in their order."""
     if not folder.is_dir():
         raise SourceNotFoundError(f"there is no such folder of {kind}s", file=folder)
+    paths = [_bare(sequence.frame_name(int(frame))) for frame in sequence.test]
+    in_folders = _files_at(paths, folder, suffixes)
+    if in_folders:
+        return _named(paths, _by_name(in_folders, kind), folder, sequence, kind)
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes and file.is_file())
     if not files:
         kinds = ", ".join(sorted(suffixes))
         raise SourceNotFoundError(f"the folder holds no {kind} ({kinds})", file=folder)
-    wanted = {_stem(sequence.frame_name(int(frame))): int(frame) for frame in sequence.test}
-    every = {_stem(sequence.frame_name(frame)) for frame in range(len(sequence))}
-    by_stem = _by_stem(files, kind)
+    wanted = [_stem(path) for path in paths]
+    every = {_stem(_bare(sequence.frame_name(frame))) for frame in range(len(sequence))}
+    by_stem = _by_name({file: file.stem for file in files}, kind)
     named = [stem for stem in by_stem if stem in every]
-    if named and len(named) == len(by_stem):
-        missing = [stem for stem in wanted if stem not in by_stem]
-        if missing:
-            raise SourceNotFoundError(
-                f"{len(missing)} of the {len(wanted)} held-out frames of {sequence.name} have no {kind}: "
-                f"{_some(missing)}",
-                file=folder,
-            )
-        return [by_stem[stem] for stem in wanted]
+    if named and (len(named) == len(by_stem) or len(set(wanted)) < len(wanted)):
+        return _named(wanted, by_stem, folder, sequence, kind)
     if any(stem in wanted for stem in named):
         strange = [file.name for stem, file in by_stem.items() if stem not in every]
         raise SourceError(
             f"some {kind}s are named after frames of {sequence.name} and some are not: {_some(strange)}",
             file=folder,
         )
-    return _by_number(files, folder, sequence, kind, list(wanted))
+    return _by_number(files, folder, sequence, kind, wanted)
 
 
 def _by_number(
@@ -116,19 +121,55 @@ def _by_number(
     return [file for _, file in sorted(zip(keys, files, strict=True))]
 
 
-def _by_stem(files: list[Path], kind: str) -> dict[str, Path]:
+def _files_at(paths: list[str], folder: Path, suffixes: frozenset[str]) -> dict[Path, str]:
+    """Files that stand where frames named with their folders say, and which frame each shows."""
+    wanted = {path for path in paths if "/" in path}
+    if not wanted:
+        return {}
+    # Looked for among what is there: joined to the folder, a frame's absolute path would lead out of it.
+    files = (file for file in sorted(folder.rglob("*")) if file.suffix.lower() in suffixes and file.is_file())
+    places = {file: file.relative_to(folder).with_suffix("").as_posix() for file in files}
+    return {file: place for file, place in places.items() if place in wanted}
+
+
+def _by_name(names: dict[Path, str], kind: str) -> dict[str, Path]:
     found: dict[str, Path] = {}
-    for file in files:
-        if file.stem in found:
-            raise SourceError(f"two {kind}s of one name: {found[file.stem].name} and {file.name}", file=file)
-        found[file.stem] = file
+    for file, name in names.items():
+        if name in found:
+            raise SourceError(f"two {kind}s of one name: {found[name].name} and {file.name}", file=file)
+        found[name] = file
     return found
 
 
-def _stem(frame_name: str) -> str:
+def _named(
+    wanted: list[str], files: dict[str, Path], folder: Path, sequence: EndoscopicSequence, kind: str
+) -> list[Path]:
+    shared = [name for name, count in Counter(wanted).items() if count > 1]
+    if shared:
+        raise SourceError(
+            f"{len(shared)} names are those of several held-out frames of {sequence.name} ({_some(shared)}); "
+            f"put the {kind}s in the frames' folders, or give them names that are none of a frame and have a "
+            f"number",
+            file=folder,
+        )
+    missing = [name for name in wanted if name not in files]
+    if missing:
+        raise SourceNotFoundError(
+            f"{len(missing)} of the {len(wanted)} held-out frames of {sequence.name} have no {kind}: "
+            f"{_some(missing)}",
+            file=folder,
+        )
+    return [files[name] for name in wanted]
+
+
+def _bare(frame_name: str) -> str:
     """Frame names may be file names or paths of the source."""
-    last = PurePosixPath(frame_name).name
-    return last.rsplit(".", 1)[0] if Path(last).suffix.lower() in COLOR_SUFFIXES else last
+    path = PurePosixPath(frame_name)
+    return (path.with_suffix("") if path.suffix.lower() in COLOR_SUFFIXES else path).as_posix()
+
+
+def _stem(path: str) -> str:
+    return path.rpartition("/")[2]
 
 
 def _color(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:

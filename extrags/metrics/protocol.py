@@ -68,6 +68,7 @@ class RenderedViews(Storable):
         depth_mm: expected z-depth in the unit of the sequence, [V, H, W], float32.
         n_gaussians: size of the scene that was rendered; None for renders made elsewhere, or not of
             Gaussians.
+        has_depth: false for renders that came without depth; `depth_mm` is 0 then and is not evaluated.
 
     Raises:
         ShapeError: when sizes do not fit each other.
@@ -79,6 +80,7 @@ class RenderedViews(Storable):
     alpha: Float[np.ndarray, "v h w"]
     depth_mm: Float[np.ndarray, "v h w"]
     n_gaussians: int | None
+    has_depth: bool = True
 
     def __post_init__(self) -> None:
         if self.alpha.shape != self.rgb.shape[:-1] or self.depth_mm.shape != self.rgb.shape[:-1]:
@@ -96,6 +98,8 @@ class RenderedViews(Storable):
             for name in ("rgb", "alpha", "depth_mm"):
                 write_frames(group, name, getattr(self, name).astype(np.float32, copy=False))
             group.attrs["n_gaussians"] = self.n_gaussians
+            if not self.has_depth:
+                group.attrs["has_depth"] = False
 
     @classmethod
     def load(cls, path: Path) -> RenderedViews:
@@ -108,7 +112,13 @@ class RenderedViews(Storable):
             raise SourceNotFoundError("no renders here", file=path)
         group = open_group(path)
         count: Any = group.attrs["n_gaussians"]
-        return cls(read_array(group, "rgb"), read_array(group, "alpha"), read_array(group, "depth_mm"), count)
+        return cls(
+            read_array(group, "rgb"),
+            read_array(group, "alpha"),
+            read_array(group, "depth_mm"),
+            count,
+            has_depth=bool(group.attrs.get("has_depth", True)),
+        )
 
 
 @dataclass(frozen=True)
@@ -182,7 +192,7 @@ def evaluate_views(
     metrics = _mean_tree([{k: v for k, v in view.items() if k not in ("frame", "name")} for view in per_view])
     metrics["n_gaussians"] = renders.n_gaussians
     metrics["surface"] = _NO_SURFACE if surface is None else surface.to_json()
-    reasons = _reasons(metrics, sequence, frames, lpips)
+    reasons = _reasons(metrics, sequence, frames, lpips, has_depth=renders.has_depth)
     reasons |= _surface_reasons(surface, surface_reason)
     return EvaluationResult(
         sequence.name,
@@ -287,13 +297,15 @@ def _evaluate_chunk(
     found = []
     for index, (stack, render) in enumerate(zip(stacks, renders, strict=True)):
         gains = exposure_gain(render, target, counted)[:, 0].tolist()
-        depth = np.where(stack.alpha[part] >= SURFACE_ALPHA, stack.depth_mm[part], 0)
+        depths = [None] * len(chosen)
+        if stack.has_depth:
+            depths = list(np.where(stack.alpha[part] >= SURFACE_ALPHA, stack.depth_mm[part], 0))
         found.append(
             [
                 _view(
                     sequence,
                     int(frame),
-                    depth[at],
+                    depths[at],
                     valid[at],
                     {name: region[at] for name, region in parts.items()},
                     {name: values[at] for name, values in plain[index].items()},
@@ -318,7 +330,7 @@ def _in_8_bits(rgb: np.ndarray) -> Float[Tensor, "n h w 3"]:
 def _view(
     sequence: EndoscopicSequence,
     frame: int,
-    depth: np.ndarray,
+    depth: np.ndarray | None,
     valid: Tensor,
     parts: dict[str, Tensor],
     plain: dict[str, dict[str, Any]],
@@ -375,10 +387,10 @@ def _photometric(
 
 
 def _depth_metrics(
-    depth: np.ndarray, sequence: EndoscopicSequence, frame: int, region: Tensor
+    depth: np.ndarray | None, sequence: EndoscopicSequence, frame: int, region: Tensor
 ) -> dict[str, float | None]:
     errors = None
-    if sequence.true_depth_mm is not None:
+    if depth is not None and sequence.true_depth_mm is not None:
         errors = depth_errors(depth, sequence.true_depth_mm[frame], region.numpy())
     keys = [metric.key for metric in registered_metrics("depth")]
     if errors is None:
@@ -400,6 +412,8 @@ def _reasons(
     sequence: EndoscopicSequence,
     frames: np.ndarray,
     lpips: LpipsByNet | None,
+    *,
+    has_depth: bool,
 ) -> dict[str, str]:
     reasons = {}
     if metrics["psnr"] is None:
@@ -413,11 +427,12 @@ def _reasons(
     if metrics["n_gaussians"] is None:
         reasons["n_gaussians"] = "the renders were made elsewhere, or are not of Gaussians"
     if metrics["depth_absrel"] is None:
-        reasons["depth_absrel"] = (
-            "the sequence has no true depth"
-            if sequence.true_depth_mm is None
-            else "no pixel has both a true and a rendered depth"
-        )
+        if sequence.true_depth_mm is None:
+            reasons["depth_absrel"] = "the sequence has no true depth"
+        elif has_depth:
+            reasons["depth_absrel"] = "no pixel has both a true and a rendered depth"
+        else:
+            reasons["depth_absrel"] = "the renders came without depth"
     for name in ("observed", "unobserved"):
         if metrics[name]["psnr"] is None:
             if sequence.observed is None:

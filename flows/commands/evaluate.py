@@ -26,7 +26,8 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--renders",
         metavar="FOLDER",
-        help="8-bit images of the sequence's size, named after the held-out frames or numbered in order",
+        help="8-bit images of the sequence's size, named after the held-out frames, in their folders where "
+        "names alone do not tell them apart, or numbered in order",
     )
     parser.add_argument(
         "--depth", metavar="FOLDER", help="z-depth of the same frames: .npy, or 16-bit PNG or TIFF; 0: none"

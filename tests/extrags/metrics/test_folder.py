@@ -53,6 +53,49 @@ def test_frames_named_like_files(sequence: EndoscopicSequence, tmp_path: Path) -
     np.testing.assert_array_equal(np.rint(read_renders(folder, named).rgb * 255), LEVELS[TEST])
 
 
+class TestFramesOfDifferentFolders:
+    """Two of the held-out frames, `left/0001` and `right/0001`, share a name."""
+
+    NAMES = ("left/0000", "left/0001", "right/0000", "right/0001", "right/0002")
+
+    @pytest.fixture
+    def stereo(self, sequence: EndoscopicSequence) -> EndoscopicSequence:
+        return replace(sequence, frame_names=self.NAMES)
+
+    def write_in_folders(self, folder: Path, frames: tuple[int, ...]) -> Path:
+        for index in frames:
+            file = folder / f"{self.NAMES[index]}.png"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(LEVELS[index]).save(file)
+        return folder
+
+    def test_folders_decide(self, stereo: EndoscopicSequence, tmp_path: Path) -> None:
+        folder = self.write_in_folders(tmp_path / "renders", (0, 1, 2, 3, 4))
+        np.testing.assert_array_equal(np.rint(read_renders(folder, stereo).rgb * 255), LEVELS[TEST])
+
+    def test_one_is_missing(self, stereo: EndoscopicSequence, tmp_path: Path) -> None:
+        folder = self.write_in_folders(tmp_path / "renders", (1, 4))
+        with pytest.raises(SourceNotFoundError, match=r"1 of the 3 held-out frames .* no image: right/0001$"):
+            read_renders(folder, stereo)
+
+    def test_bare_names_could_be_of_several(self, stereo: EndoscopicSequence, tmp_path: Path) -> None:
+        for names in (("0001", "0002"), ("0001", "0002", "0003")):
+            folder = write(tmp_path / str(len(names)), {f"{name}.png": LEVELS[0] for name in names})
+            with pytest.raises(SourceError, match=r"several held-out frames of made/up \(0001\)"):
+                read_renders(folder, stereo)
+
+    def test_other_names_go_by_number(self, stereo: EndoscopicSequence, tmp_path: Path) -> None:
+        images = {f"view{place}.png": LEVELS[index] for place, index in enumerate(TEST)}
+        renders = read_renders(write(tmp_path / "renders", images), stereo)
+        np.testing.assert_array_equal(np.rint(renders.rgb * 255), LEVELS[TEST])
+
+    def test_a_training_frame_of_that_name(self, stereo: EndoscopicSequence, tmp_path: Path) -> None:
+        split = Split("here", np.array([0, 1]), np.array([2, 3]))
+        images = {"0000.png": LEVELS[2], "0001.png": LEVELS[3]}
+        renders = read_renders(write(tmp_path / "renders", images), replace(stereo, split=split))
+        np.testing.assert_array_equal(np.rint(renders.rgb * 255), LEVELS[[2, 3]])
+
+
 def test_else_numbers_decide_and_nine_comes_before_ten(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     folder = write(
         tmp_path / "renders",
@@ -82,8 +125,20 @@ def test_the_same_figures_as_our_own_renders(sequence: EndoscopicSequence, tmp_p
 def test_without_depth_there_are_no_depth_figures(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
     result = evaluate_views(read_renders(folder, sequence), sequence, TEST, None)
-    assert result.metrics["depth_absrel"] is None
+    assert sequence.true_depth_mm is not None
+    for group in (result.metrics, result.per_view[0]):
+        assert {value for name, value in group.items() if name.startswith("depth_")} == {None}
+    assert result.reasons["depth_absrel"] == "the renders came without depth"
     assert result.metrics["psnr"] is not None
+
+
+def test_renders_without_depth_are_stored_as_such(sequence: EndoscopicSequence, tmp_path: Path) -> None:
+    folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
+    renders = read_renders(folder, sequence)
+    renders.save(tmp_path / "stored")
+    assert not RenderedViews.load(tmp_path / "stored").has_depth
+    replace(renders, has_depth=True).save(tmp_path / "with")
+    assert RenderedViews.load(tmp_path / "with").has_depth
 
 
 def test_integer_depth_needs_its_step(sequence: EndoscopicSequence, tmp_path: Path) -> None:
