@@ -12,9 +12,9 @@ import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import fmean, median
-from typing import Any
+from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from extrags import __version__
 from extrags.errors import ExtragsError
@@ -56,6 +56,15 @@ class Tolerance(BaseModel):
         description="share by which run time may grow, on the same kind of machine; none: not judged",
     )
     seconds: float = Field(5.0, ge=0, description="growth of run time that is never too much, in seconds")
+
+    @model_validator(mode="after")
+    def _can_judge(self) -> Self:
+        if self.at_least > self.runs:
+            raise ValueError(
+                f"at_least is {self.at_least}, but only the last {self.runs} runs are looked at (runs): "
+                f"nothing would ever be judged; set at_least to {self.runs} or less"
+            )
+        return self
 
 
 @dataclass(frozen=True)

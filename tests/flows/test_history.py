@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from pydantic import ValidationError
 
 from extrags.errors import ConfigError
 from extrags.report.benchmark import BenchmarkInputs, build_benchmark_report
@@ -95,6 +96,12 @@ class TestRegressions:
     def test_nothing_is_judged_by_a_single_run(self) -> None:
         assert judge(entry(psnr=10, seconds=900), BEFORE[:1], Tolerance()).regressions == []
         assert judge(entry(psnr=10), BEFORE[:1], Tolerance(at_least=1)).regressions != []
+
+    def test_what_could_never_judge_is_refused(self) -> None:
+        for wrong in ({"runs": 1}, {"runs": 5, "at_least": 6}):
+            with pytest.raises(ValidationError, match="nothing would ever be judged"):
+                Tolerance(**wrong)
+        assert judge(entry(psnr=10), BEFORE, Tolerance(runs=1, at_least=1)).regressions != []
 
     def test_what_was_not_judged_is_told_with_how_many_could_be_compared(self) -> None:
         label = "coarse (quick) on phantom/0@sparse"
