@@ -45,7 +45,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=11, ignore=("rows",))
+@stage("report", version=12, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from extrags.metrics.registry import metrics
+from extrags.metrics.registry import figures
 from extrags.report.downloads import Cell, csv_uri
 from extrags.report.inputs import ReportInputs
 from extrags.report.wording import compare, described_metrics, metric_of, number, shown_metrics
@@ -32,6 +32,13 @@ REGIONS = (
     (("unobserved",), "Never observed"),
 )
 """Kinds of pixels: where their figures stand in a tree of metrics, and what they are called."""
+_GROUP_LABELS = {
+    "observed": "Observed pixels",
+    "unobserved": "Unobserved pixels",
+    "surface": "Figures of the surface",
+    "n_gaussians": "Number of Gaussians",
+}
+"""Of what `EvaluationResult.reasons` names beside single figures."""
 
 
 def summary(inputs: ReportInputs) -> str:
@@ -124,11 +131,11 @@ def regions(inputs: ReportInputs) -> list[dict[str, Any]]:
 
 def missing_reasons(inputs: ReportInputs) -> list[tuple[str, str]]:
     """Which figures there are not, and why."""
-    labels = {metric.key: metric.label for metric in metrics()}
+    labels = {figure.name: figure.label for figure in figures()} | _GROUP_LABELS
     found: dict[str, str] = {}
     for result in (inputs.coarse_metrics, inputs.final_metrics):
         for key, reason in (result or {}).get("reasons", {}).items():
-            found.setdefault(labels.get(key, f"{key} pixels".capitalize()), str(reason))
+            found.setdefault(labels.get(key, key), str(reason))
     return sorted(found.items())
 
 
@@ -200,7 +207,11 @@ def per_view_csv(inputs: ReportInputs) -> str:
         "restored": inputs.restored_metrics,
     }
     flat = {
-        scene: [_leaves(view) for view in result["per_view"]]
+        # The name stands in a column `frame` of its own; here it is the index in the sequence.
+        scene: [
+            _leaves({key: value for key, value in view.items() if key != "frame"})
+            for view in result["per_view"]
+        ]
         for scene, result in found.items()
         if result is not None
     }
@@ -213,7 +224,7 @@ def per_view_csv(inputs: ReportInputs) -> str:
 
 
 def _leaves(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:
-    """The numbers of a tree by dotted name; no others, such as the view's own index."""
+    """The numbers of a tree by dotted name."""
     found: dict[str, Cell] = {}
     for name, value in tree.items():
         if isinstance(value, Mapping):

@@ -174,6 +174,21 @@ def test_lpips_without_weights_says_why(inputs: ReportInputs) -> None:
     assert "Not measured in this run" in text
 
 
+def test_what_there_is_not_is_called_what_it_is(inputs: ReportInputs) -> None:
+    result = result_of(20.0, 10)
+    result["reasons"] = {
+        "n_gaussians": "the renders are not of Gaussians",
+        "surface": "the sequence has no true depth",
+        "surface.accuracy_mm": "the scene has no surface",
+        "unobserved": "no view has any",
+    }
+    text = Page(build_report(replace(inputs, coarse_metrics=result, final_metrics=result), CONFIG)).text
+    assert "Number of Gaussians: not available, the renders are not of Gaussians." in text
+    assert "Figures of the surface: not available, the sequence has no true depth." in text
+    assert "Surface accuracy: not available, the scene has no surface." in text
+    assert "Unobserved pixels: not available, no view has any." in text
+
+
 def test_one_camera_and_nothing_held_out(inputs: ReportInputs) -> None:
     none = np.zeros(0, dtype=np.int64)
     alone = replace(inputs.sequence, split=Split("all", np.array([2]), none))

@@ -91,6 +91,13 @@ class TestNumbers:
         first = next(row for row in rows if row["scene"] == "final")
         assert float(first["psnr"]) == pytest.approx(expected)
 
+    def test_every_column_has_a_name_of_its_own(self, inputs: ReportInputs) -> None:
+        content = base64.b64decode(per_view_csv(inputs).partition(",")[2]).decode("utf-8")
+        header, *rows = csv.reader(io.StringIO(content, newline=""))
+        assert len(set(header)) == len(header)
+        assert header[:2] == ["frame", "scene"]
+        assert rows[0][0] == inputs.sequence.frame_name(int(inputs.frames[0]))
+
 
 def test_every_chart_of_a_page_can_be_saved(inputs: ReportInputs) -> None:
     html = build_report(inputs, ReportConfig(held_out_views=1, virtual_views=1, viewer_mb=0))
