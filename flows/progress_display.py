@@ -39,7 +39,12 @@ STYLES = {"ran": "green", "cached": "cyan", "skipped": "dim", "failed": "red", "
 
 MOST_SEQUENCES = 4
 """In work at the same time that have lines of their own."""
+NAME_WIDTH = 18
 BAR_WIDTH = 24
+SHORTEST_BAR = 6
+SHORTEST_DETAIL = 12
+GAP = 2
+"""Columns between the parts of a line."""
 PREVIEW_WAIT_SECONDS = 2.0
 """How long the end of a run waits for a picture that is being made."""
 
@@ -183,14 +188,14 @@ class RunDisplay:
         for label in in_work[:MOST_SEQUENCES]:
             yield self._stages(label, width)
             if label in self._loops:
-                yield _loop(*self._loops[label])
+                yield _loop(*self._loops[label], width)
         if len(in_work) > MOST_SEQUENCES:
             yield Text(f"and {len(in_work) - MOST_SEQUENCES} more sequences", style="dim")
         for label, loop in self._loops.items():
             if label not in self._estimate.in_work:
-                yield _loop(*loop)
+                yield _loop(*loop, width)
         if self._run.sequences:
-            yield self._whole(now)
+            yield self._whole(now, width)
         if self._picture:
             # In one piece: it is there to be clicked or copied.
             yield Text(f"picture  {self._picture}", style="dim", overflow="fold")
@@ -215,7 +220,7 @@ class RunDisplay:
             used += 2 + len(word)
         return words
 
-    def _whole(self, now: float) -> Table:
+    def _whole(self, now: float, width: int) -> Table:
         run = self._estimate
         share = run.share(now)
         words = [f"{100 * share:.0f} %"]
@@ -227,26 +232,47 @@ class RunDisplay:
         left = run.seconds_left(now)
         if left is not None and left >= 1:
             words.append(f"about {duration_text(left)} left")
-        return _bar("whole run", share, ", ".join(words), "")
+        return _bar("whole run", share, words, "", width)
 
 
-def _loop(progress: StageProgress, rate: float | None, left: float | None) -> Table:
+def _loop(progress: StageProgress, rate: float | None, left: float | None, width: int) -> Table:
     words = [f"{progress.done} of {progress.total}"]
     if rate is not None:
         words.append(rate_text(rate))
     if left is not None:
         words.append(f"about {duration_text(left)} left")
-    return _bar(progress.stage, progress.done / progress.total, ", ".join(words), progress.detail)
+    return _bar(progress.stage, progress.done / progress.total, words, progress.detail, width)
 
 
-def _bar(name: str, share: float, words: str, detail: str) -> Table:
-    line = Table.grid(padding=(0, 2))
-    line.add_column(width=18, no_wrap=True)
-    line.add_column(width=BAR_WIDTH)
-    # In one column, so that a narrow terminal cuts the detail first.
-    line.add_column(no_wrap=True, overflow="ellipsis")
-    said = Text.assemble(words, ("   " if detail else "", ""), (detail, "dim"))
-    line.add_row(f"  {name}", ProgressBar(total=1.0, completed=share, width=BAR_WIDTH), said)
+def _bar(name: str, share: float, words: list[str], detail: str, width: int) -> Table:
+    """A line of `width` columns: where it is narrow the detail goes first, the name last of all."""
+    name = f"  {name}"
+    said = ", ".join(words)
+    name_width = max(NAME_WIDTH, len(name))
+    bar_width = min(BAR_WIDTH, width - name_width - len(said) - 2 * GAP)
+    if bar_width < SHORTEST_BAR:
+        name_width = len(name)
+        bar_width = min(BAR_WIDTH, width - name_width - len(said) - 2 * GAP)
+    if bar_width < SHORTEST_BAR:
+        bar_width = 0
+        while len(words) > 1 and name_width + GAP + len(said) > width:
+            words = words[:-1]
+            said = ", ".join(words)
+        name_width = max(1, min(name_width, width - GAP - len(said)))
+    line = Table.grid(padding=(0, GAP))
+    line.add_column(width=name_width, no_wrap=True, overflow="ellipsis")
+    cells: list[Text | ProgressBar] = [Text(name)]
+    if bar_width:
+        line.add_column(width=bar_width)
+        cells.append(ProgressBar(total=1.0, completed=share, width=bar_width))
+    room = width - name_width - (bar_width and bar_width + GAP) - GAP
+    text = Text(said)
+    if detail and room - len(said) >= SHORTEST_DETAIL:
+        text.append("   ").append(detail, style="dim")
+    # With a width of its own, so that what is too long for it takes nothing from the name.
+    line.add_column(width=max(1, min(room, text.cell_len)), no_wrap=True, overflow="ellipsis")
+    cells.append(text)
+    line.add_row(*cells)
     return line
 
 

@@ -110,6 +110,23 @@ class TestDisplay:
         assert all(len(line.rstrip()) <= 50 for line in lines)
         assert sum(line.count("· ") for line in lines) == 11
 
+    @pytest.mark.parametrize("width", [28, 33, 36, 50, 60, 75, 76, 95, 110, 129])
+    def test_names_stay_whole_as_long_as_anything_else_can_go(self, width: int) -> None:
+        terminal = Terminal(width=width)
+        for stage in ("finetune-judge", "pretrain-hidden-depth"):
+            terminal.now = 0.0
+            terminal.at(stage, 0, 1000)
+            terminal.now = 10.0
+            terminal.at(stage, 400, 1000, "loss 0.031, psnr 24.1")
+            (line,) = (line for line in terminal.shown().splitlines() if "400" in line)
+            assert len(line.rstrip()) <= width
+            assert "400 of 1000" in line
+            if width >= len(f"  {stage}  400 of 1000"):
+                assert stage in line
+            else:
+                assert line.startswith(f"  {stage[:8]}")
+                assert "…" in line
+
     def test_a_loop_that_is_no_stage_of_a_run(self) -> None:
         terminal = Terminal(sequences=0)
         terminal.at("pretrain", 5, 10)
