@@ -30,6 +30,7 @@ __all__ = [
     "method_marks",
     "methods_chart",
     "pairs_chart",
+    "run_colors",
     "sequences_chart",
     "svg_image",
     "views_chart",
@@ -39,7 +40,7 @@ COARSE_COLOR = "#8794a3"
 FINAL_COLOR = "#0b6e75"
 WORSE_COLOR = "#b4481e"
 METHOD_COLORS = (FINAL_COLOR, "#c2702a", "#6b4ea0", "#3d7dbd", "#9a3b5b", "#7a7f2a")
-METHOD_MARKS = ("o", "s", "^", "D")
+METHOD_MARKS = ("o", "s", "^", "D", "v", "P", "X", "*")
 """Of methods that share a colour."""
 LEGEND_COLUMNS = 4
 LONGEST_NAME = 41
@@ -299,9 +300,12 @@ def _shortened(name: str) -> str:
 
 def method_colors(methods: Sequence[str], baseline: str) -> dict[str, str]:
     """A colour per method: grey for the baseline, the accent for the first of the others."""
-    others = [method for method in methods if method != baseline]
-    colors = {method: METHOD_COLORS[index % len(METHOD_COLORS)] for index, method in enumerate(others)}
-    return {baseline: COARSE_COLOR, **colors}
+    return {baseline: COARSE_COLOR, **run_colors([method for method in methods if method != baseline])}
+
+
+def run_colors(names: Sequence[str]) -> dict[str, str]:
+    """A colour per run or method, none of them a baseline; they repeat, see `method_marks`."""
+    return {name: METHOD_COLORS[index % len(METHOD_COLORS)] for index, name in enumerate(names)}
 
 
 def method_marks(colors: Mapping[str, str]) -> dict[str, str]:

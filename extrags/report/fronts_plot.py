@@ -9,7 +9,7 @@ from typing import Any
 from extrags.errors import ConfigError
 from extrags.metrics.fronts import COSTS, SCENE
 from extrags.metrics.registry import figures
-from extrags.report.charts import METHOD_COLORS, QUIET, drawing_style
+from extrags.report.charts import QUIET, drawing_style, method_marks, run_colors
 
 __all__ = ["write_fronts_plot"]
 
@@ -39,7 +39,8 @@ def write_fronts_plot(
     if not shown or not scenes:
         raise ConfigError(f"no cell has {cost} and any of {', '.join(names)}: there is nothing to draw")
     methods = list(dict.fromkeys(cell["method"] for cell in cells))
-    colors = {method: METHOD_COLORS[index % len(METHOD_COLORS)] for index, method in enumerate(methods)}
+    colors = run_colors(methods)
+    marks = method_marks(colors)
     with drawing_style():
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -56,7 +57,12 @@ def write_fronts_plot(
                     ]
                     values = [cell["figures"][metric.name] for cell in own]
                     axes.scatter(
-                        [cell[cost] for cell in own], values, s=22, color=colors[method], label=method
+                        [cell[cost] for cell in own],
+                        values,
+                        s=22,
+                        color=colors[method],
+                        marker=marks[method],
+                        label=method,
                     )
                 line = _front(document["fronts"], scene, cost, metric.name)
                 axes.step(

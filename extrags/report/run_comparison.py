@@ -10,7 +10,7 @@ import numpy as np
 
 from extrags.errors import ConfigError, ShapeError
 from extrags.metrics.registry import Metric
-from extrags.report.charts import METHOD_COLORS, drawing_style, svg_image
+from extrags.report.charts import drawing_style, method_marks, run_colors, svg_image
 from extrags.report.downloads import Cell, Chart, csv_uri, file_name
 from extrags.report.encode import as_uint8
 from extrags.report.image_table import ImageTable, Judged, evenly_spaced, judged_table
@@ -236,14 +236,23 @@ def _views_chart(sequence: EndoscopicSequence, runs: Sequence[ComparedRun]) -> C
     from matplotlib.figure import Figure
 
     values = {run.name: per_view_psnr(run.result) for run in runs}
+    colors = run_colors(list(values))
+    marks = method_marks(colors)
     order = np.arange(len(sequence.test)) + 1
     with drawing_style():
         figure = Figure(figsize=(9.6, 2.8), layout="constrained")
         FigureCanvasAgg(figure)
         axes: Any = figure.add_subplot()
-        for place, (name, psnr) in enumerate(values.items()):
-            color = METHOD_COLORS[place % len(METHOD_COLORS)]
-            axes.plot(order, psnr, color=color, marker="o", markersize=3.5, linewidth=1.2, label=name)
+        for name, psnr in values.items():
+            axes.plot(
+                order,
+                psnr,
+                color=colors[name],
+                marker=marks[name],
+                markersize=3.5,
+                linewidth=1.2,
+                label=name,
+            )
         axes.set_title("PSNR of each held-out view (dB)")
         axes.set_xlabel("held-out view, in the order of the recording")
         axes.xaxis.get_major_locator().set_params(integer=True)

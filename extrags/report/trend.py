@@ -6,7 +6,7 @@ import datetime
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from extrags.report.charts import drawing_style, svg_image
+from extrags.report.charts import drawing_style, method_marks, svg_image
 from extrags.report.downloads import Chart
 
 __all__ = ["trend_chart"]
@@ -28,6 +28,7 @@ def trend_chart(entries: Sequence[Mapping[str, Any]], colors: Mapping[str, str])
 
     if len(entries) < 2:
         return None
+    marks = method_marks(colors)
     with drawing_style():
         figure = Figure(figsize=(9.6, 2.8), layout="constrained")
         FigureCanvasAgg(figure)
@@ -44,7 +45,7 @@ def trend_chart(entries: Sequence[Mapping[str, Any]], colors: Mapping[str, str])
                         [when for when, _ in found],
                         [value for _, value in found],
                         color=color,
-                        marker="o",
+                        marker=marks[method],
                         markersize=3.5,
                         linewidth=1.4,
                         label=method,

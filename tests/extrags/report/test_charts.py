@@ -1,12 +1,26 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from extrags.report.charts import METHOD_COLORS, method_colors, method_marks, methods_chart, sequences_chart
+from extrags.report import ReportInputs
+from extrags.report.charts import (
+    METHOD_COLORS,
+    method_colors,
+    method_marks,
+    methods_chart,
+    sequences_chart,
+)
 from extrags.report.downloads import Chart
+from extrags.report.fronts_plot import write_fronts_plot
+from extrags.report.run_comparison import ComparedRun, build_run_comparison
+from extrags.report.trend import trend_chart
+from tests.extrags.report.conftest import result_of
 
 
 def numbers(chart: Chart) -> list[str]:
@@ -26,6 +40,57 @@ def test_any_number_of_methods_can_be_told_apart(count: int) -> None:
     assert (len(set(colors.values())) < count) == (count > len(METHOD_COLORS) + 1)
     marks = method_marks(colors)
     assert len({(colors[method], marks[method]) for method in methods}) == count
+
+
+@pytest.fixture
+def marked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, str]]:
+    """Colour, mark and label of every line and scatter that is drawn."""
+    from matplotlib.axes import Axes
+
+    found: list[tuple[str, str, str]] = []
+
+    def noting(drawn: Callable[..., Any]) -> Callable[..., Any]:
+        def noted(self: Axes, *given: Any, **style: Any) -> Any:
+            if style.get("label"):
+                found.append((style["color"], style["marker"], style["label"]))
+            return drawn(self, *given, **style)
+
+        return noted
+
+    for name in ("plot", "scatter"):
+        monkeypatch.setattr(Axes, name, noting(getattr(Axes, name)))
+    return found
+
+
+class TestLooksOfManyDiffer:
+    NAMES = tuple(f"run-{number}" for number in range(2 * len(METHOD_COLORS) + 1))
+
+    def check(self, marked: list[tuple[str, str, str]]) -> None:
+        looks = {label: (color, mark) for color, mark, label in marked}
+        assert tuple(looks) == self.NAMES
+        assert len(set(looks.values())) == len(self.NAMES)
+
+    def test_compared_runs(self, inputs: ReportInputs, marked: list[tuple[str, str, str]]) -> None:
+        assert inputs.final is not None
+        rgb = inputs.final.rgb
+        runs = [ComparedRun(name, rgb, result_of(20.0, 10)) for name in self.NAMES]
+        build_run_comparison(inputs.sequence, runs, views=1)
+        self.check(marked)
+
+    def test_the_trend(self, marked: list[tuple[str, str, str]]) -> None:
+        one = {name: {"psnr": 20.0, "seconds": 1.0} for name in self.NAMES}
+        entries = [{"when": f"2026-01-0{day}T00:00:00+00:00", "methods": one} for day in (1, 2)]
+        trend_chart(entries, method_colors(self.NAMES, self.NAMES[0]))
+        self.check(marked)
+
+    def test_fronts(self, tmp_path: Path, marked: list[tuple[str, str, str]]) -> None:
+        scene = {"sequence": "p/0", "setting": "", "width": 8, "height": 8}
+        cells = [
+            {**scene, "method": name, "processor_seconds": 1.0, "figures": {"psnr": 20.0}}
+            for name in self.NAMES
+        ]
+        write_fronts_plot({"cells": cells, "fronts": []}, tmp_path / "fronts.svg", names=("psnr",))
+        self.check(marked)
 
 
 def test_names_may_be_long_and_have_any_letters() -> None:
