@@ -23,11 +23,12 @@ from extrags.errors import ShapeError, WeightsError
 from extrags.metrics.lpips_networks import LAYERS
 from extrags.metrics.lpips_weights import find_weights, read_weights
 
-__all__ = ["Lpips", "LpipsByNet", "TargetActivations", "available_lpips"]
+__all__ = ["MIN_SIDE_PX", "Lpips", "LpipsByNet", "TargetActivations", "available_lpips"]
 
 _CHANNEL_SHIFT = (-0.030, -0.088, -0.188)
 _CHANNEL_SCALE = (0.458, 0.448, 0.450)
-_MIN_SIDE_PX = 32
+MIN_SIDE_PX = 32
+"""Images with a shorter side are refused."""
 _NORM_EPS = 1e-10
 # A few images at a time: the activations of a long stack would not fit into memory.
 _IMAGES_AT_ONCE: dict[LpipsNet, int] = {"alex": 16, "vgg": 1, "squeeze": 16}
@@ -171,9 +172,9 @@ class Lpips:
             raise ShapeError(
                 f"LPIPS compares images [..., H, W, 3]; found {tuple(first.shape)} and {tuple(second.shape)}"
             )
-        if min(first.shape[-3:-1]) < _MIN_SIDE_PX:
+        if min(first.shape[-3:-1]) < MIN_SIDE_PX:
             raise ShapeError(
-                f"LPIPS needs images of at least {_MIN_SIDE_PX} px, found {first.shape[-2]}x{first.shape[-3]}"
+                f"LPIPS needs images of at least {MIN_SIDE_PX} px, found {first.shape[-2]}x{first.shape[-3]}"
             )
         firsts = first.reshape(-1, *first.shape[-3:])
         seconds = second.reshape(-1, *second.shape[-3:])

@@ -26,7 +26,7 @@ from extrags.events import Progress, emit
 from extrags.metrics.depth import depth_errors
 from extrags.metrics.exposure import align_exposure, exposure_gain
 from extrags.metrics.image import mean_of_known
-from extrags.metrics.lpips import LpipsByNet, TargetActivations
+from extrags.metrics.lpips import MIN_SIDE_PX, LpipsByNet, TargetActivations
 from extrags.metrics.photometric import photometric_values
 from extrags.metrics.registry import PROTOCOL_VERSION
 from extrags.metrics.registry import metrics as registered_metrics
@@ -174,7 +174,8 @@ def evaluate_views(
         sequence: the frames and masks, and true depth and observed masks where it has them.
         frames: indices into the sequence.
         lpips: LPIPS by backbone (`extrags.metrics.lpips.available_lpips`); None measures none. A backbone
-            without weights has the figure None, with its reason in `reasons`.
+            without weights has the figure None, with its reason in `reasons`; so have all on images that are
+            too small for them.
         surface: figures of the scene's surface, from `extrags.metrics.surface`.
         surface_reason: said in `reasons` when `surface` is None.
         per_view: of these renders, where `figures_per_view` has measured them with others; None measures.
@@ -187,6 +188,7 @@ def evaluate_views(
         ShapeError: when renders and frames do not fit each other, or there are none.
         NonFiniteError: for NaN or infinity in the renders; names the frame.
     """
+    lpips = _lpips_for(sequence, lpips)
     if per_view is None:
         (per_view,) = figures_per_view([renders], sequence, frames, lpips, device=device)
     metrics = _mean_tree([{k: v for k, v in view.items() if k not in ("frame", "name")} for view in per_view])
@@ -229,6 +231,7 @@ def figures_per_view(
     """
     for renders in stacks:
         _check(renders, sequence, frames)
+    lpips = _lpips_for(sequence, lpips)
     for net, network in ({} if lpips is None else lpips).items():
         if isinstance(network, str):
             logger.warning("%s: LPIPS with %s is not measured: %s", sequence.name, net, network)
@@ -245,6 +248,14 @@ def figures_per_view(
     # Each with one thread of torch: filters divided among several would add up in another order.
     parts = in_threads(evaluated, range(0, len(frames), at_once))
     return [[view for part in parts for view in part[index]] for index in range(len(stacks))]
+
+
+def _lpips_for(sequence: EndoscopicSequence, lpips: LpipsByNet | None) -> LpipsByNet | None:
+    """The backbones, or why there is no figure of them on images of this size."""
+    if lpips is None or min(sequence.width, sequence.height) >= MIN_SIDE_PX:
+        return lpips
+    size = f"{sequence.width} x {sequence.height}"
+    return dict.fromkeys(lpips, f"LPIPS needs images of at least {MIN_SIDE_PX} px a side, these have {size}")
 
 
 def _check(renders: RenderedViews, sequence: EndoscopicSequence, frames: np.ndarray) -> None:

@@ -232,6 +232,21 @@ def test_an_empty_mask_gives_nulls_not_nans(sequence: EndoscopicSequence) -> Non
     assert "empty" in result.reasons["psnr"]
 
 
+def test_images_too_small_for_lpips_have_all_other_figures(sequence: EndoscopicSequence) -> None:
+    small = replace(
+        sequence,
+        rgb=sequence.rgb[:, :20, :24],
+        mask=sequence.mask[:, :20, :24],
+        depth_mm=None,
+        observed=None,
+    )
+    networks = {"alex": Lpips("alex", random_weights("alex"))}
+    result = evaluate_views(renders_of(small, TEST), small, TEST, networks)
+    assert result.metrics["lpips_alex"] is None
+    assert result.reasons["lpips_alex"] == "LPIPS needs images of at least 32 px a side, these have 24 x 20"
+    assert result.metrics["ssim"] == pytest.approx(1, abs=1e-4)
+
+
 def test_lpips_inside_the_mask(sequence: EndoscopicSequence, shared_data: Path) -> None:
     metric = Lpips.load(shared_data / "lpips_weights")
     clean = renders_of(sequence, TEST)
