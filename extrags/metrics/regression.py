@@ -77,8 +77,9 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         quantity, means, the worsening (share of a cost or figure, or dB; positive is worse), its 95 %
         interval and a verdict: `worse`, `better`, `noise`, `equal`, or `not judged` where a single pair says
         nothing about noise. `failed` names groups of runs that fail now and did not; `missing` those that
-        are not in `after`. Times and memory are judged on one kind of machine only. `regressions` has the
-        rows that are worse, and what fails or is missing, in words.
+        are not in `after`, and figures that no run there has any more. Times and memory are judged on one
+        kind of machine only. `regressions` has the rows that are worse, and what fails or is missing, in
+        words.
 
     Raises:
         ConfigError: for a document that is no such result, or two that have no group in common.
@@ -93,14 +94,14 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
     )
     rows: list[_Row] = []
     failed = []
+    missing = [f"{_label(group)} was not run" for group in sides[0] if group not in sides[1]]
     for group in common:
         was, now = (side[group] for side in sides)
-        if any(run["error"] for run in now) and not any(run["error"] for run in was):
-            error = next(run["error"] for run in now if run["error"])
+        if (error := _new_failure(was, now)) is not None:
             failed.append(f"{_label(group)} fails: {error}")
         rows += _rows(group, was, now, costs=same)
+        missing += [f"{_label(group)} has no {name}" for name in _lost(was, now)]
     _judge(rows)
-    missing = [f"{_label(group)} was not run" for group in sides[0] if group not in sides[1]]
     worse = [_words(row) for row in rows if row.verdict == "worse"]
     return {
         "level": LEVEL,
@@ -126,6 +127,28 @@ def _grouped(cases: Sequence[Mapping[str, Any]]) -> dict[tuple[Any, ...], list[M
         # Results of `benchmark` have no budgets or sizes.
         found.setdefault(tuple(case.get(key) for key in GROUP), []).append(case)
     return found
+
+
+def _new_failure(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> str | None:
+    """The error of a run that fails and did not; of one that was not run before, if none failed."""
+    before = {_repetition(run): bool(run["error"]) for run in was}
+    unstable = any(before.values())
+    for run in now:
+        if run["error"] and not before.get(_repetition(run), unstable):
+            return str(run["error"])
+    return None
+
+
+def _lost(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Figures that every run had that did not fail, and none of those now has."""
+    if all(run["error"] for run in now):
+        return []
+    good = sum(not run["error"] for run in was)
+    return [
+        figure.name
+        for figure in figures()
+        if good == len(_values(was, figure.name, figure)) > 0 and not _values(now, figure.name, figure)
+    ]
 
 
 def _rows(
@@ -154,8 +177,12 @@ def _values(runs: Sequence[Mapping[str, Any]], name: str, figure: Figure | None)
     for run in runs:
         value = run.get(name) if figure is None else figure_of(run["metrics"], figure.name)
         if not run["error"] and value is not None and math.isfinite(value):
-            found[run["seed"], run.get("repeat", 0)] = float(value)
+            found[_repetition(run)] = float(value)
     return found
+
+
+def _repetition(run: Mapping[str, Any]) -> tuple[Any, ...]:
+    return run["seed"], run.get("repeat", 0)
 
 
 def _row(

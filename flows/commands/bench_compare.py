@@ -21,7 +21,8 @@ def add_arguments(parser: Parser) -> None:
         "where there are such, else the two samples. A difference is a regression when it matters (costs "
         "5 %, 0.1 dB, other figures 1 %) and is beyond noise (t test, Holm's correction over all that is "
         "compared, 5 %); it takes two or more seeds or repeats. Times and memory are judged on one kind of "
-        "machine only. Exit code 1 on a regression, or when runs fail that did not."
+        "machine only. Exit code 1 on a regression, or when runs fail that did not, or runs or "
+        "figures are gone."
     )
     parser.add_argument("before", type=Path, metavar="A.json", help="the reference")
     parser.add_argument("after", type=Path, metavar="B.json", help="what is judged")

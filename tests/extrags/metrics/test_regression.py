@@ -112,6 +112,36 @@ def test_runs_that_fail_now_are_a_regression() -> None:
     assert found["regressions"] == ["coarse (quick) on phantom/0@sparse fails: coarse: it diverged"]
 
 
+def test_one_seed_that_failed_before_excuses_no_other() -> None:
+    before, after = result(), result()
+    before["cases"][4]["error"] = after["cases"][4]["error"] = "coarse: it diverged"
+    assert compare_results(before, after)["failed"] == []
+    for case in after["cases"]:
+        case["error"] = "coarse: no memory"
+    assert compare_results(before, after)["regressions"] == [
+        "coarse (quick) on phantom/0@sparse fails: coarse: no memory"
+    ]
+
+
+def test_other_seeds_fail_as_often_as_those_before() -> None:
+    before, after = result(), result(seeds=range(5, 10))
+    after["cases"][0]["error"] = "coarse: it diverged"
+    assert len(compare_results(before, after)["failed"]) == 1
+    before["cases"][0]["error"] = "coarse: it diverged"
+    assert compare_results(before, after)["failed"] == []
+
+
+def test_a_figure_that_is_gone_is_named() -> None:
+    before, after = result(), result()
+    for case in after["cases"]:
+        case["metrics"] = {"psnr": None}
+    found = compare_results(before, after)
+    assert found["missing"] == ["coarse (quick) on phantom/0@sparse has no psnr"]
+    assert found["regressions"] == found["missing"]
+    before["cases"][0]["metrics"] = {"psnr": None}
+    assert compare_results(before, after)["missing"] == []
+
+
 def test_groups_that_were_not_run_are_named() -> None:
     found = compare_results(result(groups=2), result())
     assert found["missing"] == ["coarse (quick) on phantom/1@sparse was not run"]
