@@ -133,6 +133,7 @@ def build_benchmark_report(inputs: BenchmarkInputs) -> str:
 
 def _summary(comparison: Mapping[str, Any], inputs: BenchmarkInputs) -> str:
     said = []
+    several = _several_profiles(inputs.runs)
     for row in comparison["paired_datasets"]:
         if row["method"] == CEILING:
             continue
@@ -142,8 +143,9 @@ def _summary(comparison: Mapping[str, Any], inputs: BenchmarkInputs) -> str:
         figure = row["figures"][name]
         where = "observed pixels" if name.startswith("observed") else "all valid pixels"
         interval = _interval(figure, 2)
+        profile = f" ({row['profile']})" if several else ""
         said.append(
-            f"{row['method']} against {inputs.baseline} on {row['dataset']}: "
+            f"{row['method']} against {inputs.baseline} on {row['dataset']}{profile}: "
             f"{number(figure['mean'], 2, signed=True)} dB PSNR on {where}"
             f"{f' (95 % interval {interval})' if interval else ''}, better on {figure['better']} of "
             f"{figure['n']} {'sequence' if figure['n'] == 1 else 'sequences'}."
@@ -218,11 +220,12 @@ def _difference_chart(
     if not rows or not panels:
         return None
     several = len({row["method"] for row in rows}) > 1
+    line_of = _line_names(rows)
     lines = []
     for row in rows:
         given = [row["figures"].get(panel.name) for panel in panels]
         cells = [None if found is None else (found["mean"], found["low"], found["high"]) for found in given]
-        lines.append((f"{row['method']}, {_label(row)}" if several else _label(row), cells))
+        lines.append((f"{row['method']}, {line_of(row)}" if several else line_of(row), cells))
     titles = [
         (f"{panel.label} ({panel.unit})" if panel.unit else panel.label, panel.higher_is_better)
         for panel in panels
@@ -238,15 +241,16 @@ def _figure_charts(
     # Whole-mask figures only where the source cannot tell what was observed.
     drawn = [figure.name for figure in figures("charts")[:2]]
     names = [name for name in drawn if name in known] or [name for name in ("psnr",) if name in known]
-    groups = list(dict.fromkeys(_label(run) for run in runs))
+    line_of = _line_names(runs)
+    groups = list(dict.fromkeys(line_of(run) for run in runs))
     charts = []
     for name in names:
         having = [run for run in runs if figure_of(run["metrics"], name) is not None]
         title = f"{known[name].label} ({known[name].unit})"
         chart = methods_chart(
             groups,
-            _by_method(having, [figure_of(run["metrics"], name) or 0.0 for run in having]),
-            _by_method(having, [float(run["seconds"]) for run in having]),
+            _by_method(having, [figure_of(run["metrics"], name) or 0.0 for run in having], line_of),
+            _by_method(having, [float(run["seconds"]) for run in having], line_of),
             method_colors(list(inputs.methods), inputs.baseline),
             title,
         )
@@ -263,13 +267,26 @@ def _trend_chart(inputs: BenchmarkInputs) -> tuple[Chart, str] | None:
 
 
 def _by_method(
-    runs: Sequence[Mapping[str, Any]], values: Sequence[float]
+    runs: Sequence[Mapping[str, Any]],
+    values: Sequence[float],
+    line_of: Callable[[Mapping[str, Any]], str],
 ) -> dict[str, dict[str, list[float]]]:
     found: dict[str, dict[str, list[float]]] = {}
     for run, value in zip(runs, values, strict=True):
-        found.setdefault(run["method"], {}).setdefault(_label(run), []).append(value)
+        found.setdefault(run["method"], {}).setdefault(line_of(run), []).append(value)
     return found
 
 
 def _label(run: Mapping[str, Any]) -> str:
     return f"{run['sequence']}@{run['setting']}" if run["setting"] else str(run["sequence"])
+
+
+def _several_profiles(runs: Sequence[Mapping[str, Any]]) -> bool:
+    return len({run["profile"] for run in runs}) > 1
+
+
+def _line_names(runs: Sequence[Mapping[str, Any]]) -> Callable[[Mapping[str, Any]], str]:
+    """What a line of a chart is called; profiles have lines of their own where there are several."""
+    if not _several_profiles(runs):
+        return _label
+    return lambda run: f"{_label(run)}, {run['profile']}"

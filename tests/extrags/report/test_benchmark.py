@@ -16,6 +16,7 @@ from extrags.sequence import EndoscopicSequence
 
 from .conftest import TEST, metrics_of
 from .pages import Page, decoded
+from .test_downloads import lines
 
 METHODS = {"3dgs": "plain 3D Gaussian Splatting", "coarse": "the light-aware coarse scene"}
 
@@ -79,6 +80,21 @@ def test_says_what_was_gained(html: str) -> None:
     assert "better in 3 of 3" in text
     assert "Surface accuracy" in text
     assert "3dgs (baseline)" in text
+
+
+def test_profiles_are_told_apart_in_words_and_charts() -> None:
+    quick = runs_of({"phantom/0": 1.0}, seeds=2)
+    balanced = [{**run, "profile": "balanced"} for run in runs_of({"phantom/0": 3.0}, seeds=2)]
+    html = build_benchmark_report(BenchmarkInputs("two", [*quick, *balanced], "3dgs", METHODS))
+    text = Page(html).text
+    assert "coarse against 3dgs on phantom@sparse (quick): +1.00 dB" in text
+    assert "coarse against 3dgs on phantom@sparse (balanced): +3.00 dB" in text
+    tables = [lines(link) for link in Page(html).links if link.startswith("data:text/csv;")]
+    names = {"phantom/0@sparse, quick", "phantom/0@sparse, balanced"}
+    for column in ("run", "sequence"):
+        drawn = [{row[column] for row in table} for table in tables if column in table[0]]
+        assert drawn
+        assert all(found == names for found in drawn)
 
 
 def test_is_one_file_and_the_same_twice(inputs: BenchmarkInputs, html: str) -> None:
