@@ -80,8 +80,9 @@ def figure_of(metrics: Mapping[str, Any] | None, name: str) -> float | None:
 
 
 def dataset_of(run: Run) -> str:
-    """`phantom@sparse` for the runs of `phantom/3` in the setting `sparse`."""
-    dataset = str(run["sequence"]).partition("/")[0]
+    """`phantom@sparse` for the runs of `phantom/3` in the setting `sparse`; `files` for those of paths."""
+    name, _, rest = str(run["sequence"]).partition("/")
+    dataset = "files" if name in ("", ".", "..") or "/" in rest else name
     return f"{dataset}@{run['setting']}" if run["setting"] else dataset
 
 

@@ -122,6 +122,9 @@ class TestTables:
     def test_names(self) -> None:
         assert dataset_of(run("a", "phantom/3", 0, 1.0)) == "phantom@sparse"
         assert dataset_of(run("a", "phantom/3", 0, 1.0, setting=None)) == "phantom"
+        assert dataset_of(run("a", "c3vdv2_sim", 0, 1.0, setting=None)) == "c3vdv2_sim"
+        for path in ("/scans/left", "./left", "../left", "scans/monday/left"):
+            assert dataset_of(run("a", path, 0, 1.0, setting=None)) == "files"
         assert figure_of({"a": {"b": 2}}, "a.b") == 2.0
         assert figure_of({"a": {"b": None}}, "a.b") is None
         assert figure_of(None, "a") is None
