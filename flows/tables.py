@@ -48,6 +48,10 @@ def figure(name: str, value: float | None) -> str:
     return "–" if value is None else f"{value:.{_digits(name)}f}"  # noqa: RUF001
 
 
+def _count(value: float | None) -> str:
+    return "–" if value is None else f"{value:.0f}"  # noqa: RUF001
+
+
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
     """A Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
@@ -71,7 +75,7 @@ def sequence_markdown(outcome: SequenceOutcome) -> str:
     metrics = markdown_table(
         ["scene", *columns, "Gaussians"],
         [
-            [which, *(figure(name, tree.get(name)) for name in columns), tree.get("n_gaussians", "")]
+            [which, *(figure(name, tree.get(name)) for name in columns), _count(tree.get("n_gaussians"))]
             for which, tree in outcome.metrics.items()
             if tree is not None
         ],

@@ -87,6 +87,9 @@ def test_tables_have_the_backbones_that_were_asked_for() -> None:
     assert "lpips_vgg" in table_figures({**tree, "lpips_vgg": None})
     outcome = SequenceOutcome("made/up", metrics={"coarse": tree, "final": both})
     assert "0.4567" in sequence_markdown(outcome)
+    for count, text in ((None, "–"), (1234, "1234")):  # noqa: RUF001
+        counted = SequenceOutcome("made/up", metrics={"coarse": {**tree, "n_gaussians": count}})
+        assert f"| {text} |\n\n" in sequence_markdown(counted)
     assert "lpips_vgg" not in sequence_markdown(SequenceOutcome("made/up", metrics={"coarse": tree}))
     case = {
         "dataset": "made",
