@@ -149,7 +149,7 @@ def _absent(skipped: dict[str, str]) -> dict[str, str]:
     }
 
 
-@stage("dataset-report", version=3, ignore=("rows",))
+@stage("dataset-report", version=4, ignore=("rows",))
 def dataset_report(
     slot: Slot,
     name: str,
@@ -165,7 +165,7 @@ def dataset_report(
         slot: the artefact to write.
         name: title of the page.
         profile: name of the profile of the settings.
-        sequences: their names, in the order they are shown.
+        sequences: their names, with the variant where there is one, in the order they are shown.
         metrics: artefacts with the metrics of each sequence, by `NAME coarse` and `NAME final`.
         failures: error messages by sequence.
         rows: `SequenceOutcome.to_json()` of each: times, states and links, not part of the cache key.
@@ -178,7 +178,8 @@ def dataset_report(
 
     shown = [
         DatasetRow(
-            name=sequence,
+            name=row["name"],
+            variant=row["variant"],
             status="failed" if sequence in failures else "completed",
             seconds=sum(stage["made_seconds"] for stage in row["stages"]),
             coarse=figures(sequence, "coarse"),

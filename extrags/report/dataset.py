@@ -38,6 +38,7 @@ class DatasetRow:
         stages: `{stage, state, seconds, reason}`.
         error: what went wrong, for a failed sequence.
         seed: of the run, when there are several of the same sequence.
+        variant: what else sets it apart from other runs of the same sequence, in words.
         link: relative address of the sequence's own page; no link when empty.
     """
 
@@ -49,12 +50,14 @@ class DatasetRow:
     stages: Sequence[Mapping[str, Any]] = ()
     error: str = ""
     seed: int | None = None
+    variant: str = ""
     link: str = ""
 
     @property
     def label(self) -> str:
-        """Name and seed."""
-        return self.name if self.seed is None else f"{self.name}, seed {self.seed}"
+        """Name, seed and variant."""
+        named = self.name if self.seed is None else f"{self.name}, seed {self.seed}"
+        return f"{named} [{self.variant}]" if self.variant else named
 
 
 def build_dataset_report(
@@ -62,11 +65,12 @@ def build_dataset_report(
 ) -> str:
     """One self-contained HTML page that compares the sequences of a run.
 
-    Means are over the sequences that have both a coarse and a final figure, with the standard deviation
-    between them; sequences run with several seeds get a table of their spread. Failures stand at the top.
+    Means are over the rows that have both a coarse and a final figure, with the standard deviation between
+    them; where a sequence has several, they are called runs. Sequences run with several seeds get a table of
+    their spread. Failures stand at the top.
 
     Args:
-        rows: the sequences, in the order they are to be shown.
+        rows: the sequences, or runs of them, in the order they are to be shown.
         name: title of the page.
         made: when, in words; nothing is said when empty.
         profile: of the settings.
@@ -89,7 +93,8 @@ def build_dataset_report(
         profile=profile,
         summary=_summary(rows),
         facts=[
-            ("Sequences", count(len(rows))),
+            ("Sequences", count(len({row.name for row in rows}))),
+            *([("Runs", count(len(rows)))] if _kind(rows) == "runs" else []),
             ("Completed", count(sum(row.status == "completed" for row in rows))),
             ("Failed", count(sum(row.status == "failed" for row in rows))),
             ("Run time of all", duration(sum(row.seconds for row in rows))),
@@ -112,7 +117,7 @@ def _summary(rows: Sequence[DatasetRow]) -> str:
     psnr = metric_named("psnr")
     pairs = [pair for row in rows if (pair := _both(row, psnr, ())) is not None]
     completed = sum(row.status == "completed" for row in rows)
-    text = f"{completed} of {len(rows)} sequences completed."
+    text = f"{completed} of {len(rows)} {_kind(rows)} completed."
     if not pairs:
         return f"{text} None of them has both a coarse and a final figure to compare."
     change = np.array([final - coarse for coarse, final in pairs])
@@ -121,6 +126,11 @@ def _summary(rows: Sequence[DatasetRow]) -> str:
         f"{text} Over the {len(pairs)} with a coarse and a final scene, PSNR on held-out views changes by "
         f"{number(float(change.mean()), 2, signed=True)} dB on average; {better} of {len(pairs)} gain."
     )
+
+
+def _kind(rows: Sequence[DatasetRow]) -> Literal["sequences", "runs"]:
+    """What the rows are."""
+    return "sequences" if len({row.name for row in rows}) == len(rows) else "runs"
 
 
 def _table_row(row: DatasetRow, metrics: Sequence[Metric]) -> dict[str, Any]:

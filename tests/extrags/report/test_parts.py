@@ -163,13 +163,27 @@ def test_dataset_page_compares_and_names_failures() -> None:
     html = build_dataset_report(rows, name="phantom")
     page = Page(html)
     assert html == build_dataset_report(rows, name="phantom")
-    assert "3 of 4 sequences completed." in page.text
+    assert "3 of 4 runs completed." in page.text
+    assert "Sequences 3 Runs 4" in page.text
     assert "changes by +1.00 dB on average; 2 of 3 gain" in page.text
     assert "frame 0003: zero focal length" in page.text
     assert "+2.00 better ± 1.41" in page.text  # two seeds: 1 and 3
     assert "+1.00 better ± 2.00" in page.text  # three rows: 1, 3, -1
     assert [link for link in page.links[1:] if not link.startswith("data:")] == ["phantom-0.html"]
     assert all(load.startswith("data:image/") for load in page.loads)
+
+
+def test_dataset_page_of_one_run_a_sequence_speaks_of_sequences() -> None:
+    page = Page(build_dataset_report([row("phantom/0", 1.0), row("phantom/1", 2.0)]))
+    assert "2 of 2 sequences completed." in page.text
+    assert "Runs" not in page.text
+
+
+def test_dataset_page_names_variants() -> None:
+    page = Page(build_dataset_report([row("phantom/0", gain, variant=f"seed {gain:.0f}") for gain in (1, 2)]))
+    assert "2 of 2 runs completed." in page.text
+    assert "Sequences 1 Runs 2" in page.text
+    assert "phantom/0 [seed 2]" in page.text
 
 
 def test_dataset_page_of_nothing_but_failures() -> None:
