@@ -9,6 +9,7 @@ name.
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from pathlib import Path, PurePosixPath
@@ -53,8 +54,10 @@ def read_renders(
         SourceError: for a file that cannot be read or matches no held-out frame, or could be of several.
         ShapeError: for an image of another size; names the file and both sizes.
         NonFiniteError: for depth that holds NaN or infinity.
-        ConfigError: for integer depth without its step.
+        ConfigError: for integer depth without its step, or a step that is not positive.
     """
+    if depth_step_mm is not None and not 0 < depth_step_mm < math.inf:
+        raise ConfigError(f"a step of depth of {depth_step_mm} mm; expected a length above zero")
     shape = (sequence.height, sequence.width)
     rgb = [_color(file, shape) for file in _files_of(folder, sequence, COLOR_SUFFIXES, "image")]
     depth = np.zeros((len(rgb), *shape), dtype=np.float32)

@@ -44,6 +44,8 @@ def evaluate(given: argparse.Namespace) -> int:
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     if given.renders is None and (given.depth is not None or given.depth_step is not None):
         raise ConfigError("--depth goes with --renders: it holds the depth of the same frames")
+    if given.depth is None and given.depth_step is not None:
+        raise ConfigError("--depth-step goes with --depth: without it there is no depth to measure")
     found = _finished(given) if given.renders is None else _renders(given)
     if given.json != "-":
         _print(found)

@@ -147,6 +147,9 @@ def test_integer_depth_needs_its_step(sequence: EndoscopicSequence, tmp_path: Pa
     depth = write(tmp_path / "depth", {f"{index}.png": steps for index in range(3)})
     with pytest.raises(ConfigError, match="holds integers"):
         read_renders(folder, sequence, depth_folder=depth)
+    for wrong in (0.0, -0.01, float("nan")):
+        with pytest.raises(ConfigError, match="expected a length above zero"):
+            read_renders(folder, sequence, depth_folder=depth, depth_step_mm=wrong)
     renders = read_renders(folder, sequence, depth_folder=depth, depth_step_mm=0.01)
     np.testing.assert_allclose(renders.depth_mm, 22.0, rtol=1e-6)
 
