@@ -57,6 +57,8 @@ def add_arguments(parser: Parser) -> None:
 def stability(given: argparse.Namespace) -> int:
     """`extrags bench stability`."""
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
+    if given.threads < 1:
+        raise ConfigError(f"--threads {given.threads}: expected 1 or more")
     # Read when torch is loaded.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     from extrags.raster.bench import machine

@@ -568,3 +568,4 @@ class TestBench:
         assert "lamp/case: FAILS at seed 7" in said.err
         assert "1 rows, 1 of them fail" in said.out
         assert main(["bench", "stability", "--rows", "wind"]) == 2
+        assert main(["bench", "stability", "--threads", "0"]) == 2
