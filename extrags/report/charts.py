@@ -408,6 +408,8 @@ def pairs_chart(
                     continue
                 mean, low, high = cell
                 color = FINAL_COLOR if (mean > 0) == higher_is_better else WORSE_COLOR
+                if mean == 0:
+                    color = COARSE_COLOR
                 if low is not None and high is not None:
                     panel.hlines(at, low, high, color=color, linewidth=2.2, alpha=0.4)
                 panel.scatter([mean], [at], s=22, color=color, zorder=3)

@@ -10,10 +10,14 @@ import pytest
 
 from extrags.report import ReportInputs
 from extrags.report.charts import (
+    COARSE_COLOR,
+    FINAL_COLOR,
     METHOD_COLORS,
+    WORSE_COLOR,
     method_colors,
     method_marks,
     methods_chart,
+    pairs_chart,
     sequences_chart,
 )
 from extrags.report.downloads import Chart
@@ -91,6 +95,16 @@ class TestLooksOfManyDiffer:
         ]
         write_fronts_plot({"cells": cells, "fronts": []}, tmp_path / "fronts.svg", names=("psnr",))
         self.check(marked)
+
+
+def test_no_difference_has_the_colour_of_neither(monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib.axes import Axes
+
+    colors: list[str] = []
+    monkeypatch.setattr(Axes, "scatter", lambda self, *given, **style: colors.append(style["color"]))
+    panels = [("PSNR (dB)", True), ("LPIPS", False)]
+    pairs_chart(panels, [(str(mean), [(mean, None, None)] * 2) for mean in (1.0, 0.0, -1.0)])
+    assert colors == [FINAL_COLOR, COARSE_COLOR, WORSE_COLOR, WORSE_COLOR, COARSE_COLOR, FINAL_COLOR]
 
 
 def test_names_may_be_long_and_have_any_letters() -> None:
