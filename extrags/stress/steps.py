@@ -234,7 +234,8 @@ def _depths(lit: bool) -> Iterator[tuple[str, LitScene]]:
     one = torch.zeros_like(scene.depth)
     one[16, 20] = 3.0
     yield "a single pixel", replace(scene, depth=one)
-    yield "outliers", replace(scene, depth=torch.where(torch.rand(32, 40) < 0.1, 1e6, scene.depth))
+    outliers = torch.rand(32, 40, generator=torch.Generator().manual_seed(0)) < 0.1
+    yield "outliers", replace(scene, depth=torch.where(outliers, 1e6, scene.depth))
     step = torch.ones_like(scene.depth)
     step[:, 20:] = 1e3
     yield "a step by a thousand", replace(scene, depth=step)

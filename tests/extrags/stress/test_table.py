@@ -9,6 +9,7 @@ import torch
 from extrags.stress import ROWS, Effort, optimiser, run_rows, steps
 from extrags.stress.inputs import lit_tube, random_lit_scene
 from extrags.stress.optimiser import Drift, training_drift
+from extrags.stress.rows import differs
 
 PARTS = {
     "rasteriser",
@@ -46,6 +47,12 @@ CHOSEN = (
 def test_all_parts_have_rows_of_different_names() -> None:
     assert {row.part for row in ROWS} == PARTS
     assert len({row.name for row in ROWS}) == len(ROWS)
+
+
+@pytest.mark.parametrize("case", steps.CASES)
+def test_cases_of_the_training_step_are_the_same_each_time(case: str) -> None:
+    first, second = ([scene for _, scene in steps.CASES[case](True)] for _ in range(2))
+    assert differs([vars(scene) for scene in first], [vars(scene) for scene in second]) == 0
 
 
 def test_quick_rows_pass() -> None:
