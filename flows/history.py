@@ -228,29 +228,30 @@ def trend(entries: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The history as a page draws it, the oldest first.
 
     Returns:
-        `{when, commit, version, methods: {METHOD: {psnr, seconds}}}` of each entry: means over sequences
-        and seeds, over those sequences, settings and seeds that the last entry has as well; None where
-        there are none. Run times of other kinds of machines are left out.
+        `{when, commit, version, methods: {METHOD: {psnr, seconds}}}` of each entry: means over all profiles,
+        sequences, settings and seeds that did not fail in the last entry. A method that lacks one of them,
+        or failed there, is left out of an entry: a mean over others would be another figure. Run times of
+        other kinds of machines are None.
     """
     if not entries:
         return []
     last = entries[-1]
+    wanted: dict[str, dict[tuple[str, ...], str | None]] = {}
+    for group, values in _comparable(last, last).items():
+        if not values["error"]:
+            name = next((figure for figure in FIGURES if figure in values["figures"]), None)
+            wanted.setdefault(group[0], {})[group] = name
     drawn = []
     for entry in entries:
+        found = _comparable(entry, last)
         methods: dict[str, dict[str, float | None]] = {}
-        by_method: dict[str, list[dict[str, Any]]] = {}
-        for group, values in _comparable(entry, last).items():
-            if not values["error"]:
-                by_method.setdefault(group[0], []).append(values)
-        for method, values_of in by_method.items():
-            psnr = [
-                next((item["figures"][figure] for figure in FIGURES if figure in item["figures"]), None)
-                for item in values_of
-            ]
-            known = [value for value in psnr if value is not None]
+        for method, groups in wanted.items():
+            if any(group not in found or found[group]["error"] for group in groups):
+                continue
+            psnr = [found[group]["figures"].get(name) for group, name in groups.items() if name is not None]
             methods[method] = {
-                "psnr": fmean(known) if known else None,
-                "seconds": fmean(item["seconds"] for item in values_of)
+                "psnr": _mean(psnr) if psnr else None,
+                "seconds": fmean(found[group]["seconds"] for group in groups)
                 if _same_machine(entry, last)
                 else None,
             }

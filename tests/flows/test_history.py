@@ -199,6 +199,22 @@ class TestRecords:
             {"psnr": 22.0, "seconds": 102.0},
         ]
 
+    def test_the_trend_is_over_the_same_sequences_and_figures_throughout(self) -> None:
+        def both(day: int, **changed: Any) -> dict[str, Any]:
+            found = entry(day=day)
+            other = [{**case, "sequence": "phantom/9", "figures": {"psnr": 40.0}} for case in found["cases"]]
+            return {**found, "cases": [*found["cases"], *({**case, **changed} for case in other)]}
+
+        alone = entry(day=1)
+        failed = both(2, error="coarse: it diverged", figures={})
+        otherwise = both(3, figures={"observed.psnr": 50.0})
+        drawn = [item["methods"].get("coarse") for item in trend([alone, failed, otherwise, both(4)])]
+        assert drawn[:2] == [None, None]
+        assert [None if found is None else found["psnr"] for found in drawn[2:]] == [None, 31.0]
+        # What fails in the last one is not in its mean; then it is in none.
+        drawn = [item["methods"].get("coarse") for item in trend([both(1), both(2, error="no")])]
+        assert [None if found is None else found["psnr"] for found in drawn] == [22.0, 22.0]
+
 
 def test_the_page_shows_trend_and_regressions() -> None:
     runs = [
