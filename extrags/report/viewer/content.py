@@ -148,6 +148,8 @@ def viewer_section(inputs: ReportInputs, config: ReportConfig) -> dict[str, Any]
         absent = "The settings leave the viewer out (report.viewer_mb is 0)."
     elif inputs.sequence.world_from_camera is None:
         absent = inputs.why_absent("poses", "poses")
+    elif inputs.config is not None and inputs.config.uc_nerf.enabled:
+        absent = "The scene is a radiance field, and the viewer draws Gaussians."
     else:
         absent = inputs.why_absent("coarse_scene", "coarse")
     return {"viewer": content, "viewer_absent": absent, "viewer_script": script_text(*SCRIPTS)}

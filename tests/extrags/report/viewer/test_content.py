@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from extrags.config import ReportConfig
+from extrags.config import PipelineConfig, ReportConfig
 from extrags.redaction import has_credentials
 from extrags.report import ReportInputs, build_report
 from extrags.report.viewer import viewer_content
@@ -107,6 +107,18 @@ def test_left_out_where_asked_for(drawn: ReportInputs) -> None:
     assert "viewer" not in page.ids
     assert "The settings leave the viewer out (report.viewer_mb is 0)." in page.text
     assert viewer_content(replace(drawn, coarse_scene=None, final_scene=None), 10**7) is None
+
+
+def test_left_out_where_there_are_no_gaussians(drawn: ReportInputs) -> None:
+    field = replace(
+        drawn,
+        coarse_scene=None,
+        final_scene=None,
+        config=PipelineConfig().with_overrides({"uc_nerf.enabled": True}),
+    )
+    text = Page(build_report(field, CONFIG)).text
+    assert "The scene is a radiance field, and the viewer draws Gaussians." in text
+    assert "Nothing from the stage coarse" not in text
 
 
 def test_a_scene_without_light(drawn: ReportInputs) -> None:
