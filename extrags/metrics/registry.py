@@ -256,8 +256,11 @@ _BUILT_IN = (
     Metric("coverage", "Coverage", True, kind="surface", groups=_SURFACE, shown={"columns": _SURFACE}),
 )
 
-_NODES = ("aligned", "observed", "unobserved", "whole", "surface", "gain", "pixel_share", "n_gaussians")
-"""Other names in the tree of metrics."""
+_NODES = (
+    *("aligned", "observed", "unobserved", "whole", "surface", "gain", "pixel_share", "n_gaussians"),
+    *("frame", "name"),
+)
+"""Other names in the trees of metrics, those of single views among them."""
 _metrics: dict[str, Metric] = {metric.key: metric for metric in _BUILT_IN}
 
 

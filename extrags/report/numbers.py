@@ -109,7 +109,7 @@ def regions(inputs: ReportInputs) -> list[dict[str, Any]]:
         for alignment, kind in (((), "plain"), (("aligned",), "exposure-aligned")):
             cells = [
                 None
-                if alignment and metric.key.startswith("depth")
+                if alignment and metric.kind == "depth"
                 else compare(
                     metric,
                     metric_of(coarse, *path, *alignment, metric.key),

@@ -204,6 +204,8 @@ class TestOwnMetric:
         [
             ({"key": "psnr"}, "psnr: the key is taken"),
             ({"key": "observed"}, "observed: the key is taken"),
+            ({"key": "frame"}, "frame: the key is taken"),
+            ({"key": "name"}, "name: the key is taken"),
             ({"measure": None}, "only photometric metrics with a `measure`"),
             ({"kind": "depth"}, "only photometric metrics with a `measure`"),
             ({"key": "My metric"}, "a key is lower case"),

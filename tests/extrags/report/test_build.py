@@ -10,7 +10,9 @@ import pytest
 
 from extrags.config import ReportConfig
 from extrags.errors import NonFiniteError, ShapeError
+from extrags.metrics.registry import Metric, register_metric, unregister_metric
 from extrags.report import ReportInputs, build_report
+from extrags.report.numbers import regions
 from extrags.sequence import Split
 
 from .conftest import Renders, result_of
@@ -187,6 +189,19 @@ def test_what_there_is_not_is_called_what_it_is(inputs: ReportInputs) -> None:
     assert "Figures of the surface: not available, the sequence has no true depth." in text
     assert "Surface accuracy: not available, the scene has no surface." in text
     assert "Unobserved pixels: not available, no view has any." in text
+
+
+def test_a_metric_of_colours_is_aligned_whatever_it_is_called(inputs: ReportInputs) -> None:
+    register_metric(Metric("depth_of_colour", "Depth of colour", True, measure=lambda *_: {}))
+    try:
+        result = result_of(20.0, 10)
+        result["metrics"]["aligned"]["depth_of_colour"] = 0.5
+        _, aligned = regions(replace(inputs, coarse_metrics=result, final_metrics=result))[:2]
+    finally:
+        unregister_metric("depth_of_colour")
+    shown = aligned["cells"][-1]
+    assert shown is not None
+    assert shown.final == "0.500"
 
 
 def test_one_camera_and_nothing_held_out(inputs: ReportInputs) -> None:
