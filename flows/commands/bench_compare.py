@@ -52,6 +52,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _print(found: dict[str, Any], *, every: bool) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     from flows.terminal import console
@@ -67,9 +68,9 @@ def _print(found: dict[str, Any], *, every: bool) -> None:
             decibels = row["unit"] == "dB"
             change = f"{row['worsening']:+.2f} dB" if decibels else f"{row['worsening']:+.1%}"
             table.add_row(
-                name,
-                row["method"],
-                row["budget"] or "",
+                escape(name),
+                escape(row["method"]),
+                escape(row["budget"] or ""),
                 row["quantity"],
                 f"{row['before']:.4g}",
                 f"{row['after']:.4g}",

@@ -91,10 +91,13 @@ def _tell(row: dict[str, Any]) -> None:
     from flows.terminal import console
 
     ended = "passes" if row["passed"] else f"FAILS at {row['where']}"
-    console(error=True).print(f"{row['part']}/{row['case']}: {ended}, {row['seconds']:.1f} s", soft_wrap=True)
+    console(error=True).print(
+        f"{row['part']}/{row['case']}: {ended}, {row['seconds']:.1f} s", soft_wrap=True, markup=False
+    )
 
 
 def _print_table(rows: list[dict[str, Any]]) -> None:
+    from rich.markup import escape
     from rich.table import Table
 
     from flows.terminal import console
@@ -111,7 +114,8 @@ def _print_table(rows: list[dict[str, Any]]) -> None:
             worst,
             f"{row['limit']:.3g}",
             "yes" if row["passed"] else "NO",
-            row["note"] or row["where"],
+            # Errors quote shapes and values, which are no markup.
+            escape(row["note"] or row["where"]),
             str(row["trials"]),
             f"{row['seconds']:.1f}",
         )

@@ -17,7 +17,8 @@ from extrags.config import PROFILES, PipelineConfig
 from extrags.config.settings import settings_of
 from extrags.errors import ConfigError, MissingDependencyError
 from extrags.store import Store
-from extrags.stress import Row
+from extrags.stress import Effort, Row
+from extrags.stress.rows import Trial
 from flows.cli import VERBS, main, parser
 from flows.commands.common import parsed_settings, run_config
 from flows.outcome import SequenceOutcome
@@ -569,3 +570,23 @@ class TestBench:
         assert "1 rows, 1 of them fail" in said.out
         assert main(["bench", "stability", "--rows", "wind"]) == 2
         assert main(["bench", "stability", "--threads", "0"]) == 2
+
+    def test_an_error_is_told_with_its_brackets(
+        self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        def failing(effort: Effort) -> Iterator[Trial]:
+            yield "at [/a/b] first", 3.0
+            raise ValueError("expected images [n, 3]")
+
+        def worse(effort: Effort) -> Iterator[Trial]:
+            yield "at [/a/b] first", 3.0
+
+        rows = tuple(
+            Row("lamp", name, "what", 1.0, trials) for name, trials in (("a", failing), ("b", worse))
+        )
+        monkeypatch.setattr("extrags.stress.ROWS", rows)
+        assert main(["bench", "stability"]) == 1
+        said = capsys.readouterr()
+        assert "expected images [n, 3]" in said.out
+        assert "at [/a/b] first" in said.out
+        assert "FAILS at at [/a/b] first" in said.err
