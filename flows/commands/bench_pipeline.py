@@ -100,14 +100,15 @@ def pipeline(given: argparse.Namespace) -> int:
     (folder / "results.json").write_text(text, encoding="utf-8")
     table = grid_markdown(found)
     (folder / "grid.md").write_text(table, encoding="utf-8")
-    if any(cell["runs"] for cell in found["cells"]):
+    measured = any(cell["runs"] for cell in found["cells"])
+    if measured:
         for suffix in (".svg", ".png"):
             write_fronts_plot(found, folder / f"fronts{suffix}")
     if given.json != "-":
         from flows.terminal import console
 
         console().print(table, markup=False, soft_wrap=True)
-        told = f"results: {folder / 'results.json'}, {folder / 'fronts.svg'}"
+        told = f"results: {folder / 'results.json'}" + (f", {folder / 'fronts.svg'}" if measured else "")
         console().print(told, soft_wrap=True, markup=False)
     write_json(found, given.json)
     return 1 if any(case["error"] for case in found["cases"]) else 0
@@ -140,8 +141,9 @@ def grid_markdown(found: dict[str, Any]) -> str:
     header += [figure.label for figure in shown]
     lines = [f"| {' | '.join(header)} |", f"|{'---|' * 5}{'---:|' * (len(header) - 5)}"]
     for cell in found["cells"]:
-        name = f"{cell['sequence']}@{cell['setting']}" if cell["setting"] else cell["sequence"]
-        row = [name, f"{cell['width']}x{cell['height']}", cell["method"], cell["profile"], cell["budget"]]
+        # What failed before it was read has no size.
+        size = f"{cell['width']}x{cell['height']}" if cell["width"] else "-"
+        row = [_name(cell), size, cell["method"], cell["profile"], cell["budget"]]
         row += [str(cell["runs"]) + (f" ({cell['failed']} failed)" if cell["failed"] else "")]
         row += [_number(cell[key]) for key in ("seconds", "processor_seconds", "peak_mib")]
         for figure in shown:
@@ -150,7 +152,16 @@ def grid_markdown(found: dict[str, Any]) -> str:
             row.append(f"**{text}**" if (*_identity(cell), figure.name) in on else text)
         lines.append(f"| {' | '.join(row)} |")
     lines += ["", "Bold: on the front of this figure against processor time, within its sequence and size."]
+    failed = [case for case in found["cases"] if case["error"]]
+    lines += [""] * bool(failed)
+    for case in failed:
+        what = f"{_name(case)}, {case['method']}, {case['profile']}, {case['budget']}, seed {case['seed']}"
+        lines.append(f"* {what} failed in {case['error']}")
     return "\n".join(lines) + "\n"
+
+
+def _name(run: dict[str, Any]) -> str:
+    return f"{run['sequence']}@{run['setting']}" if run["setting"] else str(run["sequence"])
 
 
 def _front_members(found: dict[str, Any], names: list[str]) -> set[tuple[Any, ...]]:

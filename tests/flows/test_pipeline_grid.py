@@ -11,6 +11,7 @@ import pytest
 from extrags.errors import ConfigError
 from flows.budgets import Budget
 from flows.cli import main
+from flows.commands.bench_pipeline import grid_markdown
 from flows.pipeline_grid import Cell, cells_of, run_cell, run_grid
 from flows.selection import Chosen
 from tests.flows.tiny import SEQUENCE, TINY
@@ -134,6 +135,19 @@ def test_the_verbs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "compare", str(result), str(tmp_path / "worse.json")]) == 1
     assert "it diverged" in capsys.readouterr().out
     assert main(["bench", "compare", str(result), str(tmp_path / "none.json")]) == 2
+
+
+def test_the_table_says_what_failed(tmp_path: Path) -> None:
+    unread = {"width": None, "height": None, "metrics": None, "error": "ingest: no such file"}
+    costs = dict.fromkeys(("seconds", "processor_seconds", "peak_mib"))
+    found = run_grid(cells(), tmp_path, run=lambda cell, _: {**_case(cell), **unread, **costs})
+    table = grid_markdown(found)
+    assert "| phantom/0@sparse | - | coarse | quick |" in table
+    assert "0 (1 failed)" in table
+    assert "* phantom/0@sparse, coarse, quick, " in table
+    assert table.count("seed 0 failed in ingest: no such file\n") == 2
+    fine = run_grid(cells(), tmp_path / "fine", run=lambda cell, _: _case(cell))
+    assert "failed" not in grid_markdown(fine)
 
 
 def _never(cell: Cell, store: str) -> dict[str, Any]:
