@@ -236,14 +236,17 @@ def _ceiling(
             continue
         for group, members in _groups(runs, about):
             found = {}
+            counted: set[Any] = set()
             for figure in known:
                 ceiling = gain_by_sequence(members, CEILING, figure)
                 gains = gain_by_sequence(members, method, figure)
-                shares = [gains[key] / ceiling[key] for key in gains if ceiling.get(key, 0.0) > 0]
-                if shares:
-                    found[figure.name] = asdict(spread(shares))
+                below = [key for key in gains if ceiling.get(key, 0.0) > 0]
+                counted.update(below)
+                if below:
+                    found[figure.name] = asdict(spread([gains[key] / ceiling[key] for key in below]))
             if found:
-                sizes = _sizes([run for run in members if run["method"] == method])
+                own = [run for run in members if run["method"] == method]
+                sizes = _sizes([run for run in own if (run["sequence"], run["setting"]) in counted])
                 rows.append({**group, "method": method, "baseline": baseline, **sizes, "figures": found})
     return rows
 

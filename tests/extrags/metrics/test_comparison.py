@@ -153,6 +153,7 @@ class TestCeiling:
         (row,) = comparison["ceiling_datasets"]
         assert (row["method"], row["baseline"], row["figures"]["psnr"]["n"]) == ("coarse", "3dgs", 2)
         assert row["figures"]["psnr"]["mean"] == pytest.approx(0.6)
+        assert (row["n_sequences"], row["n_seeds"]) == (2, 2)
         # Lower is better: the same share of the way down.
         assert row["figures"]["lpips_alex"]["mean"] == pytest.approx(0.6)
 
