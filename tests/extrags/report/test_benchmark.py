@@ -117,6 +117,15 @@ def test_pictures_stand_side_by_side(html: str) -> None:
         assert sum(wanted in alt for alt in alts) == 2, wanted
 
 
+def test_the_outline_is_explained_wherever_it_is_drawn(
+    inputs: BenchmarkInputs, compared: ComparedViews
+) -> None:
+    blind = replace(compared, sequence=replace(compared.sequence, observed=None))
+    for pictures, explained in (([blind, compared], True), ([compared, blind], True), ([blind], False)):
+        text = Page(build_benchmark_report(replace(inputs, pictures=pictures, views=1))).text
+        assert ("Cyan outlines surface" in text) == explained
+
+
 def test_errors_share_a_scale_and_show_the_better(compared: ComparedViews) -> None:
     table = compared_rows(compared.sequence, (compared.baseline, compared.contender), 1, 100_000)
     (row,) = table.rows
