@@ -2,9 +2,10 @@
 
 Runs of both results that have everything in common, seed and repeat included, are pairs; a difference is
 judged by the spread of the pairs' differences (one-sided t test). Where seeds or repeats do not match, the
-two samples are compared as they are (Welch's test). As very many quantities are looked at, the threshold is
-Holm's, over all of them: the chance of a single false alarm in a comparison is at most `LEVEL`. A difference
-smaller than what matters (`MATTERS`) is never a regression, however certain it is.
+two samples are compared as they are (Welch's test). Repeats of a seed count once for a figure. As very many
+quantities are looked at, the threshold is Holm's, over all of them: the chance of a single false alarm in a
+comparison is at most `LEVEL`. A difference smaller than what matters (`MATTERS`) is never a regression,
+however certain it is.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Any, Literal
 
 import numpy as np
@@ -143,11 +145,13 @@ def _lost(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) ->
     """Figures that every run had that did not fail, and none of those now has."""
     if all(run["error"] for run in now):
         return []
-    good = sum(not run["error"] for run in was)
+    good = [run for run in was if not run["error"]]
     return [
         figure.name
         for figure in figures()
-        if good == len(_values(was, figure.name, figure)) > 0 and not _values(now, figure.name, figure)
+        if good
+        and all(figure_of(run["metrics"], figure.name) is not None for run in good)
+        and not _values(now, figure.name, figure)
     ]
 
 
@@ -172,13 +176,17 @@ def _rows(
 
 
 def _values(runs: Sequence[Mapping[str, Any]], name: str, figure: Figure | None) -> dict[Any, float]:
-    """By seed and repeat."""
-    found = {}
+    """A cost by seed and repeat; a figure by seed, its mean over the repeats.
+
+    Repeats of a seed have the same figure to the last bit: they tell nothing about its noise.
+    """
+    found: dict[Any, list[float]] = {}
     for run in runs:
         value = run.get(name) if figure is None else figure_of(run["metrics"], figure.name)
         if not run["error"] and value is not None and math.isfinite(value):
-            found[_repetition(run)] = float(value)
-    return found
+            key = _repetition(run) if figure is None else run["seed"]
+            found.setdefault(key, []).append(float(value))
+    return {key: fmean(values) for key, values in found.items()}
 
 
 def _repetition(run: Mapping[str, Any]) -> tuple[Any, ...]:

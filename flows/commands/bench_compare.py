@@ -20,8 +20,8 @@ def add_arguments(parser: Parser) -> None:
         "Compare two results of `bench pipeline` or `benchmark`: pairs of runs with the same seed and repeat "
         "where there are such, else the two samples. A difference is a regression when it matters (costs "
         "5 %, 0.1 dB, other figures 1 %) and is beyond noise (t test, Holm's correction over all that is "
-        "compared, 5 %); it takes two or more seeds or repeats. Times and memory are judged on one kind of "
-        "machine only. Exit code 1 on a regression, or when runs fail that did not, or runs or "
+        "compared, 5 %); it takes two or more seeds, or repeats for costs. Times and memory are judged on "
+        "one kind of machine only. Exit code 1 on a regression, or when runs fail that did not, or runs or "
         "figures are gone."
     )
     parser.add_argument("before", type=Path, metavar="A.json", help="the reference")
@@ -88,4 +88,6 @@ def _print(found: dict[str, Any], *, every: bool) -> None:
     told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(counts.items()))
     out.print(f"compared: {told}", soft_wrap=True)
     if counts.get("not judged"):
-        out.print("not judged: a single pair says nothing about noise; measure more --seeds or --repeats")
+        out.print(
+            "not judged: a single pair says nothing about noise; measure more --seeds, or --repeats for costs"
+        )

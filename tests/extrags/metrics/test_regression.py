@@ -112,6 +112,22 @@ def test_runs_that_fail_now_are_a_regression() -> None:
     assert found["regressions"] == ["coarse (quick) on phantom/0@sparse fails: coarse: it diverged"]
 
 
+def test_repeats_of_a_seed_are_no_evidence_about_figures() -> None:
+    def repeated(slower: float, worse_db: float) -> dict[str, Any]:
+        once = result(slower=slower, worse_db=worse_db, noise=0.01, seeds=range(1))["cases"][0]
+        return {
+            "machine": MACHINE,
+            "cases": [
+                {**once, "repeat": repeat, "seconds": once["seconds"] * (1 + repeat / 1000)}
+                for repeat in range(5)
+            ],
+        }
+
+    rows = {row["quantity"]: row for row in compare_results(repeated(1.0, 0.0), repeated(2.0, 0.5))["rows"]}
+    assert (rows["psnr"]["n"], rows["psnr"]["verdict"]) == (1, "not judged")
+    assert (rows["seconds"]["n"], rows["seconds"]["verdict"]) == (5, "worse")
+
+
 def test_one_seed_that_failed_before_excuses_no_other() -> None:
     before, after = result(), result()
     before["cases"][4]["error"] = after["cases"][4]["error"] = "coarse: it diverged"
