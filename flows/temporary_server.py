@@ -23,7 +23,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from importlib import metadata
 from pathlib import Path
@@ -129,6 +129,7 @@ def _launch(settings: dict[str, str]) -> tuple[str, subprocess.Popen[bytes]]:
         "PREFECT_SERVER_MEMOIZE_BLOCK_AUTO_REGISTRATION": "false",
         "PYTHONPATH": os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])]),
     }
+    environment |= database_address(environment)
     # The port is taken here and handed over, so that nobody else can take it meanwhile.
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
@@ -196,6 +197,27 @@ def copy_database(source: Path, target: Path) -> bool:
         part.unlink(missing_ok=True)
 
 
+def _in_address(path: Path) -> str:
+    """A path as SQLAlchemy reads it in an address: it undoes percent escapes, and ends the path at `?`."""
+    return str(path).replace("%", "%25").replace("?", "%3F")
+
+
+def database_address(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variable that names the database in Prefect's home where Prefect itself would name another place.
+
+    Prefect puts the path of its home into the address as it is. Nothing is said where that is right, or
+    where somebody has chosen a database.
+    """
+    home = environment.get("PREFECT_HOME")
+    chosen = ("PREFECT_SERVER_DATABASE_", "PREFECT_API_DATABASE_")
+    if home is None or any(name.startswith(chosen) for name in environment):
+        return {}
+    database = Path(home).expanduser() / DATABASE
+    if _in_address(database) == str(database):
+        return {}
+    return {"PREFECT_SERVER_DATABASE_CONNECTION_URL": f"sqlite+aiosqlite:///{_in_address(database)}"}
+
+
 def _stop(process: subprocess.Popen[bytes]) -> None:
     if process.stdin is not None:
         process.stdin.close()
@@ -241,7 +263,7 @@ def _provide_database() -> None:
     database = PREFECT_HOME.value() / DATABASE
     address = str(PREFECT_API_DATABASE_CONNECTION_URL.value())
     # Another database, such as Postgres, is whose it is.
-    if database.exists() or not address.endswith(f"/{database}"):
+    if database.exists() or not address.endswith(f"/{_in_address(database)}"):
         return
     template = cache_directory() / f"prefect-{metadata.version('prefect')}.db"
     if copy_database(template, database):
@@ -254,10 +276,9 @@ def _provide_database() -> None:
     database.parent.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(dir=database.parent) as folder:
         made = Path(folder) / DATABASE
+        address_there = address.replace(_in_address(database), _in_address(made))
         with (
-            temporary_settings(
-                {PREFECT_API_DATABASE_CONNECTION_URL: f"{address.removesuffix(str(database))}{made}"}
-            ),
+            temporary_settings({PREFECT_API_DATABASE_CONNECTION_URL: address_there}),
             # Else the server would go on with this one.
             temporary_database_config(None),
         ):

@@ -6,7 +6,9 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-from flows.temporary_server import copy_database
+import pytest
+
+from flows.temporary_server import DATABASE, copy_database, database_address
 
 
 def made(path: Path, word: str = "whole") -> Path:
@@ -42,3 +44,21 @@ def test_without_a_sound_template_there_is_no_copy(tmp_path: Path) -> None:
     broken.write_bytes(b"no database" * 1000)
     assert not copy_database(broken, target)
     assert list(tmp_path.iterdir()) == [broken]
+
+
+@pytest.mark.parametrize("folder", ["a%20b", "100%", "why?", "%3F", "plain", "two words", "[é]#1"])
+def test_the_server_opens_the_database_in_its_home_whatever_that_is_called(folder: str) -> None:
+    from sqlalchemy import make_url
+
+    home = Path("/store") / folder / "prefect"
+    given = database_address({"PREFECT_HOME": str(home)})
+    # Without a variable, Prefect puts the path into the address as it is.
+    (address,) = given.values() or (f"sqlite+aiosqlite:///{home / DATABASE}",)
+    assert make_url(address).database == str(home / DATABASE)
+    assert set(given) <= {"PREFECT_SERVER_DATABASE_CONNECTION_URL"}
+
+
+def test_a_database_that_somebody_chose_stays() -> None:
+    chosen = {"PREFECT_HOME": "/a%20b", "PREFECT_API_DATABASE_CONNECTION_URL": "postgresql://host/runs"}
+    assert database_address(chosen) == {}
+    assert database_address({}) == {}
