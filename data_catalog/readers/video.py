@@ -39,6 +39,10 @@ logger = logging.getLogger(__name__)
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".mxf", ".y4m")
 _MIN_DECODED = 0.9
 _USUAL_FRAMES_PER_S = 25.0
+_COUNTS_WHAT_IS_HIDDEN = "mp4"
+"""Of the containers, this family alone: it counts frames that an edit list leaves out, as those between the
+last key frame and the beginning of a part that was cut out without coding it anew. Its durations are those of
+what is shown, and of a header that a truncated file has whole or not at all."""
 _UNSPECIFIED_COLOUR = 2
 """What FFmpeg says of a matrix of colours that the file does not name."""
 _HIGH_DEFINITION_PX = (1280, 577)
@@ -68,6 +72,9 @@ class VideoFile:
             duration_s = max(0.0, container.duration / 1e6 - self._start_s) if container.duration else 0.0
             # Where the container does not count its frames, what a steady rate would give.
             self._announced = stream.frames or round(duration_s * self._frames_per_s)
+            if _COUNTS_WHAT_IS_HIDDEN in container.format.name and stream.duration:
+                shown_s = float(stream.duration * stream.time_base)
+                self._announced = min(self._announced, round(shown_s * self._frames_per_s))
             aspect = float(stream.sample_aspect_ratio or 1)
             turned_deg = next((frame.rotation for frame in _decoded(container, stream)), 0)
         # Counterclockwise, as numpy turns.

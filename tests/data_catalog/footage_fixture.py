@@ -55,6 +55,30 @@ def write_late(file: Path, frames: np.ndarray, start_s: float) -> Path:
     return file
 
 
+def write_cut_out(file: Path, frames: np.ndarray, hidden: int) -> Path:
+    """MP4 that was cut out of a longer one without coding it anew.
+
+    The first so many frames are stored, since others rest on their key frame, and an edit list hides them.
+    """
+    import av
+
+    with av.open(str(file), "w", container_options={"avoid_negative_ts": "disabled"}) as container:
+        stream = container.add_stream("mpeg4", rate=25, options={"g": "600", "b": "4000000"})
+        stream.height, stream.width = frames.shape[1:3]
+        stream.pix_fmt = "yuv420p"
+
+        def mux(packets: Sequence[Any]) -> None:
+            for packet in packets:
+                earlier = round(hidden / 25 / float(packet.time_base))
+                packet.pts, packet.dts = packet.pts - earlier, packet.dts - earlier
+                container.mux(packet)
+
+        for image in frames:
+            mux(stream.encode(av.VideoFrame.from_ndarray(image)))
+        mux(stream.encode())
+    return file
+
+
 def write_ten_bit(file: Path, frames: np.ndarray, *, pixel_aspect: str = "1:1") -> Path:
     """YUV4MPEG2 with 10 bits a channel and halved chroma, limited range."""
     height, width = frames.shape[1:3]

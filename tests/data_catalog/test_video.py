@@ -24,6 +24,7 @@ from tests.data_catalog.footage_fixture import (
     interlaced,
     retimed,
     turned,
+    write_cut_out,
     write_flagged,
     write_late,
     write_ten_bit,
@@ -374,6 +375,13 @@ class TestRefused:
     def test_a_whole_video_that_starts_late_is_not(self, tmp_path, name, start_s) -> None:
         """The duration in its header includes the time before the first frame."""
         file = VideoFile(write_late(tmp_path / name, moving_scene(20, 64, 48), start_s))
+        frames = list(file.frames(TimeSpan()))
+        assert file.announced == len(frames) == 20
+        assert [frame.time_s for frame in frames] == pytest.approx(np.arange(20) / 25, abs=2e-3)
+
+    def test_a_whole_video_that_hides_its_beginning_is_not(self, tmp_path) -> None:
+        """The header counts frames that are not shown."""
+        file = VideoFile(write_cut_out(tmp_path / "part.mp4", moving_scene(40, 64, 48), 20))
         frames = list(file.frames(TimeSpan()))
         assert file.announced == len(frames) == 20
         assert [frame.time_s for frame in frames] == pytest.approx(np.arange(20) / 25, abs=2e-3)
