@@ -13,7 +13,7 @@ from typing import Any
 from data_catalog.c3vd import reader as c3vd
 from data_catalog.calibration_files import with_calibration_file
 from data_catalog.dataset import Descriptor, Source
-from data_catalog.folder_reader import FolderReader
+from data_catalog.folder_reader import FolderReader, understood
 from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.posed_frames import assembled
 from data_catalog.readers import (
@@ -115,8 +115,9 @@ class FolderDataset:
         reader, place = _reader(source), Path(source.paths[0])
         if config.calibration is None:
             return reader.read(place, config, source.name)
-        frames = with_calibration_file(reader.frames(place, config), Path(config.calibration).expanduser())
-        return assembled(frames, config, source.name)
+        with understood(place):
+            file = Path(config.calibration).expanduser()
+            return assembled(with_calibration_file(reader.frames(place, config), file), config, source.name)
 
     def _source(self, path: Path, reader: FolderReader) -> Source:
         return Source(

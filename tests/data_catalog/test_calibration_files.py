@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from PIL import Image
 from data_catalog import read, resolve, source_fingerprint
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera
 from data_catalog.calibration_files import read_calibration
+from data_catalog.readers import frames_folder
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
@@ -275,6 +277,22 @@ class TestPlainFrames:
         assert "calibration" not in source_fingerprint(plain_frames)
         with pytest.raises(SourceNotFoundError, match="no such calibration file"):
             key(tmp_path / "none.yml")
+
+    def test_what_a_reader_does_not_foresee_is_an_error_of_the_source(
+        self, plain_frames, tmp_path, monkeypatch
+    ) -> None:
+        """As without a calibration file."""
+
+        def stumbles(*_: object) -> None:
+            raise KeyError("entry")
+
+        config = IngestConfig(calibration=str(opencv_file(tmp_path / "a.yml", [0.1, 0, 0, 0])))
+        found = resolve(plain_frames)
+        monkeypatch.setattr(
+            "data_catalog.folders._registered", [replace(frames_folder.READER, frames=stumbles)]
+        )
+        with pytest.raises(SourceError, match=r"its content is not understood \(KeyError: 'entry'\)"):
+            read(found, config)
 
     def test_not_beside_intrinsics_that_are_stated(self, plain_frames, tmp_path) -> None:
         config = IngestConfig(calibration=str(opencv_file(tmp_path / "a.yml", [0.1, 0, 0, 0])))
