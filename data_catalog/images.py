@@ -55,8 +55,15 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def colour_files(folder: Path) -> list[Path]:
-    """Image files directly in a folder, in natural order."""
-    found = [file for file in folder.iterdir() if file.suffix.lower() in COLOUR_SUFFIXES and file.is_file()]
+    """Image files directly in a folder, in natural order.
+
+    Hidden ones are none: macOS leaves `._NAME` with attributes beside each file on disks of others.
+    """
+    found = [
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in COLOUR_SUFFIXES and not file.name.startswith(".") and file.is_file()
+    ]
     return sorted(found, key=lambda file: natural_key(file.name))
 
 

@@ -20,7 +20,7 @@ from data_catalog.footage import Footage, FootageFrame, TimeSpan
 from data_catalog.images import spread
 from data_catalog.interlacing import deinterlaced
 from data_catalog.posed_frames import PosedFrame, SourceFrames
-from data_catalog.readers.frames_folder import INTRINSICS_FILE, read_intrinsics
+from data_catalog.readers.frames_folder import INTRINSICS_FILE, mask_beside, read_intrinsics
 from data_catalog.sampling import Sampling
 from data_catalog.survey import Shot, Survey, choose_frames, survey
 from extrags.config import IngestConfig
@@ -73,7 +73,7 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
         guess_is_used=config.calibration is None,
     )
     lens = Lens.pinhole(K, found.width, found.height)
-    mask_file = file.parent / "mask.png"
+    mask_file = mask_beside(file.parent)
     second = _SecondPass(footage, span, numbers, found.numbers[here], interlaced=shot.interlaced)
     return SourceFrames(
         frames=[
@@ -81,7 +81,7 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
                 name=f"{number:06d}",
                 file=file,
                 lens=lens,
-                mask_file=mask_file if mask_file.is_file() else None,
+                mask_file=mask_file,
                 number=number,
             )
             for number in numbers.tolist()

@@ -32,20 +32,39 @@ from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.lens import Lens
 
-__all__ = ["INTRINSICS_FILE", "READER", "read_intrinsics"]
+__all__ = ["INTRINSICS_FILE", "MASK_FILE", "READER", "is_mask", "mask_beside", "read_intrinsics"]
 
 logger = logging.getLogger(__name__)
 
 INTRINSICS_FILE = "intrinsics.json"
+MASK_FILE = "mask.png"
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 _SIZES = (("width", "height"), ("w", "h"))
-_NOT_FRAMES = ("mask.png",)
+
+
+def is_mask(file: Path) -> bool:
+    """Whether an image is a mask by its name, and no frame."""
+    return file.stem.lower() == "mask"
+
+
+def mask_beside(folder: Path, images: Path | None = None) -> Path | None:
+    """The mask of all frames, or None; of others it is said that they are not read.
+
+    Args:
+        folder: that should hold it.
+        images: folder of the images; None for the same.
+    """
+    found = folder / MASK_FILE
+    for file in (file for place in {folder, images or folder} for file in colour_files(place)):
+        if is_mask(file) and file != found:
+            logger.warning("%s is not read; the mask of all frames is %s", file, found)
+    return found if found.is_file() else None
 
 
 def _images(folder: Path) -> list[Path]:
     for place in (folder, folder / "images", folder / "rgb"):
         if place.is_dir():
-            found = [file for file in colour_files(place) if file.name not in _NOT_FRAMES]
+            found = [file for file in colour_files(place) if not is_mask(file)]
             if found:
                 return found
     return []
@@ -56,7 +75,7 @@ def _recognises(folder: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    extra = [folder / INTRINSICS_FILE, folder / "mask.png"]
+    extra = [folder / INTRINSICS_FILE, folder / MASK_FILE]
     return sorted([*_images(folder), *(file for file in extra if file.is_file())])
 
 
@@ -67,16 +86,13 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     width, height = image_size(files[0], frame=files[0].name)
     K = read_intrinsics(folder, width, height, guess_is_used=config.calibration is None)
     lens = Lens.pinhole(K, width, height)
-    mask_file = folder / "mask.png"
-    if not mask_file.is_file():
+    mask_file = mask_beside(folder, files[0].parent)
+    if mask_file is None:
         for place in (folder / "mask", folder / "masks"):
             if place.is_dir():
                 logger.warning("%s is not read; of plain frames, one mask.png holds for all", place)
     return SourceFrames(
-        frames=[
-            PosedFrame(file.name, file, lens, mask_file=mask_file if mask_file.is_file() else None)
-            for file in files
-        ],
+        frames=[PosedFrame(file.name, file, lens, mask_file=mask_file) for file in files],
         pose_file=folder,
         metric=False,
         masks=_ContentMask(),
@@ -143,7 +159,9 @@ def read_intrinsics(
             ASSUMED_FIELD_OF_VIEW_DEG, width, height, pixel_aspect=pixel_aspect
         )
     try:
-        content = json.loads(file.read_text())
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(content, dict):
+            raise TypeError(f"found {type(content).__name__}, not an object")
         _check_described(content, width, height, file)
         if "K" in content:
             K = np.asarray(content["K"], dtype=np.float64)

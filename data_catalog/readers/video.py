@@ -28,7 +28,7 @@ from data_catalog.footage import FootageFrame, TimeSpan
 from data_catalog.images import colour_files
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames
-from data_catalog.readers.frames_folder import INTRINSICS_FILE
+from data_catalog.readers.frames_folder import INTRINSICS_FILE, MASK_FILE, is_mask
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 
@@ -161,14 +161,19 @@ def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
         return place if place.suffix.lower() in suffixes else None
     if not place.is_dir():
         return None
-    found = [file for file in place.iterdir() if file.suffix.lower() in suffixes and file.is_file()]
-    images = [file for file in colour_files(place) if file.name != "mask.png"]
+    # Hidden ones are none, as of images.
+    found = [
+        file
+        for file in place.iterdir()
+        if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
+    ]
+    images = [file for file in colour_files(place) if not is_mask(file)]
     return found[0] if len(found) == 1 and not images else None
 
 
 def with_files_beside(file: Path) -> list[Path]:
     """A footage and what belongs to it, sorted."""
-    beside = [file.parent / name for name in (INTRINSICS_FILE, "mask.png")]
+    beside = [file.parent / name for name in (INTRINSICS_FILE, MASK_FILE)]
     return sorted([file, *(other for other in beside if other.is_file())])
 
 

@@ -147,6 +147,24 @@ class TestFrames:
         read(frames)
         assert "masks is not read; of plain frames, one mask.png holds for all" in caplog.text
 
+    @pytest.mark.parametrize("name", ["mask.jpg", "Mask.PNG"])
+    def test_a_mask_of_another_name_is_no_frame_and_it_is_said(self, frames, name, caplog) -> None:
+        Image.fromarray(np.full((60, 80), 255, np.uint8)).save(frames / name)
+        assert read(frames).frame_names == ("frame_1", "frame_2", "frame_10")
+        assert f"{name} is not read; the mask of all frames is" in caplog.text
+
+    def test_a_mask_among_the_images_of_a_folder_below_is_said_to_be_unread(self, frames, caplog) -> None:
+        (frames / "images").mkdir()
+        for file in frames.glob("*.png"):
+            file.rename(frames / "images" / file.name)
+        Image.fromarray(np.full((60, 80), 255, np.uint8)).save(frames / "images" / "mask.png")
+        assert len(read(frames)) == 3
+        assert "images/mask.png is not read; the mask of all frames is" in caplog.text
+
+    def test_what_macos_leaves_beside_files_is_no_frame(self, frames) -> None:
+        (frames / "._frame_1.png").write_bytes(b"\x00\x05\x16\x07")
+        assert read(frames).frame_names == ("frame_1", "frame_2", "frame_10")
+
     def test_intrinsics_file(self, frames) -> None:
         (frames / "intrinsics.json").write_text(json.dumps({"fx": 70, "fy": 71, "cx": 41, "cy": 29}))
         sequence = read(frames, IngestConfig(downscale=2))
@@ -159,6 +177,7 @@ class TestFrames:
             ({"fx": 70}, "expected K, or fx"),
             ({"field_of_view_deg": 200}, "200 degrees"),
             ({"K": [[1, 2], [3, 4]]}, "3 x 3"),
+            ([70, 71, 41, 29], r"intrinsics\.json.*expected K, or fx.*found list"),
             ({"fx": 70, "fy": 71, "cx": 41, "cy": 29, "k1": -0.3}, r"k1: -0\.3; expected a pinhole"),
             ({"field_of_view_deg": 80, "dist_coeffs": [0, 0.1]}, r"dist_coeffs: .*ingest\.calibration"),
             ({"field_of_view_deg": 80, "camera_model": "OPENCV"}, 'camera_model: "OPENCV"; expected a pinh'),
