@@ -54,6 +54,7 @@ logger = logging.getLogger(__name__)
 POSES_FILE = "poses.json"
 _DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
 _LENGTH_UNITS = ("mm", "arbitrary")
+_LARGEST_RECORDING = 1_000_000
 
 
 def _recognises(folder: Path) -> bool:
@@ -91,7 +92,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
                 ),
                 mask_file=mask_files[index],
                 depth_file=depth_files[index],
-                recording=int(entry.get("recording", 0)),
+                recording=_recording(entry, file),
                 split=entry.get("split"),
             )
             for index, entry in enumerate(entries)
@@ -217,6 +218,19 @@ def _check_splits(frames: list[dict[str, Any]], file: Path) -> None:
                 frame=entry["file"],
                 field="split",
             )
+
+
+def _recording(entry: dict[str, Any], file: Path) -> int:
+    number = entry.get("recording", 0)
+    whole = isinstance(number, int) or (isinstance(number, float) and number.is_integer())
+    if not whole or abs(number) > _LARGEST_RECORDING:
+        raise SourceError(
+            f"found {str(number)[:40]!r}; expected the number of a recording",
+            file=file,
+            frame=entry["file"],
+            field="recording",
+        )
+    return int(number)
 
 
 def _lens(folder: Path, entry: dict[str, Any], content: dict[str, Any], file: Path) -> Lens:

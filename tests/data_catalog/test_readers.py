@@ -278,6 +278,12 @@ class TestPosedFolder:
         with pytest.raises(SourceError, match=rf"belong to rgb/0000\.png as well; .* as {kind}/a/0000\."):
             read(posed_folder)
 
+    @pytest.mark.parametrize("number", ["a", None, 1.5, [0], 1e300])
+    def test_a_recording_that_is_no_number(self, posed_folder, edit_poses, number) -> None:
+        edit_poses(lambda content: content["frames"][3].update(recording=number))
+        with pytest.raises(SourceError, match=r"poses\.json, frame rgb/0003\.png, field recording: found"):
+            read(posed_folder)
+
     def test_masks_that_are_missing_or_elsewhere_are_said(self, posed_folder, caplog) -> None:
         shutil.rmtree(posed_folder / "mask", ignore_errors=True)
         size = (48, 40)
