@@ -163,7 +163,7 @@ def _scaled(found: _Described, width: int, height: int, file: Path) -> Lens:
 
 
 def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
-    storage = read_file_storage(text, file)
+    storage = read_file_storage(text, file, (*_OPENCV_NAMES["K"], *_OPENCV_NAMES["D"]))
     K, D = (_matrix(storage, name, file) for name in ("K", "D"))
     width, height = (_whole(storage, name) or size for name, size in (("width", width), ("height", height)))
     fisheye = bool(_whole(storage, "fisheye")) or _ros_model(storage, file) in _ROS_FISHEYES

@@ -2,7 +2,9 @@
 
 OpenCV's own parser corrupts memory on damaged files.
 
-Read are numbers, text and matrices at the top of the file; everything below them is passed over.
+Read are numbers, text and matrices at the top of the file; everything below them is passed over. Matrices
+with several numbers in an entry, as the points that OpenCV's own calibration writes beside the camera, are
+not understood, and need not be.
 
 Source: https://docs.opencv.org, "File Input and Output using XML / YAML / JSON files".
 """
@@ -11,7 +13,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -27,11 +29,16 @@ _LARGEST = 10_000
 """Numbers of a matrix; calibrations have a few."""
 
 
-def read_file_storage(text: str, file: Path) -> dict[str, Any]:
-    """The entries at the top of a file, matrices as float64 arrays.
+def read_file_storage(text: str, file: Path, matrices: Collection[str]) -> dict[str, Any]:
+    """The entries at the top of a file.
+
+    Args:
+        text: its content.
+        file: named in errors.
+        matrices: names of entries whose matrices become float64 arrays; those of others stay mappings.
 
     Raises:
-        SourceError: the text is none of the three, or a matrix is not what its size says.
+        SourceError: the text is none of the three, or such a matrix is not what its size says.
     """
     start = text.lstrip()[:1]
     try:
@@ -42,7 +49,10 @@ def read_file_storage(text: str, file: Path) -> dict[str, Any]:
         raise _refused(error, file) from error
     if not isinstance(entries, Mapping):
         raise _refused("there are no entries", file)
-    return {str(name): _value(value, file, str(name)) for name, value in entries.items()}
+    return {
+        str(name): _value(value, file, str(name)) if name in matrices else value
+        for name, value in entries.items()
+    }
 
 
 def _refused(problem: object, file: Path) -> SourceError:

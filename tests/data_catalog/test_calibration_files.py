@@ -46,7 +46,14 @@ OCAMCALIB = """\
 """
 
 
-def opencv_file(path: Path, distortion: list[float], *, fisheye: bool = False, sized: bool = True) -> Path:
+def opencv_file(
+    path: Path,
+    distortion: list[float],
+    *,
+    fisheye: bool = False,
+    sized: bool = True,
+    points: bool = False,
+) -> Path:
     storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     if sized:
         storage.write("image_width", WIDTH)
@@ -55,6 +62,9 @@ def opencv_file(path: Path, distortion: list[float], *, fisheye: bool = False, s
         storage.write("fisheye_model", 1)
     storage.write("camera_matrix", K)
     storage.write("distortion_coefficients", np.array([distortion]))
+    if points:
+        storage.write("image_points", np.zeros((25, 250, 2), np.float32))
+        storage.write("grid_points", np.zeros((1, 54, 3), np.float32))
     storage.release()
     return path
 
@@ -145,6 +155,15 @@ class TestOpenCV:
         assert isinstance(lens, Lens)
         assert lens.is_pinhole
         np.testing.assert_allclose(lens.K[:2, 2], [83.5, 61.0])
+
+    @pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+    def test_points_that_lie_beside_the_camera(self, tmp_path, suffix) -> None:
+        """OpenCV's own calibration writes them, with two and three numbers in an entry."""
+        terms = [-0.2, 0.05, 0, 0, 0]
+        plain = opencv_file(tmp_path / f"plain.{suffix}", terms)
+        file = opencv_file(tmp_path / f"scope.{suffix}", terms, points=True)
+        assert "2f" in file.read_text()
+        assert read_calibration(file, WIDTH, HEIGHT) == read_calibration(plain, WIDTH, HEIGHT)
 
     def test_images_of_another_size(self, tmp_path) -> None:
         file = opencv_file(tmp_path / "a.yml", [-0.2, 0.05, 0, 0])
