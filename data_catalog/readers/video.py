@@ -219,7 +219,7 @@ def _opened(file: Path, named: Path) -> Iterator[tuple[Any, Any]]:
         raise SourceError(problem, file=named) from error
     with container:
         if not container.streams.video:
-            raise SourceError(problem, file=named)
+            raise SourceError("no stream of pictures in it, only sound?", file=named)
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         yield container, stream

@@ -393,6 +393,16 @@ class TestRefused:
         with pytest.raises(SourceError, match=r"late\.mkv.*(truncated|cannot be opened)"):
             list(VideoFile(whole).frames(TimeSpan()))
 
+    def test_sound_alone(self, tmp_path) -> None:
+        with av.open(str(tmp_path / "voice.mp4"), "w") as container:
+            stream = container.add_stream("aac", rate=44100, layout="mono")
+            frame = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+            frame.sample_rate = 44100
+            container.mux(stream.encode(frame))
+            container.mux(stream.encode())
+        with pytest.raises(SourceError, match=r"voice\.mp4: no stream of pictures in it"):
+            read(tmp_path / "voice.mp4")
+
     @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
     def test_a_truncated_file(self, video, tmp_path, share) -> None:
         file = tmp_path / "cut.avi"
