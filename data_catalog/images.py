@@ -34,6 +34,7 @@ __all__ = [
 
 BITS_PER_SAMPLE = 258
 """Tag of TIFF."""
+_TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _MASK_THRESHOLD = 127
 _LOSSY_SUFFIXES = (".jpg", ".jpeg")
@@ -381,8 +382,13 @@ def _image_errors(file: Path, frame: object, field: str) -> Iterator[None]:
     try:
         yield
     except UnidentifiedImageError as error:
+        with file.open("rb") as stream:
+            is_tiff = stream.read(4) in _TIFF_SIGNATURES
+        # Those of 64-bit numbers, which numpy's are unless somebody asks for others.
+        kind = "a TIFF of a kind that is not read, expected are numbers of at most 32 bits"
         raise SourceError(
-            f"not an image, or damaged from its first bytes ({file.stat().st_size} bytes)",
+            f"{kind if is_tiff else 'not an image'}, or damaged from its first bytes "
+            f"({file.stat().st_size} bytes)",
             file=file,
             frame=frame,
             field=field,

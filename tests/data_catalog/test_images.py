@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_catalog.images import read_colour, read_mask
+from data_catalog.images import read_colour, read_depth, read_mask
 from extrags.errors import SourceError
 
 GREY = np.random.default_rng(0).integers(0, 2**16, (20, 30), dtype=np.uint16)
@@ -50,6 +50,15 @@ def test_floating_point_has_no_white(tmp_path: Path) -> None:
     file = written(tmp_path / "a.tif", GREY.astype(np.float32))
     with pytest.raises(SourceError, match=r"a\.tif, frame 7, field rgb: floating-point values; expected"):
         read_colour(file, frame=7)
+
+
+def test_a_tiff_that_is_not_read_is_not_said_to_be_no_image(tmp_path: Path) -> None:
+    file = written(tmp_path / "a.tif", GREY.astype(np.float64))
+    with pytest.raises(SourceError, match=r"field depth: a TIFF of a kind .* at most 32 bits, or damaged"):
+        read_depth(file)
+    file.write_bytes(b"no image")
+    with pytest.raises(SourceError, match=r"field depth: not an image, or damaged from its first bytes"):
+        read_depth(file)
 
 
 def test_a_tiff_tells_how_many_of_sixteen_bits_it_uses(tmp_path: Path) -> None:
