@@ -2,8 +2,9 @@
 
 * OpenCV: YAML, XML or JSON of `cv::FileStorage` with `camera_matrix` and `distortion_coefficients` (0, 4, 5,
   8 or more numbers; with 4 and `fisheye_model: 1` the Kannala-Brandt fisheye), and `image_width` and
-  `image_height`, without which the calibration holds for the images as they are. Numbers are a matrix of
-  OpenCV's, a plain list, or what ROS writes (`rows`, `cols`, `data`, and `distortion_model`).
+  `image_height`, or `image_size` with both, without which the calibration holds for the images as they are.
+  Numbers are a matrix of OpenCV's, a plain list, or what ROS writes (`rows`, `cols`, `data`, and
+  `distortion_model`).
 * Kalibr: the `camchain.yaml` with the camera `cam0`: pinhole with radtan, equidistant, fov or no distortion.
 * Scaramuzza: `calib_results.txt` of OCamCalib, a polynomial of fourth degree.
 
@@ -15,6 +16,7 @@ Scaramuzza et al., "A toolbox for easily calibrating omnidirectional cameras", I
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -33,7 +35,7 @@ from extrags.lens import Lens
 
 __all__ = ["CALIBRATION_VERSION", "read_calibration", "with_calibration_file"]
 
-CALIBRATION_VERSION = 2
+CALIBRATION_VERSION = 3
 """Raised by hand whenever the same file gives another camera."""
 
 _PROPORTION_TOLERANCE = 0.005
@@ -43,8 +45,9 @@ _OPENCV_NAMES = {
         *("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "dist_coeffs", "dist_coeff"),
         *("distortion_coeffs", "distortion", "dist", "D"),
     ),
-    "width": ("image_width", "image_Width"),
-    "height": ("image_height", "image_Height"),
+    "width": ("image_width", "image_Width", "imageWidth"),
+    "height": ("image_height", "image_Height", "imageHeight"),
+    "size": ("image_size", "imageSize", "image_Size", "img_size"),
     "fisheye": ("fisheye_model",),
     "model": ("distortion_model",),
 }
@@ -77,7 +80,8 @@ def read_calibration(file: Path, width: int, height: int) -> Lens | ScaramuzzaCa
     if not file.is_file():
         raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
     try:
-        text = file.read_text(encoding="utf-8")
+        # Editors on Windows put a mark at the beginning.
+        text = file.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
         raise SourceError(f"cannot be read as text: {error}", file=file, field="calibration") from error
     if "#polynomial coefficients" in text:
@@ -165,12 +169,12 @@ def _scaled(found: _Described, width: int, height: int, file: Path) -> Lens:
 def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
     storage = read_file_storage(text, file, (*_OPENCV_NAMES["K"], *_OPENCV_NAMES["D"]))
     K, D = (_matrix(storage, name, file) for name in ("K", "D"))
-    width, height = (_whole(storage, name) or size for name, size in (("width", width), ("height", height)))
+    width, height = _size(storage, file) or (width, height)
     fisheye = bool(_whole(storage, "fisheye")) or _ros_model(storage, file) in _ROS_FISHEYES
     if K is None or K.size != 9:
         raise SourceError("expected a matrix of 3 x 3 numbers", file=file, field="camera_matrix")
     K = K.reshape(3, 3)
-    unread = [name for name in storage if "dist" in name.lower() and name not in _OPENCV_NAMES["model"]]
+    unread = [name for name in storage if _is_distortion(name, storage[name])]
     if D is None and unread:
         raise SourceError(
             f"expected this name for the distortion; {unread[0]!r} is not known here",
@@ -201,6 +205,31 @@ def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
     else:
         model, terms = "FULL_OPENCV", (*terms, 0.0, 0.0, 0.0)[:8]
     return _Described(model, K, terms, width, height)
+
+
+def _is_distortion(name: str, value: Any) -> bool:
+    """Whether an entry tells of distortion, by its name; terms of their own that are zero tell of none."""
+    if re.fullmatch(r"[kp][1-6]", name):
+        return str(value).strip() not in ("0", "0.", "0.0")
+    return "dist" in name.lower() and name not in _OPENCV_NAMES["model"]
+
+
+def _size(storage: Mapping[str, Any], file: Path) -> tuple[int, int] | None:
+    """Width and height of the images that were calibrated with; None where the file does not say.
+
+    Raises:
+        SourceError: it says one of the two, or no numbers.
+    """
+    name = next((name for name in _OPENCV_NAMES["size"] if name in storage), None)
+    found = storage[name] if name is not None else [_node(storage, key) for key in ("width", "height")]
+    listed = found.split() if isinstance(found, str) else found
+    if name is None and listed == [None, None]:
+        return None
+    width, height = _numbers(listed, 2, file, name or "image_width, image_height")
+    if width < 1 or height < 1:
+        # Programs that do not know it write 0.
+        return None
+    return int(width), int(height)
 
 
 def _node(storage: Mapping[str, Any], key: str) -> Any:

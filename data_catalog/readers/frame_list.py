@@ -33,7 +33,8 @@ def load_frame_list(file: Path, key: str) -> dict[str, Any]:
         SourceError: no JSON, no such list, an empty one, a frame without file, or one listed twice.
     """
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        # Editors on Windows put a mark at the beginning.
+        content = json.loads(file.read_text(encoding="utf-8-sig"))
     except (RecursionError, ValueError) as error:
         raise SourceError(f"not readable as JSON: {error}", file=file) from error
     if not isinstance(content, dict) or not isinstance(content.get("frames"), list):

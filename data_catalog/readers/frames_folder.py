@@ -159,7 +159,7 @@ def read_intrinsics(
             ASSUMED_FIELD_OF_VIEW_DEG, width, height, pixel_aspect=pixel_aspect
         )
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(file.read_text(encoding="utf-8-sig"))
         if not isinstance(content, dict):
             raise TypeError(f"found {type(content).__name__}, not an object")
         _check_described(content, width, height, file)

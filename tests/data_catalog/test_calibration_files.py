@@ -186,6 +186,37 @@ class TestOpenCV:
         with pytest.raises(SourceError, match=problem):
             read_calibration(tmp_path / "a.yml", WIDTH, HEIGHT)
 
+    @pytest.mark.parametrize(
+        "told",
+        [
+            f"image_size: [{WIDTH}, {HEIGHT}]\n",
+            f"imageSize: [{WIDTH}, {HEIGHT}]\n",
+            f"imageWidth: {WIDTH}\nimageHeight: {HEIGHT}\n",
+        ],
+    )
+    def test_sizes_by_other_names(self, tmp_path, told) -> None:
+        """Of a file whose size is passed over, images of half the size would get the camera of the whole."""
+        file = opencv_file(tmp_path / "a.yml", [-0.2, 0.05, 0, 0])
+        expected = read_calibration(file, WIDTH // 2, HEIGHT // 2)
+        text = opencv_file(file, [-0.2, 0.05, 0, 0], sized=False).read_text()
+        file.write_text(f"\ufeff{text}{told}", encoding="utf-8")
+        assert read_calibration(file, WIDTH // 2, HEIGHT // 2) == expected
+
+    def test_half_a_size(self, tmp_path) -> None:
+        file = opencv_file(tmp_path / "a.yml", [-0.2, 0.05, 0, 0], sized=False)
+        file.write_text(f"{file.read_text()}image_width: {WIDTH}\n")
+        with pytest.raises(SourceError, match=r"field image_width, image_height: found .*expected 2 finite"):
+            read_calibration(file, WIDTH, HEIGHT)
+
+    def test_terms_that_stand_by_themselves(self, tmp_path) -> None:
+        """They were passed over: a pinhole, without a word."""
+        text = f"camera_matrix: {K.tolist()}\n"
+        (tmp_path / "a.yml").write_text(f"{text}k1: 0.0\np2: 0\n")
+        assert read_calibration(tmp_path / "a.yml", WIDTH, HEIGHT).is_pinhole
+        (tmp_path / "a.yml").write_text(f"{text}k1: -0.2\n")
+        with pytest.raises(SourceError, match=r"field distortion_coefficients: .*'k1' is not known here"):
+            read_calibration(tmp_path / "a.yml", WIDTH, HEIGHT)
+
     def test_terms_that_are_not_known(self, tmp_path) -> None:
         with pytest.raises(SourceError, match="thin-prism and tilt terms"):
             read_calibration(opencv_file(tmp_path / "a.yml", [0.1] * 12), WIDTH, HEIGHT)

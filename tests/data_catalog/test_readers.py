@@ -189,6 +189,11 @@ class TestFrames:
         with pytest.raises(SourceError, match=message):
             read(frames)
 
+    def test_intrinsics_with_the_mark_of_an_editor(self, frames) -> None:
+        told = {"fx": 70, "fy": 71, "cx": 41, "cy": 29}
+        (frames / "intrinsics.json").write_text(f"\ufeff{json.dumps(told)}", encoding="utf-8")
+        np.testing.assert_allclose(read(frames).K[0], [[70, 0, 41], [0, 71, 29], [0, 0, 1]])
+
     def test_a_pinhole_may_be_told_at_length(self, frames) -> None:
         told = {"fx": 70, "fy": 71, "cx": 41, "cy": 29, "k1": 0, "p2": 0.0, "model": "PINHOLE"}
         (frames / "intrinsics.json").write_text(json.dumps({**told, "width": 80, "height": 60}))
@@ -277,6 +282,11 @@ class TestPosedFolder:
         edit_poses(lambda content: content["frames"][1].update(file="rgb/a/0000.png"))
         with pytest.raises(SourceError, match=rf"belong to rgb/0000\.png as well; .* as {kind}/a/0000\."):
             read(posed_folder)
+
+    def test_poses_with_the_mark_of_an_editor(self, posed_folder) -> None:
+        before, file = read(posed_folder), posed_folder / "poses.json"
+        file.write_text(f"\ufeff{file.read_text()}", encoding="utf-8")
+        np.testing.assert_array_equal(read(posed_folder).world_from_camera, before.world_from_camera)
 
     @pytest.mark.parametrize("number", ["a", None, 1.5, [0], 1e300])
     def test_a_recording_that_is_no_number(self, posed_folder, edit_poses, number) -> None:
