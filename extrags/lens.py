@@ -25,6 +25,7 @@ __all__ = [
     "Lens",
     "Undistortion",
     "distortion_of_pinhole",
+    "resized_depth",
     "sample_depth",
     "size_for_focal",
 ]
@@ -383,3 +384,18 @@ def sample_depth(
     one_surface = (low > 0) & (high <= low * (1 + _FOLD_STEP))
     inverse = (weights / np.where(corners > 0, corners, 1)).sum(axis=0)
     return np.asarray(np.where(one_surface, 1 / np.where(one_surface, inverse, 1), nearest))
+
+
+def resized_depth(depth: Float[np.ndarray, "h w"], width: int, height: int) -> Float[np.ndarray, "h2 w2"]:
+    """A depth map at the pixel centres of an image of another size, as `sample_depth` gives it.
+
+    OpenCV's nearest pixel is the one at the upper left, up to half a new pixel away from the centre.
+
+    Args:
+        depth: 0 where unknown.
+        width: of the result, in pixels.
+        height: of the result, in pixels.
+    """
+    u = (np.arange(width) + 0.5) * depth.shape[1] / width
+    v = (np.arange(height) + 0.5) * depth.shape[0] / height
+    return sample_depth(depth, *np.meshgrid(u, v)).astype(depth.dtype)

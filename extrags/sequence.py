@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.frame_stacks import frames_of, stacked
-from extrags.lens import Undistortion
+from extrags.lens import Undistortion, resized_depth
 from extrags.radial_lens import VIRTUAL_FIELD_DEG, RadialLens
 from extrags.store.storable import Storable
 from extrags.thresholds import RELIABLE_DEPTH_ERROR, SATURATED
@@ -342,7 +342,7 @@ class EndoscopicSequence(Storable):
         """The same frames, downscaled to this width in pixels if they are wider; the aspect ratio is kept.
 
         Colours are means over the area of a pixel. A pixel is valid where all of its area is; its depth is
-        that of the nearest source pixel, since a mean over an edge belongs to neither side.
+        that at its centre, on one side of an edge, since a mean over it belongs to neither.
         """
         if self.width <= width:
             return self
@@ -365,6 +365,9 @@ class EndoscopicSequence(Storable):
         def resized(stack: np.ndarray, interpolation: int) -> np.ndarray:
             return stacked((cv2.resize(i, size, interpolation=interpolation) for i in stack), len(stack))
 
+        def depths(stack: np.ndarray | None) -> np.ndarray | None:
+            return None if stack is None else stacked((resized_depth(d, *size) for d in stack), len(stack))
+
         def where_share(stack: np.ndarray, above: float) -> np.ndarray:
             shares = (cv2.resize(i.astype(np.float32), size, interpolation=cv2.INTER_AREA) for i in stack)
             return stacked((share > above for share in shares), len(stack))
@@ -372,19 +375,18 @@ class EndoscopicSequence(Storable):
         K = self.K.copy()
         K[:, 0] *= size[0] / self.width
         K[:, 1] *= size[1] / self.height
-        depth, observed, specular = self.depth_mm, self.observed, self.specular
-        withheld = self.withheld_depth_mm
+        observed, specular, error = self.observed, self.specular, self.depth_error
         return replace(
             self,
             rgb=resized(self.rgb, cv2.INTER_AREA),
             K=K,
             mask=where_share(self.mask, ALL_OF_AREA),
-            depth_mm=None if depth is None else resized(depth, cv2.INTER_NEAREST),
-            withheld_depth_mm=None if withheld is None else resized(withheld, cv2.INTER_NEAREST),
+            depth_mm=depths(self.depth_mm),
+            withheld_depth_mm=depths(self.withheld_depth_mm),
             observed=None if observed is None else where_share(observed, ALL_OF_AREA),
             specular=None if specular is None else where_share(specular, 0.0),
             focal_std_px=None if self.focal_std_px is None else self.focal_std_px * size[0] / self.width,
-            depth_error=None if self.depth_error is None else resized(self.depth_error, cv2.INTER_NEAREST),
+            depth_error=None if error is None else resized(error, cv2.INTER_NEAREST_EXACT),
         )
 
     def training_part(self) -> EndoscopicSequence:

@@ -8,6 +8,7 @@ import pytest
 import zarr
 from zarr.storage import ZipStore
 
+from extrags.cameras import Cameras, pixel_rays
 from extrags.errors import ShapeError
 from extrags.sequence import EndoscopicSequence, Split, saturated_mask
 from extrags.store import content_digest
@@ -51,9 +52,42 @@ class TestAtMostWidth:
         np.testing.assert_array_equal(small.specular, pairs(sequence.specular).any(axis=(2, 4)))
         assert small.depth_mm is not None
         assert sequence.depth_mm is not None
-        assert np.isin(small.depth_mm, sequence.depth_mm).all()
         np.testing.assert_allclose(small.K[:, :2], sequence.K[:, :2] / 2)
         assert (small.split, small.world_from_camera is sequence.world_from_camera) == (sequence.split, True)
+
+    @pytest.mark.parametrize("width", [80, 40, 53])
+    def test_depth_is_that_at_the_centre_of_a_pixel(self, width: int) -> None:
+        """Exactly, on a plane that leans away."""
+
+        def plane(cameras: Cameras) -> np.ndarray:
+            x, y, _ = np.moveaxis(pixel_rays(cameras)[0], -1, 0)
+            return (10 / (1 + 0.5 * x + 0.3 * y)).astype(np.float32)[None]
+
+        K = np.array([[[160.0, 0, 80], [0, 160.0, 60], [0, 0, 1]]])
+        poses = np.eye(4)[None]
+        depth_mm = plane(Cameras(K, poses, 160, 120))
+        sequence = EndoscopicSequence(
+            "plane",
+            np.zeros((1, 120, 160, 3), np.uint8),
+            K,
+            np.ones((1, 120, 160), bool),
+            Split("all", np.arange(1), np.arange(0)),
+            poses,
+            depth_mm,
+            withheld_depth_mm=depth_mm,
+        )
+        small = sequence.at_most_width(width)
+        np.testing.assert_allclose(small.depth_mm, plane(small.cameras), rtol=1e-5)
+        np.testing.assert_array_equal(small.depth_mm, small.withheld_depth_mm)
+
+    def test_depth_is_of_one_side_of_an_edge(self) -> None:
+        sequence = small_sequence()
+        depth_mm = np.where(np.arange(8) < 3, 10.0, 30.0).astype(np.float32) * np.ones((4, 6, 1), np.float32)
+        depth_mm[0, :2] = 0
+        small = replace(sequence, depth_mm=depth_mm, withheld_depth_mm=None).at_most_width(4)
+        assert small.depth_mm is not None
+        assert set(np.unique(small.depth_mm)) == {0.0, 10.0, 30.0}
+        np.testing.assert_array_equal(small.depth_mm[1], [[10, 10, 30, 30]] * 3)
 
     def test_narrow_ones_stay(self) -> None:
         sequence = small_sequence()
