@@ -76,6 +76,14 @@ def add_arguments(parser: Parser) -> None:
         help="the virtual views of trajectories that the explorer chooses are practised on as well, besides "
         "the clips off the path (those of --hidden-depth always are, and alone)",
     )
+    parser.add_argument(
+        "--exact-share",
+        type=float,
+        default=0.0,
+        metavar="X",
+        help="how often, beyond chance, a reconstruction is given exact poses and depth and a light model "
+        "(from 0 to 1; default: %(default)s)",
+    )
     parser.add_argument("--scenes-only", action="store_true", help="make the scenes, and train nothing")
     parser.add_argument(
         "--scenes",
@@ -263,6 +271,8 @@ def checked(given: argparse.Namespace, scenes: int, validation_scenes: int, *, p
         value = getattr(given, name)
         if value is not None and value < least:
             raise ConfigError(f"--{name.replace('_', '-')} {value}: expected {least} or more")
+    if not 0 <= given.exact_share <= 1:
+        raise ConfigError(f"--exact-share {given.exact_share}: expected a number from 0 to 1")
     if given.out is None and not given.scenes_only:
         raise ConfigError("--out: where do the weights go? (--scenes-only makes scenes alone)")
     if given.real_textures:
@@ -302,6 +312,8 @@ def _command(given: argparse.Namespace) -> str:
         parts.append(f"--first-scene {given.first_scene}")
     if given.size_factor != 1:
         parts.append(f"--size-factor {given.size_factor}")
+    if given.exact_share:
+        parts.append(f"--exact-share {given.exact_share}")
     parts += [
         f"--{name.replace('_', '-')}"
         for name in (

@@ -36,7 +36,10 @@ def hidden_depth_settings(given: argparse.Namespace) -> HiddenDepthConfig:
     """
     from extrags.restoration.hidden_depth.training import HiddenDepthConfig
 
-    others = ("generative", "deterministic", "refiner", "explored", "without_perceptual", "perceptual_weight")
+    others = (
+        *("generative", "deterministic", "refiner", "explored", "exact_share"),
+        *("without_perceptual", "perceptual_weight"),
+    )
     for name in others:
         if getattr(given, name) not in (None, False):
             raise ConfigError(

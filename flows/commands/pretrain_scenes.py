@@ -32,6 +32,7 @@ class SceneSource:
         size_factor: how many times wider and higher pictures of cavities are.
         real_textures: whether some cavities wear tissue of real frames.
         explored: whether the virtual views of the explorer's trajectories are among those to restore.
+        exact_share: how often the reconstruction is given exact poses and depth, beyond chance.
     """
 
     family: str
@@ -39,6 +40,7 @@ class SceneSource:
     size_factor: int = 1
     real_textures: bool = False
     explored: bool = False
+    exact_share: float = 0.0
 
     @property
     def file_name(self) -> str:
@@ -76,6 +78,8 @@ class SceneSource:
         if self.explored:
             stages = {name: getattr(quick, name) for name in ("surface", "freespace", "explore")}
             parts |= {name: stage.model_dump(mode="json") for name, stage in stages.items()}
+        if self.exact_share:
+            parts["exact_share"] = self.exact_share
         return json.dumps(parts, sort_keys=True)
 
     @property
@@ -107,7 +111,14 @@ def scene_sources(given: argparse.Namespace, count: int) -> list[SceneSource]:
     for number in range(count):
         family = given.kinds[number % len(given.kinds)]
         sources.append(
-            SceneSource(family, made[family], given.size_factor, given.real_textures, given.explored)
+            SceneSource(
+                family,
+                made[family],
+                given.size_factor,
+                given.real_textures,
+                given.explored,
+                given.exact_share,
+            )
         )
         made[family] += 1
     return sources
@@ -140,7 +151,13 @@ def make_scene(source: SceneSource, file: Path) -> None:
     from extrags.restoration.training_data.pretraining_scenes import make_pretraining_scene
 
     quick = profile_config("quick")
-    scene = make_pretraining_scene(source.recording(), quick, source.seed, explored=source.explored)
+    scene = make_pretraining_scene(
+        source.recording(),
+        quick,
+        source.seed,
+        explored=source.explored,
+        exact_share=source.exact_share,
+    )
     scene.save(file, origin=source.origin)
 
 

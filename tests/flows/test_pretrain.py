@@ -54,9 +54,18 @@ def small_scene(seed: int) -> PretrainingScene:
     )
 
 
-def sources(kinds: tuple[str, ...] = ("phantom", "cavities"), count: int = 3) -> list[SceneSource]:
+def sources(
+    kinds: tuple[str, ...] = ("phantom", "cavities"), count: int = 3, exact_share: float = 0.0
+) -> list[SceneSource]:
     return scene_sources(
-        Namespace(kinds=list(kinds), first_scene=0, size_factor=1, real_textures=False, explored=False),
+        Namespace(
+            kinds=list(kinds),
+            first_scene=0,
+            size_factor=1,
+            real_textures=False,
+            explored=False,
+            exact_share=exact_share,
+        ),
         count,
     )
 
@@ -98,6 +107,7 @@ def test_families_take_turns_and_do_not_share_numbers() -> None:
     assert len({source.origin for source in found}) == 6
     assert SceneSource("cavities", 0, size_factor=2).origin != SceneSource("cavities", 0).origin
     assert SceneSource("phantom", 0, explored=True).origin != SceneSource("phantom", 0).origin
+    assert sources(exact_share=0.5)[0].origin != SceneSource("phantom", 0).origin
 
 
 def test_scenes_alone_train_nothing(scenes: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -251,11 +261,18 @@ class TestRefiner:
             assert option in capsys.readouterr().err
         assert main([*given, *out, "--first-scene", "-1"]) == 2
         assert "--first-scene -1" in capsys.readouterr().err
+        assert main([*given, *out, "--exact-share", "1.5"]) == 2
+        assert "--exact-share 1.5" in capsys.readouterr().err
 
 
 def test_scenes_can_begin_at_a_number() -> None:
     given = Namespace(
-        kinds=["phantom", "cavities"], first_scene=7, size_factor=1, real_textures=False, explored=True
+        kinds=["phantom", "cavities"],
+        first_scene=7,
+        size_factor=1,
+        real_textures=False,
+        explored=True,
+        exact_share=0.5,
     )
     assert [source.index for source in scene_sources(given, 4)] == [7, 7, 8, 8]
 

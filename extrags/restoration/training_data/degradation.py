@@ -58,8 +58,14 @@ class Degradation:
     missing_share: float
 
     @classmethod
-    def random(cls, generator: np.random.Generator) -> Degradation:
-        """A degradation, drawn; its flaws fall independently."""
+    def random(cls, generator: np.random.Generator, *, exact_share: float = 0.0) -> Degradation:
+        """A degradation, drawn; its flaws fall independently.
+
+        Args:
+            generator: draws it.
+            exact_share: how often, beyond chance, poses and depth are exact and light is modelled; steps and
+                number of Gaussians are drawn all the same.
+        """
         share = float(generator.uniform(*GAUSSIANS))
         iterations = int(np.exp(generator.uniform(*np.log(ITERATIONS))))
         light = bool(generator.random() < _WITH_LIGHT)
@@ -68,7 +74,7 @@ class Degradation:
         names = list(_FLAWS)
         flaw = names[int(generator.choice(len(names), p=list(_FLAWS.values())))]
         largest = {"exact": 0.0, "noisy": _NOISE, "waves": _WAVES, "missing": _NOISE}[flaw]
-        return cls(
+        degradation = cls(
             iterations,
             share,
             light,
@@ -78,6 +84,10 @@ class Degradation:
             float(generator.uniform(0.2, 1.0) * largest),
             float(generator.uniform(0.3, 0.8)) if flaw == "missing" else 0.0,
         )
+        # Without a share nothing is drawn: scenes that were made before stay what they are.
+        if exact_share > 0 and generator.random() < exact_share:
+            return cls(iterations, share, True, 0.0, 0.0, "exact", 0.0, 0.0)
+        return degradation
 
     def settings(self, coarse: CoarseConfig, seed: int) -> CoarseConfig:
         """Settings of the reconstruction: steps, number of Gaussians and light model of this degradation."""

@@ -207,7 +207,12 @@ class PretrainingScene:
 
 
 def make_pretraining_scene(
-    recording: PretrainingRecording, config: PipelineConfig, seed: int, *, explored: bool = False
+    recording: PretrainingRecording,
+    config: PipelineConfig,
+    seed: int,
+    *,
+    explored: bool = False,
+    exact_share: float = 0.0,
 ) -> PretrainingScene:
     """Spoil and reconstruct a recording, and pair the views to restore with the truth.
 
@@ -217,12 +222,13 @@ def make_pretraining_scene(
         seed: of the draws and of the reconstruction.
         explored: whether there are also the virtual views of the trajectories that the explorer chooses,
             some of each; each trajectory is a clip.
+        exact_share: as `Degradation.random` takes it.
 
     Raises:
         DivergedError: when the reconstruction does not stay finite.
     """
     generator = np.random.default_rng([seed, 5])
-    degradation = Degradation.random(generator)
+    degradation = Degradation.random(generator, exact_share=exact_share)
     sequence = degradation.applied(recording.sequence, generator)
     settings = degradation.settings(config.coarse, seed)
     scene = reconstruct(sequence.training_part(), settings, stage="pretraining-scene").scene

@@ -40,6 +40,17 @@ def test_draws_cover_what_is_promised() -> None:
     assert drawn[3] == Degradation.random(np.random.default_rng(3))
 
 
+def test_a_share_is_exact_beyond_chance() -> None:
+    drawn = [Degradation.random(np.random.default_rng(seed), exact_share=0.5) for seed in range(300)]
+    exact = [one.depth == "exact" and one.pose_mm == 0 and one.light for one in drawn]
+    by_chance = 0.3 * 0.5 * 0.75
+    assert np.mean(exact) == pytest.approx(0.5 + 0.5 * by_chance, abs=0.09)
+    for seed, (one, is_exact) in enumerate(zip(drawn, exact, strict=True)):
+        plain = Degradation.random(np.random.default_rng(seed))
+        assert (one.iterations, one.gaussians_share) == (plain.iterations, plain.gaussians_share)
+        assert is_exact or one == plain
+
+
 def test_without_flaws_nothing_changes(tube: Tube) -> None:
     same = spoilt(tube)
     assert same.depth_mm is tube.sequence.depth_mm
