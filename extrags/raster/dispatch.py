@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from extrags.errors import ConfigError, MissingDependencyError
@@ -63,6 +63,7 @@ def rasterize(
     backend: Backend = "auto",
     median_depth: bool = False,
     visibility: bool = False,
+    visibility_mask: Bool[Tensor, "c h w"] | None = None,
     query_points: Float[Tensor, "q 3"] | None = None,
     absgrad: bool = False,
     light: CameraLight | None = None,
@@ -94,6 +95,7 @@ def rasterize(
             takes gsplat for CUDA tensors, native for float32 CPU tensors, the reference for other dtypes.
         median_depth: fill `Rendering.median_depth`.
         visibility: fill `Rendering.visibility_max` and `visibility_sum`.
+        visibility_mask: the pixels that count for these, for instance those that show tissue; None is all.
         query_points: world points at which `Rendering.transmittance` is wanted.
         absgrad: fill `means2d.absgrad` on backward.
         light: near-field light of the cameras; `sh` or `colors` are then albedo. Differentiable.
@@ -113,8 +115,9 @@ def rasterize(
     al., "EWA volume splatting", 2001, with the Jacobian of Kannala and Brandt's model, PAMI 2006.
     """
     packed = None if light is None else light.packed()
+    counted = None if visibility_mask is None else visibility_mask.to(means.device, means.dtype)
     inputs = RasterInputs(
-        means, quats, scales, opacities, sh, colors, viewmats, Ks, background, query_points, packed
+        means, quats, scales, opacities, sh, colors, viewmats, Ks, background, query_points, packed, counted
     )
     inputs, degree = checked_inputs(inputs, width, height, near, sh_degree)
     options = RasterOptions(width, height, degree, near, median_depth, visibility, absgrad, lens)

@@ -187,6 +187,7 @@ class _Call:
 
     options: RasterOptions
     query_points: Tensor | None
+    visibility_mask: Tensor | None
     Ks: Tensor
     means2d: Tensor
     radius_px: Tensor
@@ -199,10 +200,11 @@ class _Call:
     @classmethod
     def prepared(cls, inputs: RasterInputs, options: RasterOptions) -> _Call:
         c, n = len(inputs.viewmats), len(inputs.means)
-        points = inputs.query_points
+        points, counted = inputs.query_points, inputs.visibility_mask
         return cls(
             options=options,
             query_points=None if points is None else points.detach().contiguous(),
+            visibility_mask=None if counted is None else counted.detach().contiguous(),
             Ks=inputs.Ks.detach().contiguous(),
             means2d=torch.empty(c, n, 2),
             radius_px=torch.empty(c, n),
@@ -289,6 +291,7 @@ class _Rasterize(torch.autograd.Function):
                 median_depth=_of_camera(call.median_depth, index),
                 visibility_max=_of_camera(call.visibility_max, index),
                 visibility_sum=_of_camera(call.visibility_sum, index),
+                visibility_mask=_of_camera(call.visibility_mask, index),
             )
             frame = rendered_frame(gaussians.of_camera(index), camera, images, degree=options.sh_degree)
             if call.query_points is not None and call.transmittance is not None:

@@ -125,6 +125,9 @@ def _render_view(inputs: RasterInputs, options: RasterOptions, camera: int) -> d
                 if options.visibility and len(touching):
                     ids = seen.ids[touching]
                     part = weights.detach()
+                    if inputs.visibility_mask is not None:
+                        column, row = chunk.detach().floor().long().unbind(-1)
+                        part = part * inputs.visibility_mask[camera, row, column][:, None]
                     visibility_sum.index_add_(0, ids, part.sum(0))
                     best = torch.maximum(visibility_max[ids], part.amax(0))
                     visibility_max[ids] = best

@@ -50,8 +50,9 @@ class Rendering:
             0 where it is culled. [C, N].
         median_depth: z-depth of the Gaussian at which the transmittance falls to one half or below;
             0 where it never does. Not differentiable. [C, H, W].
-        visibility_max: largest blending weight (transmittance times alpha) over the pixels, [C, N].
-        visibility_sum: sum of the blending weights over the pixels, [C, N].
+        visibility_max: largest blending weight (transmittance times alpha) over the pixels, or over those of
+            a `visibility_mask`, [C, N].
+        visibility_sum: sum of the blending weights over the same pixels, [C, N].
         transmittance: at the query points, [C, Q]: what is left of the light at the centre of the pixel
             the point projects to, in front of its depth. NaN where the point lies outside the image or
             not beyond the near plane. Not differentiable.
@@ -88,6 +89,7 @@ class RasterInputs:
     background: Float[Tensor, "c 3"] | Float[Tensor, "3"] | None
     query_points: Float[Tensor, "q 3"] | None
     light: Float[Tensor, "c 12"] | None = None
+    visibility_mask: Float[Tensor, "c h w"] | None = None
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,7 @@ def checked_inputs(
         "Ks": ((c, 3, 3),),
         "background": ((c, 3),),
         "light": ((c, 12),),
+        "visibility_mask": ((c, height, width),),
     }
     for name, shapes in expected.items():
         value = getattr(inputs, name)

@@ -94,8 +94,12 @@ def _depth_and_seen(
 ) -> tuple[Float[Tensor, "r h w"], Bool[Tensor, "r n"]]:
     depths, seen = [], []
     for frame in frames:
+        mask = torch.from_numpy(sequence.mask[frame])
         with torch.no_grad():
-            rendering = scene.render(sequence.cameras[int(frame)], visibility=True)
+            # What lies in the dark corners of a round picture was not seen by it.
+            rendering = scene.render(
+                sequence.cameras[int(frame)], visibility=True, visibility_mask=mask[None]
+            )
         seen.append(visibility_of(rendering)[0] > SEEN_WEIGHT)
         rendered = torch.where(rendering.alpha[0] > SOLID_ALPHA, rendering.depth[0], torch.zeros(()))
         depth = rendered
@@ -103,7 +107,6 @@ def _depth_and_seen(
         if reliable is not None:
             known = torch.from_numpy(reliable)
             depth = torch.where(known > 0, known, rendered)
-        mask = torch.from_numpy(sequence.mask[frame])
         depths.append(torch.where(mask, depth, torch.zeros(())))
     return torch.stack(depths), torch.stack(seen)
 

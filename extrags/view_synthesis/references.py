@@ -18,6 +18,8 @@ from extrags.scene import Scene
 
 __all__ = ["SEEN_WEIGHT", "LightTransfer", "ReferenceViews", "visibility_of"]
 
+TRUST = 3
+"""Channel of `ReferenceViews.packed` that holds the trust."""
 SEEN_WEIGHT = 0.02
 """A Gaussian counts as seen in a view when its largest blending weight there exceeds this."""
 
@@ -86,6 +88,11 @@ class ReferenceViews:
     def __len__(self) -> int:
         return len(self.frames)
 
+    @property
+    def valid(self) -> Bool[Tensor, "r h w"]:
+        """Where the views show tissue: what is trusted at all."""
+        return self.packed[:, TRUST] > 0
+
     @cached_property
     def viewmats(self) -> Float[Tensor, "r 4 4"]:
         """Camera from world."""
@@ -122,7 +129,9 @@ class ReferenceViews:
         seen = []
         for view in range(len(self)):
             with torch.no_grad():
-                rendering = scene.render(self.cameras[view], visibility=True)
+                rendering = scene.render(
+                    self.cameras[view], visibility=True, visibility_mask=self.valid[[view]]
+                )
             seen.append(visibility_of(rendering) > SEEN_WEIGHT)
         return replace(self, seen=torch.cat(seen))
 

@@ -111,6 +111,7 @@ struct CameraSettings {
 struct ImageArrays {
   Out rgb, alpha, depth, means2d, radius;
   std::optional<Out> median_depth, visibility_max, visibility_sum;
+  std::optional<In> visibility_mask;
 
   void check(size_t pixels, size_t n) const {
     expect(rgb.size() == 3 * pixels, "rgb");
@@ -119,11 +120,13 @@ struct ImageArrays {
     expect(means2d.size() == 2 * n && radius.size() == n, "means2d or radius");
     expect(visibility_max.has_value() == visibility_sum.has_value(), "visibility");
     expect(!visibility_max || (visibility_max->size() == n && visibility_sum->size() == n), "visibility");
+    expect(!visibility_mask || visibility_mask->size() == pixels, "visibility_mask");
   }
 
   Images pointers() const {
     return Images{rgb.data(), alpha.data(), depth.data(), data_or_null(median_depth), means2d.data(),
-                  radius.data(), data_or_null(visibility_max), data_or_null(visibility_sum)};
+                  radius.data(), data_or_null(visibility_max), data_or_null(visibility_sum),
+                  data_or_null(visibility_mask)};
   }
 };
 

@@ -96,6 +96,10 @@ static void composite_tile(View* view, const Images* out, int tile, const TileFr
       // Lanes outside the image are finished from the start.
       const Mask inside = gt(Vec(static_cast<float>(view->width)), px) & gt(Vec(static_cast<float>(view->height)), py);
       Vec threshold = select(inside, Vec(kLog2AlphaMin), finished);
+      Vec counted(1.f);
+      if constexpr (kVisibility) {
+        if (out->visibility_mask != nullptr) counted = get_block(out->visibility_mask, view, x0, y0);
+      }
       uint32_t kept = 0;
       for (uint32_t k = 0; k < count; ++k) {
         const uint32_t local = entries[k];
@@ -129,9 +133,10 @@ static void composite_tile(View* view, const Images* out, int tile, const TileFr
         }
         if constexpr (kVisibility) {
           float* of_local = visibility + 2 * static_cast<size_t>(local);
-          const float best = largest(weight);
+          const Vec shown = weight * counted;
+          const float best = largest(shown);
           of_local[0] = best > of_local[0] ? best : of_local[0];
-          of_local[1] += sum(weight);
+          of_local[1] += sum(shown);
         }
         transmittance = select(hit, behind, transmittance);
         hits[kept] = static_cast<uint16_t>(to_bits(hit));

@@ -136,6 +136,7 @@ struct Images {
   float* radius;        // [n]
   float* visibility_max;  // [n] or null
   float* visibility_sum;  // [n] or null
+  const float* visibility_mask;  // [h, w] of 0 and 1, or null: the pixels that count for visibility
 };
 
 struct ImageGradients {

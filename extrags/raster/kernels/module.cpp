@@ -371,12 +371,14 @@ NB_MODULE(_native, m) {
            nb::arg("near"), nb::arg("background").none() = nb::none(), nb::arg("light").none() = nb::none(),
            nb::arg("lens").none() = nb::none());
   nb::class_<ImageArrays>(m, "Images", "What a forward pass fills.")
-      .def(nb::init<Out, Out, Out, Out, Out, std::optional<Out>, std::optional<Out>, std::optional<Out>>(),
+      .def(nb::init<Out, Out, Out, Out, Out, std::optional<Out>, std::optional<Out>, std::optional<Out>,
+                    std::optional<In>>(),
            nb::kw_only(), nb::arg("rgb").noconvert(), nb::arg("alpha").noconvert(),
            nb::arg("depth").noconvert(), nb::arg("means2d").noconvert(), nb::arg("radius").noconvert(),
            nb::arg("median_depth").none().noconvert() = nb::none(),
            nb::arg("visibility_max").none().noconvert() = nb::none(),
-           nb::arg("visibility_sum").none().noconvert() = nb::none());
+           nb::arg("visibility_sum").none().noconvert() = nb::none(),
+           nb::arg("visibility_mask").none().noconvert() = nb::none());
   nb::class_<ImageGradientArrays>(m, "ImageGradients",
                                   "Of the loss; that of the depth needs the forward's depth image too.")
       .def(nb::init<std::optional<In>, std::optional<In>, std::optional<In>, std::optional<In>>(),

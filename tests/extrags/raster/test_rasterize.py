@@ -152,6 +152,36 @@ def test_equals_renders_of_gsplat(case: str, backend: str, shared_data: Path) ->
     assert float((image - data["out_img"]).abs().max()) < 1e-5
 
 
+@pytest.mark.parametrize(("backend", "dtype"), [("native", torch.float32), ("reference", torch.float64)])
+def test_visibility_counts_the_pixels_of_a_mask_alone(backend: str, dtype: torch.dtype) -> None:
+    scene = tube(700, 67, 45, cameras=2).to(dtype)
+    mask = torch.rand(2, 45, 67, generator=torch.Generator().manual_seed(3)) > 0.4
+    mask[1, :, 30:] = False
+    whole = scene.render(backend, visibility=True)
+    parts = [scene.render(backend, visibility=True, visibility_mask=part) for part in (mask, ~mask)]
+    for part in parts:
+        assert torch.equal(part.rgb, whole.rgb)
+    assert whole.visibility_max is not None
+    assert whole.visibility_sum is not None
+    total, largest = parts[0].visibility_sum + parts[1].visibility_sum, parts[0].visibility_max  # type: ignore[operator]
+    # The sums of two halves are those of the whole but for the order they are added in.
+    rounding = 67 * 45 * torch.finfo(dtype).eps
+    torch.testing.assert_close(total, whole.visibility_sum, rtol=rounding, atol=rounding)
+    assert torch.equal(torch.maximum(largest, parts[1].visibility_max), whole.visibility_max)  # type: ignore[arg-type]
+    assert (largest < whole.visibility_max).any()  # type: ignore[operator]
+    everything = scene.render(backend, visibility=True, visibility_mask=mask | ~mask)
+    assert torch.equal(everything.visibility_sum, whole.visibility_sum)  # type: ignore[arg-type]
+    reference = tube(700, 67, 45, cameras=2).to(torch.float64)
+    truth = reference.render("reference", visibility=True, visibility_mask=mask)
+    torch.testing.assert_close(largest, truth.visibility_max.to(dtype), rtol=0, atol=2e-5)  # type: ignore[union-attr]
+
+
+def test_a_mask_of_another_size_is_refused() -> None:
+    scene = tube(20, 16, 12)
+    with pytest.raises(ShapeError, match="visibility_mask"):
+        scene.render("native", visibility=True, visibility_mask=torch.ones(1, 16, 12, dtype=torch.bool))
+
+
 @pytest.mark.parametrize("backend", ["native", "reference"])
 @pytest.mark.parametrize("n", [0, 1, 15, 16, 17])
 def test_any_number_of_gaussians(n: int, backend: str) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -47,6 +49,24 @@ class TestObservation:
     def test_no_real_view_is_an_error(self, tube: Tube) -> None:
         with pytest.raises(CaptureError):
             gather_references(tube.scene, tube.sequence, np.zeros(0, np.int64))
+
+    def test_dark_corners_have_seen_nothing(self, tube: Tube) -> None:
+        frames = tube.sequence.train
+        mask = tube.sequence.mask.copy()
+        mask[..., WIDTH // 2 :] = False
+        masked = replace(tube.sequence, mask=mask)
+        whole = gather_references(tube.scene, tube.sequence, frames)
+        half = gather_references(tube.scene, masked, frames)
+        own = tube.scene.render(tube.sequence.cameras[frames]).means2d.numpy()
+        for view in range(len(frames)):
+            seen, before = half.seen[view].numpy(), whole.seen[view].numpy()
+            assert not (seen & ~before).any()
+            # Gaussians reach a few pixels from their centres.
+            inside, outside = own[view, :, 0] < WIDTH / 2 - 12, own[view, :, 0] > WIDTH / 2 + 12
+            assert np.array_equal(seen[inside], before[inside])
+            assert (before & outside).any()
+            assert not seen[outside].any()
+        assert torch.equal(half.of_scene(tube.scene).seen, half.seen)
 
     def test_exposures_must_belong_to_the_frames(self, tube: Tube) -> None:
         with pytest.raises(ShapeError, match="exposures"):
