@@ -36,14 +36,17 @@ class RealViews:
     def images(
         self, index: Int[np.ndarray, "n"], clip: Clip, chosen: slice = slice(None)
     ) -> Float[np.ndarray, "n h w 3"]:
-        """Chosen frames in [0, 1], at the mean exposure of the views that they are to be continued into.
+        """Chosen frames in [0, 1], of the size and at the mean exposure of the views they are continued into.
+
+        Views are restored at the working size (`enhance.max_width`), which the frames may exceed; their
+        colours are then means over the area of a pixel.
 
         Args:
             index: of the frames.
             clip: whose views these are.
             chosen: which of its views.
         """
-        frames = np.asarray(self.rgb[index], dtype=np.float32) / np.float32(255)
+        frames = _resized(self.rgb[index], clip.cameras.width, clip.cameras.height) / np.float32(255)
         if clip.exposure is None:
             return frames
         transfer, gain = clip.transfer, float(np.mean(clip.exposure[chosen]))
@@ -86,3 +89,15 @@ class RealViews:
         """Read what `save` wrote."""
         group = open_group(path)
         return cls(read_array(group, "rgb"), read_array(group, "world_from_camera"))
+
+
+def _resized(frames: UInt8[np.ndarray, "n h w 3"], width: int, height: int) -> Float[np.ndarray, "n h2 w2 3"]:
+    images = frames.astype(np.float32)
+    if images.shape[1:3] == (height, width):
+        return images
+    import cv2
+
+    smaller = np.empty((len(images), height, width, 3), np.float32)
+    for position, image in enumerate(images):
+        smaller[position] = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    return smaller

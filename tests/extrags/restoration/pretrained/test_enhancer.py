@@ -26,6 +26,8 @@ from extrags.restoration.pretrained.inputs import clip_inputs, ranked_references
 from extrags.restoration.pretrained.model import find_model, require_diffusers
 from extrags.restoration.pretrained.real_views import RealViews
 from extrags.restoration.protocol import Clip
+from extrags.restoration.trajectories import at_working_size
+from extrags.view_synthesis.gather import gather_references
 from tests.extrags.lit_tube import HEIGHT, WIDTH, Tube, tube_cameras
 from tests.extrags.restoration.pretrained.tiny_pipelines import ADAPTERS
 
@@ -55,7 +57,20 @@ def prepared(tube: Tube, config: EnhanceConfig) -> PretrainedEnhancer:
     return made
 
 
+def smaller_clip(tube: Tube, width: int) -> Clip:
+    """Two views at a working size below that of the frames."""
+    sequence, trajectories = at_working_size(
+        tube.sequence, [tube_cameras(2, offset_mm=4.0)], EnhanceConfig(max_width=width)
+    )
+    references = gather_references(tube.scene, sequence, sequence.train)
+    return render_clips(tube.scene, references, trajectories, count=4)[0]
+
+
 class TestRestoration:
+    def test_views_smaller_than_the_frames(self, tube: Tube, saved: Callable[[str], Path]) -> None:
+        made = prepared(tube, settings("sd-inpaint", saved("StableDiffusionInpaintPipeline")))
+        assert made.restore(smaller_clip(tube, WIDTH // 2)).rgb.shape == (2, HEIGHT // 2, WIDTH // 2, 3)
+
     @pytest.mark.parametrize("backend", ["wan-vace", "ltx"])
     def test_masked_pipelines_leave_known_pixels_as_they_were(
         self, backend: str, tube: Tube, clip: Clip, saved: Callable[[str], Path]
@@ -154,6 +169,16 @@ class TestInputs:
             expected = light.apply_response(float(exposure[chosen].mean()) * signal).clamp(0, 1)
             found = views.images(np.array([1, 3]), darker, chosen)
             np.testing.assert_allclose(found, expected.numpy(), atol=1e-6)
+
+    def test_real_views_have_the_size_of_the_clip(self, tube: Tube) -> None:
+        """Virtual views are at most `enhance.max_width` wide, frames need not be."""
+        views = RealViews.gather(tube.scene, tube.sequence)
+        small = tube.sequence.at_most_width(WIDTH // 2)
+        index = np.array([1, 3])
+        found = views.images(index, smaller_clip(tube, WIDTH // 2))
+        assert found.shape == (2, HEIGHT // 2, WIDTH // 2, 3)
+        np.testing.assert_allclose(found, small.rgb[small.train[index]] / 255, atol=2 / 255)
+        assert views.images(index[:0], smaller_clip(tube, WIDTH // 2)).shape == (0, *found.shape[1:])
 
 
 class TestSettings:
