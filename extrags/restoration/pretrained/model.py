@@ -154,6 +154,12 @@ def _from_hub(model: str, rule: PipelineRule, settings: PretrainedConfig) -> Pat
             return Path(hub.snapshot_download(model, revision=settings.revision, local_files_only=True))
         pipeline = importlib.import_module("diffusers").DiffusionPipeline
         return Path(pipeline.download(model, revision=settings.revision, use_safetensors=True))
+    except errors.HFValidationError as error:
+        # `../models` has the form of an id, but is none.
+        raise WeightsError(
+            f"enhance.pretrained.model={model}: there is no such folder, and it is no hub id. "
+            f"{_how_to_get(rule.usual_model, rule)}"
+        ) from error
     except (errors.HfHubHTTPError, errors.LocalEntryNotFoundError, OSError) as error:
         where = "in the local Hugging Face cache" if settings.local_files_only else "on the hub"
         raise WeightsError(

@@ -237,6 +237,11 @@ class TestMissing:
         with pytest.raises(WeightsError, match=r"model=/no/such/folder: there is no such folder"):
             find_model(ADAPTERS["ltx"].rule, PretrainedConfig(model="/no/such/folder"))
 
+    @pytest.mark.parametrize("model", ["../wan", "./wan", "models/wan--old"])
+    def test_relative_folder_that_is_not_there(self, model: str, diffusers: ModuleType) -> None:
+        with pytest.raises(WeightsError, match=r"no such folder, and it is no hub id.*hf download Wan"):
+            find_model(ADAPTERS["wan-vace"].rule, PretrainedConfig(model=model))
+
     def test_folder_that_holds_no_pipeline(self, diffusers: ModuleType, tmp_path: Path) -> None:
         with pytest.raises(WeightsError, match=r"holds no model_index\.json"):
             find_model(ADAPTERS["ltx"].rule, PretrainedConfig(model=str(tmp_path)))
