@@ -121,6 +121,23 @@ class Adapter(ABC):
         """Share of the noise that known pixels start from."""
         return self.settings.strength or self.rule.strength
 
+    @property
+    def steps_run(self) -> int:
+        """Denoising steps that are left of a full run at this strength."""
+        return int(self.steps * self.strength)
+
+    def check_steps(self) -> None:
+        """Look at steps and strength; needs no pipeline.
+
+        Raises:
+            ConfigError: when so few steps at this strength leave none to run.
+        """
+        if self.steps_run < 1:
+            raise ConfigError(
+                f"{self.steps} steps at strength {self.strength:g} leave no step to run; "
+                "raise enhance.pretrained.steps or strength"
+            )
+
     def restore(self, window: Window, seed: int) -> Float[np.ndarray, "t h w 3"]:
         """Restore a window; the same window and seed give the same images on the same machine.
 
@@ -129,14 +146,10 @@ class Adapter(ABC):
             seed: of all noise.
 
         Raises:
-            ConfigError: when so few steps at this strength leave none to run.
+            ConfigError: as `check_steps`.
             NonFiniteError: when the pipeline returns NaN (half precision can).
         """
-        if int(self.steps * self.strength) < 1:
-            raise ConfigError(
-                f"{self.steps} steps at strength {self.strength:g} leave no step to run; "
-                "raise enhance.pretrained.steps or strength"
-            )
+        self.check_steps()
         with torch.no_grad():
             images = np.asarray(self._restored(window, seed), dtype=np.float32)
         if not np.isfinite(images).all():

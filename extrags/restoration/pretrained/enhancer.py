@@ -240,6 +240,7 @@ class DiffusersBackend:
                 f"enhance.pretrained.overlap={settings.overlap} leaves no new frame in windows of {frames}, "
                 "the first of which is a real view"
             )
+        self.adapter(None, {}, settings).check_steps()
         check_device(settings)
         return find_model(rule, settings)
 

@@ -49,6 +49,11 @@ class LtxCondition(Adapter):
         masked=False,
     )
 
+    @property
+    def steps_run(self) -> int:
+        """All: strength says how firm the condition is, and leaves the schedule whole."""
+        return self.steps
+
     def _restored(self, window: Window, seed: int) -> np.ndarray:
         condition = importlib.import_module("diffusers.pipelines.ltx.pipeline_ltx_condition")
         images = pictures(window.frames)

@@ -102,6 +102,9 @@ class TestSettings:
         with pytest.raises(ConfigError, match="no step"):
             StableDiffusionImageToImage(Recorder(), TEXT, few).restore(window(2), 0)
 
+    def test_strength_leaves_all_steps_of_ltx(self, saved: Callable[[str], Path]) -> None:
+        assert opened("ltx", saved, steps=2, strength=0.2).restore(window(9), 0).shape == (9, 32, 32, 3)
+
     def test_nan_is_refused(self) -> None:
         with pytest.raises(NonFiniteError, match="dtype=float32"):
             WanVace(Recorder(float("nan")), TEXT, SETTINGS).restore(window(5), 0)

@@ -19,7 +19,7 @@ from extrags.confidence import PerceptualDifference
 from extrags.config import CoarseConfig, EnhanceConfig, PretrainedConfig
 from extrags.errors import ConfigError, MissingDependencyError, WeightsError
 from extrags.model_files import fingerprint
-from extrags.restoration.backends import load_enhancer, train_enhancer
+from extrags.restoration.backends import backend_of, load_enhancer, train_enhancer
 from extrags.restoration.clips import make_pseudo_observations, render_clips
 from extrags.restoration.pretrained.enhancer import PretrainedEnhancer
 from extrags.restoration.pretrained.inputs import clip_inputs, ranked_references, window_seed
@@ -191,6 +191,14 @@ class TestSettings:
         config = settings("sd-inpaint", saved("StableDiffusionInpaintPipeline"), frames=5, overlap=4)
         with pytest.raises(ConfigError, match="leaves no new frame"):
             prepared(tube, config)
+
+    def test_no_step_left_is_said_before_anything_is_reconstructed(
+        self, saved: Callable[[str], Path]
+    ) -> None:
+        config = settings("sd-inpaint", saved("StableDiffusionInpaintPipeline"))
+        short = config.pretrained.model_copy(update={"strength": 0.2})
+        with pytest.raises(ConfigError, match=r"2 steps at strength 0\.2 leave no step"):
+            backend_of("sd-inpaint").check(config.model_copy(update={"pretrained": short}))
 
 
 class TestMissing:
