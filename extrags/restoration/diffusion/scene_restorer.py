@@ -46,8 +46,8 @@ def scene_restorer(
     """
     start = pretrained(config)
     transfer = gather_references(scene, sequence, sequence.train).transfer
+    patches = choose_patches(sequence) if start is not None and start.network.generative else None
     if start is not None and config.train_iterations == 0:
-        patches = choose_patches(sequence) if start.network.generative else None
         untouched = start.with_settings(config, _scene_gamut(sequence), patches)
         if not config.judge or len(sequence.train) < MIN_FRAMES:
             return untouched
@@ -58,7 +58,7 @@ def scene_restorer(
         # How far off it is differs more from scene to scene than where.
         return better_of_both(untouched, pairs, transfer, calibrate=True)
     pairs = make_pairs(scene, sequence, config, coarse)
-    trained = train_on_scene(pairs, transfer, config, start)
+    trained = train_on_scene(pairs, transfer, config, start, patches=patches)
     return better_of_both(trained, pairs, transfer) if config.judge else trained
 
 

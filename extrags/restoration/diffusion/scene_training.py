@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from extrags.config import EnhanceConfig
 from extrags.events import MetricRecorded, emit
@@ -42,6 +44,7 @@ def train_on_scene(
     config: EnhanceConfig,
     start: EmbeddedEnhancer | None = None,
     *,
+    patches: Float[Tensor, "r 3 s s"] | None = None,
     deterministic: bool = False,
 ) -> EmbeddedEnhancer:
     """Train on a scene's pairs, and keep the training only where the validation pairs show a gain.
@@ -54,6 +57,7 @@ def train_on_scene(
         transfer: how brightness changes with distance in this scene.
         config: budget, widths and seed.
         start: a restorer that was pretrained on other scenes.
+        patches: parts of the scene's real frames, which a generative `start` takes texture from.
         deterministic: train a plain regression instead of a diffusion; with `start`, as that one is.
 
     Raises:
@@ -68,7 +72,7 @@ def train_on_scene(
         network = build_network(CONDITION_CHANNELS, config.channels, generator)
         base = EmbeddedEnhancer(network, 1, 1, config.seed, False, gamut, {}, deterministic=deterministic)
         rate = config.learning_rate
-    base = base.with_settings(config, gamut)
+    base = base.with_settings(config, gamut, patches)
     candidates = base.candidate_steps(config)
     before = {} if start is None else validation_scores(base, pairs, transfer, candidates)
     training = _SceneTraining(pairs, transfer, config, base, rate, generator, candidates, before)
@@ -123,6 +127,7 @@ class _SceneTraining:
         """Train a copy of the base."""
         config = self.config
         learner = replace(self.base, network=copy.deepcopy(self.base.network))
+        patches = learner.patches
         sampler = CropSampler(
             self.pairs,
             self.transfer,
@@ -130,6 +135,9 @@ class _SceneTraining:
             crop_px=config.crop,
             side_multiple=SIZE_MULTIPLE,
             seed=config.seed,
+            frames=None if patches is None else (patches, torch.ones_like(patches[:, 0], dtype=torch.bool)),
+            patches=(0, 0) if patches is None else (len(patches), patches.shape[-1]),
+            folded=learner.network.folded,
         )
         settings = TrainingSettings(
             iterations,

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,10 +22,13 @@ from extrags.restoration.diffusion.network_training import (
 )
 from extrags.restoration.diffusion.patches import choose_patches
 from extrags.restoration.diffusion.rectified_flow import Predicted, sample
+from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.training_data.augmentation import Batch
-from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Conditioning
+from extrags.restoration.training_data.pairs import Pairs
+from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, INVENTED_CHANNELS, Conditioning
 from extrags.view_synthesis.gamut import Gamut
 from tests.extrags.lit_tube import Tube
+from tests.extrags.restoration.conftest import SMALL
 
 WIDTHS = (16, 24, 32)
 
@@ -224,6 +228,21 @@ class TestDrawing:
         assert loaded.network.generative
         torch.testing.assert_close(loaded.patches, ready.patches, rtol=0, atol=1e-6)
 
+    def test_one_is_trained_on_a_scene(self, tube: Tube, tube_pairs: Pairs) -> None:
+        """With channels of its own for what is invented, and with the texture that it will be shown."""
+        network = build_network(
+            CONDITION_CHANNELS + INVENTED_CHANNELS, WIDTHS, seeded(1), generative=True
+        ).eval()
+        start = replace(self.enhancer(), network=network)
+        patches = choose_patches(tube.sequence, side_px=32)
+        config = SMALL.model_copy(update={"train_iterations": 2, "steps": 1})
+        training: list[bool] = []
+        network.texture.register_forward_pre_hook(lambda *_: training.append(torch.is_grad_enabled()))
+        trained = train_on_scene(tube_pairs, tube.references.transfer, config, start, patches=patches)
+        assert trained.patches is patches
+        assert training.count(True) == 2
+        assert trained.record["iterations"] == 2
+
 
 class TestChoosePatches:
     def test_they_come_from_frames_far_apart_and_have_texture(self, tube: Tube) -> None:
@@ -234,7 +253,5 @@ class TestChoosePatches:
         assert not torch.equal(patches[0], patches[1])
 
     def test_without_a_usable_tile_there_are_none(self, tube: Tube) -> None:
-        from dataclasses import replace
-
         dark = replace(tube.sequence, rgb=np.zeros_like(tube.sequence.rgb))
         assert choose_patches(dark, side_px=32) is None
