@@ -163,7 +163,7 @@ def pretrain(given: argparse.Namespace) -> int:
 
     from extrags.raster.bench import machine
     from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
-    from extrags.restoration.diffusion.pretraining import PretrainingConfig
+    from extrags.restoration.diffusion.pretraining import PretrainingConfig, check_settings
     from extrags.restoration.diffusion.pretraining import pretrain as trained
     from extrags.restoration.diffusion.weights import BUNDLED
     from extrags.restoration.hidden_depth.training import HiddenDepthConfig
@@ -194,8 +194,11 @@ def pretrain(given: argparse.Namespace) -> int:
         begun = beginning(given.start or BUNDLED, config.completion)
     elif isinstance(config, RefinerConfig):
         restorer = start_of_refiner(given.start or BUNDLED)
-    elif isinstance(config, PretrainingConfig) and given.start is not None:
-        start = EmbeddedEnhancer.load(Path(given.start))
+    else:
+        if given.start is not None:
+            start = EmbeddedEnhancer.load(Path(given.start))
+        if not given.scenes_only:
+            check_settings(config, start)
     # As things are now: in some hours the working tree may be another.
     about: dict[str, Any] = {"command": _command(given), "machine": machine()}
     sources = scene_sources(given, config.scenes)

@@ -16,12 +16,14 @@ from extrags.depth.completion import CompletionNetwork
 from extrags.errors import CaptureError
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.network import build_network
 from extrags.restoration.hidden_depth.examples import HiddenDepthExamples
 from extrags.restoration.refinement.refiner import Refiner
 from extrags.restoration.surface_texture import SurfaceTexture
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, ReferenceFrames
-from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
+from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, LAYER_CHANNELS, Layers
+from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 from flows.cli import main
 from flows.commands import pretrain_scenes
@@ -187,6 +189,24 @@ def test_what_would_fail_after_hours_is_said_at_once(
     (tmp_path / "file").write_text("")
     assert main(["pretrain", "--out", str(tmp_path / "file" / "w"), "--without-perceptual"]) == 2
     assert "cannot be written" in capsys.readouterr().err
+
+
+def test_settings_that_do_not_fit_are_told_before_a_scene_is_made(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def too_late(*_: object) -> None:
+        raise AssertionError("scenes were made")
+
+    monkeypatch.setattr("flows.commands.pretrain.make_scenes", too_late)
+    given = ["pretrain", "--out", str(tmp_path / "w"), "--scenes-folder", str(tmp_path / "scenes")]
+    given += ["--scenes", "3", "--validation-scenes", "1", "--without-perceptual"]
+    assert main([*given, "--set", "drawing_processes=3"]) == 2
+    assert "there are 2 scenes to train on" in capsys.readouterr().err
+    network = build_network(CONDITION_CHANNELS, (8, 16, 16), torch.Generator().manual_seed(1))
+    start = EmbeddedEnhancer(network, 1, 1, 0, False, Gamut(0.0, 1e6, 0.0, 1e6), {})
+    start.save(tmp_path / "start")
+    assert main([*given, "--start", str(tmp_path / "start")]) == 2
+    assert "the weights to start from have channels (8, 16, 16)" in capsys.readouterr().err
 
 
 def test_the_weights_of_the_package_say_where_they_come_from() -> None:

@@ -42,7 +42,7 @@ from extrags.restoration.uncertainty.domain import Domain
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, INVENTED_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
 
-__all__ = ["PretrainingConfig", "pretrain"]
+__all__ = ["PretrainingConfig", "check_settings", "pretrain"]
 
 ANY_HUE = Gamut(0.0, 1e6, 0.0, 1e6)
 MAX_STEPS = 4
@@ -121,7 +121,7 @@ def pretrain(
             it may have been written on another device. None keeps none.
 
     Raises:
-        ConfigError: when the number of files does not fit the settings.
+        ConfigError: when the number of files does not fit the settings, or as `check_settings`.
         WeightsError: when a file is not a pretraining scene, or the perceptual distance has no weights.
         DivergedError: when the loss stops being finite.
     """
@@ -130,12 +130,7 @@ def pretrain(
             f"{len(files)} pretraining scenes found, settings say {config.scenes}, of which "
             f"{config.validation_scenes} are for validation"
         )
-    if config.drawing_processes > config.scenes - config.validation_scenes:
-        raise ConfigError(
-            f"drawing_processes={config.drawing_processes}: there are "
-            f"{config.scenes - config.validation_scenes} scenes to train on, and each process needs one"
-        )
-    device = chosen_device(config.device, "pretraining.device")
+    device = check_settings(config, start)
     perceptual = Lpips.load(net="squeeze").to(device) if config.perceptual else None
     generator = torch.Generator().manual_seed(config.seed)
     network = _starting_network(config, start, generator).to(device)
@@ -175,6 +170,36 @@ def pretrain(
     )
     kept, unseen = files[: -config.validation_scenes], files[-config.validation_scenes :]
     return replace(_scored(trained, unseen, config), domain=_domain(trained, kept, unseen, config))
+
+
+def check_settings(config: PretrainingConfig, start: EmbeddedEnhancer | None) -> torch.device:
+    """Look at everything in the settings that would fail once the scenes are there.
+
+    Args:
+        config: budget.
+        start: restorer whose weights are trained further; None starts from random weights.
+
+    Returns:
+        Where the network is trained.
+
+    Raises:
+        ConfigError: when there are more drawing processes than scenes, the device is not there, or the
+            weights to start from are of another kind of network.
+    """
+    if config.drawing_processes > config.scenes - config.validation_scenes:
+        raise ConfigError(
+            f"drawing_processes={config.drawing_processes}: there are "
+            f"{config.scenes - config.validation_scenes} scenes to train on, and each process needs one"
+        )
+    if start is not None:
+        if start.network.widths != config.channels or start.deterministic != config.deterministic:
+            raise ConfigError(
+                f"the weights to start from have channels {start.network.widths}, deterministic is "
+                f"{start.deterministic}; the settings say {config.channels} and {config.deterministic}"
+            )
+        if start.network.generative and not config.generative:
+            raise ConfigError("the weights to start from are generative; set generative as well")
+    return chosen_device(config.device, "pretraining.device")
 
 
 def _train(
@@ -265,11 +290,6 @@ def _starting_network(
     if start is None:
         channels = CONDITION_CHANNELS + (INVENTED_CHANNELS if config.generative else 0)
         return build_network(channels, config.channels, generator, generative=config.generative)
-    if start.network.widths != config.channels or start.deterministic != config.deterministic:
-        raise ConfigError(
-            f"the weights to start from have channels {start.network.widths}, deterministic is "
-            f"{start.deterministic}; the settings say {config.channels} and {config.deterministic}"
-        )
     network = copy.deepcopy(start.network)
     if config.generative and not network.generative:
         return network.widened(CONDITION_CHANNELS + INVENTED_CHANNELS)

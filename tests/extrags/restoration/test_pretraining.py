@@ -11,10 +11,12 @@ import torch
 from extrags.config import CoarseConfig, profile_config
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
+from extrags.restoration.diffusion.network import build_network
 from extrags.restoration.diffusion.pretraining import PretrainingConfig, _mixed_sampler, pretrain
 from extrags.restoration.training_data.parallel import drawn_in_processes
 from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, make_pretraining_scene
-from extrags.view_synthesis.conditioning import Layers
+from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, INVENTED_CHANNELS, Layers
+from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 from tests.extrags.lit_tube import Tube, tube_depth_mm, tube_picture, tube_recording
 from tests.extrags.restoration.conftest import SMALL
@@ -215,6 +217,17 @@ class TestPretraining:
     def test_more_processes_than_scenes_are_refused(self, files: list[Path]) -> None:
         with pytest.raises(ConfigError, match="drawing_processes=3: there are 2 scenes"):
             pretrain(files, TINY.model_copy(update={"drawing_processes": 3}))
+
+    def test_a_plain_network_does_not_start_from_a_generative_one(self, files: list[Path]) -> None:
+        network = build_network(
+            CONDITION_CHANNELS + INVENTED_CHANNELS,
+            TINY.channels,
+            torch.Generator().manual_seed(1),
+            generative=True,
+        )
+        start = EmbeddedEnhancer(network, 1, 1, 0, False, Gamut(0.0, 1e6, 0.0, 1e6), {})
+        with pytest.raises(ConfigError, match="are generative; set generative"):
+            pretrain(files, TINY, start)
 
     def test_a_generative_network_starts_from_a_plain_one(
         self,
