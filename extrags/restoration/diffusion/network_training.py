@@ -8,6 +8,7 @@ distance, and to an adversary (`extrags.restoration.diffusion.adversary`) that l
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -173,7 +174,8 @@ class NetworkTraining:
             for part, values in parts.items()
             for name, value in values.items()
         }
-        return {**state, "iteration": torch.tensor(self.iteration)}
+        history = torch.frombuffer(bytearray(json.dumps(self.history).encode()), dtype=torch.uint8)
+        return {**state, "iteration": torch.tensor(self.iteration), "history": history}
 
     def restore(self, state: dict[str, Tensor]) -> None:
         """Go on where `state` was taken, on this or another device.
@@ -193,6 +195,9 @@ class NetworkTraining:
         if self.adversary is not None:
             self.adversary.restore(part("adversary"))
         self.iteration = int(state["iteration"])
+        if "history" in state:
+            # Checkpoints of an earlier version have none.
+            self.history = json.loads(bytes(state["history"].cpu().numpy()))
 
     def _predicted(self, batch: Batch, *, drawing: bool) -> Predicted:
         count = len(batch.clean)

@@ -197,6 +197,16 @@ class TestPretraining:
         with pytest.raises(WeightsError, match=r"checkpoint\.safetensors: not a checkpoint of this training"):
             pretrain(files, other, checkpoint=checkpoint)
 
+    def test_a_training_that_goes_on_keeps_the_record_of_its_beginning(
+        self, files: list[Path], tmp_path: Path
+    ) -> None:
+        checkpoint = tmp_path / "checkpoint.safetensors"
+        first = pretrain(files, TINY, checkpoint=checkpoint).record["history"]
+        longer = TINY.model_copy(update={"iterations": 20})
+        history = pretrain(files, longer, checkpoint=checkpoint).record["history"]
+        assert [entry["iteration"] for entry in history] == [10, 12, 20]
+        assert history[:2] == first
+
     def test_crops_of_several_sizes_are_refused(
         self, scene: PretrainingScene, files: list[Path], tmp_path: Path
     ) -> None:
