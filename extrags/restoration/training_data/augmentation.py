@@ -40,6 +40,8 @@ COLOR_JITTER = 0.1
 views are nearer to the wall than real ones: the restorer has to keep the colour of its input, not the mean
 of the scene."""
 SMALLEST_CROP_PX = 32
+PATCH_SIDE_MULTIPLE = 8
+"""Sides of patches are multiples of this, which the network's patch encoder needs."""
 PATCH_TRIALS = 8
 """Places tried for a patch that shows nothing but tissue; the best of them counts."""
 
@@ -272,11 +274,11 @@ def random_patches(
         frames: real frames of a scene.
         valid: which of their pixels show tissue.
         count: how many.
-        side_px: side of each; smaller where frames are smaller.
+        side_px: side of each, a multiple of 8; where frames are smaller, the largest such multiple.
         generator: of frames, places and symmetries.
     """
     height, width = frames.shape[-2:]
-    side = min(side_px, height, width)
+    side = min(side_px, height, width) // PATCH_SIDE_MULTIPLE * PATCH_SIDE_MULTIPLE
     cut = []
     for _ in range(count):
         best, most = frames[:1, :, :side, :side], -1.0

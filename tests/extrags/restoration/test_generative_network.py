@@ -23,7 +23,7 @@ from extrags.restoration.diffusion.network_training import (
 from extrags.restoration.diffusion.patches import choose_patches
 from extrags.restoration.diffusion.rectified_flow import Predicted, sample
 from extrags.restoration.diffusion.scene_training import train_on_scene
-from extrags.restoration.training_data.augmentation import Batch
+from extrags.restoration.training_data.augmentation import Batch, random_patches
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, INVENTED_CHANNELS, Conditioning
 from extrags.view_synthesis.gamut import Gamut
@@ -102,6 +102,13 @@ class TestTextureTransfer:
             whole = network.texture(coarse, patches).coarse
             monkeypatch.setattr("extrags.restoration.diffusion.texture_transfer.QUERIES_AT_ONCE", 7)
             torch.testing.assert_close(network.texture(coarse, patches).coarse, whole, rtol=1e-5, atol=1e-5)
+
+    def test_patches_of_small_frames_fit_the_encoder(self) -> None:
+        frames = torch.rand(2, 3, 60, 90, generator=seeded(5))
+        valid = torch.ones(2, 60, 90, dtype=torch.bool)
+        patches = random_patches(frames, valid, 3, 64, np.random.default_rng(1))
+        assert patches.shape == (3, 3, 56, 56)
+        assert generative_network().texture.encode(patches[None]).key.shape == (1, 3 * 7 * 7, 64)
 
 
 class TestWidened:
