@@ -18,6 +18,7 @@ from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.diffusion.validation import restored_pairs, scores_of, validation_pairs
 from extrags.restoration.protocol import Enhancer
 from extrags.restoration.training_data.pairs import Pairs, make_pairs
+from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training.leave_out import MIN_FRAMES
@@ -59,11 +60,19 @@ def scene_restorer(
         return better_of_both(untouched, pairs, transfer, calibrate=True)
     pairs = make_pairs(scene, sequence, config, coarse)
     trained = train_on_scene(pairs, transfer, config, start, patches=patches)
-    return better_of_both(trained, pairs, transfer) if config.judge else trained
+    if not config.judge:
+        return trained
+    weights = Calibration() if start is None else start.calibration
+    return better_of_both(trained, pairs, transfer, of_weights=weights)
 
 
 def better_of_both(
-    enhancer: EmbeddedEnhancer, pairs: Pairs, transfer: LightTransfer, *, calibrate: bool = False
+    enhancer: EmbeddedEnhancer,
+    pairs: Pairs,
+    transfer: LightTransfer,
+    *,
+    calibrate: bool = False,
+    of_weights: Calibration | None = None,
 ) -> Enhancer:
     """The restorer, or the classical one where that is clearly better on the scene's validation pairs.
 
@@ -75,6 +84,8 @@ def better_of_both(
         pairs: those for validation were not trained on.
         transfer: how brightness changes with distance.
         calibrate: fit the expected error of the restorer that is kept to these pairs.
+        of_weights: calibration of the weights it began with, where its own has been fitted to these pairs,
+            by which no error can be larger than expected.
     """
     chosen = validation_pairs(pairs)
     # By their means: a drawn view has texture of its own, which costs PSNR wherever it is right.
@@ -84,7 +95,8 @@ def better_of_both(
     emit(MetricRecorded("enhance", "judged_gain_over_classical_db", restored - filled))
     shown = restored_pairs(enhancer, means.pairs, transfer) if enhancer.drawing else means
     # Without validation pairs nothing tells of errors: the restorer was trained on these.
-    ratio = None if chosen is None else error_over_expected(enhancer, shown)
+    known = enhancer if of_weights is None else replace(enhancer, calibration=of_weights)
+    ratio = None if chosen is None else error_over_expected(known, shown)
     if ratio is not None:
         emit(MetricRecorded("enhance", "error_over_expected", ratio))
     judged = {

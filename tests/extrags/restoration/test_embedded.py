@@ -31,6 +31,7 @@ from extrags.restoration.diffusion.validation import restored_pairs, validation_
 from extrags.restoration.protocol import Clip, Enhancer
 from extrags.restoration.training_data.augmentation import Batch
 from extrags.restoration.training_data.pairs import Pairs
+from extrags.restoration.uncertainty import calibration
 from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.thresholds import HOLE_ALPHA
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, Conditioning
@@ -307,6 +308,23 @@ class TestEmbedded:
         assert half == pytest.approx(ratio / 2, rel=1e-5)
         expected, true = cell_errors(restored)
         assert ratio == pytest.approx(true.mean() / expected.mean(), rel=1e-5)
+
+    def test_the_error_of_a_restorer_trained_on_the_scene_is_over_what_its_weights_expect(
+        self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, tmp_path, monkeypatch
+    ) -> None:
+        """Its own expectation was fitted to these very pairs: the error is never above it."""
+        monkeypatch.setattr(calibration, "MIN_CELLS", 50)
+        monkeypatch.setattr(scene_restorer, "make_pairs", lambda *_: tube_pairs)
+        sure = replace(trained, calibration=Calibration((0.01, 1.0), (0.001, 0.1)))
+        sure.save(tmp_path)
+        harmful = {"scene_learning_rate": 0.5, "train_iterations": 3, "pretrained_weights": str(tmp_path)}
+        served = train_enhancer(tube.scene, tube.sequence, SMALL.model_copy(update=harmful), CoarseConfig())
+        assert isinstance(served, EmbeddedEnhancer)
+        assert served.calibration != sure.calibration
+        untouched = better_of_both(sure, tube_pairs, tube.references.transfer)
+        assert isinstance(untouched, EmbeddedEnhancer)
+        ratios = [each.record["judged"]["error_over_expected"] for each in (served, untouched)]
+        assert ratios[0] == pytest.approx(ratios[1], rel=1e-2) != pytest.approx(1, rel=0.5)
 
     def test_pairs_are_restored_once_to_judge_and_to_calibrate(
         self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer, monkeypatch
