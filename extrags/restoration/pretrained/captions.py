@@ -135,7 +135,7 @@ def _from_file(name: str, file: Path) -> str:
 
     try:
         texts = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise SourceError(f"not readable as YAML or JSON ({error})", file=file) from error
     if not isinstance(texts, dict):
         raise SourceError(f"expected {{name: text}}, found a {type(texts).__name__}", file=file)

@@ -136,7 +136,7 @@ def _target(config: Path) -> str:
         description = yaml.safe_load(config.read_text(encoding="utf-8"))
         target = description["model"]["target"]
         description["model"]["params"]
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ConfigError(f"{config}: not readable as YAML ({error})") from error
     except (KeyError, TypeError) as error:
         raise ConfigError(f"{config}: expected model.target and model.params ({error})") from error

@@ -116,6 +116,12 @@ class TestConstantAndFile:
             with pytest.raises(SourceError, match=told):
                 caption_of(sequence(), CaptionConfig(source="file", file=str(tmp_path / "texts.yaml")))
 
+    def test_a_file_in_another_encoding_is_named(self, tmp_path: Path) -> None:
+        file = tmp_path / "texts.yaml"
+        file.write_bytes("test/scene: mucosa, folds 5 \xb5m apart".encode("latin-1"))
+        with pytest.raises(SourceError, match=r"texts\.yaml: not readable as YAML or JSON \('utf-8'"):
+            caption_of(sequence(), CaptionConfig(source="file", file=str(file)))
+
 
 class TestEndpoint:
     def test_asks_once_shows_the_cost_and_keeps_the_answer(

@@ -191,6 +191,11 @@ class TestPreflight:
         with pytest.raises(ConfigError, match=told):
             check_clone(settings(clone))
 
+    def test_config_in_another_encoding(self, clone: Path) -> None:
+        (clone / "configs" / "inference.yaml").write_bytes(b"# 5 \xb5m\nmodel: 3\n")
+        with pytest.raises(ConfigError, match=r"inference\.yaml: not readable as YAML \('utf-8'"):
+            check_clone(settings(clone))
+
     def test_sizes(self, clone: Path) -> None:
         with pytest.raises(ConfigError, match="multiples of 16"):
             check_clone(settings(clone, width=60))
