@@ -99,7 +99,8 @@ def examples_of(files: Sequence[Path], start: RefinedRestorer) -> list[Path]:
     from extrags.restoration.training_data.pretraining_scenes import PretrainingScene
 
     found = []
-    for done, file in enumerate(files, start=1):
+    for done, file in enumerate(files):
+        emit(Progress("refiner-examples", done, len(files)))
         origin = f"{EXAMPLES_VERSION} {start.digest} {PretrainingScene.made_from(file)}"
         key = hashlib.blake2b(origin.encode(), digest_size=8).hexdigest()
         example = file.parent / "refinement" / f"{file.stem}_{key}.safetensors"
@@ -111,7 +112,7 @@ def examples_of(files: Sequence[Path], start: RefinedRestorer) -> list[Path]:
                 continue
             made.save(example)
         found.append(example)
-        emit(Progress("refiner-examples", done, len(files)))
+    emit(Progress("refiner-examples", len(files), len(files)))
     return found
 
 

@@ -14,6 +14,7 @@ from extrags.array_files import load_safetensors
 from extrags.cameras import Cameras
 from extrags.depth.completion import CompletionNetwork
 from extrags.errors import CaptureError
+from extrags.events import Progress, subscribed
 from extrags.metrics.lpips import Lpips
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
@@ -27,6 +28,7 @@ from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
 from flows.cli import main
 from flows.commands import pretrain_scenes
+from flows.commands.pretrain_refiner import examples_of, start_of_refiner
 from flows.commands.pretrain_scenes import SceneSource, make_scenes, scene_sources
 from tests.extrags.random_lpips import random_weights
 from tests.extrags.restoration.test_hidden_depth import half_hidden
@@ -264,6 +266,14 @@ class TestRefiner:
         before = [file.stat().st_mtime_ns for file in kept]
         assert main([*given, "--out", str(tmp_path / "again")]) == 0
         assert [file.stat().st_mtime_ns for file in kept] == before
+
+    def test_a_scene_without_texture_is_done_too(self, tmp_path: Path) -> None:
+        file = tmp_path / "scene.safetensors"
+        small_scene(0).save(file)
+        told: list[object] = []
+        with subscribed(told.append):
+            assert examples_of([file], start_of_refiner("bundled")) == []
+        assert told[-1] == Progress("refiner-examples", 1, 1)
 
     def test_wrong_settings_are_named(
         self, given: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
