@@ -59,7 +59,7 @@ class PretrainingConfig(StageConfig):
     validation_scenes: int = Field(6, ge=1, description="how many of them, the last ones, validate only")
     iterations: int = Field(13_500, ge=1, description="optimisation steps")
     batch: int = Field(4, ge=1, description="crops per step, each from a scene of its own")
-    crop: int = Field(96, ge=32, description="side of a crop in pixels, a multiple of 8")
+    crop: int = Field(96, ge=32, multiple_of=8, description="side of a crop in pixels")
     channels: tuple[int, int, int] = Field((48, 96, 160), description="widths of the U-Net's levels")
     learning_rate: float = Field(8e-4, gt=0, description="peak, after the warm-up")
     ema_decay: float = Field(0.999, ge=0, lt=1, description="memory of the running mean of the weights")

@@ -263,6 +263,10 @@ class TestPretraining:
         assert scores[0] > far * near.domain_score
         assert 1 < replace(enhancer, patches=patches).modesty <= far
 
+    def test_crops_have_sides_that_the_network_takes(self) -> None:
+        with pytest.raises(ValueError, match="multiple of 8"):
+            PretrainingConfig(crop=100)
+
     def test_drawing_needs_the_perceptual_distance(self) -> None:
         with pytest.raises(ValueError, match="needs the perceptual distance"):
             PretrainingConfig(generative=True, perceptual=False)
