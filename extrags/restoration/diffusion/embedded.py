@@ -286,6 +286,8 @@ class EmbeddedEnhancer:
             for name, value in self.network.state_dict().items()
         }
         save_file(weights, str(path / WEIGHTS))
+        # Those of a restorer that was here before are not this one's.
+        (path / PATCHES).unlink(missing_ok=True)
         if self.patches is not None:
             save_file({"patches": (self.patches * COLOR_STEPS).round().to(torch.uint8)}, str(path / PATCHES))
         description = {

@@ -234,6 +234,8 @@ class TestDrawing:
         assert loaded.drawing
         assert loaded.network.generative
         torch.testing.assert_close(loaded.patches, ready.patches, rtol=0, atol=1e-6)
+        self.enhancer().save(tmp_path)
+        assert EmbeddedEnhancer.load(tmp_path).patches is None
 
     def test_one_is_trained_on_a_scene(self, tube: Tube, tube_pairs: Pairs) -> None:
         """With channels of its own for what is invented, and with the texture that it will be shown."""
