@@ -69,7 +69,7 @@ int main(int, char** given) {
   std::vector<float> rgb(3 * pixels), alpha(pixels), depth(pixels), median(pixels), means2d(2 * n), radius(n),
       most(n), sum(n);
   const Images images{rgb.data(), alpha.data(), depth.data(), median.data(), means2d.data(), radius.data(),
-                      most.data(), sum.data()};
+                      most.data(), sum.data(), nullptr};
   kernels.forward(&view, &scene, &images);
 
   const std::vector<float> target = numbers.many(3 * pixels, 0, 1), mask = numbers.many(pixels, 0, 1),
