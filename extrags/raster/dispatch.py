@@ -108,12 +108,15 @@ def rasterize(
     Raises:
         ShapeError: when shapes, dtypes or devices do not fit together, or a size is out of range.
         NonFiniteError: when an input holds a NaN or an infinity; names the array and the entry.
-        ConfigError: when the chosen backend cannot take these tensors.
+        ConfigError: when the chosen backend cannot take these tensors, or a visibility mask is given where no
+            visibility is asked for.
         MissingDependencyError: when the chosen backend is not installed.
 
     Source: Kerbl et al., 3D Gaussian Splatting, SIGGRAPH 2023; Ye et al., gsplat, JMLR 2025. Lens: Zwicker et
     al., "EWA volume splatting", 2001, with the Jacobian of Kannala and Brandt's model, PAMI 2006.
     """
+    if visibility_mask is not None and not visibility:
+        raise ConfigError("a visibility_mask is given, but no visibility is asked for")
     packed = None if light is None else light.packed()
     counted = None if visibility_mask is None else visibility_mask.to(means.device, means.dtype)
     inputs = RasterInputs(

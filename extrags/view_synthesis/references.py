@@ -18,8 +18,6 @@ from extrags.scene import Scene
 
 __all__ = ["SEEN_WEIGHT", "LightTransfer", "ReferenceViews", "visibility_of"]
 
-TRUST = 3
-"""Channel of `ReferenceViews.packed` that holds the trust."""
 SEEN_WEIGHT = 0.02
 """A Gaussian counts as seen in a view when its largest blending weight there exceeds this."""
 
@@ -91,7 +89,7 @@ class ReferenceViews:
     @property
     def valid(self) -> Bool[Tensor, "r h w"]:
         """Where the views show tissue: what is trusted at all."""
-        return self.packed[:, TRUST] > 0
+        return self.packed[:, 3] > 0
 
     @cached_property
     def viewmats(self) -> Float[Tensor, "r 4 4"]:

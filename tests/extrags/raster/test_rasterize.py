@@ -152,28 +152,45 @@ def test_equals_renders_of_gsplat(case: str, backend: str, shared_data: Path) ->
     assert float((image - data["out_img"]).abs().max()) < 1e-5
 
 
-@pytest.mark.parametrize(("backend", "dtype"), [("native", torch.float32), ("reference", torch.float64)])
-def test_visibility_counts_the_pixels_of_a_mask_alone(backend: str, dtype: torch.dtype) -> None:
-    scene = tube(700, 67, 45, cameras=2).to(dtype)
+def _visibility(scene: RasterScene, backend: str, mask: Tensor | None) -> tuple[Tensor, Tensor]:
+    rendering = scene.render(backend, visibility=True, visibility_mask=mask)
+    assert rendering.visibility_max is not None
+    assert rendering.visibility_sum is not None
+    return rendering.visibility_max, rendering.visibility_sum
+
+
+def _random_masks() -> Tensor:
     mask = torch.rand(2, 45, 67, generator=torch.Generator().manual_seed(3)) > 0.4
     mask[1, :, 30:] = False
-    whole = scene.render(backend, visibility=True)
-    parts = [scene.render(backend, visibility=True, visibility_mask=part) for part in (mask, ~mask)]
-    for part in parts:
-        assert torch.equal(part.rgb, whole.rgb)
-    assert whole.visibility_max is not None
-    assert whole.visibility_sum is not None
-    total, largest = parts[0].visibility_sum + parts[1].visibility_sum, parts[0].visibility_max  # type: ignore[operator]
-    # The sums of two halves are those of the whole but for the order they are added in.
+    return mask
+
+
+@pytest.mark.parametrize(("backend", "dtype"), [("native", torch.float32), ("reference", torch.float64)])
+def test_visibility_of_a_mask_and_of_the_rest_make_the_whole(backend: str, dtype: torch.dtype) -> None:
+    scene, mask = tube(700, 67, 45, cameras=2).to(dtype), _random_masks()
+    largest, total = _visibility(scene, backend, None)
+    inside, outside = (_visibility(scene, backend, part) for part in (mask, ~mask))
+    assert torch.equal(torch.maximum(inside[0], outside[0]), largest)
+    assert (inside[0] < largest).any()
+    assert (outside[0] < largest).any()
+    # The sums differ by the order they are added in.
     rounding = 67 * 45 * torch.finfo(dtype).eps
-    torch.testing.assert_close(total, whole.visibility_sum, rtol=rounding, atol=rounding)
-    assert torch.equal(torch.maximum(largest, parts[1].visibility_max), whole.visibility_max)  # type: ignore[arg-type]
-    assert (largest < whole.visibility_max).any()  # type: ignore[operator]
-    everything = scene.render(backend, visibility=True, visibility_mask=mask | ~mask)
-    assert torch.equal(everything.visibility_sum, whole.visibility_sum)  # type: ignore[arg-type]
-    reference = tube(700, 67, 45, cameras=2).to(torch.float64)
-    truth = reference.render("reference", visibility=True, visibility_mask=mask)
-    torch.testing.assert_close(largest, truth.visibility_max.to(dtype), rtol=0, atol=2e-5)  # type: ignore[union-attr]
+    torch.testing.assert_close(inside[1] + outside[1], total, rtol=rounding, atol=rounding)
+    assert torch.equal(_visibility(scene, backend, mask | ~mask)[1], total)
+
+
+def test_masked_visibility_equals_the_reference(isa: str) -> None:
+    scene, mask = tube(700, 67, 45, cameras=2), _random_masks()
+    found = _visibility(scene.to(torch.float32), "native", mask)
+    expected = _visibility(scene.to(torch.float64), "reference", mask)
+    for own, true in zip(found, expected, strict=True):
+        # As the other extras of two backends.
+        assert relative_l2(own, true) < 1e-4
+
+
+def test_a_mask_without_visibility_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no visibility"):
+        tube(20, 16, 12).render("native", visibility_mask=torch.ones(1, 12, 16, dtype=torch.bool))
 
 
 def test_a_mask_of_another_size_is_refused() -> None:

@@ -131,6 +131,16 @@ class TestPretrainingScene:
         assert len(scene.references.cameras) == len(train)
         assert scene.cameras.centers.tolist() == tube.sequence.cameras.centers[tube.sequence.test].tolist()
 
+    def test_an_exact_scene_keeps_the_poses_of_its_recording(
+        self, tube: Tube, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("extrags.restoration.training_data.degradation.ITERATIONS", (10, 20))
+        monkeypatch.setattr("extrags.restoration.training_data.degradation._EXACT_POSES", 0.0)
+        exact = tube.sequence.cameras[tube.sequence.train].world_from_camera
+        for share in (0.0, 1.0):
+            made = make_pretraining_scene(tube_recording(tube), RUN, 3, exact_share=share)
+            assert np.array_equal(made.references.cameras.world_from_camera, exact) == bool(share)
+
     def test_files_of_another_version_are_refused(
         self, scene: PretrainingScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
