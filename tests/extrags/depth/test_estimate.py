@@ -76,21 +76,29 @@ def test_a_gpu_gives_that_of_a_processor(device: str, specification: Callable[[]
     """On the processor, torch's implementation stands in for what runs on a GPU."""
     small = with_points(withheld_phantom(8, width=64, height=48))
     part = small.training_part()
-    expected = estimate_depth(part, DepthConfig(device="cpu", **SETTINGS))
+    settings = [
+        DepthConfig(device="cpu", completion=completion, **SETTINGS) for completion in ("none", "bundled")
+    ]
+    expected = [estimate_depth(part, each) for each in settings]
     specification()
-    found = estimate_depth(part, DepthConfig(device=device, **SETTINGS))
-    assert (expected.report["device"], found.report["device"]) == ("cpu", device)
-    away = np.abs(np.log(found.depth[part.mask] / expected.depth[part.mask]))
-    # Rounding moves most depths by less than a thousandth. Where two depths match nearly equally well it
-    # decides between them: between two implementations on a processor 1.5 % of these pixels move by more than
-    # a percent.
+    there = [each.model_copy(update={"device": device}) for each in settings]
+    found = [estimate_depth(part, each) for each in there]
+    assert {each.report["device"] for each in expected} == {"cpu"}
+    assert {each.report["device"] for each in found} == {device}
+    # Rounding moves most depths of stereo by less than a thousandth. Where two depths match nearly equally
+    # well it decides between them: between two implementations on a processor 1.7 % of these pixels move by
+    # more than a percent.
+    away = np.abs(np.log(found[0].depth[part.mask] / expected[0].depth[part.mask]))
     assert np.median(away) < 1e-3
     assert (away > 0.01).mean() < 0.04
-    assert relative_error(small, found).mean() == pytest.approx(
-        relative_error(small, expected).mean(), rel=0.03
-    )
-    again = estimate_depth(part, DepthConfig(device=device, **SETTINGS)) if device == "cuda" else found
-    np.testing.assert_array_equal(again.depth, found.depth)
+    # The completion looks far around such a pixel, and carries it on into others, on some processors more
+    # than on others: it is no nearer to the truth and no farther.
+    for own, true in zip(found, expected, strict=True):
+        assert relative_error(small, own).mean() == pytest.approx(
+            relative_error(small, true).mean(), rel=0.03
+        )
+    again = estimate_depth(part, there[1]) if device == "cuda" else found[1]
+    np.testing.assert_array_equal(again.depth, found[1].depth)
 
 
 def test_cuda_that_is_not_there_is_refused(
