@@ -120,6 +120,24 @@ def _with_savings(plan: ScenePlan, config: PipelineConfig) -> ScenePlan:
     return plan.model_copy(update={"decisions": tuple(lines)})
 
 
+def _restored_by(config: PipelineConfig) -> str:
+    """What will restore the virtual views, as far as it is known before the stage runs."""
+    settings = config.enhance
+    if settings.backend == "classical":
+        return "restored by blending and filling, without a network"
+    steps = "as many steps as its weights say"
+    if settings.steps != "auto":
+        steps = f"{settings.steps} step{'' if settings.steps == 1 else 's'}"
+    if settings.backend != "embedded":
+        return f"restored by {settings.backend}" + ("" if settings.steps == "auto" else f" in {steps}")
+    if settings.steps == "auto" and settings.train_iterations:
+        steps = "as many steps as validation pairs of the scene decide"
+    by = f"restored by the embedded network in {steps}"
+    if settings.judge:
+        by += ", or by blending and filling where leave-out frames find it worse (enhance.judge)"
+    return by
+
+
 def _decisions(lacking: float, config: PipelineConfig) -> tuple[Decision, ...]:
     settings = config.assess
     needed = lacking > settings.min_hole_share
@@ -172,7 +190,9 @@ def _decisions(lacking: float, config: PipelineConfig) -> tuple[Decision, ...]:
         line("freespace", f"exploration needs it: {why}"),
         line("explore", f"{why}; {spent}", trajectories=trajectories),
         line(
-            "enhance", f"at most {views} virtual views come from {trajectories} trajectories", max_views=views
+            "enhance",
+            f"at most {views} virtual views come from {trajectories} trajectories; {_restored_by(config)}",
+            max_views=views,
         ),
         line("finetune", f"on at most {views} virtual views", iterations=config.finetune.iterations),
     )

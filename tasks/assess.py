@@ -22,6 +22,9 @@ _OF_BUDGETS = (
 )
 """Settings that the decisions rest on."""
 
+_OF_RESTORER = ("enhance.backend", "enhance.judge", "enhance.steps", "enhance.train_iterations")
+"""Settings that say what will restore the virtual views."""
+
 _OF_SAVINGS = (
     "coarse.densify.max_gaussians",
     "enhance.folds",
@@ -41,7 +44,7 @@ def measuring_settings(config: AssessConfig) -> AssessConfig:
 
 def planning_settings(config: PipelineConfig) -> PipelineConfig:
     """The settings that `plan` reads, all others at their defaults: these are not part of the key."""
-    names = (*(f"assess.{name}" for name in _OF_PLAN), *_OF_BUDGETS, *_OF_SAVINGS)
+    names = (*(f"assess.{name}" for name in _OF_PLAN), *_OF_BUDGETS, *_OF_RESTORER, *_OF_SAVINGS)
     read = {name: config.value(name) for name in names}
     return PipelineConfig().with_overrides(read)
 
@@ -71,7 +74,7 @@ def assess(
     slot.counts["lacking_share"] = found["lacking_share"]
 
 
-@stage("plan", version=4)
+@stage("plan", version=5)
 def plan(slot: Slot, measured: Ref, config: PipelineConfig) -> None:
     """Derive the plan from the measurements and the budgets of the run; writes `plan.json`."""
     from extrags.scene_plan import decide

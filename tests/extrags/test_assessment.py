@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -124,6 +125,21 @@ class TestAssess:
         assert plan.decision("enhance").budget == {"max_views": 2}
         assert "2 of 20 trajectories" in plan.decision("explore").reason
         assert "enhance.max_views=2 allows no more" in plan.decision("explore").reason
+
+    @pytest.mark.parametrize(
+        ("settings", "said"),
+        [
+            ({}, "embedded network in as many steps as its weights say, or by blending and filling where"),
+            ({"enhance.judge": False, "enhance.steps": 4}, "restored by the embedded network in 4 steps$"),
+            ({"enhance.train_iterations": 100}, "in as many steps as validation pairs of the scene decide"),
+            ({"enhance.backend": "classical"}, "restored by blending and filling, without a network$"),
+            ({"enhance.backend": "ltx", "enhance.steps": 1}, "restored by ltx in 1 step$"),
+            ({"enhance.backend": "ltx"}, "restored by ltx$"),
+        ],
+    )
+    def test_it_says_what_will_restore_the_virtual_views(self, settings: dict[str, object], said: str):
+        plan = decide({"lacking_share": 0.5}, PipelineConfig().with_overrides(settings))
+        assert re.search(said, plan.decision("enhance").reason)
 
     def test_every_number_is_finite_and_every_share_a_share(self):
         for plan in (tube_plan(), ball_plan()):

@@ -134,7 +134,11 @@ DIRECTLY: dict[str, tuple[str, ...]] = {
     "explore.visibility": ("assess", *EXPLORE),
     "explore.render_width": ("assess", *EXPLORE),
     "explore.*": EXPLORE,
-    "enhance.backend": ("enhance-train",),
+    # The plan says what will restore.
+    "enhance.backend": ("plan", "enhance-train"),
+    "enhance.judge": ("plan", "enhance-train"),
+    "enhance.steps": ("plan", "enhance-train"),
+    "enhance.train_iterations": ("plan", "enhance-train"),
     "enhance.pretrained_weights": (),  # By content, below.
     "enhance.keyframes": ("enhance-keyframes", "finetune-judge"),
     "enhance.max_views": ("plan", *RESTORE),
