@@ -6,6 +6,7 @@
 constexpr float kLog2AlphaMin = -7.994353436858858f;
 constexpr int kSide = kTileBlocks, kBlocks = kSide * kSide;
 constexpr int kEntriesAhead = 32;  // entries whose gradients are reduced together
+constexpr int kRecordsAhead = 32;  // records of Gaussians, anywhere in memory, fetched while a tile's are copied
 constexpr int kPrefetch = 8;       // entries ahead whose records are fetched
 
 // Stable radix sort by depth. Keys are the bits of positive floats, whose order is that of the floats;
@@ -124,8 +125,9 @@ static void bin_tile(View* view, int tile, int slot, const TileFrame& t) {
   const uint32_t tile_y = static_cast<uint32_t>(tile / view->tiles_x);
   const uint32_t* chunk_pairs = static_cast<const uint32_t*>(view->chunk_pairs.data);
   const int chunk_bits = __builtin_ctz(static_cast<unsigned>(view->chunk));
+  for (int i = 0; i < t.count && i < kRecordsAhead; ++i) __builtin_prefetch(&records[keys[i].id]);
   for (int i = 0; i < t.count; ++i) {
-    __builtin_prefetch(&records[keys[i + 8 < t.count ? i + 8 : i].id]);
+    __builtin_prefetch(&records[keys[i + kRecordsAhead < t.count ? i + kRecordsAhead : i].id]);
     const Record& record = records[keys[i].id];
     const uint32_t pair = record.pair + tile_y * record.tiles_across + tile_x;
     store(&locals[i].x, load(&record.x));

@@ -1,7 +1,7 @@
 // L1 + SSIM with its gradient, streaming over rows; the formula is in loss.py.
 //
 // A row is taken as 3 width floats: horizontal taps lie three floats apart, no channel is split off. Row y
-// passes three stages as the rows below it arrive: blurred horizontally (five maps of image and target),
+// passes three stages as the rows below it arrive: blurred horizontally (four maps of image and target),
 // blurred vertically into SSIM and its derivatives (three maps, blurred horizontally again), and blurred
 // vertically into the gradient. Every row's numbers depend on its own inputs only, so the image may be cut
 // into any number of bands. The vertical passes take several rows together: these share most of the rows they
@@ -10,6 +10,7 @@
 constexpr int kTaps = 5;        // on each side
 constexpr int kPad = 32;        // floats beside a row; at least 3 kTaps, and a vector more on the right
 constexpr int kLossRows = 4;    // taken together by the vertical passes
+constexpr int kMoments = 4;    // maps whose window means SSIM needs
 constexpr int kRing = 16;       // rows kept of each map; at least 2 kTaps + kLossRows
 constexpr float kSsimC1 = 1e-4f, kSsimC2 = 9e-4f;
 
@@ -45,26 +46,24 @@ EXTRAGS_INLINE void blur_down(const float* const* rows, int i, const Vec* taps, 
   }
 }
 
-// Blurs x, y, xx, yy and xy of one row horizontally.
+// Blurs x, y, xx + yy and xy of one row horizontally: SSIM needs the sum of the two variances alone.
 static void blur_products(const float* x, const float* y, float* maps, int n, const Vec* taps) {
-  for (int i = 0; i < n; i += 16, maps += 5 * 16) {
+  for (int i = 0; i < n; i += 16, maps += kMoments * 16) {
     const Vec x0 = load(x + i), y0 = load(y + i);
     Vec sx = x0 * taps[0], sy = y0 * taps[0];
-    Vec sxx = sx * x0, syy = sy * y0, sxy = sx * y0;
+    Vec squares = fma(sx, x0, sy * y0), sxy = sx * y0;
     for (int k = 1; k <= kTaps; ++k) {
       const Vec xl = load(x + i - 3 * k), xr = load(x + i + 3 * k);
       const Vec yl = load(y + i - 3 * k), yr = load(y + i + 3 * k);
       sx = fma(xl + xr, taps[k], sx);
       sy = fma(yl + yr, taps[k], sy);
-      sxx = fma(fma(xl, xl, xr * xr), taps[k], sxx);
-      syy = fma(fma(yl, yl, yr * yr), taps[k], syy);
+      squares = fma(fma(xl, xl, xr * xr) + fma(yl, yl, yr * yr), taps[k], squares);
       sxy = fma(fma(xl, yl, xr * yr), taps[k], sxy);
     }
     store(maps, sx);
     store(maps + 16, sy);
-    store(maps + 32, sxx);
-    store(maps + 48, syy);
-    store(maps + 64, sxy);
+    store(maps + 32, squares);
+    store(maps + 48, sxy);
   }
 }
 
@@ -84,15 +83,15 @@ static void ssim_rows(const float* const* rows, const float* const* weights, flo
   for (int j = 0; j < kRows; ++j) loss[j] = zero;
   for (int i = 0; i < n; i += 16) {
     const int lanes = n - i < 16 ? n - i : 16;
-    Vec means[kRows][5];
-    blur_down<kRows, 5>(rows, i, taps, means);
+    Vec means[kRows][kMoments];
+    blur_down<kRows, kMoments>(rows, i, taps, means);
     for (int j = 0; j < kRows; ++j) {
-      const Vec mx = means[j][0], my = means[j][1], xx = means[j][2], yy = means[j][3], xy = means[j][4];
+      const Vec mx = means[j][0], my = means[j][1], squares = means[j][2], xy = means[j][3];
       const Vec mxx = mx * mx, myy = my * my, mxy = mx * my;
-      // Rounding may leave a variance below zero.
-      const Vec vxx = max(xx - mxx, zero), vyy = max(yy - myy, zero), vxy = xy - mxy;
+      // Rounding may leave the sum of variances below zero.
+      const Vec m_squares = mxx + myy, variances = max(squares - m_squares, zero), vxy = xy - mxy;
       const Vec a1 = fma(two, mxy, c1), a2 = fma(two, vxy, c2);
-      const Vec b1 = mxx + myy + c1, b2 = vxx + vyy + c2;
+      const Vec b1 = m_squares + c1, b2 = variances + c2;
       const Vec inverse = one / (b1 * b2), inverse1 = b2 * inverse, inverse2 = b1 * inverse;
       const Vec ssim = a1 * a2 * inverse;
       const Vec weight = load_first(weights[j] + i, lanes);
@@ -147,7 +146,7 @@ struct LossBand {
   const float* zeros;           // as long as a row of either
 
   size_t padded() const { return static_cast<size_t>(context->padded); }
-  float* product_row(int row) const { return products + static_cast<size_t>(row % kRing) * 5 * padded(); }
+  float* product_row(int row) const { return products + static_cast<size_t>(row % kRing) * kMoments * padded(); }
   float* gradient_row(int row) const { return gradients + static_cast<size_t>(row % kRing) * 3 * padded(); }
 };
 
@@ -215,7 +214,7 @@ static void loss_band(void* data, int band, int) {
     for (float*& row : b.derivatives[j]) row = take_row();
   }
   b.products = next;
-  b.gradients = b.products + static_cast<size_t>(kRing) * 5 * c.padded;
+  b.gradients = b.products + static_cast<size_t>(kRing) * kMoments * c.padded;
   b.zeros = b.gradients + static_cast<size_t>(kRing) * 3 * c.padded;
   if (images.ssim_mask == nullptr && images.mask == nullptr) {
     for (float* weights : b.weights) expand_mask(nullptr, images.width, 0, weights);
@@ -261,7 +260,7 @@ static double loss(const LossImages* images, Buffer* working) {
   c.bands = num_threads() < most ? num_threads() : most;
   c.row_floats = 3 * images->width;
   c.padded = (c.row_floats + 15) / 16 * 16 + 2 * kPad;
-  c.per_band = static_cast<size_t>(c.padded) * (2 + 4 * kLossRows + 8 * kRing + 5);
+  c.per_band = static_cast<size_t>(c.padded) * (2 + 4 * kLossRows + (kMoments + 3) * kRing + kMoments);
   const size_t losses = sizeof(double) * 2 * images->height;
   const size_t head = (losses + 63) / 64 * 64;
   reserve(working, head + sizeof(float) * c.per_band * c.bands);

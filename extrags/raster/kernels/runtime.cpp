@@ -139,7 +139,7 @@ class Pool {
 
   void wait_for_work(uint64_t last) {
     using clock = std::chrono::steady_clock;
-    const auto give_up = clock::now() + std::chrono::microseconds(40);
+    const auto give_up = clock::now() + std::chrono::microseconds(200);
     for (int spins = 1; epoch_.load(std::memory_order_acquire) == last; ++spins) {
       relax();
       if (spins % 64 != 0 || clock::now() < give_up) continue;
