@@ -29,7 +29,7 @@ from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["GENERATOR_VERSION", "CavityConfig", "cavity_config", "cavity_recording"]
 
-GENERATOR_VERSION = 1
+GENERATOR_VERSION = 2
 """Raised by hand whenever the same number gives other pixels."""
 _SIZES = (
     *((160, 128), (176, 144), (192, 144), (192, 160), (208, 176)),

@@ -24,8 +24,9 @@ _GAMMA = 2.2
 _DARKEST, _DARK_SHARE, _GLARE, _GLARE_SHARE = 18, 0.01, 245, 0.02
 _GREY = 0.06
 _SMOOTHED_PX = 48
-_PIECE, _PIECES = 90, 6
-"""Radius of the pieces in texels, and how many there are down and across."""
+_PIECE, _PIECES = 124, 6
+"""Radius of the pieces in texels, and how many there are down and across. The nearest middle is no farther
+than the diagonal of a cell, 122 texels, so that every place is covered."""
 
 
 def texture_files(folder: Path | None = None) -> list[Path]:
@@ -117,11 +118,11 @@ def _strewn(patch: Float[np.ndarray, "p p c"], rng: np.random.Generator) -> Floa
 
     side = 2 * _PATCH
     total = np.zeros((side, side, patch.shape[2]), dtype=np.float32)
-    weights = np.full((side, side, 1), 1e-6, dtype=np.float32)
+    weights = np.zeros((side, side, 1), dtype=np.float32)
     span = np.arange(-_PIECE, _PIECE)
     rho = np.sqrt(span[:, None] ** 2 + span**2) / _PIECE
     # Sharp: where pieces meet, one of them wins within a few texels, and hardly anything is blurred.
-    weight = np.clip(1 - rho, 0, 1)[..., None].astype(np.float32) ** 4
+    weight = np.clip(1 - rho, 0, 1)[..., None].astype(np.float32) ** 6
     step = side // _PIECES
     for row in range(_PIECES):
         for column in range(_PIECES):

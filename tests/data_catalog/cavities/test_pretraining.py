@@ -14,7 +14,7 @@ from data_catalog.cavities.lamps import Lamps
 from data_catalog.cavities.noise import stream
 from data_catalog.cavities.pretraining import CavityConfig, cavity_config, cavity_recording
 from data_catalog.cavities.processing import Processor, random_sensor
-from data_catalog.cavities.real_textures import photographed_tile, texture_files
+from data_catalog.cavities.real_textures import _strewn, photographed_tile, texture_files
 from data_catalog.cavities.scene import Cavity
 from data_catalog.cavities.shapes import KINDS
 from data_catalog.cavities.views import CLIP_VIEWS, recording_poses, target_clips, unseen_share
@@ -145,6 +145,11 @@ class TestRecording:
 
 
 class TestRealTextures:
+    def test_the_pieces_of_a_patch_leave_no_place_bare(self) -> None:
+        patch = np.full((256, 256, 4), 0.5, dtype=np.float32)
+        for seed in range(12):
+            np.testing.assert_allclose(_strewn(patch, stream(seed, "paint")), 0.5, rtol=1e-5)
+
     def test_only_frames_at_even_positions_are_used(self, shared_data: Path) -> None:
         folder = shared_data / "laparoscopy_frames_40"
         if not folder.is_dir():
