@@ -186,7 +186,8 @@ def make_skin(
     ordinary = _ORDINARY.get(kind, "mucosa")
     ground = paint(ordinary, palette, rng, _GROUND_SIDE)
     if photograph is not None:
-        ground = photograph
+        # It was taken in white light, which is not the light of every scene.
+        ground = np.concatenate([palette.seen(photograph[..., :3]), photograph[..., 3:]], axis=2)
     layers = [_layer(ground, rng, -1, 0.0, 1.0, 0.0, 0.0)]
     patches = [name for name, share in _PATCHES[kind].items() if rng.random() < share]
     rng.shuffle(patches)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from data_catalog.cavities import skin
 from data_catalog.cavities.canvas import TEXEL_MM, Canvas
 from data_catalog.cavities.growths import TISSUES, Growth, stamp, tissue_shares
 from data_catalog.cavities.materials import MATERIALS, paint
@@ -128,6 +131,22 @@ class TestPaint:
             )
             lost = (values[:, 6] - np.square(gradient).sum(axis=1)).mean()
             assert lost == pytest.approx(share * 0.04, abs=0.012)
+
+
+@pytest.mark.parametrize("narrow_band", [False, True])
+def test_photographed_tissue_is_seen_in_the_light_of_the_scene(
+    narrow_band: bool, colon: Cavity, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn = draw_palette("colon", stream(1, "skin"))
+    monkeypatch.setattr(skin, "draw_palette", lambda kind, rng: replace(drawn, narrow_band=narrow_band))
+    photograph = np.random.default_rng(0).uniform(0.1, 0.9, (64, 64, 6)).astype(np.float32)
+    made = skin.make_skin("colon", colon.wall, [], 1.0, stream(1, "skin"), 18.0, photograph)
+    ground = made.layers[0].tile.stacked[0][1:65, 1:65]
+    np.testing.assert_array_equal(ground[..., 3], photograph[..., 3])
+    shown, (red, green, blue) = ground[..., :3], photograph[20, 30, :3].tolist()
+    assert np.array_equal(shown, photograph[..., :3]) is not narrow_band
+    seen = replace(drawn, narrow_band=narrow_band).seen((red, green, blue))
+    np.testing.assert_allclose(shown[20, 30], seen, rtol=1e-6)
 
 
 def test_a_cavity_is_the_same_each_time(colon: Cavity) -> None:
