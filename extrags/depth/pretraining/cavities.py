@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 __all__ = ["KINDS", "Cavities", "Kind", "Waves"]
@@ -208,12 +208,19 @@ class Cavities:
         return self._with_lumps(torch.logsumexp(inside * 12, dim=2) / 12, points)
 
     def _field(self, points: Tensor) -> Tensor:
+        return torch.minimum(self._ground(points), self.to_instruments(points))
+
+    def _ground(self, points: Tensor) -> Tensor:
         flat = points * torch.tensor([1.0, 1.0, 0.0], device=points.device)
         height = self.distance + self.relief_height * self.relief(flat)
-        inside = self._with_lumps(
+        return self._with_lumps(
             0.8 * (height - points[:, :, 2]), points - torch.nn.functional.pad(height[:, :, None], (2, 0))
         )
-        return torch.minimum(inside, self.to_instruments(points))
+
+    def on_instruments(self, points: Float[Tensor, "c n 3"]) -> Bool[Tensor, "c n"]:
+        """Which points of an open field's wall lie on a rod, with its bumps and wherever it has moved."""
+        points = self.at_rest(points)
+        return self.to_instruments(points) < self._ground(points)
 
     def to_instruments(self, points: Float[Tensor, "c n 3"]) -> Float[Tensor, "c n"]:
         """Distance to the nearest rod; far for scenes without."""

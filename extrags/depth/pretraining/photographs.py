@@ -225,17 +225,16 @@ class _Lamps:
     def radiance(
         self, scene: Cavities, mucosa: _Mucosa, points: Tensor, rotation: Tensor, center: Tensor
     ) -> Tensor:
-        normal = _normal(scene, points)
-        albedo = mucosa.albedo(scene.at_rest(points))
-        rods = scene.kind == "field"
-        if rods:
-            on_rod = scene.to_instruments(points) < 0.02
+        normal, at_rest = _normal(scene, points), scene.at_rest(points)
+        albedo = mucosa.albedo(at_rest)
+        if scene.kind == "field":
+            on_rod = scene.on_instruments(points)
             albedo = torch.where(on_rod[:, :, None], mucosa.rod_colour[:, None], albedo)
         to_eye = center[:, None] - points
         distance = to_eye.norm(dim=2, keepdim=True).clamp_min(1e-6)
         to_eye = to_eye / distance
         bent = normal + mucosa.relief_strength[:, :, None] * torch.stack(
-            [mucosa.relief(points + shift) for shift in (0.0, 7.3, 17.9)], dim=2
+            [mucosa.relief(at_rest + shift) for shift in (0.0, 7.3, 17.9)], dim=2
         )
         bent = bent / bent.norm(dim=2, keepdim=True)
         axis = rotation[:, None, :, 2]

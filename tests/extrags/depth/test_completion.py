@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import pytest
 import torch
 
 from extrags.depth.completion import INPUT_CHANNELS, STEREO, CompletionNetwork, completion_loss
+from extrags.depth.pretraining import cavities, photographs
 from extrags.depth.pretraining import examples as practice
 from extrags.depth.pretraining.cavities import KINDS, Cavities, Kind
 from extrags.depth.pretraining.examples import make_examples
@@ -159,6 +161,42 @@ def test_tissue_moves_in_some_scenes() -> None:
     moved = (scene.at_rest(points) - points).norm(dim=2).amax(dim=1)
     assert not moved[still].any()
     assert (moved[~still] > 0).all()
+
+
+def test_rods_are_of_one_colour_all_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bumps swell a rod, and in some scenes it moves with the tissue."""
+    monkeypatch.setattr(cavities, "MOVING_SHARE", 0.5)
+    scene = Cavities("field", 24, torch.Generator().manual_seed(1))
+    monkeypatch.setattr(photographs._Mucosa, "albedo", lambda mucosa, points: torch.full_like(points, 0.99))
+    scene.moment = 2.0
+    mucosa, lamps = photographs._Mucosa(scene, scene.generator), photographs._Lamps(scene)
+    lamps.shine, lamps.fixed = torch.zeros(24, 1), torch.ones(24, 1)
+    poses = scene.camera_paths(3)[:, 2]
+    x, y = torch.meshgrid(torch.linspace(-0.8, 0.8, 40), torch.linspace(-0.8, 0.8, 40), indexing="ij")
+    local = torch.stack([x.flatten(), y.flatten(), torch.ones(1600)], dim=1).expand(24, -1, -1)
+    directions = local @ poses[:, :3, :3].transpose(1, 2)
+    z, hit = photographs._march(scene, poses[:, :3, 3], directions)
+    points = poses[:, None, :3, 3] + z[:, :, None] * directions
+    light = lamps.radiance(scene, mucosa, points, poses[:, :3, :3], poses[:, :3, 3])[:, :, 0]
+    sun = torch.nn.functional.normalize(lamps.sun, dim=1)[:, None]
+    facing = (photographs._normal(scene, points) * sun).sum(2)
+    colour = light / (0.6 + 0.4 * facing)
+    # Without its rods a scene is free where they were.
+    tissue = without_rods(scene)
+    rod = hit & (tissue.clearance(points) > 1e-3)
+    assert int(rod.sum()) > 1000
+    wrong = (colour - mucosa.rod_colour[:, :1]).abs() > 1e-3
+    assert not wrong[rod].any()
+    on_tissue = hit & (tissue.clearance(points) < 1e-4)
+    assert torch.allclose(colour[on_tissue], torch.tensor(0.99), atol=1e-3)
+
+
+def without_rods(scene: Cavities) -> Cavities:
+    """The same scene without rods."""
+    without = copy.copy(scene)
+    point, direction, radius = scene.instruments
+    without.instruments = (point, direction, -radius.abs() - 1e-6)
+    return without
 
 
 def test_compression_spoils_only_what_is_compressed() -> None:
