@@ -29,6 +29,9 @@ from extrags.depth.pretraining.training import (
 
 log = logging.getLogger("extrags.depth.pretraining")
 
+FURTHER_SEED = 1_000_003
+"""For each example that was made before, so much is added to the seed of further ones."""
+
 
 def main() -> None:
     """Command line."""
@@ -52,7 +55,9 @@ def main() -> None:
     parser.add_argument(
         "--keep", type=float, default=0.0, help="share of the starting weights in the mean that is written"
     )
-    parser.add_argument("--bank", type=Path, help="examples made before: read if there, and written")
+    parser.add_argument(
+        "--bank", type=Path, help="examples made before: read if there, and written with those made now"
+    )
     parser.add_argument("--seconds", type=float, default=1e9, help="stop making examples after this time")
     parser.add_argument("--device", default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--most-examples", type=int, default=10**9, help="stop making examples at so many")
@@ -69,6 +74,9 @@ def main() -> None:
             for channels, truth, known in parts:
                 target.add(Examples(channels, truth, known))
         log.info("%d examples read", len(bank))
+        # From the seed alone the examples that were read would be made once more, and with fewer batches to
+        # validate with some of those that validate would be trained on.
+        generator.manual_seed(options.seed + FURTHER_SEED * (len(bank) + len(held_out)))
     network = CompletionNetwork().to(device)
     if options.start is not None:
         network.load_state_dict(
