@@ -38,5 +38,9 @@ class CavernConfig(BaseModel):
 
 
 def stream(scene: int, purpose: str, *indices: int) -> np.random.Generator:
-    """The random stream of a cavern for one purpose; streams do not influence each other."""
+    """The random stream of a cavern for one purpose; streams do not influence each other.
+
+    No index and the index 0 give the same stream: numpy fills a short seed up with zeros. (So vignetting and
+    gamma of a cavern come from the same numbers as exposure and first colour gain of recording A.)
+    """
     return np.random.default_rng([0xCAE85, scene, _STREAMS.index(purpose), *indices])

@@ -17,7 +17,10 @@ _CHUNK = 1 << 16
 
 
 def stream(scene: int, purpose: str, *indices: int) -> np.random.Generator:
-    """The random stream of a scene for one purpose; streams do not influence each other."""
+    """The random stream of a scene for one purpose; streams do not influence each other.
+
+    No index and the index 0 give the same stream: numpy fills a short seed up with zeros.
+    """
     return np.random.default_rng([0xCA517, scene, _STREAMS.index(purpose), *indices])
 
 

@@ -63,5 +63,9 @@ class PhantomConfig(BaseModel):
 
 
 def stream(scene: int, purpose: str, *indices: int) -> np.random.Generator:
-    """The random stream of a scene for one purpose; streams do not influence each other."""
+    """The random stream of a scene for one purpose; streams do not influence each other.
+
+    No index and the index 0 give the same stream: numpy fills a short seed up with zeros. (So the phase of
+    the uneven pace of recording A in the setting `sparse` is the scene's reference direction.)
+    """
     return np.random.default_rng([0xC0105, scene, _STREAMS.index(purpose), *indices])
