@@ -31,6 +31,7 @@ from data_catalog.phantom.geometry import Wall
 from data_catalog.phantom.trajectories import DISTANCED, TRAINING, PathStyle, styled_path
 from data_catalog.ray_casting import RayCaster
 from extrags.cameras import Cameras, pixel_rays
+from extrags.errors import ConfigError
 
 __all__ = ["PASSES", "Plan", "examination", "sees_pocket"]
 
@@ -70,7 +71,16 @@ class Plan:
 
 
 def examination(config: PhantomConfig) -> Plan:
-    """The frames of a thorough examination in the order of time."""
+    """The frames of a thorough examination in the order of time.
+
+    Raises:
+        ConfigError: when no frame lies between two that train.
+    """
+    if not 2 <= config.train_every < config.video_frames:
+        raise ConfigError(
+            f"the setting {config.setting} holds out frames that lie between two that train; there are none "
+            f"with train_every={config.train_every} and video_frames={config.video_frames}"
+        )
     video = np.arange(0, config.video_frames, config.train_every)
     passed = np.repeat(np.arange(len(PASSES)), len(video))
     number = np.tile(video, len(PASSES))

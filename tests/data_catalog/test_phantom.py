@@ -10,7 +10,7 @@ from data_catalog.phantom.config import PhantomConfig
 from data_catalog.phantom.geometry import build_wall
 from data_catalog.phantom.imaging import recording_sensor
 from data_catalog.phantom.recording import Phantom, record
-from data_catalog.phantom.thorough import PASSES, sees_pocket
+from data_catalog.phantom.thorough import PASSES, examination, sees_pocket
 from data_catalog.phantom.trajectories import MIN_CLEARANCE_MM, camera_path, path_style, styled_path
 from data_catalog.ray_casting import RayCaster
 from data_catalog.visibility import observed_from_depth
@@ -215,6 +215,16 @@ class TestThoroughExamination:
         for _, style, stream in PASSES:
             path = styled_path(config, wall, rays, style, stream, np.linspace(0, 1, 100))
             assert rays.clearance_mm(path[:, :3, 3]).min() > MIN_CLEARANCE_MM
+
+    @pytest.mark.parametrize(("video_frames", "train_every"), [(4, 1), (10, 10)])
+    def test_without_a_frame_between_two_that_train_nothing_is_held_out(
+        self, video_frames: int, train_every: int
+    ) -> None:
+        config = PhantomConfig(setting="covered", video_frames=video_frames, train_every=train_every)
+        with pytest.raises(ConfigError, match=f"none with train_every={train_every} "):
+            examination(config)
+        plan = examination(config.model_copy(update={"video_frames": 11, "train_every": 10}))
+        assert plan.number[~plan.trains].tolist() == [5] * len(PASSES)
 
     def test_one_recording_has_no_other(self) -> None:
         with pytest.raises(ConfigError, match="the setting covered has no recording a"):
