@@ -27,7 +27,11 @@ from extrags.sequence import EndoscopicSequence, Split
 __all__ = ["MIN_CLEARANCE_MM", "record", "recording_cameras"]
 
 MIN_CLEARANCE_MM = 2.5
-"""The lens keeps this distance from the wall."""
+"""The lens keeps this distance from the wall wherever the line through the chambers does.
+
+That line does not go round boulders: of caverns 0 to 39 seven (8, 9, 12, 19, 20, 35 and 38) have frames
+nearer to the wall, and of caverns 0 to 99 two (12 and 35) have one frame of a recording within the rock.
+"""
 _EVALUATES, _TRAINS = 0, 1
 _LOOK_AHEAD_MM = 15.0
 # Share of the chain, side of the lumen, share of the room, mean turn and its swing in degrees.
