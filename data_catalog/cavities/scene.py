@@ -9,12 +9,12 @@ from jaxtyping import Float
 
 from data_catalog.cavities.growths import draw_growths, stamp
 from data_catalog.cavities.noise import stream
-from data_catalog.cavities.shapes import KINDS, Kind, Shape, make_shape
+from data_catalog.cavities.shapes import Kind, Shape, make_shape
 from data_catalog.cavities.skin import Skin, make_skin
 from data_catalog.cavities.surface import Lattice, Wall, contour
 from data_catalog.ray_casting import RayCaster
 
-__all__ = ["NODES", "Cavity", "build_cavity", "kind_of"]
+__all__ = ["NODES", "Cavity", "build_cavity"]
 
 NODES = 1_600_000
 """Of the lattice that a wall is contoured on."""
@@ -39,11 +39,6 @@ class Cavity:
     wall: Wall
     rays: RayCaster
     skin: Skin
-
-
-def kind_of(scene: int, kinds: tuple[Kind, ...] = KINDS) -> Kind:
-    """The kind of a scene: in turn, so that each is as frequent."""
-    return kinds[scene % len(kinds)]
 
 
 def build_cavity(

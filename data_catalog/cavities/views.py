@@ -21,7 +21,7 @@ _TRIES = 14
 _COARSE = (16, 12)
 _NEAREST_CLIP = 0.5
 """What a clip looks at is farther than this times what the recording looks at."""
-_NEAREST_SHARE = 0.9
+_NEAREST_SHARE = 1.8
 """What is in the middle of the picture is farther than this times the lens's margin."""
 
 
@@ -117,7 +117,6 @@ def target_clips(
         for k, pose in enumerate(train.world_from_camera)
     ]
     nearest = _NEAREST_CLIP * float(np.median(usual))
-    small = Cameras(train.K, train.world_from_camera, train.width, train.height)
     poses, index = [], []
     for clip in range(clips):
         way = ("aside", "turned", "turned", "nearer", "back")[int(rng.integers(5))]
@@ -127,7 +126,7 @@ def target_clips(
             if drawn is None:
                 severity *= 0.9
                 continue
-            unseen = float(unseen_share(space.rays, train, _like(small, drawn)).mean())
+            unseen = float(unseen_share(space.rays, train, _like(train, drawn)).mean())
             miss = max(UNSEEN[0] - unseen, unseen - UNSEEN[1], 0.0)
             if miss < best_miss:
                 best, best_miss = drawn, miss
@@ -214,7 +213,7 @@ def _open_view(pose: Float[np.ndarray, "4 4"], space: FreeSpace) -> Float[np.nda
         directions = _middle_rays(pose)
         depth = space.rays.cast(pose[:3, 3], directions).distance
         depth = np.where(np.isfinite(depth), depth, 1e3)
-        if np.median(depth) > _NEAREST_SHARE * 2 * space.margin_mm:
+        if np.median(depth) > _NEAREST_SHARE * space.margin_mm:
             return pose
         open_way = unit((directions * np.minimum(depth, 60)[:, None]).sum(axis=0))
         forward = pose[:3, 2]
@@ -233,9 +232,9 @@ def _middle_rays(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "n 3"]:
     return np.asarray(local @ pose[:3, :3].T)
 
 
-def _turned(right: float, down: float, roll: float) -> Float[np.ndarray, "3 3"]:
+def _turned(right: float, up: float, roll: float) -> Float[np.ndarray, "3 3"]:
     y, x, z = np.array([0, 1.0, 0]), np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
-    return np.asarray(rotation_about(y, right) @ rotation_about(x, down) @ rotation_about(z, roll))
+    return np.asarray(rotation_about(y, right) @ rotation_about(x, up) @ rotation_about(z, roll))
 
 
 def _pose(rotation: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "4 4"]:
