@@ -112,7 +112,8 @@ class Processor:
         image = sensor.develop(light, exposure, rng).astype(np.float32) / 255
         image = self._graded(image)
         if not clean and self.interlace_px:
-            image[1::2] = np.roll(image, int(rng.choice([-1, 1])) * self.interlace_px, axis=1)[1::2]
+            columns = np.arange(image.shape[1]) - int(rng.choice([-1, 1])) * self.interlace_px
+            image[1::2] = image[1::2, np.clip(columns, 0, image.shape[1] - 1)]
         picture = np.round(255 * np.clip(image, 0, 1)).astype(np.uint8)
         return picture if clean or not self.quality else self._compressed(picture)
 

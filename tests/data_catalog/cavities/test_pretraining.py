@@ -113,6 +113,8 @@ class TestProcessing:
         edge = np.abs(np.diff(image[:, 4:-4], axis=1)).argmax(axis=1)
         assert len(set(edge[::2].tolist())) == 1
         assert abs(int(edge[1]) - int(edge[0])) == 2
+        # What leaves a row on one side does not come in again on the other.
+        assert image[1::2, :4].max() < image[1::2, -4:].min()
 
 
 class TestRecording:
