@@ -84,7 +84,7 @@ def pretraining_recording(index: int, *, to_restore: bool = True) -> Pretraining
     truth: dict[str, Any] = {
         "generator_version": GENERATOR_VERSION,
         "phantom": config.model_dump(),
-        "exposure": exposures,
+        "exposure": exposures + [1.0] * len(targets),
     }
     sequence = EndoscopicSequence(
         name=f"pretraining/{index}",

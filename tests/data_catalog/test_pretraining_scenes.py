@@ -68,6 +68,12 @@ def test_any_view_is_photographed_as_those_to_restore_are(recording: Pretraining
     assert np.array_equal(recording.photograph(whole.cameras[view]), whole.rgb[view])
 
 
+def test_every_frame_has_its_exposure(recording: PretrainingRecording) -> None:
+    exposure = np.array(recording.sequence.truth["exposure"])
+    assert len(exposure) == len(recording.sequence)
+    assert (exposure[recording.sequence.test] == 1).all()
+
+
 def test_what_is_to_be_restored_is_not_trained_on(recording: PretrainingRecording) -> None:
     small = recording.sequence
     assert len(small.train) == 4
