@@ -48,6 +48,8 @@ READERS: tuple[FolderReader, ...] = (
 """The most specific first: a folder is read by the first that recognises it."""
 
 _registered: list[FolderReader] = []
+_NAMED_FILES = 5
+"""So many of the files between which a user has to choose are named."""
 
 
 def readers() -> tuple[FolderReader, ...]:
@@ -142,9 +144,23 @@ def _recognised(path: Path) -> FolderReader:
             f"({', '.join(video.VIDEO_SUFFIXES)}) or a DICOM file ({', '.join(dicom.DICOM_SUFFIXES)})",
             file=path,
         )
+    for kind, suffixes in (("videos", video.VIDEO_SUFFIXES), ("DICOM files", dicom.DICOM_SUFFIXES)):
+        found = video.files_of_kind(path, suffixes)
+        if len(found) > 1:
+            raise SourceError(
+                f"{len(found)} {kind} in this folder: {_listed(found)}; give the path of the one to read",
+                file=path,
+            )
     kinds = "; ".join(f"{reader.name}: {reader.summary}" for reader in readers())
     empty = "the folder is empty" if not any(path.iterdir()) else "no sequence recognised in this folder"
     raise SourceNotFoundError(f"{empty}; expected one of: {kinds}", file=path)
+
+
+def _listed(files: list[Path]) -> str:
+    names = [file.name for file in files[:_NAMED_FILES]]
+    more = [f"{len(files) - len(names)} more"] if len(files) > len(names) else []
+    *first, last = names + more
+    return f"{', '.join(first)} and {last}"
 
 
 def _reader(source: Source) -> FolderReader:

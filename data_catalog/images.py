@@ -148,7 +148,7 @@ def read_depth(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:
 
     Raises:
         SourceNotFoundError: there is no such file.
-        SourceError: the file is damaged, or not one channel.
+        SourceError: the file is damaged, not one channel, or in colours of a palette.
     """
     if file.suffix.lower() == ".npy":
         if not file.is_file():
@@ -158,7 +158,7 @@ def read_depth(file: Path, *, frame: object = None) -> Float[np.ndarray, "h w"]:
         except (ValueError, OSError) as error:
             raise SourceError(f"cannot be read: {error}", file=file, frame=frame, field="depth") from error
     else:
-        values = np.array(_opened(file, frame, "depth", mode=None))
+        values = np.array(_stored_numbers(file, frame))
     if values.ndim != 2 or values.dtype.kind not in "fiu":
         raise SourceError(
             f"found an array {values.shape} of {values.dtype}; expected one number per pixel",
@@ -364,12 +364,24 @@ class Resampling:
         return array[self.top : self.top + self.crop_height, self.left : self.left + self.crop_width]
 
 
-def _opened(file: Path, frame: object, field: str, *, mode: str | None) -> np.ndarray:
+def _stored_numbers(file: Path, frame: object) -> np.ndarray:
+    """Pixels of an image that holds numbers; a palette of greys is undone."""
     from PIL import Image
 
-    with _image_errors(file, frame, field), Image.open(file) as image:
+    with _image_errors(file, frame, "depth"), Image.open(file) as image:
         image.load()
-        return np.asarray(image if mode is None else image.convert(mode))
+        if image.mode not in ("P", "PA"):
+            return np.asarray(image)
+        colours = np.asarray(image.convert("RGB"))
+    # Programs that make files smaller store grey of few values as places in a palette.
+    if (colours != colours[..., :1]).any():
+        raise SourceError(
+            "colours of a palette; expected one number per pixel, not depth in false colours",
+            file=file,
+            frame=frame,
+            field="depth",
+        )
+    return colours[..., 0]
 
 
 @contextmanager

@@ -120,7 +120,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="transforms",
-    version=4,
+    version=5,
     summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in "
     "data_catalog/readers/transforms_json.py",
     recognises=_recognises,

@@ -25,18 +25,22 @@ from jaxtyping import UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import FootageFrame, TimeSpan
-from data_catalog.images import colour_files
+from data_catalog.images import colour_files, natural_key
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames
 from data_catalog.readers.frames_folder import INTRINSICS_FILE, MASK_FILE, is_mask
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 
-__all__ = ["READER", "VIDEO_SUFFIXES", "VideoFile", "only_file", "with_files_beside"]
+__all__ = ["READER", "VIDEO_SUFFIXES", "VideoFile", "files_of_kind", "only_file", "with_files_beside"]
 
 logger = logging.getLogger(__name__)
 
-VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".mxf", ".y4m")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".mxf", ".y4m"),
+    # Transport streams and discs of recorders, and what telephones and older programs write.
+    *(".ts", ".m2ts", ".mts", ".m2t", ".vob", ".m2v", ".3gp", ".3g2", ".asf", ".flv", ".ogv"),
+)
 _MIN_DECODED = 0.9
 _USUAL_FRAMES_PER_S = 25.0
 _COUNTS_WHAT_IS_HIDDEN = "mp4"
@@ -161,14 +165,24 @@ def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
         return place if place.suffix.lower() in suffixes else None
     if not place.is_dir():
         return None
-    # Hidden ones are none, as of images.
-    found = [
-        file
-        for file in place.iterdir()
-        if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
-    ]
+    found = files_of_kind(place, suffixes)
     images = [file for file in colour_files(place) if not is_mask(file)]
     return found[0] if len(found) == 1 and not images else None
+
+
+def files_of_kind(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Files with one of the suffixes directly in a folder, in natural order; hidden ones are none.
+
+    Args:
+        folder: that may hold them.
+        suffixes: of the kind, in small letters.
+    """
+    found = [
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
+    ]
+    return sorted(found, key=lambda file: natural_key(file.name))
 
 
 def with_files_beside(file: Path) -> list[Path]:

@@ -94,6 +94,20 @@ class TestFolders:
         with pytest.raises(SourceNotFoundError, match="no sequence recognised"):
             read(tmp_path)
 
+    @pytest.mark.parametrize(("suffix", "kind"), [("mp4", "videos"), ("dcm", "DICOM files")])
+    def test_several_recordings_are_named(self, tmp_path, suffix, kind) -> None:
+        for name in (f"exam_10.{suffix}", f"exam_9.{suffix.upper()}", f"._exam_9.{suffix}"):
+            (tmp_path / name).write_bytes(b"0")
+        told = rf"2 {kind} in this folder: exam_9\.{suffix.upper()} and exam_10\.{suffix}; give the path"
+        with pytest.raises(SourceError, match=told):
+            resolve(tmp_path)
+
+    def test_of_many_recordings_some_are_named(self, tmp_path) -> None:
+        for number in range(9):
+            (tmp_path / f"{number}.ts").write_bytes(b"0")
+        with pytest.raises(SourceError, match=r"9 videos .*: 0\.ts, 1\.ts, 2\.ts, 3\.ts, 4\.ts and 4 more;"):
+            resolve(tmp_path)
+
 
 class TestPhantomSettings:
     def test_size_follows_the_settings(self) -> None:

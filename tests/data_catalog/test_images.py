@@ -61,6 +61,31 @@ def test_a_tiff_that_is_not_read_is_not_said_to_be_no_image(tmp_path: Path) -> N
         read_depth(file)
 
 
+class TestDepthOfAPalette:
+    """Programs that make files smaller store grey of few values so; false colours are stored the same."""
+
+    VALUES = np.array([[0, 40, 200], [200, 7, 40]], np.uint8)
+
+    def written(self, file: Path, colours: np.ndarray) -> Path:
+        places = np.searchsorted(np.unique(self.VALUES), self.VALUES).astype(np.uint8)
+        image = Image.fromarray(places, mode="P")
+        image.putpalette(colours.astype(np.uint8).tobytes())
+        image.save(file)
+        return file
+
+    def test_greys_are_what_they_stand_for(self, tmp_path: Path) -> None:
+        greys = np.repeat(np.unique(self.VALUES)[:, None], 3, axis=1)
+        found = read_depth(self.written(tmp_path / "a.png", greys))
+        assert found.dtype == np.float32
+        np.testing.assert_array_equal(found, self.VALUES)
+
+    def test_colours_are_refused(self, tmp_path: Path) -> None:
+        colours = np.array([[0, 0, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255]])
+        file = self.written(tmp_path / "a.png", colours)
+        with pytest.raises(SourceError, match=r"a\.png, frame 3, field depth: colours of a palette"):
+            read_depth(file, frame=3)
+
+
 def test_a_tiff_tells_how_many_of_sixteen_bits_it_uses(tmp_path: Path) -> None:
     """Of 12 bits, packed, white is 4095."""
     values = np.array([[0, 2048, 4095, 16]], dtype=np.uint16)

@@ -24,6 +24,7 @@ from tests.data_catalog.footage_fixture import (
     interlaced,
     retimed,
     turned,
+    write_coded,
     write_cut_out,
     write_flagged,
     write_late,
@@ -253,6 +254,26 @@ class TestKindsOfFiles:
         for name, image in zip(sequence.frame_names, sequence.rgb, strict=True):
             assert image.dtype == np.uint8
             assert np.abs(image.astype(int) - scene[int(name)]).mean() < 6
+
+    @pytest.mark.parametrize(
+        ("suffix", "codec"),
+        [
+            (".ts", "libx264"),
+            (".m2ts", "libx264"),
+            (".MTS", "libx264"),
+            (".vob", "mpeg2video"),
+            (".m2v", "mpeg2video"),
+            (".3gp", "mpeg4"),
+            (".asf", "msmpeg4"),
+            (".flv", "flv"),
+        ],
+    )
+    def test_containers(self, tmp_path, suffix, codec) -> None:
+        scene = moving_scene(12, *SIZE, speed=6)
+        sequence = read(write_coded(tmp_path / f"a{suffix}", scene, codec))
+        assert len(sequence) >= 4
+        for name, image in zip(sequence.frame_names, sequence.rgb, strict=True):
+            assert np.abs(image.astype(int) - scene[int(name)]).mean() < 8
 
     def test_pixels_that_are_not_square(self, tmp_path) -> None:
         file = write_ten_bit(tmp_path / "a.y4m", moving_scene(12, *SIZE, speed=6), pixel_aspect="16:15")
