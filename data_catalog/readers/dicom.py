@@ -247,7 +247,7 @@ def _frames(place: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="dicom",
-    version=3,
+    version=4,
     summary="a DICOM multi-frame file (dcm), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

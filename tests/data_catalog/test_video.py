@@ -15,7 +15,7 @@ import pytest
 from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.footage import FootageFrame, TimeSpan
 from data_catalog.readers.footage_frames import footage_frames
-from data_catalog.readers.video import VideoFile
+from data_catalog.readers.video import VideoFile, _colours
 from data_catalog.survey import Survey, choose_frames, survey
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError
@@ -105,6 +105,42 @@ class TestColours:
         (found,) = VideoFile(file).frames(TimeSpan())
         # Eight bits of luminance and chrominance.
         assert np.abs(found.rgb.astype(int) - colour).max() <= 3
+
+    @pytest.mark.parametrize("color_range", [1, 2], ids=["limited", "full"])
+    @pytest.mark.parametrize(("pixel_format", "step"), [("yuv420p", 1), ("yuv422p", 1), ("yuv420p10le", 4)])
+    def test_greys_are_rounded_to_the_nearest(self, color_range, pixel_format, step) -> None:
+        """FFmpeg's own choice makes limited ranges up to 1/255 too dark, and those of 10 bits 2/255."""
+        levels = range(16, 236)
+        found = [_colours(grey(level * step, 128 * step, pixel_format, color_range)) for level in levels]
+        told = np.array(levels) if color_range == 2 else 255 * (np.array(levels) - 16) / 219
+        assert np.abs(np.array(found) - told[:, None, None, None]).max() <= 0.51
+
+    @pytest.mark.parametrize("color_range", [1, 2], ids=["limited", "full"])
+    def test_colours_are_not_darkened(self, color_range) -> None:
+        scene = cv2.GaussianBlur(np.random.default_rng(0).uniform(0, 255, (120, 160, 3)), (0, 0), 2)
+        # BT.709 by hand: FFmpeg's own way there rounds as badly as that back.
+        red, green, blue = np.moveaxis(scene, -1, 0)
+        luminance = 0.2126 * red + 0.7152 * green + 0.0722 * blue
+        chrominances = [(blue - luminance) / 1.8556, (red - luminance) / 1.5748]
+        scales, floor = ((219 / 255, 224 / 255), 16) if color_range == 1 else ((1, 1), 0)
+        planes = [luminance * scales[0] + floor, *(part * scales[1] + 128 for part in chrominances)]
+        frame = av.VideoFrame(160, 120, "yuv420p")
+        for plane, values in zip(frame.planes, planes, strict=True):
+            small = cv2.resize(values, (plane.width, plane.height), interpolation=cv2.INTER_AREA)
+            padded = np.pad(small, ((0, 0), (0, plane.line_size - plane.width)))
+            plane.update(np.rint(padded).astype(np.uint8).tobytes())
+        frame.color_range, frame.colorspace = color_range, 1
+        error = _colours(frame) - scene
+        assert np.abs(error.mean(axis=(0, 1))).max() < 0.1
+
+
+def grey(luminance: int, chrominance: int, pixel_format: str, color_range: int) -> av.VideoFrame:
+    frame = av.VideoFrame(96, 16, pixel_format)
+    kind = np.dtype(np.uint16 if pixel_format.endswith("10le") else np.uint8)
+    for plane, value in zip(frame.planes, (luminance, chrominance, chrominance), strict=True):
+        plane.update(np.full(plane.buffer_size // kind.itemsize, value, kind).tobytes())
+    frame.color_range, frame.colorspace = color_range, 1
+    return frame
 
 
 def calibration_file(folder: Path) -> Path:
