@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -35,6 +36,7 @@ def read_renders(
     *,
     depth_folder: Path | None = None,
     depth_step_mm: float | None = None,
+    not_measured: Sequence[str] = (),
 ) -> RenderedViews:
     """Read renders of a sequence's held-out frames.
 
@@ -44,6 +46,7 @@ def read_renders(
         depth_folder: z-depth maps of the same frames, 0 where there is no surface: `.npy` or floating-point
             TIFF in the unit of the sequence, or 16-bit PNG or TIFF in steps of `depth_step_mm`.
         depth_step_mm: unit of integer depth images; not needed for floating-point ones.
+        not_measured: names of frames that the sequence lacks, of which there may be images all the same.
 
     Returns:
         The renders in the order of `sequence.test`. Alpha is 1; without depth maps they have no depth.
@@ -59,10 +62,10 @@ def read_renders(
     if depth_step_mm is not None and not 0 < depth_step_mm < math.inf:
         raise ConfigError(f"a step of depth of {depth_step_mm} mm; expected a length above zero")
     shape = (sequence.height, sequence.width)
-    rgb = [_color(file, shape) for file in _files_of(folder, sequence, COLOR_SUFFIXES, "image")]
+    rgb = [_color(file, shape) for file in _files_of(folder, sequence, COLOR_SUFFIXES, "image", not_measured)]
     depth = np.zeros((len(rgb), *shape), dtype=np.float32)
     if depth_folder is not None:
-        files = _files_of(depth_folder, sequence, DEPTH_SUFFIXES, "depth map")
+        files = _files_of(depth_folder, sequence, DEPTH_SUFFIXES, "depth map", not_measured)
         depth = np.stack([_depth(file, shape, depth_step_mm) for file in files])
     return RenderedViews(
         np.stack(rgb),
@@ -73,7 +76,13 @@ def read_renders(
     )
 
 
-def _files_of(folder: Path, sequence: EndoscopicSequence, suffixes: frozenset[str], kind: str) -> list[Path]:
+def _files_of(
+    folder: Path,
+    sequence: EndoscopicSequence,
+    suffixes: frozenset[str],
+    kind: str,
+    not_measured: Sequence[str],
+) -> list[Path]:
     """One file per held-out frame, in their order."""
     if not folder.is_dir():
         raise SourceNotFoundError(f"there is no such folder of {kind}s", file=folder)
@@ -86,7 +95,8 @@ def _files_of(folder: Path, sequence: EndoscopicSequence, suffixes: frozenset[st
         kinds = ", ".join(sorted(suffixes))
         raise SourceNotFoundError(f"the folder holds no {kind} ({kinds})", file=folder)
     wanted = [_stem(path) for path in paths]
-    every = {_stem(_bare(sequence.frame_name(frame))) for frame in range(len(sequence))}
+    frames = [sequence.frame_name(frame) for frame in range(len(sequence))]
+    every = {_stem(_bare(name)) for name in (*frames, *not_measured)}
     by_stem = _by_name({file: file.stem for file in files}, kind)
     named = [stem for stem in by_stem if stem in every]
     if named and (len(named) == len(by_stem) or len(set(wanted)) < len(wanted)):

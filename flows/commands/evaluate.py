@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import logging
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,8 @@ from flows.commands.common import finished_run, run_config, set_up_logging, stor
 from flows.commands.options import Parser, add_json, add_method
 
 __all__ = ["add_arguments", "evaluate"]
+
+logger = logging.getLogger(__name__)
 
 GROUPS = ("", "aligned", "observed", "unobserved", "whole")
 
@@ -54,7 +58,11 @@ def evaluate(given: argparse.Namespace) -> int:
 
 
 def _renders(given: argparse.Namespace) -> dict[str, Any]:
-    """Measure a folder; the sequence comes from the store, or is read into it."""
+    """Measure a folder; the sequence comes from the store, or is read into it.
+
+    Where the store has poses that were estimated with these settings, frames are those that a run measures:
+    without the ones that got no pose, and as the estimated lens makes them.
+    """
     from extrags.store import Store
     from flows.environment import prepare
 
@@ -64,7 +72,7 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
     from extrags.metrics.protocol import evaluate_views
     from extrags.sequence import EndoscopicSequence
     from flows.methods import METHODS
-    from flows.runners import DirectRunner
+    from flows.runners import DirectRunner, NotInStoreError, StoreRunner
     from flows.wiring import SequenceRun
     from tasks.weights import lpips_by_net, lpips_weights
 
@@ -74,11 +82,29 @@ def _renders(given: argparse.Namespace) -> dict[str, Any]:
     if outcome.error is not None:
         raise outcome.error
     sequence = run.store.load(EndoscopicSequence, run.refs["sequence"])
+    without_pose: tuple[str, ...] = ()
+    lookup = StoreRunner(root)
+    known = SequenceRun(given.sequence, config, root, lookup, given.profile, leave_out=left_out)
+    with suppress(NotInStoreError):
+        if known.run("poses").error is None and "poses" in known.refs:
+            read, sequence = sequence, known.store.load(EndoscopicSequence, known.refs["poses"])
+            held_out = [read.frame_name(int(frame)) for frame in read.test]
+            left = {sequence.frame_name(int(frame)) for frame in sequence.test}
+            without_pose = tuple(name for name in held_out if name not in left)
+    if without_pose:
+        logger.warning(
+            "%s: %d of %d held-out frames have no estimated pose and are not measured: %s",
+            given.sequence,
+            len(without_pose),
+            len(without_pose) + len(sequence.test),
+            ", ".join(without_pose),
+        )
     views = read_renders(
         Path(given.renders),
         sequence,
         depth_folder=None if given.depth is None else Path(given.depth),
         depth_step_mm=given.depth_step,
+        not_measured=without_pose,
     )
     return evaluate_views(
         views,

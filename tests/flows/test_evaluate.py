@@ -13,12 +13,15 @@ from PIL import Image
 
 from extrags.errors import ConfigError
 from extrags.metrics.protocol import RenderedViews
+from extrags.poses import PoseEstimate
 from extrags.sequence import EndoscopicSequence
 from flows.cli import main
 from flows.commands.benchmark import parsed_seeds, parsed_variants
 from flows.commands.common import items
 from flows.outcome import SequenceOutcome
-from tests.flows.tiny import SEQUENCE, TINY
+from flows.runners import DirectRunner
+from flows.wiring import run_sequence
+from tests.flows.tiny import SEQUENCE, TINY, tiny_config
 
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
 
@@ -50,6 +53,18 @@ def folders(finished: tuple[str, SequenceOutcome], tmp_path_factory: pytest.Temp
     return root
 
 
+def all_but_one_held_out(sequence: EndoscopicSequence, config: object) -> PoseEstimate:
+    """The poses of the source, of all frames but the first held-out one."""
+    assert sequence.world_from_camera is not None
+    registered = np.arange(len(sequence)) != sequence.test[0]
+    found = np.where(registered[:, None, None], sequence.world_from_camera, np.nan)
+    counts = {"registered_train": 1, "n_train": 1, "registered_test": 1, "n_test": 1}
+    no_points = np.zeros((0, 3), np.float32)
+    return PoseEstimate(
+        "colmap", found, registered, no_points, no_points.astype(np.uint8), None, True, counts
+    )
+
+
 def settled(store: str) -> list[str]:
     return ["--profile", "quick", "--store", store, *SETTINGS]
 
@@ -76,6 +91,35 @@ class TestEvaluate:
         more = ["--renders", str(folders / "renders"), "--method", "oracle", "--json", "-"]
         assert main(["evaluate", SEQUENCE, *settled(store), *more]) == 0
         assert json.loads(capsys.readouterr().out)["n_views"] == 14
+
+    @pytest.mark.parametrize("also", [False, True], ids=["without them", "with them"])
+    def test_renders_where_frames_got_no_pose(
+        self,
+        also: bool,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+        caplog: pytest.LogCaptureFixture,
+    ) -> None:
+        monkeypatch.setattr("extrags.poses.estimate_poses", all_but_one_held_out)
+        store = str(tmp_path / "store")
+        config = tiny_config(poses__replace_given=True)
+        outcome = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="poses")
+        read, posed = (
+            EndoscopicSequence.load(Path(outcome.artefacts[name]) / "sequence")
+            for name in ("ingest", "sequence")
+        )
+        assert len(posed.test) == len(read.test) - 1
+        folder = tmp_path / "renders"
+        folder.mkdir()
+        for frame in read.test if also else read.test[1:]:
+            Image.fromarray(read.rgb[frame]).save(folder / f"{read.frame_name(int(frame))}.png")
+        more = ["--set", "poses.replace_given=true", "--renders", str(folder), "--json", "-"]
+        assert main(["evaluate", SEQUENCE, *settled(store), *more]) == 0
+        assert json.loads(capsys.readouterr().out)["n_views"] == len(posed.test)
+        left_out = read.frame_name(int(read.test[0]))
+        assert f"1 of {len(read.test)} held-out frames have no estimated pose" in caplog.text
+        assert f"not measured: {left_out}" in caplog.text
 
     def test_a_finished_run(
         self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]

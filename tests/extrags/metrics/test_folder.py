@@ -96,6 +96,16 @@ class TestFramesOfDifferentFolders:
         np.testing.assert_array_equal(np.rint(renders.rgb * 255), LEVELS[[2, 3]])
 
 
+def test_images_of_frames_that_are_not_measured(sequence: EndoscopicSequence, tmp_path: Path) -> None:
+    """As of frames that the estimate of poses left out: there may be some or none, by name."""
+    folder = write(tmp_path / "renders", {f"b_{index:04d}.png": LEVELS[index] for index in (*TEST, 0)})
+    Image.fromarray(LEVELS[2]).save(folder / "b_0007.png")
+    with pytest.raises(SourceError, match=r"some are not: b_0007\.png"):
+        read_renders(folder, sequence)
+    views = read_renders(folder, sequence, not_measured=("b_0007", "b_0008"))
+    np.testing.assert_array_equal(views.rgb, LEVELS[TEST].astype(np.float32) / 255)
+
+
 def test_else_numbers_decide_and_nine_comes_before_ten(sequence: EndoscopicSequence, tmp_path: Path) -> None:
     folder = write(
         tmp_path / "renders",
