@@ -297,6 +297,14 @@ def board_rows(store: Store, patterns: Sequence[str] = (), target: str = "") -> 
                 profile=str(record["profile"]),
                 seed="" if seed is None else str(seed),
                 settings=setting_text(record["variant"]),
+                further=setting_text(
+                    {
+                        name: value
+                        # Records of earlier versions have none.
+                        for name, value in record.get("settings", {}).items()
+                        if name not in record["variant"]
+                    }
+                ),
                 status=record["status"],
                 reason=f"{record['stage']}: {record['reason']}" if record["status"] == "failed" else "",
                 ended=str(record["ended"]),

@@ -26,6 +26,8 @@ class BoardRow:
         profile: named settings.
         seed: of all stages; empty for each stage's own.
         settings: what a matrix changed, in words; empty for nothing.
+        further: other settings that were given, in words. They do not set runs apart: of runs that differ in
+            these alone the last one is on record.
         status: how its last run ended.
         reason: why it failed.
         ended: UTC, ISO 8601.
@@ -40,6 +42,7 @@ class BoardRow:
     profile: str
     seed: str = ""
     settings: str = ""
+    further: str = ""
     status: Literal["ok", "failed"] = "ok"
     reason: str = ""
     ended: str = ""
@@ -82,7 +85,7 @@ def build_leaderboard(rows: Sequence[BoardRow], *, name: str = "Leaderboard") ->
         "leaderboard.html.j2",
         name=name,
         summary=_summary(rows),
-        warning=_warning(rows),
+        warnings=_warnings(rows),
         facts=[
             ("Runs", count(len(rows))),
             ("Sequences", count(len({row.sequence for row in rows}))),
@@ -115,15 +118,23 @@ def _summary(rows: Sequence[BoardRow]) -> str:
         return "No run is on record."
     newest = max(row.ended for row in rows)[:16].replace("T", " ")
     return (
-        f"The last run of each sequence, method, profile and seed on record; the newest ended {newest} UTC."
+        "The last run of each sequence, method, profile and seed on record, whatever its further settings; "
+        f"the newest ended {newest} UTC."
     )
 
 
-def _warning(rows: Sequence[BoardRow]) -> str:
-    columns = _distinct(row.column for row in rows if row.held_out_trained_on)
-    if not columns:
-        return ""
-    return f"Held-out frames were trained on in {', '.join(columns)}, which is never marked as best."
+def _warnings(rows: Sequence[BoardRow]) -> list[str]:
+    found = []
+    if columns := _distinct(row.column for row in rows if row.held_out_trained_on):
+        found.append(
+            f"Held-out frames were trained on in {', '.join(columns)}, which is never marked as best."
+        )
+    if len({row.further for row in rows}) > 1:
+        found.append(
+            "Not all runs had the same further settings: they stand with each in the list of all runs, and "
+            "the tables before it do not tell them apart."
+        )
+    return found
 
 
 def _board(rows: Sequence[BoardRow], figure: Figure, profile: str) -> dict[str, Any] | None:
@@ -210,10 +221,11 @@ def _run(row: BoardRow, shown: Sequence[Figure]) -> dict[str, Any]:
 
 
 def _csv(rows: Sequence[BoardRow], shown: Sequence[Figure]) -> str:
-    header = ["sequence", "method", "profile", "seed", "settings", "status", "reason", "ended", "seconds"]
+    header = ["sequence", "method", "profile", "seed", "settings", "further_settings"]
+    header += ["status", "reason", "ended", "seconds"]
     lines: list[list[Cell]] = [
         [
-            *(row.sequence, row.method, row.profile, row.seed, row.settings),
+            *(row.sequence, row.method, row.profile, row.seed, row.settings, row.further),
             *(row.status, row.reason, row.ended, row.seconds),
             *(None if row.metrics is None else figure_of(row.metrics, item.name) for item in shown),
         ]

@@ -60,7 +60,7 @@ def store(finished: tuple[str, SequenceOutcome], tmp_path_factory: pytest.TempPa
         case = SequenceCase(SEQUENCE, profile="quick", seed=0, changed=changed)
         record_outcome(found, case, outcome, "report", config)
     failed = SequenceOutcome(SEQUENCE, "failed")
-    case = SequenceCase(SEQUENCE, method="3dgs", profile="quick")
+    case = SequenceCase(SEQUENCE, method="3dgs", profile="quick", settings={"coarse.iterations": 60})
     record_outcome(found, case, failed, "report", config)
     return found
 
@@ -124,6 +124,11 @@ def test_rows_of_the_leaderboard(store: Store) -> None:
         ("3dgs", "failed"),
         ("extrags", "ok"),
         ("extrags", "ok"),
+    ]
+    assert [(row.settings, row.further) for row in rows] == [
+        ("", "coarse.iterations = 60"),
+        ("", ""),
+        ("report.held_out_views = 2", ""),
     ]
     assert rows[1].metrics is not None
     assert rows[1].link.startswith("file://")

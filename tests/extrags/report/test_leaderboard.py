@@ -69,6 +69,19 @@ def test_settings_of_a_matrix_are_columns_of_their_own() -> None:
     assert "3dgs, coarse.iterations = 500" in Page(build_leaderboard([ROWS[0], changed])).text
 
 
+def test_further_settings_stand_with_each_run() -> None:
+    """They do not set runs apart, so that who reads the tables has to be told of them."""
+    further = "coarse.iterations = 500"
+    rows = [ROWS[0], replace(ROWS[4], further=further)]
+    page = Page(build_leaderboard(rows))
+    assert f"extrags {further} quick" in page.text
+    assert "Not all runs had the same further settings" in page.text
+    (file,) = (lines(link) for link in page.links if link.startswith("data:"))
+    assert [line["further_settings"] for line in file] == ["", further]
+    same = Page(build_leaderboard([replace(row, further=further) for row in rows]))
+    assert "Not all runs" not in same.text
+
+
 @pytest.mark.parametrize(
     ("sequence", "dataset"),
     [
