@@ -94,7 +94,7 @@ class Metric:
         key: its name in the tree of metrics and in tables: lower case, digits and underscores.
         label: name shown in tables and pages.
         higher_is_better: whether larger values are better.
-        unit: empty for a plain number.
+        unit: empty for a plain number; `mm` stands for the unit of the scene where that is not metric.
         digits: decimals on pages.
         table_digits: decimals in tables on the command line.
         kind: photometric metrics are measured by `measure`, the others by `extrags.metrics.depth` and

@@ -82,6 +82,13 @@ def test_says_what_was_gained(html: str) -> None:
     assert "3dgs (baseline)" in text
 
 
+def test_lengths_are_millimetres_of_metric_scenes_alone(html: str) -> None:
+    told = "of scenes that are not metric in units of the scene"
+    assert told in Page(html).text
+    plain = [run("3dgs", "phantom/0", 0, 20.0) | {"metrics": metrics_of(20.0)}]
+    assert told not in Page(build_benchmark_report(BenchmarkInputs("light", plain, "3dgs", METHODS))).text
+
+
 def test_profiles_are_told_apart_in_words_and_charts() -> None:
     quick = runs_of({"phantom/0": 1.0}, seeds=2)
     balanced = [{**run, "profile": "balanced"} for run in runs_of({"phantom/0": 3.0}, seeds=2)]
