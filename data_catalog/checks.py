@@ -61,7 +61,7 @@ def check_sequence(sequence: EndoscopicSequence, *, file: object = None) -> None
         file: named in errors.
 
     Raises:
-        PoseError: a pose that is not a rigid motion, or axes that the depth contradicts.
+        PoseError: a pose that is not a rigid motion, or axes or positions that the depth contradicts.
         SourceError: anything else; names frame and field.
     """
     _check_split(sequence, file)
@@ -202,10 +202,11 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
 
     Depth carried from frame to frame meets the next frame's depth only when both have one unit. Where it does
     not, but does so with all depth times one factor, that factor is named. Frames without parallax tell
-    nothing.
+    nothing, and where cameras move little any large factor fits as well as no motion: that is no unit.
 
     Raises:
         SourceError: another factor, at least 1.5 times more or less, fits much better.
+        PoseError: no motion at all fits much better, and no factor much better than that.
     """
     pairs = neighbouring_frames(sequence)
     if sequence.world_from_camera is None or sequence.depth_mm is None or not pairs:
@@ -224,7 +225,10 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     errors = np.array([error_with(float(factor)) for factor in _DEPTH_FACTORS])
     factor, best = float(_DEPTH_FACTORS[errors.argmin()]), float(errors.min())
     clearly_other = max(factor, 1 / factor) >= _CLEARLY_OTHER_FACTOR
-    if clearly_other and best < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
+    if not clearly_other or best >= min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
+        return
+    still = error_with(np.inf)
+    if best < _CLEARLY_BETTER * still:
         nearest = min(_KNOWN_FACTORS, key=lambda known: abs(np.log(known / factor)))
         hint = f", as of {_KNOWN_FACTORS[nearest]}" if abs(np.log(nearest / factor)) < 0.2 else ""
         raise SourceError(
@@ -233,6 +237,14 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
             f"{factor:.3g}{hint}. Expected depth in the unit of the poses",
             file=file,
             field="depth_mm",
+        )
+    if still < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
+        raise PoseError(
+            f"the positions of the cameras contradict the depth: carried from frame to frame it is off by "
+            f"{as_given:.0%} (median), but only by {still:.1%} if the cameras did not move at all. Expected "
+            "positions of cameras in the world, in the unit of the depth",
+            file=file,
+            field="world_from_camera",
         )
 
 

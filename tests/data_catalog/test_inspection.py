@@ -14,7 +14,7 @@ from data_catalog.inspection import contact_sheet, facts, inspect
 from data_catalog.matches import match_neighbours, pose_support
 from extrags.cameras import invert_poses
 from extrags.config import IngestConfig
-from extrags.errors import SourceError, UnknownSequenceError
+from extrags.errors import PoseError, SourceError, UnknownSequenceError
 
 
 class TestRightSources:
@@ -96,6 +96,22 @@ class TestDepthScale:
     def test_small_errors_are_let_pass(self, clip, distanced) -> None:
         check_depth_scale(replace(clip, depth_mm=(clip.depth_mm * 1.05).astype(np.float32)))
         check_sequence(distanced)
+
+    def test_wrong_positions_are_no_unit(self, clip) -> None:
+        """Of cameras that move little, any large factor fits as well as none that moves."""
+        calm = clip.world_from_camera.copy()
+        calm[:, :3, 3] = calm[0, :3, 3]
+        calm[:, :3, :3] = calm[0, :3, :3]
+        still = replace(
+            clip, world_from_camera=calm, depth_mm=np.repeat(clip.depth_mm[:1], len(clip), axis=0)
+        )
+        check_depth_scale(still)
+        wandering = calm.copy()
+        wandering[:, :3, 3] += np.random.default_rng(0).normal(scale=5.0, size=(len(clip), 3))
+        told = "positions of the cameras contradict the depth: .* off by .*if the cameras did not move at all"
+        with pytest.raises(PoseError, match=told) as caught:
+            check_depth_scale(replace(still, world_from_camera=wandering))
+        assert caught.value.field == "world_from_camera"
 
     def test_no_parallax_no_verdict(self, clip) -> None:
         still = np.repeat(clip.world_from_camera[:1], len(clip), axis=0)
