@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import Cameras
 from extrags.config import SurfaceConfig
-from extrags.errors import CaptureError, ConfigError
+from extrags.errors import CaptureError, ConfigError, SourceError
 from extrags.frame_quantiles import median_of_frames, quantile_of_frames
 from extrags.frame_stacks import frames_of, stacked
 from extrags.radial_lens import WIDE_FIELD_DEG
@@ -191,11 +191,13 @@ def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: Endoscopic
     """Surface metrics of a reconstruction, separately for observed and unobserved surface.
 
     Args:
-        mesh: from `scene_surface`, or any mesh in the same world; None for an empty reconstruction.
+        mesh: from `scene_surface`, or any mesh in the same world; None for an empty reconstruction, and one
+            without area is such.
         truth: the true surface.
         sequence: its cameras and masks define which surface is observed.
 
     Raises:
+        SourceError: for a true surface without area.
         ShapeError: while the poses are unknown.
     """
     points = sample_surface(truth.mesh, N_SAMPLES, seed=_SEED)
@@ -204,7 +206,7 @@ def evaluate_surface(mesh: Mesh | None, truth: TrueSurface, sequence: Endoscopic
     found_observed = found_unobserved = np.zeros(0, dtype=bool)
     to_truth = np.zeros(0)
     to_mesh = np.full(len(points), np.inf)
-    if mesh is not None and len(mesh.triangles):
+    if mesh is not None and _areas(mesh).sum() > 0:
         found = sample_surface(mesh, N_SAMPLES, seed=_SEED + 1)
         to_truth, nearest = distance_to_surface(found, truth.mesh)
         found_observed, found_unobserved = _parts(nearest, truth, sequence)
@@ -227,8 +229,8 @@ def surface_errors(
     """Errors of a whole surface against another, regardless of which parts were observed.
 
     Args:
-        reconstructed: the mesh to evaluate.
-        true: the ground-truth mesh.
+        reconstructed: the mesh to evaluate; one without area is empty.
+        true: the ground-truth mesh; without area nothing is measured.
         threshold_mm: distance below which a sample counts as correct.
         n_samples: samples per mesh.
         seed: seed of the sampling.
@@ -239,10 +241,10 @@ def surface_errors(
     if not threshold_mm > 0:
         raise ConfigError(f"the threshold is {threshold_mm}; expected a length above zero")
     to_truth = to_mesh = np.zeros(0)
-    if len(reconstructed.triangles) and len(true.triangles):
+    if _areas(true).sum() > 0 and _areas(reconstructed).sum() > 0:
         to_truth, _ = distance_to_surface(sample_surface(reconstructed, n_samples, seed=seed + 1), true)
         to_mesh, _ = distance_to_surface(sample_surface(true, n_samples, seed=seed), reconstructed)
-    elif len(true.triangles):
+    elif _areas(true).sum() > 0:
         to_mesh = np.full(n_samples, np.inf)
     return _errors(to_truth, to_mesh, threshold_mm)
 
@@ -256,7 +258,8 @@ def sample_surface(mesh: Mesh, n_samples: int, *, seed: int) -> Float[np.ndarray
         seed: seed of the sampling.
 
     Raises:
-        ConfigError: for a mesh without area, or no samples.
+        SourceError: for a mesh without area.
+        ConfigError: for no samples.
     """
     return sample_triangles(mesh, n_samples, seed=seed)[0]
 
@@ -267,23 +270,34 @@ def sample_triangles(
     """As `sample_surface`; also the triangle that each point lies in.
 
     Raises:
+        SourceError: as `sample_surface`.
         ConfigError: as `sample_surface`.
     """
     if n_samples < 1:
         raise ConfigError(f"{n_samples} samples of a surface; expected 1 or more")
-    corners = mesh.vertices[mesh.triangles].astype(np.float64)
-    edges = corners[:, 1:] - corners[:, :1]
-    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    area = _areas(mesh)
     total = area.sum()
     if not total > 0:
-        raise ConfigError("a mesh without any area cannot be sampled")
+        raise SourceError(
+            f"a surface of {len(mesh.triangles)} triangles without any area cannot be sampled; expected at "
+            "least one of some area",
+            field="triangles",
+        )
     rng = np.random.default_rng(seed)
     place = (np.arange(n_samples) + rng.random(n_samples)) * (total / n_samples)
     triangle = np.minimum(np.searchsorted(np.cumsum(area), place, side="right"), len(area) - 1)
     # Square root: uniform in the triangle, not in the parallelogram's skew (Osada et al. 2002).
     root, along = np.sqrt(rng.random(n_samples)), rng.random(n_samples)
     weights = np.stack([1 - root, root * (1 - along), root * along], axis=1)
-    return np.asarray(np.einsum("nk,nkx->nx", weights, corners[triangle])), triangle
+    corners = mesh.vertices[mesh.triangles[triangle]].astype(np.float64)
+    return np.asarray(np.einsum("nk,nkx->nx", weights, corners)), triangle
+
+
+def _areas(mesh: Mesh) -> Float[np.ndarray, "t"]:
+    """Area of each triangle."""
+    corners = mesh.vertices[mesh.triangles].astype(np.float64)
+    edges = corners[:, 1:] - corners[:, :1]
+    return np.asarray(0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1))
 
 
 def distance_to_surface(

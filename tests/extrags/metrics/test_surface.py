@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from extrags.cameras import look_at
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, SourceError
 from extrags.gaussians import Gaussians
 from extrags.metrics.surface import (
     PROTOCOL_FUSION,
@@ -61,6 +61,7 @@ def joined(*meshes: Mesh) -> Mesh:
     )
 
 
+LINE = Mesh(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], dtype=np.float32), np.array([[0, 1, 2]]))
 EMPTY = Mesh(np.zeros((0, 3), dtype=np.float32), np.zeros((0, 3), dtype=np.int32))
 
 
@@ -130,8 +131,9 @@ class TestWholeSurfaces:
         assert 100 * at_wide.fscore == pytest.approx(float(wide), abs=1.0)
         assert at_narrow.fscore < 0.9 * at_wide.fscore
 
-    def test_nothing_reconstructed(self) -> None:
-        errors = surface_errors(EMPTY, rectangle((0, 0), (1, 1), 0), 1.0)
+    @pytest.mark.parametrize("nothing", [EMPTY, LINE], ids=["no triangle", "no area"])
+    def test_nothing_reconstructed(self, nothing: Mesh) -> None:
+        errors = surface_errors(nothing, rectangle((0, 0), (1, 1), 0), 1.0)
         assert (errors.recall, errors.fscore) == (0.0, 0.0)
         assert errors.accuracy_mm is None
         assert errors.completeness_mm is None
@@ -158,9 +160,8 @@ class TestSamples:
         assert not np.array_equal(sample_surface(mesh, 100, seed=1), sample_surface(mesh, 100, seed=2))
 
     def test_a_mesh_without_area_is_refused(self) -> None:
-        line = Mesh(np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0]], dtype=np.float32), np.array([[0, 1, 2]]))
-        with pytest.raises(ConfigError, match="without any area"):
-            sample_surface(line, 10, seed=0)
+        with pytest.raises(SourceError, match="field triangles: a surface of 1 triangles without any area"):
+            sample_surface(LINE, 10, seed=0)
         with pytest.raises(ConfigError, match="1 or more"):
             sample_surface(sphere(1.0, 8), 0, seed=0)
 
