@@ -96,7 +96,9 @@ def non_decreasing(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 def cell_means(
     values: Float[Tensor, "n 1 h w"], weight: Float[Tensor, "n 1 h w"]
 ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
-    """Weighted mean and mean weight of each cell, row by row."""
+    """Weighted mean and mean weight of each cell, row by row; an image smaller than a cell has none."""
+    if min(values.shape[-2:]) < CELL_PX:
+        return np.zeros(0, dtype=np.float32), np.zeros(0, dtype=np.float32)
     share = functional.avg_pool2d(weight, CELL_PX)
     mean = functional.avg_pool2d(values * weight, CELL_PX) / share.clamp_min(1e-6)
     return mean.flatten().numpy(), share.flatten().numpy()

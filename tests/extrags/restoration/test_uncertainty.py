@@ -7,6 +7,7 @@ from scipy.optimize import isotonic_regression
 
 from extrags.restoration.uncertainty.calibration import Calibration, cell_means, non_decreasing
 from extrags.restoration.uncertainty.error_model import MIN_CONTRAST, MIN_ERROR, ErrorModel, error_features
+from extrags.restoration.uncertainty.reliability_diagram import calibration
 from extrags.view_synthesis.conditioning import LAYER_CHANNELS, Layers
 
 
@@ -49,6 +50,18 @@ def test_cell_means_leave_out_what_has_no_weight() -> None:
     mean, share = cell_means(values, weight)
     assert mean[0] == pytest.approx(1)
     assert share.tolist() == pytest.approx([0.5, 0])
+
+
+@pytest.mark.parametrize(("height", "width"), [(7, 40), (40, 7)])
+def test_images_smaller_than_a_cell_have_none(height: int, width: int) -> None:
+    predicted = np.full((2, height, width), 0.1, np.float32)
+    error = np.full((2, height, width, 3), 0.05, np.float32)
+    found = calibration(predicted, error, np.ones(predicted.shape, dtype=bool))
+    assert found["cells"] == 0
+    assert found["bins"] == []
+    assert found["rank_correlation"] is None
+    assert found["calibration_error"] is None
+    assert found["coverage"] == {"50": 1.0, "90": 1.0}
 
 
 class TestErrorModel:
