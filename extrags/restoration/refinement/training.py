@@ -128,7 +128,9 @@ def train_refiner(
     return replace(refiner, record={**record, "validation_scores": scores})
 
 
-def refiner_scores(refiner: Refiner, files: Sequence[Path], lpips: Lpips) -> dict[str, dict[str, float]]:
+def refiner_scores(
+    refiner: Refiner, files: Sequence[Path], lpips: Lpips
+) -> dict[str, dict[str, float | None]]:
     """Figures of the invented pixels: smooth, with texture laid onto it, and refined.
 
     Args:
@@ -137,7 +139,8 @@ def refiner_scores(refiner: Refiner, files: Sequence[Path], lpips: Lpips) -> dic
         lpips: any backbone.
 
     Returns:
-        For each of the three the means of PSNR and of LPIPS over the views in which something is invented.
+        For each of the three the means of PSNR and of LPIPS over the views in which something is invented;
+        None where that is no view.
     """
     found: dict[str, dict[str, list[float]]] = {}
     for file in files:
@@ -158,6 +161,8 @@ def refiner_scores(refiner: Refiner, files: Sequence[Path], lpips: Lpips) -> dic
             figures[lpips.name] += [value for value in distances if value is not None]
             figures["psnr"] += [value for value in psnr_per_image(shown, clean, region) if value is not None]
     return {
-        name: {figure: round(float(np.mean(values)), 4) for figure, values in figures.items()}
+        name: {
+            figure: round(float(np.mean(values)), 4) if values else None for figure, values in figures.items()
+        }
         for name, figures in found.items()
     }

@@ -299,6 +299,18 @@ class TestTraining:
         again = refiner_scores(trained, files[-1:], random_perception)
         assert again == scores
 
+    def test_where_nothing_is_invented_there_is_no_score(
+        self, files: list[Path], random_perception: Lpips, tmp_path: Path
+    ) -> None:
+        examples = RefinementExamples.load(files[-1])
+        maps = examples.maps.clone()
+        maps[:, 0] = 0
+        replace(examples, maps=maps).save(tmp_path / "known")
+        refiner = train_refiner(files, self.config(1, adversarial_weight=0.0))
+        scores = refiner_scores(refiner, [tmp_path / "known"], random_perception)
+        assert set(scores) == {"smooth", "textured", "refined"}
+        assert all(value is None for figures in scores.values() for value in figures.values())
+
     def test_the_adversary_is_told_of_in_every_report(self, files: list[Path]) -> None:
         """It judges every other step, and reports are made in the other ones."""
         history = train_refiner(files, self.config(20)).record["history"]
