@@ -38,10 +38,12 @@ def choose_patches(
         side_px: side of a patch.
 
     Returns:
-        Colours in [0, 1]; None where no tile is usable.
+        Colours in [0, 1]; None where no tile is usable, as in frames of fewer than 8 pixels a side.
     """
     height, width = sequence.rgb.shape[1:3]
     side = min(side_px, height // 8 * 8, width // 8 * 8)
+    if side < 8:
+        return None
     train = np.asarray(sequence.train, dtype=np.int64)
     frames = train[np.unique(np.linspace(0, len(train) - 1, min(len(train), MAX_FRAMES)).round().astype(int))]
     chosen: list[Tensor] = []

@@ -25,6 +25,7 @@ from extrags.restoration.diffusion.rectified_flow import Predicted, sample
 from extrags.restoration.diffusion.scene_training import train_on_scene
 from extrags.restoration.training_data.augmentation import Batch, random_patches
 from extrags.restoration.training_data.pairs import Pairs
+from extrags.sequence import EndoscopicSequence
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, INVENTED_CHANNELS, Conditioning
 from extrags.view_synthesis.gamut import Gamut
 from tests.extrags.lit_tube import Tube
@@ -260,6 +261,17 @@ class TestChoosePatches:
         assert patches.shape == (4, 3, 32, 32)
         assert all(0.05 < float(patch.mean()) < 0.9 for patch in patches)
         assert not torch.equal(patches[0], patches[1])
+
+    def test_frames_without_room_for_a_patch(self, tube: Tube) -> None:
+        rgb = np.full((len(tube.sequence), 7, 40, 3), 120, np.uint8)
+        small = EndoscopicSequence(
+            name="low",
+            rgb=rgb,
+            K=np.repeat(np.diag([20.0, 20.0, 1.0])[None], len(rgb), axis=0),
+            mask=np.ones(rgb.shape[:3], dtype=bool),
+            split=tube.sequence.split,
+        )
+        assert choose_patches(small) is None
 
     def test_without_a_usable_tile_there_are_none(self, tube: Tube) -> None:
         dark = replace(tube.sequence, rgb=np.zeros_like(tube.sequence.rgb))
