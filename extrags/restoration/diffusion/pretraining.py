@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import logging
 import math
 import time
@@ -48,6 +49,10 @@ ANY_HUE = Gamut(0.0, 1e6, 0.0, 1e6)
 MAX_STEPS = 4
 DOMAIN_PATCHES = 8
 """Patches per scene that tell what the network has learned from."""
+SETTINGS = "settings"
+"""Name in a checkpoint of the settings of its training."""
+MAY_CHANGE = ("iterations", "device", "drawing_processes", "most_seconds", "checkpoint_seconds")
+"""Settings that a training which goes on may have otherwise than the one that wrote its checkpoint."""
 
 logger = logging.getLogger(__name__)
 
@@ -118,11 +123,13 @@ def pretrain(
         start: restorer whose weights are trained further; None starts from random weights.
         stage: named in progress events.
         checkpoint: file that the training is written to every now and then, and goes on from if it is there;
-            it may have been written on another device. None keeps none.
+            it may have been written on another device, and for another number of iterations, time and
+            processes, not with other settings. None keeps none.
 
     Raises:
         ConfigError: when the number of files does not fit the settings, or as `check_settings`.
-        WeightsError: when a file is not a pretraining scene, or the perceptual distance has no weights.
+        WeightsError: when a file is not a pretraining scene, the perceptual distance has no weights, or the
+            checkpoint is of a training with other settings.
         DivergedError: when the loss stops being finite.
     """
     if len(files) != config.scenes or config.validation_scenes >= config.scenes:
@@ -151,7 +158,7 @@ def pretrain(
     )
     training = NetworkTraining(network, settings, generator, stage=stage)
     if checkpoint is not None and checkpoint.exists():
-        _go_on(training, checkpoint)
+        _go_on(training, checkpoint, config)
         generator.manual_seed(config.seed + training.iteration)
         logger.info("%s: going on from %s, step %d", stage, checkpoint, training.iteration)
     sampler = partial(_mixed_sampler, files[: -config.validation_scenes], config, training.iteration)
@@ -218,26 +225,47 @@ def _train(
             training.step(batch)
             now = time.monotonic()
             if checkpoint is not None and now - written > config.checkpoint_seconds:
-                save_safetensors(checkpoint, training.state())
+                _write(checkpoint, training, config)
                 written = now
             if now - begun > config.most_seconds:
                 break
         following.cancel()
     if checkpoint is not None:
-        save_safetensors(checkpoint, training.state())
+        _write(checkpoint, training, config)
 
 
-def _go_on(training: NetworkTraining, file: Path) -> None:
+def _write(file: Path, training: NetworkTraining, config: PretrainingConfig) -> None:
+    """A checkpoint, with the settings that shaped the training so far."""
+    settings = torch.frombuffer(bytearray(json.dumps(_lasting(config)).encode()), dtype=torch.uint8)
+    save_safetensors(file, {**training.state(), SETTINGS: settings})
+
+
+def _lasting(config: PretrainingConfig) -> dict[str, Any]:
+    return config.model_dump(mode="json", exclude=set(MAY_CHANGE))
+
+
+def _go_on(training: NetworkTraining, file: Path, config: PretrainingConfig) -> None:
     """Take over a checkpoint.
 
     Raises:
         WeightsError: when the file is none, or of a training with other settings.
     """
     try:
-        training.restore(load_safetensors(file))
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        state = load_safetensors(file)
+        # Checkpoints of an earlier version have none.
+        given = json.loads(bytes(state[SETTINGS].numpy())) if SETTINGS in state else {}
+        changed = [
+            f"{name} was {given[name]} and is {value}"
+            for name, value in _lasting(config).items()
+            if name in given and given[name] != value
+        ]
+        if changed:
+            raise ValueError(f"its settings are others: {', '.join(changed)}")
+        training.restore(state)
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise WeightsError(
-            f"{file}: not a checkpoint of this training ({error}); remove it to begin anew"
+            f"{file}: not a checkpoint of this training ({error}); give the same settings, or remove it to "
+            "begin anew"
         ) from error
 
 

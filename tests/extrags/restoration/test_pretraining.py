@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from extrags.array_files import load_safetensors, save_safetensors
 from extrags.config import CoarseConfig, profile_config
 from extrags.errors import ConfigError, WeightsError
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
@@ -206,6 +207,34 @@ class TestPretraining:
         other = short.model_copy(update={"channels": (16, 16, 16)})
         with pytest.raises(WeightsError, match=r"checkpoint\.safetensors: not a checkpoint of this training"):
             pretrain(files, other, checkpoint=checkpoint)
+
+    @pytest.mark.parametrize(
+        ("changes", "told"),
+        [
+            ({"learning_rate": 1e-3}, r"learning_rate was .* and is 0\.001"),
+            ({"drawn_share": 0.2, "seed": 7}, r"drawn_share was 0\.7 and is 0\.2, seed was 0 and is 7"),
+        ],
+    )
+    def test_it_does_not_go_on_with_other_settings(
+        self, files: list[Path], tmp_path: Path, changes: dict[str, float], told: str
+    ) -> None:
+        checkpoint = tmp_path / "checkpoint.safetensors"
+        short = TINY.model_copy(update={"most_seconds": 1e-3})
+        pretrain(files, short, checkpoint=checkpoint)
+        with pytest.raises(WeightsError, match=rf"its settings are others: {told}\); give the same"):
+            pretrain(files, short.model_copy(update=changes), checkpoint=checkpoint)
+
+    def test_checkpoints_of_an_earlier_version_tell_no_settings(
+        self, files: list[Path], tmp_path: Path
+    ) -> None:
+        checkpoint = tmp_path / "checkpoint.safetensors"
+        short = TINY.model_copy(update={"most_seconds": 1e-3})
+        pretrain(files, short, checkpoint=checkpoint)
+        state = load_safetensors(checkpoint)
+        del state["settings"]
+        save_safetensors(checkpoint, state)
+        other = short.model_copy(update={"learning_rate": 1e-3})
+        assert pretrain(files, other, checkpoint=checkpoint).record["iterations_made"] == 2
 
     def test_a_training_that_goes_on_keeps_the_record_of_its_beginning(
         self, files: list[Path], tmp_path: Path
