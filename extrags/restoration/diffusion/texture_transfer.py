@@ -157,9 +157,11 @@ class TextureTransfer(nn.Module):
         sharpness = INITIAL_SHARPNESS * self.log_sharpness.exp()
         attended, best, likeness = [], [], []
         for part in query.split(QUERIES_AT_ONCE, dim=1):
-            similarity = part @ patches.key.transpose(1, 2)
+            # In bfloat16 similarities are multiples of 1/256: of many places one could not tell the best.
+            with torch.autocast(part.device.type, enabled=False):
+                similarity = part @ patches.key.transpose(1, 2)
+                attention = (sharpness * similarity).softmax(dim=2).to(patches.coarse.dtype)
             nearest = similarity.max(dim=2)
-            attention = (sharpness * similarity).softmax(dim=2).to(patches.coarse.dtype)
             attended.append(attention @ patches.coarse)
             best.append(nearest.indices)
             likeness.append(nearest.values)

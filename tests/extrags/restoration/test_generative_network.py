@@ -11,6 +11,7 @@ from torch import Tensor
 
 from extrags.config import EnhanceConfig
 from extrags.metrics.lpips import Lpips
+from extrags.restoration.diffusion import texture_transfer
 from extrags.restoration.diffusion.adversary import Adversary, Scene
 from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
@@ -23,6 +24,7 @@ from extrags.restoration.diffusion.network_training import (
 from extrags.restoration.diffusion.patches import choose_patches
 from extrags.restoration.diffusion.rectified_flow import Predicted, sample
 from extrags.restoration.diffusion.scene_training import train_on_scene
+from extrags.restoration.diffusion.texture_transfer import KEY_WIDTH, PatchFeatures, TextureTransfer
 from extrags.restoration.training_data.augmentation import Batch, random_patches
 from extrags.restoration.training_data.pairs import Pairs
 from extrags.sequence import EndoscopicSequence
@@ -103,6 +105,39 @@ class TestTextureTransfer:
             whole = network.texture(coarse, patches).coarse
             monkeypatch.setattr("extrags.restoration.diffusion.texture_transfer.QUERIES_AT_ONCE", 7)
             torch.testing.assert_close(network.texture(coarse, patches).coarse, whole, rtol=1e-5, atol=1e-5)
+
+    def test_the_best_place_is_found_in_float32_whatever_the_precision(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """In bfloat16 similarities are multiples of 1/256, and the first of several equal ones was taken."""
+        transfer = TextureTransfer((16, 16, KEY_WIDTH)).eval()
+        torch.nn.init.dirac_(transfer.query.weight)
+        torch.nn.init.zeros_(transfer.query.bias)
+        places = 500
+        # Of values that bfloat16 holds, so that the queries are the same in either precision.
+        coarse = torch.randn(1, KEY_WIDTH, 6, 6, generator=seeded(1)).bfloat16().float()
+        # Of much the same looks, as mucosa has.
+        like = 1 + 0.1 * torch.randn(1, places, KEY_WIDTH, generator=seeded(2))
+        key = torch.nn.functional.normalize(like, dim=-1)
+        patches = PatchFeatures(
+            key,
+            torch.randn(1, places, 32, generator=seeded(3)),
+            torch.randn(1, places, 4 * 8, generator=seeded(4)),
+            torch.randn(1, places, 16 * 8, generator=seeded(5)),
+        )
+        found: list[Tensor] = []
+        fetched = texture_transfer._fetched
+        monkeypatch.setattr(
+            texture_transfer,
+            "_fetched",
+            lambda features, index, *size: found.append(index) or fetched(features, index, *size),
+        )
+        with torch.no_grad():
+            transfer(coarse, patches)
+            with torch.autocast("cpu", torch.bfloat16):
+                transfer(coarse, patches)
+        assert len(found) == 4
+        assert all(torch.equal(index, found[0]) for index in found)
 
     def test_patches_of_small_frames_fit_the_encoder(self) -> None:
         frames = torch.rand(2, 3, 60, 90, generator=seeded(5))
