@@ -62,7 +62,7 @@ def judge(
     slot.counts["amount"] = judgement.amount
 
 
-@stage("finetune", version=11)
+@stage("finetune", version=12)
 def finetune(
     slot: Slot,
     scene: Ref,

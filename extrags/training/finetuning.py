@@ -390,12 +390,16 @@ def _near_known_surface(
 
 
 def _real_depth(scene: Scene, sequence: EndoscopicSequence, frame: int) -> Float[np.ndarray, "h w"]:
+    """Depth of the surface that a training frame saw, 0 where it saw none.
+
+    Where its own depth is unknown or unsure the scene's is taken: other frames have had their say there.
+    """
+    valid = sequence.mask[frame]
     reliable = sequence.reliable_depth_mm(frame)
-    if reliable is not None and sequence.depth_error is None:
+    if reliable is not None and bool(((reliable > 0) | ~valid).all()):
         return reliable
     with torch.no_grad():
         rendering = scene.render(sequence.cameras[frame])
-    depth = rendering.depth[0].numpy()
-    rendered = np.where((rendering.alpha[0].numpy() > HOLE_ALPHA), depth, 0)
-    # Where an estimate is unsure the scene knows better: there other frames have had their say.
+    shown = valid & (rendering.alpha[0].numpy() > HOLE_ALPHA)
+    rendered = np.where(shown, rendering.depth[0].numpy(), np.float32(0))
     return rendered if reliable is None else np.where(reliable > 0, reliable, rendered)

@@ -65,6 +65,34 @@ def real_views_carve_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(finetuning, "_clear_of_cameras", lambda points, *_: np.ones(len(points), dtype=bool))
 
 
+class TestSurfaceThatFramesSaw:
+    FRAME = 0
+
+    def seen(self, tube_sequence: EndoscopicSequence, **changes: Any) -> np.ndarray:
+        scene = Scene(tube_gaussians(), tube_light())
+        return finetuning._real_depth(scene, replace(tube_sequence, **changes), self.FRAME)
+
+    def test_gaps_of_measured_depth_are_the_scenes(self, tube_sequence: EndoscopicSequence) -> None:
+        """A frame without any depth has the scene's throughout; a highlight must not open a way through."""
+        assert tube_sequence.depth_mm is not None
+        gaps = tube_sequence.depth_mm.copy()
+        gaps[:, 2:12, 2:20] = 0
+        found = self.seen(tube_sequence, depth_mm=gaps)
+        assert (found[2:12, 2:20] > 0).all()
+        np.testing.assert_allclose(found, self.seen(tube_sequence, depth_mm=None), rtol=1e-4)
+
+    @pytest.mark.parametrize("known", [True, False])
+    def test_nothing_is_seen_outside_the_mask(self, tube_sequence: EndoscopicSequence, known: bool) -> None:
+        mask = tube_sequence.mask.copy()
+        mask[:, :, :20] = False
+        assert tube_sequence.depth_mm is not None
+        depth = tube_sequence.depth_mm.copy()
+        depth[:, 5, 30] = 0
+        found = self.seen(tube_sequence, mask=mask, depth_mm=depth if known else None)
+        assert not found[:, :20].any()
+        assert (found[:, 20:] > 0).mean() > 0.9
+
+
 class TestHoleGaussians:
     ROOM = 10_000
 
