@@ -231,7 +231,8 @@ def synthetic_pairs(scene: Scene, sequence: EndoscopicSequence, config: EnhanceC
         config: number of views and seed.
 
     Raises:
-        CaptureError: with fewer than four training frames.
+        CaptureError: with fewer than four training frames; when some of them, that lie near each other, know
+            no surface: neither their depth nor the scene tells of any.
     """
     scene = scene.to("cpu")
     train = np.asarray(sequence.train, dtype=np.int64)
@@ -251,6 +252,12 @@ def synthetic_pairs(scene: Scene, sequence: EndoscopicSequence, config: EnhanceC
         count = min(TARGETS_PER_SUBSET, remaining, len(others))
         targets = generator.choice(others[: max(count, len(others) // 2)], count, replace=False)
         views = everything.subset(subset)
+        if not _usable(views).any():
+            shown = ", ".join(sequence.frame_name(int(frame)) for frame in views.frames)
+            raise CaptureError(
+                f"{sequence.name}: no surface is known at any valid pixel of the training frames {shown}; "
+                "the restorer cannot be shown views made from them"
+            )
         crude = Scene(_crude_gaussians(views, generator), scene.light)
         views = views.of_scene(crude)
         gain = everything.exposure[torch.from_numpy(targets)]
@@ -267,13 +274,16 @@ def synthetic_pairs(scene: Scene, sequence: EndoscopicSequence, config: EnhanceC
     return Pairs.concatenated(parts)
 
 
+def _usable(views: ReferenceViews) -> Bool[np.ndarray, "p"]:
+    """Pixels, of all views in a row, that are trusted and whose depth is known."""
+    return ((views.packed[:, 3] > 0) & (views.packed[:, 5] > 0)).flatten().numpy()
+
+
 def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> Gaussians:
     """Unoptimised Gaussians on the views' surface: noisy depth, torn holes, floaters."""
     rays = pixel_rays(views.cameras).reshape(-1, 3)
     packed = views.packed.permute(0, 2, 3, 1).reshape(-1, 6).numpy().astype(np.float64)
-    usable = np.flatnonzero((packed[:, 5] > 0) & (packed[:, 3] > 0))
-    if len(usable) == 0:
-        raise CaptureError(f"no usable depth in frames {views.frames.tolist()}")
+    usable = np.flatnonzero(_usable(views))
     count = min(SYNTHETIC_GAUSSIANS, len(usable))
     chosen = np.sort(generator.choice(usable, count, replace=False))
     view = chosen // (views.cameras.width * views.cameras.height)

@@ -69,6 +69,14 @@ class TestPairs:
         with pytest.raises(CaptureError, match="classical"):
             synthetic_pairs(replace(tube.scene, light=None), lone, SMALL)
 
+    def test_frames_without_surface_are_named(self, tube: Tube) -> None:
+        mask = np.zeros_like(tube.sequence.mask)
+        mask[tube.sequence.train[0]] = True
+        blind = replace(tube.sequence, mask=mask)
+        told = rf"{blind.name}: no surface is known at any valid pixel of the training frames \w+, \w+"
+        with pytest.raises(CaptureError, match=told):
+            synthetic_pairs(tube.scene, blind, SMALL)
+
     def test_more_folds_than_frames(self, tube: Tube) -> None:
         split = replace(tube.sequence.split, train=tube.sequence.train[:4])
         few = replace(tube.sequence, split=split)
