@@ -10,7 +10,7 @@ from tasks.stage import stage
 __all__ = ["render_uc_nerf", "uc_nerf"]
 
 
-@stage("uc-nerf", version=1)
+@stage("uc-nerf", version=2)
 def uc_nerf(slot: Slot, sequence: Ref, config: UcNerfConfig) -> None:
     """Train the baseline on the training frames; writes `uc_nerf/` and `history.json`."""
     from extrags.baselines.uc_nerf.training import train
@@ -22,7 +22,7 @@ def uc_nerf(slot: Slot, sequence: Ref, config: UcNerfConfig) -> None:
     slot.counts["parameters"] = sum(value.numel() for value in result.scene.network.parameters())
 
 
-@stage("uc-nerf-render", version=1)
+@stage("uc-nerf-render", version=2)
 def render_uc_nerf(slot: Slot, scene: Ref, sequence: Ref) -> None:
     """What `evaluate-render` does, for the baseline; writes `renders/` and, with true depth, `mesh/`."""
     from extrags.baselines.uc_nerf import rendering

@@ -15,6 +15,7 @@ from extrags.baselines.uc_nerf.stereo import (
     DepthPrior,
     EncodedViews,
     image_grid,
+    inside_mask,
     projection_to_views,
 )
 from extrags.config import UcNerfConfig
@@ -266,7 +267,7 @@ class ConditionedField(nn.Module):
             functional.grid_sample(image, grid, padding_mode="border", align_corners=False)
             for image in (images.rgb, views.fine[:, 1:])
         ]
-        return torch.cat(found, dim=1).movedim(1, -1), valid
+        return torch.cat(found, dim=1).movedim(1, -1), inside_mask(valid, grid, images.mask)
 
     def _volume_samples(
         self, rays: Rays, z: Tensor, prior: DepthPrior, inverse_range: tuple[float, float]

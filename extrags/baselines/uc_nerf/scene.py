@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 
 from extrags.baselines.uc_nerf.field import ConditionedField, RayColors, Rays, sample_depths
@@ -43,6 +43,7 @@ class UcNerf(Storable):
         network: trained on the frames.
         config: settings the network was made with.
         rgb: colours of the training frames, uint8, [F, H, W, 3].
+        mask: their pixels that show tissue, [F, H, W].
         cameras: of these frames.
         inverse_range: inverse z-depth of the far and the near end of rays.
         center: mean camera centre, origin of the position encoding, [3].
@@ -54,6 +55,7 @@ class UcNerf(Storable):
     network: UcNerfNetwork
     config: UcNerfConfig
     rgb: UInt8[np.ndarray, "f h w 3"]
+    mask: Bool[np.ndarray, "f h w"]
     cameras: Cameras
     inverse_range: tuple[float, float]
     center: Float[np.ndarray, "3"]
@@ -62,7 +64,7 @@ class UcNerf(Storable):
     def encoded(self) -> EncodedViews:
         """The training frames as source views."""
         with torch.no_grad(), one_torch_thread():
-            return self.network.stereo.encode(PosedImages.of(self.rgb, self.cameras))
+            return self.network.stereo.encode(PosedImages.of(self.rgb, self.cameras, self.mask))
 
     def render(
         self, camera: Cameras, encoded: EncodedViews | None = None, *, color: bool = True
@@ -110,6 +112,7 @@ class UcNerf(Storable):
         """Write a zarr v3 group: frames, cameras and the networks' parameters."""
         with new_group(path) as group:
             write_frames(group, "rgb", self.rgb)
+            write_frames(group, "mask", self.mask)
             write_array(group, "K", self.cameras.K)
             write_array(group, "world_from_camera", self.cameras.world_from_camera)
             write_array(group, "center", self.center)
@@ -142,6 +145,7 @@ class UcNerf(Storable):
             network,
             config,
             rgb,
+            read_array(group, "mask"),
             cameras,
             (float(far), float(near)),
             read_array(group, "center"),

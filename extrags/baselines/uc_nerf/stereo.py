@@ -27,6 +27,7 @@ __all__ = [
     "camera_tensors",
     "depth_distribution",
     "image_grid",
+    "inside_mask",
     "locally_normalised",
     "plane_sweep",
     "projection_to_views",
@@ -41,6 +42,8 @@ _MIN_CONTRAST = 0.01
 _UNMATCHED_COST = 1.0
 """Cost of a hypothesis that fewer than two views see: that of unrelated patches of unit variance."""
 _START_SHARPNESS = 8.0
+_WHOLE = 0.999
+"""Share of a mask from which a place counts as wholly inside; the rest is rounding."""
 _FINE_DEVIATIONS = 2.0
 """Half the fine interval, in standard deviations of the coarse distribution."""
 
@@ -61,23 +64,29 @@ class PosedImages:
         rgb: colours in [0, 1], [V, 3, H, W].
         K: intrinsics in pixels, [V, 3, 3].
         viewmats: camera from world, [V, 4, 4].
+        mask: pixels that show tissue; the others match nothing and lend no colour. None is all.
     """
 
     rgb: Float[Tensor, "v 3 h w"]
     K: Float[Tensor, "v 3 3"]
     viewmats: Float[Tensor, "v 4 4"]
+    mask: Bool[Tensor, "v h w"] | None = None
 
     @staticmethod
-    def of(rgb: np.ndarray, cameras: Cameras) -> PosedImages:
-        """Frames, uint8 [V, H, W, 3], and their cameras."""
+    def of(rgb: np.ndarray, cameras: Cameras, mask: np.ndarray | None = None) -> PosedImages:
+        """Frames, uint8 [V, H, W, 3], black outside their masks, [V, H, W]; and their cameras."""
         colors = torch.from_numpy(rgb.astype(np.float32) / 255).permute(0, 3, 1, 2).contiguous()
-        return PosedImages(colors, *camera_tensors(cameras))
+        if mask is None or mask.all():
+            return PosedImages(colors, *camera_tensors(cameras))
+        counted = torch.from_numpy(mask)
+        return PosedImages(colors * counted[:, None], *camera_tensors(cameras), counted)
 
     def __len__(self) -> int:
         return int(self.rgb.shape[0])
 
     def __getitem__(self, index: list[int]) -> PosedImages:
-        return PosedImages(self.rgb[index], self.K[index], self.viewmats[index])
+        mask = None if self.mask is None else self.mask[index]
+        return PosedImages(self.rgb[index], self.K[index], self.viewmats[index], mask)
 
     def resized(self, width: int, height: int) -> PosedImages:
         """The same views at another size, averaged over areas; intrinsics are scaled."""
@@ -85,7 +94,15 @@ class PosedImages:
         if (w, h) == (width, height):
             return self
         rgb = functional.interpolate(self.rgb, (height, width), mode="area")
-        return PosedImages(rgb, _scaled(self.K, width / w, height / h), self.viewmats)
+        K = _scaled(self.K, width / w, height / h)
+        return PosedImages(rgb, K, self.viewmats, self.resized_mask(width, height))
+
+    def resized_mask(self, width: int, height: int) -> Bool[Tensor, "v h2 w2"] | None:
+        """The masks at another size: true where all that is averaged over is inside; None is all."""
+        if self.mask is None or self.mask.shape[-2:] == (height, width):
+            return self.mask
+        share = functional.interpolate(self.mask[:, None].float(), (height, width), mode="area")
+        return share[:, 0] > _WHOLE
 
 
 @dataclass(frozen=True)
@@ -156,6 +173,7 @@ def plane_sweep(
     K: Float[Tensor, "3 3"],
     viewmat: Float[Tensor, "4 4"],
     inverse: Float[Tensor, "d h w"],
+    mask: Bool[Tensor, "n hs ws"] | None = None,
 ) -> tuple[Float[Tensor, "n f d h w"], Bool[Tensor, "n d h w"]]:
     """Source features as seen in the target view if its surface lay at each depth hypothesis.
 
@@ -166,9 +184,10 @@ def plane_sweep(
         K: intrinsics of the target view, in pixels of the hypotheses.
         viewmat: camera from world of the target view.
         inverse: inverse z-depth of the hypotheses of each pixel.
+        mask: pixels of the source views that count; None is all.
 
     Returns:
-        Features, bilinearly interpolated, and where they are from inside the source image.
+        Features, bilinearly interpolated, and where they are from inside the source image and its mask.
     """
     d, h, w = inverse.shape
     A, b = projection_to_views(K, viewmat, source_K, source_viewmats)
@@ -178,6 +197,7 @@ def plane_sweep(
     homogeneous = (A @ pixels)[:, :, None] + b[:, :, None, None] * inverse.reshape(1, 1, d, -1)
     grid, valid = image_grid(homogeneous.movedim(1, -1), features.shape[-1], features.shape[-2])
     warped = functional.grid_sample(features, grid, padding_mode="border", align_corners=False)
+    valid = inside_mask(valid, grid, mask)
     return warped.reshape(*warped.shape[:2], d, h, w), valid.reshape(-1, d, h, w)
 
 
@@ -191,6 +211,19 @@ def image_grid(
     valid = (z > 1e-9) & (grid.abs() <= 1).all(dim=-1)
     # Far outside the image float32 positions overflow the integers of the interpolation.
     return grid.clamp(-2, 2), valid
+
+
+def inside_mask(
+    valid: Bool[Tensor, "n *p"], grid: Float[Tensor, "n *p 2"], mask: Bool[Tensor, "n h w"] | None
+) -> Bool[Tensor, "n *p"]:
+    """Which valid positions of `image_grid` are interpolated from pixels inside the masks alone."""
+    if mask is None:
+        return valid
+    places = grid.reshape(len(grid), 1, -1, 2)
+    share = functional.grid_sample(
+        mask[:, None].to(grid.dtype), places, padding_mode="border", align_corners=False
+    )
+    return valid & (share.reshape(valid.shape) > _WHOLE)
 
 
 def variance_cost(
@@ -228,22 +261,33 @@ def depth_distribution(
     return mean, (variance + 1e-12).sqrt(), entropy
 
 
-def locally_normalised(rgb: Float[Tensor, "v 3 h w"]) -> Float[Tensor, "v 1 h w"]:
+def locally_normalised(
+    rgb: Float[Tensor, "v 3 h w"], mask: Bool[Tensor, "v h w"] | None = None
+) -> Float[Tensor, "v 1 h w"]:
     """Grey with the mean of its window subtracted, divided by its standard deviation.
 
     The lamp moves with the camera, so a surface point differs in brightness from view to view: only what is
     invariant to gain and offset can be matched.
+
+    Args:
+        rgb: colours.
+        mask: pixels that count in the windows; others are 0 in the result. None is all.
     """
     grey = rgb.mean(dim=1, keepdim=True)
     pad = _NORMALISING_WINDOW_PX // 2
 
-    def mean(image: Tensor) -> Tensor:
+    def pooled(image: Tensor) -> Tensor:
         return functional.avg_pool2d(
             image, _NORMALISING_WINDOW_PX, stride=1, padding=pad, count_include_pad=False
         )
 
-    centred = grey - mean(grey)
-    return centred / (mean(centred.square()) + _MIN_CONTRAST**2).sqrt()
+    if mask is None:
+        centred = grey - pooled(grey)
+        return centred / (pooled(centred.square()) + _MIN_CONTRAST**2).sqrt()
+    inside = mask[:, None].to(grey.dtype)
+    share = pooled(inside).clamp_min(1e-6)
+    centred = (grey - pooled(grey * inside) / share) * inside
+    return centred / (pooled(centred.square()) / share + _MIN_CONTRAST**2).sqrt()
 
 
 class _Regulariser(nn.Module):
@@ -297,9 +341,9 @@ class StereoNetwork(nn.Module):
         levels = []
         for level, encoder in enumerate(self.encoders):
             width = min(w, self.stereo_width << level)
-            rgb = images.resized(width, max(2, round(h * width / w))).rgb
-            grey = locally_normalised(rgb)
-            levels.append(torch.cat([grey, encoder(torch.cat([rgb, grey], dim=1))], dim=1))
+            small = images.resized(width, max(2, round(h * width / w)))
+            grey = locally_normalised(small.rgb, small.mask)
+            levels.append(torch.cat([grey, encoder(torch.cat([small.rgb, grey], dim=1))], dim=1))
         return EncodedViews(images, *levels)
 
     def forward(
@@ -355,7 +399,8 @@ class StereoNetwork(nn.Module):
         height, width = features.shape[-2:]
         source_K = _scaled(images.K, width / images.rgb.shape[-1], height / images.rgb.shape[-2])
         target_K = _scaled(K, width / size[0], height / size[1])
-        warped, valid = plane_sweep(features, source_K, images.viewmats, target_K, viewmat, inverse)
+        mask = images.resized_mask(width, height)
+        warped, valid = plane_sweep(features, source_K, images.viewmats, target_K, viewmat, inverse, mask)
         variance, share = variance_cost(warped, valid)
         # One view always agrees with itself.
         matched = valid.sum(dim=0) >= 2

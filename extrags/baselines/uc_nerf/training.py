@@ -53,6 +53,9 @@ NEAR_MARGIN, FAR_MARGIN = 0.5, 1.5
 _DEPTH_QUANTILES = (0.01, 0.99)
 _CORNER_DISTANCE_PX = 4
 _CORNER_QUALITY = 0.01
+_CORNER_REACH_PX = 7
+"""Side of the pixels that the strength of a corner depends on: derivatives of 3 x 3 in a window of 3 x 3,
+and of neighbours, which it is the largest of."""
 _OCCLUSION_CELL_PX = 8
 _OCCLUSION_MARGIN = 1.1
 _MIN_SPARSE = 4
@@ -147,12 +150,13 @@ class _Training:
             network=network,
             config=config,
             rgb=sequence.rgb[frames],
+            mask=sequence.mask[frames],
             cameras=cameras,
             inverse_range=(1 / (FAR_MARGIN * float(farthest)), 1 / (NEAR_MARGIN * float(nearest))),
             center=cameras.centers.mean(axis=0),
             scale=scale,
         )
-        self.images = PosedImages.of(self.scene.rgb, cameras)
+        self.images = PosedImages.of(self.scene.rgb, cameras, self.scene.mask)
         self.center = torch.from_numpy(self.scene.center.astype(np.float32))
         self.neighbours = [
             [
@@ -236,8 +240,10 @@ class _Training:
             self._stereo_loss(prior, encoded, rays, view, frame)
             + (confidence * (found.depth - 1 / guide[0]).abs() / scene.scale).mean()
         )
+        mask = self.images.mask
+        shown = view.colours if mask is None else view.colours * mask[frame, ..., None]
         loss = loss + config.smoothness_weight * edge_aware_smoothness(
-            prior.inverse * scene.scale, _resized(view.colours, prior.inverse)
+            prior.inverse * scene.scale, _resized(shown, prior.inverse)
         )
         patches = self._patches(found, guide, confidence)
         return loss + config.gradient_weight * scale_invariant_gradient(*patches), squared
@@ -339,15 +345,18 @@ def photometric_consistency(
     section 3.
     """
     warped, valid = plane_sweep(
-        locally_normalised(sources.rgb),
+        locally_normalised(sources.rgb, sources.mask),
         sources.K,
         sources.viewmats,
         target.K[0],
         target.viewmats[0],
         inverse[None],
+        sources.mask,
     )
-    difference = (warped[:, 0, 0] - locally_normalised(target.rgb)[:, 0]).abs()
+    difference = (warped[:, 0, 0] - locally_normalised(target.rgb, target.mask)[:, 0]).abs()
     counted = valid[:, 0] & (weight > 0)
+    if target.mask is not None:
+        counted = counted & target.mask
     best, index = difference.masked_fill(~counted, math.inf).sort(dim=0)
     kept = slice(0, max(1, len(sources) // 2))
     counts = counted.gather(0, index)[kept].to(best.dtype)
@@ -409,7 +418,9 @@ def _visible_points(sequence: EndoscopicSequence, frame: int, points: np.ndarray
 def _depth_at_corners(
     sequence: EndoscopicSequence, frame: int, depth_mm: np.ndarray, per_frame: int
 ) -> SparseDepth:
-    usable = sequence.supervised_mask(frame) & (depth_mm[frame] > 0)
+    # What a corner is measured in lies inside the mask as well: its outline is no corner of tissue.
+    inside = cv2.erode(sequence.mask[frame].astype(np.uint8), np.ones((_CORNER_REACH_PX,) * 2, np.uint8))
+    usable = sequence.supervised_mask(frame) & (depth_mm[frame] > 0) & (inside > 0)
     grey = cv2.cvtColor(sequence.rgb[frame], cv2.COLOR_RGB2GRAY)
     corners = cv2.goodFeaturesToTrack(
         grey, per_frame, _CORNER_QUALITY, _CORNER_DISTANCE_PX, mask=usable.astype(np.uint8)

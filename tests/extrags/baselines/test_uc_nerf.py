@@ -134,6 +134,17 @@ class TestPlaneSweep:
             locally_normalised(image), locally_normalised(0.5 * image + 0.2), atol=0.01, rtol=0.01
         )
 
+    def test_windows_end_at_the_mask(self) -> None:
+        image = torch.rand(1, 3, 20, 24)
+        mask = torch.ones(1, 20, 24, dtype=torch.bool)
+        mask[:, :, 10:] = False
+        cut = locally_normalised(image[..., :10])
+        found = locally_normalised(image, mask)
+        torch.testing.assert_close(found[..., :10], cut, atol=1e-4, rtol=1e-4)
+        assert not found[..., 10:].any()
+        every = torch.ones_like(mask)
+        torch.testing.assert_close(locally_normalised(image, every), locally_normalised(image))
+
     def test_untrained_stereo_finds_a_slanted_plane(self) -> None:
         """The hand-crafted cost alone; source views are darker the farther they are, as under a lamp."""
         views = cameras(np.array([[0.0, 0, 0], [2.5, 0, 0], [-2.5, 0.5, 0], [0, 2, 0], [0, -2, 0]]))
@@ -379,6 +390,22 @@ class TestTraining:
             first.scene.network.parameters(), second.scene.network.parameters(), strict=True
         ):
             assert torch.equal(one, other)
+
+    def test_pixels_outside_the_masks_have_no_influence(self) -> None:
+        """Neither in training nor, as sources that colours are blended from, in rendering."""
+        mask = np.zeros((len(slanted_plane()), HEIGHT, WIDTH), dtype=bool)
+        mask[:, 4:-3, 5:-4] = True
+        masked = replace(slanted_plane(), mask=mask)
+        noise = np.random.default_rng(0).integers(0, 256, masked.rgb.shape, dtype=np.uint8)
+        other = replace(masked, rgb=np.where(mask[..., None], masked.rgb, noise))
+        config = TINY.model_copy(update={"iterations": 6})
+        first, second = (
+            rendering.render(train(sequence, config).scene, masked) for sequence in (masked, other)
+        )
+        np.testing.assert_array_equal(first.rgb, second.rgb)
+        np.testing.assert_array_equal(first.depth_mm, second.depth_mm)
+        whole = rendering.render(train(replace(masked, mask=np.ones_like(mask)), config).scene, masked)
+        assert np.abs(whole.rgb - first.rgb).max() > 0
 
     def test_the_seed_alone_decides(self) -> None:
         sequence, found, events = slanted_plane(), [], []
