@@ -7,16 +7,19 @@ import math
 
 import numpy as np
 import torch
+from jaxtyping import Bool, UInt32
+from torch.nn import functional
 
 from extrags.cameras import Cameras, rotation_about
 from extrags.config import AssessConfig, CoverageConfig, PipelineConfig
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
-from extrags.exploration.coverage import direction_counts, training_coverage
+from extrags.exploration.coverage import direction_counts, training_coverage, view_pairs
 from extrags.exploration.waves import start_views
 from extrags.scene import Scene
 from extrags.scene_plan import ScenePlan, decide
 from extrags.sequence import EndoscopicSequence
+from extrags.view_synthesis.references import visibility_of
 
 __all__ = ["assess", "measure", "probe_views"]
 
@@ -28,6 +31,8 @@ PROBE_CLEARANCE_SHARE = 0.2
 """Smallest distance of a probe camera from solid Gaussians, in median rendered depths."""
 SOLID_OPACITY = 0.5
 PROBES_PER_BATCH = 8
+WHOLE = 0.999
+"""Share of a small pixel's area from which it counts as wholly inside a mask; the rest is rounding."""
 
 
 def assess(scene: Scene, sequence: EndoscopicSequence, config: PipelineConfig | None = None) -> ScenePlan:
@@ -56,16 +61,19 @@ def measure(
 
     A pixel of a probe view is lacking when it is a hole (alpha below `hole_alpha`) or when more than half of
     its alpha comes from Gaussians that the training views saw from fewer than `min_directions` direction
-    bins. Budgets are not used here: `decide` turns the numbers into a plan.
+    bins. What a training view shows outside its mask was not seen by it. Budgets are not used here: `decide`
+    turns the numbers into a plan.
 
     Args:
         scene: the coarse reconstruction; probe views are rendered where it is.
         sequence: its frames.
         settings: the probe views, and the thresholds for lacking pixels.
-        coverage: when a Gaussian counts as seen; the same rule as in the exploration.
+        coverage: when a Gaussian counts as seen; the same rule as in the exploration, whose virtual views
+            have no masks.
 
     Returns:
-        Measurements by name; shares are of all pixels of the probe views, or of all Gaussians.
+        Measurements by name; shares are of all pixels of the probe views, of the valid ones of the training
+        views, or of all Gaussians.
 
     Raises:
         CaptureError: when there are no Gaussians, or no training view sees any.
@@ -79,8 +87,9 @@ def measure(
     # Blending weights come from the native kernels, and the search tree is on the processor.
     on_processor = scene.to("cpu")
     small = cameras.at_most_width(coverage.render_width)
-    depth_unit_mm, training_holes = _training_view_measurements(scene, small, settings)
-    covered = training_coverage(on_processor, small, **coverage.options)
+    valid = _valid_pixels(sequence, small)
+    depth_unit_mm, training_holes = _training_view_measurements(scene, small, valid, settings)
+    covered = _covered(on_processor, small, valid, coverage)
     directions = direction_counts(covered)
     probes = probe_views(on_processor, small.as_pinholes(), depth_unit_mm, settings)
     holes, poor = _lacking_pixels(scene, probes, directions < settings.min_directions, settings)
@@ -160,13 +169,45 @@ def probe_views(scene: Scene, cameras: Cameras, depth_unit_mm: float, config: As
     return Cameras(K, np.stack(poses), cameras.width, cameras.height)
 
 
-def _training_view_measurements(scene: Scene, cameras: Cameras, config: AssessConfig) -> tuple[float, float]:
+def _valid_pixels(sequence: EndoscopicSequence, cameras: Cameras) -> Bool[np.ndarray, "v h w"]:
+    """Pixels of the training views, at the size of `cameras`, all of whose area shows tissue."""
+    size = (cameras.height, cameras.width)
+    found = np.zeros((len(cameras), *size), dtype=bool)
+    for index, frame in enumerate(sequence.train):
+        mask = torch.from_numpy(sequence.mask[int(frame)]).float()[None, None]
+        found[index] = functional.interpolate(mask, size, mode="area")[0, 0].numpy() > WHOLE
+    return np.asarray(found & cameras.field)
+
+
+def _covered(
+    scene: Scene, cameras: Cameras, valid: Bool[np.ndarray, "v h w"], coverage: CoverageConfig
+) -> UInt32[np.ndarray, "n"]:
+    """`training_coverage` by the valid pixels alone; by the frustum, masks are not looked at."""
+    if coverage.visibility == "frustum" or valid.all():
+        return training_coverage(scene, cameras, **coverage.options)
+    covered = np.zeros(len(scene.gaussians), dtype=np.uint32)
+    with torch.no_grad():
+        for start in range(0, len(cameras), PROBES_PER_BATCH):
+            batch = slice(start, start + PROBES_PER_BATCH)
+            rendering = scene.render(
+                cameras[batch], sh_degree=0, visibility=True, visibility_mask=torch.from_numpy(valid[batch])
+            )
+            seen = visibility_of(rendering).numpy() > coverage.visible_weight
+            for center, of_view in zip(cameras[batch].centers, seen, strict=True):
+                rows = np.flatnonzero(of_view)
+                covered[rows] |= view_pairs(scene, center, rows, coverage.directions)
+    return covered
+
+
+def _training_view_measurements(
+    scene: Scene, cameras: Cameras, valid: Bool[np.ndarray, "v h w"], config: AssessConfig
+) -> tuple[float, float]:
     """Median rendered depth, and share of holes in the training views themselves."""
     depths, holes = [], []
     with torch.no_grad():
         for start in range(0, len(cameras), PROBES_PER_BATCH):
             rendering = scene.render(cameras[start : start + PROBES_PER_BATCH], sh_degree=0)
-            field = torch.from_numpy(cameras[start : start + PROBES_PER_BATCH].field).to(scene.device)
+            field = torch.from_numpy(valid[start : start + PROBES_PER_BATCH]).to(scene.device)
             surface = (rendering.alpha >= config.hole_alpha) & field
             depths.append(rendering.depth[surface].cpu().numpy())
             holes.append((field & ~surface)[field].cpu().numpy())

@@ -49,7 +49,7 @@ def planning_settings(config: PipelineConfig) -> PipelineConfig:
     return PipelineConfig().with_overrides(read)
 
 
-@stage("assess", version=3)
+@stage("assess", version=4)
 def assess(
     slot: Slot,
     scene: Ref,

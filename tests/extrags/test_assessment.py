@@ -109,6 +109,29 @@ class TestAssess:
         assert holes["hole_share"] > whole["hole_share"] + 0.1
         assert holes["training_hole_share"] > whole["training_hole_share"] + 0.1
 
+    def test_what_lies_outside_the_masks_was_not_seen(self):
+        tube = small_tube()
+        mask = np.zeros_like(tube.sequence.mask)
+        mask[:, :, : mask.shape[2] // 2] = True
+        half = assess(tube.scene, replace(tube.sequence, mask=mask), config()).measurements
+        whole = tube_plan().measurements
+        assert half["gaussians_unseen_share"] > whole["gaussians_unseen_share"] + 0.05
+        assert half["directions_mean"] < whole["directions_mean"]
+
+    def test_holes_outside_the_masks_of_training_views_do_not_count(self):
+        tube = small_tube()
+        scene = with_gap(tube)
+        found = assess(scene, tube.sequence, config()).measurements
+        with torch.no_grad():
+            alpha = scene.render(tube.sequence.cameras).alpha.numpy()
+        seen = replace(tube.sequence, mask=alpha >= AssessConfig().hole_alpha)
+        assert found["training_hole_share"] > 0.1
+        assert assess(scene, seen, config()).measurements["training_hole_share"] < 0.02
+
+    def test_masks_that_leave_nothing_out_change_nothing(self):
+        whole = replace(small_tube().sequence, mask=np.ones_like(small_tube().sequence.mask))
+        assert assess(small_tube().scene, whole, config()) == tube_plan()
+
     def test_the_budget_follows_the_need(self):
         tube = small_tube()
         lacking = tube_plan().measurements["lacking_share"]
