@@ -133,6 +133,7 @@ def reconstruct_dataset(
         )
         outcome = outcome_of(case.sequence, state)
         outcome.variant = case.variant
+        outcome.seed = case.seed if len(seeds or ()) > 1 else None
         if not isinstance(state.result(raise_on_failure=False), SequenceOutcome | SequenceFailedError):
             record_outcome_quietly(Store(store), case, outcome, until, case.config())
         page.sequence_ended(outcome, store)

@@ -111,6 +111,8 @@ class SequenceOutcome:
     """The exception of a failed stage; only available in the process that ran it."""
     variant: str = ""
     """What sets it apart from other runs of the same sequence in a matrix: `3dgs, seed 1`."""
+    seed: int | None = None
+    """Of all its stages, where it is one of several seeds."""
 
     @property
     def title(self) -> str:
@@ -146,6 +148,7 @@ class SequenceOutcome:
         return {
             "name": self.name,
             "variant": self.variant,
+            "seed": self.seed,
             "status": self.status,
             "seconds": round(self.seconds, 3),
             "stages": [row.to_json() for row in self.stages],

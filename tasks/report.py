@@ -149,7 +149,7 @@ def _absent(skipped: dict[str, str]) -> dict[str, str]:
     }
 
 
-@stage("dataset-report", version=4, ignore=("rows",))
+@stage("dataset-report", version=5, ignore=("rows",))
 def dataset_report(
     slot: Slot,
     name: str,
@@ -179,7 +179,8 @@ def dataset_report(
     shown = [
         DatasetRow(
             name=row["name"],
-            variant=row["variant"],
+            variant=_without_seed(row["variant"], row["seed"]),
+            seed=row["seed"],
             status="failed" if sequence in failures else "completed",
             seconds=sum(stage["made_seconds"] for stage in row["stages"]),
             coarse=figures(sequence, "coarse"),
@@ -195,6 +196,11 @@ def dataset_report(
         for every in (shown, [replace(row, seconds=0.0, stages=()) for row in shown])
     )
     _save_page(slot, page, content)
+
+
+def _without_seed(variant: str, seed: int | None) -> str:
+    """What else sets a run apart: its seed stands in a column of its own."""
+    return ", ".join(word for word in variant.split(", ") if word != f"seed {seed}")
 
 
 def _neighbour(page: str | None) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -37,7 +37,7 @@ class DatasetRow:
         final: the same of the fine-tuned scene; None when the plan left fine-tuning out.
         stages: `{stage, state, seconds, reason}`.
         error: what went wrong, for a failed sequence.
-        seed: of the run, when there are several of the same sequence.
+        seed: of the run, when there are several of the same sequence and variant.
         variant: what else sets it apart from other runs of the same sequence, in words.
         link: relative address of the sequence's own page; no link when empty.
     """
@@ -67,7 +67,7 @@ def build_dataset_report(
 
     Means are over the rows that have both a coarse and a final figure, with the standard deviation between
     them; where a sequence has several, they are called runs. Sequences run with several seeds get a table of
-    their spread. Failures stand at the top.
+    their spread, each variant by itself. Failures stand at the top.
 
     Args:
         rows: the sequences, or runs of them, in the order they are to be shown.
@@ -173,10 +173,10 @@ def _seed_rows(rows: Sequence[DatasetRow], metrics: Sequence[Metric]) -> list[di
     groups: dict[str, list[DatasetRow]] = {}
     for row in rows:
         if row.seed is not None:
-            groups.setdefault(row.name, []).append(row)
+            groups.setdefault(replace(row, seed=None).label, []).append(row)
     return [
-        {"label": name, "seeds": len(group), "cells": [_mean_cell(metric, group, ()) for metric in metrics]}
-        for name, group in groups.items()
+        {"label": label, "seeds": len(group), "cells": [_mean_cell(metric, group, ()) for metric in metrics]}
+        for label, group in groups.items()
         if len(group) > 1
     ]
 

@@ -186,6 +186,20 @@ def test_dataset_page_names_variants() -> None:
     assert "phantom/0 [seed 2]" in page.text
 
 
+def test_dataset_page_does_not_mix_variants_of_several_seeds() -> None:
+    rows = [
+        row("phantom/0", gain + 2 * seed, variant=variant, seed=seed)
+        for variant, gain in (("3dgs", 1.0), ("coarse", 5.0))
+        for seed in (0, 1)
+    ]
+    spread = Page(build_dataset_report(rows)).text.split("Spread over seeds")[1]
+    # Two seeds each, 2 dB apart.
+    assert "phantom/0 [3dgs] 2" in spread
+    assert "+2.00 better ± 1.41" in spread
+    assert "phantom/0 [coarse] 2" in spread
+    assert "+6.00 better ± 1.41" in spread
+
+
 def test_dataset_page_of_nothing_but_failures() -> None:
     page = Page(build_dataset_report([DatasetRow("a", "failed", 1.0, error="no frames")]))
     assert "None of them has both a coarse and a final figure to compare." in page.text
