@@ -66,7 +66,7 @@ def restoring_settings(config: EnhanceConfig, finish: Finish) -> EnhanceConfig:
     return settings.model_copy(update={"precision": chosen_precision(config)})
 
 
-@stage("evaluate-restore", version=11)
+@stage("evaluate-restore", version=12)
 def restore(
     slot: Slot,
     renders: Ref,

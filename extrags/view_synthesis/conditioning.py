@@ -159,7 +159,8 @@ def observe_views(
     """Render virtual views and carry real ones into them.
 
     Two rasterisations per view: colour with depth, then what is known about each Gaussian from this
-    direction and distance together with the square of its depth.
+    direction and distance together with the square of its depth. Colours of Gaussians that training views
+    hardly determine are drawn towards their neighbours' (`extrags.view_synthesis.shrinkage`).
 
     Args:
         scene: the reconstruction.
@@ -194,7 +195,9 @@ def _observe_one(
 ) -> Observation:
     scale = references.transfer.scale_mm
     with torch.no_grad():
-        rendering = scene.render(camera, exposure=exposure, visibility=True, median_depth=True)
+        rendering = references.shown(scene).render(
+            camera, exposure=exposure, visibility=True, median_depth=True
+        )
         if rendering.visibility_max is None or rendering.median_depth is None:
             raise ShapeError("the rasteriser returned neither visibility nor median depth")
         alpha = rendering.alpha[:, None]

@@ -11,6 +11,7 @@ from extrags.errors import CaptureError, ShapeError
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, saturated_mask
 from extrags.view_synthesis.references import SEEN_WEIGHT, LightTransfer, ReferenceViews, visibility_of
+from extrags.view_synthesis.shrinkage import colour_support, shrunk_sh0
 from extrags.view_synthesis.warp import with_fitted_transfer
 
 __all__ = ["gather_references"]
@@ -53,7 +54,7 @@ def gather_references(
     if len(frames) == 0:
         raise CaptureError(f"{sequence.name}: no real views to refer to")
     cameras = sequence.cameras[frames]
-    depth, seen = _depth_and_seen(scene, sequence, frames)
+    depth, seen, support = _depth_and_seen(scene, sequence, frames)
     if not bool((depth > 0).any()):
         raise CaptureError(f"{sequence.name}: no depth in any of the {len(frames)} real views")
     rgb = torch.from_numpy(sequence.rgb[frames].astype(np.float32) / 255).permute(0, 3, 1, 2)
@@ -71,6 +72,7 @@ def gather_references(
         _exposures(scene, frames) if exposure is None else exposure,
         seen,
         LightTransfer(scene.light, 0.0, scale),
+        shrunk_sh0(scene, support),
     )
     if scene.light is None:
         references = with_fitted_transfer(references)
@@ -91,8 +93,8 @@ def _exposures(scene: Scene, frames: Int[np.ndarray, "r"]) -> Float[Tensor, "r"]
 
 def _depth_and_seen(
     scene: Scene, sequence: EndoscopicSequence, frames: Int[np.ndarray, "r"]
-) -> tuple[Float[Tensor, "r h w"], Bool[Tensor, "r n"]]:
-    depths, seen = [], []
+) -> tuple[Float[Tensor, "r h w"], Bool[Tensor, "r n"], Float[Tensor, "n"]]:
+    depths, seen, support = [], [], torch.zeros(len(scene.gaussians))
     for frame in frames:
         mask = torch.from_numpy(sequence.mask[frame])
         with torch.no_grad():
@@ -101,6 +103,7 @@ def _depth_and_seen(
                 sequence.cameras[int(frame)], visibility=True, visibility_mask=mask[None]
             )
         seen.append(visibility_of(rendering)[0] > SEEN_WEIGHT)
+        support += colour_support(scene, sequence.cameras[int(frame)], rendering)
         rendered = torch.where(rendering.alpha[0] > SOLID_ALPHA, rendering.depth[0], torch.zeros(()))
         depth = rendered
         reliable = sequence.reliable_depth_mm(int(frame))
@@ -108,7 +111,7 @@ def _depth_and_seen(
             known = torch.from_numpy(reliable)
             depth = torch.where(known > 0, known, rendered)
         depths.append(torch.where(mask, depth, torch.zeros(())))
-    return torch.stack(depths), torch.stack(seen)
+    return torch.stack(depths), torch.stack(seen), support
 
 
 def _trust(sequence: EndoscopicSequence, frames: Int[np.ndarray, "r"]) -> Float[np.ndarray, "r h w"]:

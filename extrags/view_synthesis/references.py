@@ -15,6 +15,7 @@ from extrags.errors import ShapeError
 from extrags.illumination import NearFieldLight
 from extrags.raster import Rendering
 from extrags.scene import Scene
+from extrags.view_synthesis.shrinkage import colour_support, shrunk_sh0
 
 __all__ = ["SEEN_WEIGHT", "LightTransfer", "ReferenceViews", "visibility_of"]
 
@@ -74,6 +75,8 @@ class ReferenceViews:
         exposure: gain of each view, [R].
         seen: which Gaussians of the scene each view sees, [R, N].
         transfer: how brightness changes with distance.
+        sh0: constant harmonics of the scene's Gaussians as other views are to show them (`shrunk_sh0`), from
+            all views that were gathered; None takes the scene's own, [N, 1, 3].
     """
 
     frames: Int[np.ndarray, "r"]
@@ -82,6 +85,7 @@ class ReferenceViews:
     exposure: Float[Tensor, "r"]
     seen: Bool[Tensor, "r n"]
     transfer: LightTransfer
+    sh0: Float[Tensor, "n 1 3"] | None = None
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -124,14 +128,30 @@ class ReferenceViews:
 
     def of_scene(self, scene: Scene) -> ReferenceViews:
         """The same images and depths for other Gaussians: what each view sees is found anew."""
-        seen = []
+        seen, support = [], torch.zeros(len(scene.gaussians))
         for view in range(len(self)):
             with torch.no_grad():
                 rendering = scene.render(
                     self.cameras[view], visibility=True, visibility_mask=self.valid[[view]]
                 )
             seen.append(visibility_of(rendering) > SEEN_WEIGHT)
-        return replace(self, seen=torch.cat(seen))
+            support += colour_support(scene, self.cameras[view], rendering)
+        return replace(self, seen=torch.cat(seen), sh0=shrunk_sh0(scene, support))
+
+    def shown(self, scene: Scene) -> Scene:
+        """The scene as views from elsewhere are to show it: with the colours of `sh0`.
+
+        Raises:
+            ShapeError: when the scene has other Gaussians than the references know of.
+        """
+        if self.sh0 is None:
+            return scene
+        if len(self.sh0) != len(scene.gaussians):
+            raise ShapeError(
+                f"references of a scene of {len(self.sh0)} Gaussians, and one of "
+                f"{len(scene.gaussians)} is shown"
+            )
+        return Scene(replace(scene.gaussians, sh0=self.sh0), scene.light)
 
 
 def visibility_of(rendering: Rendering) -> Float[Tensor, "c n"]:
