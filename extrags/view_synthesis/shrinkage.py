@@ -30,7 +30,7 @@ from extrags.scene import Scene
 
 __all__ = ["PRIOR_PX", "colour_support", "shrunk_sh0"]
 
-PRIOR_PX = 8.0
+PRIOR_PX = 4.0
 """What the neighbours' mean is worth, in pixels of training views under a gain of one."""
 NEIGHBOURS = 16
 
