@@ -228,24 +228,24 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     if not clearly_other or best >= min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
         return
     still = error_with(np.inf)
-    if best < _CLEARLY_BETTER * still:
-        nearest = min(_KNOWN_FACTORS, key=lambda known: abs(np.log(known / factor)))
-        hint = f", as of {_KNOWN_FACTORS[nearest]}" if abs(np.log(nearest / factor)) < 0.2 else ""
-        raise SourceError(
-            f"depth and poses are in different units: carried from frame to frame depth is off by "
-            f"{as_given:.0%} (median), but only by {best:.1%} when it is multiplied by about "
-            f"{factor:.3g}{hint}. Expected depth in the unit of the poses",
-            file=file,
-            field="depth_mm",
-        )
-    if still < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
+    if best >= _CLEARLY_BETTER * still and still < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
         raise PoseError(
             f"the positions of the cameras contradict the depth: carried from frame to frame it is off by "
-            f"{as_given:.0%} (median), but only by {still:.1%} if the cameras did not move at all. Expected "
-            "positions of cameras in the world, in the unit of the depth",
+            f"{as_given:.0%} (median), but only by {still:.1%} if the cameras did not move at all (by "
+            f"{best:.1%} when it is multiplied by about {factor:.3g}, which so little motion cannot tell). "
+            "Expected positions of cameras in the world, in the unit of the depth",
             file=file,
             field="world_from_camera",
         )
+    nearest = min(_KNOWN_FACTORS, key=lambda known: abs(np.log(known / factor)))
+    hint = f", as of {_KNOWN_FACTORS[nearest]}" if abs(np.log(nearest / factor)) < 0.2 else ""
+    raise SourceError(
+        f"depth and poses are in different units: carried from frame to frame depth is off by "
+        f"{as_given:.0%} (median), but only by {best:.1%} when it is multiplied by about "
+        f"{factor:.3g}{hint}. Expected depth in the unit of the poses",
+        file=file,
+        field="depth_mm",
+    )
 
 
 def _check_split(sequence: EndoscopicSequence, file: object) -> None:

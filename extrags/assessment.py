@@ -68,8 +68,8 @@ def measure(
         scene: the coarse reconstruction; probe views are rendered where it is.
         sequence: its frames.
         settings: the probe views, and the thresholds for lacking pixels.
-        coverage: when a Gaussian counts as seen; the same rule as in the exploration, whose virtual views
-            have no masks.
+        coverage: when a Gaussian counts as seen; as in the exploration, which takes all pixels of training
+            views, though. By the frustum no masks are looked at.
 
     Returns:
         Measurements by name; shares are of all pixels of the probe views, of the valid ones of the training
@@ -170,12 +170,17 @@ def probe_views(scene: Scene, cameras: Cameras, depth_unit_mm: float, config: As
 
 
 def _valid_pixels(sequence: EndoscopicSequence, cameras: Cameras) -> Bool[np.ndarray, "v h w"]:
-    """Pixels of the training views, at the size of `cameras`, all of whose area shows tissue."""
+    """Pixels of the training views, at the size of `cameras`, all of whose area shows tissue.
+
+    Of a frame without such a pixel (a speckled mask, a small field) those that show some.
+    """
     size = (cameras.height, cameras.width)
     found = np.zeros((len(cameras), *size), dtype=bool)
     for index, frame in enumerate(sequence.train):
         mask = torch.from_numpy(sequence.mask[int(frame)]).float()[None, None]
-        found[index] = functional.interpolate(mask, size, mode="area")[0, 0].numpy() > WHOLE
+        share = functional.interpolate(mask, size, mode="area")[0, 0].numpy()
+        whole = share > WHOLE
+        found[index] = whole if whole.any() else share > 0
     return np.asarray(found & cameras.field)
 
 

@@ -128,6 +128,8 @@ class ReferenceViews:
 
     def of_scene(self, scene: Scene) -> ReferenceViews:
         """The same images and depths for other Gaussians: what each view sees is found anew."""
+        # Blending weights come from the native kernels, and the search for neighbours is on the processor.
+        scene = scene.to("cpu")
         seen, support = [], torch.zeros(len(scene.gaussians))
         for view in range(len(self)):
             with torch.no_grad():

@@ -19,6 +19,7 @@ Source: shrinkage towards a prior mean, [Efron1975].
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -76,7 +77,11 @@ def shrunk_sh0(scene: Scene, support: Float[Tensor, "n"]) -> Float[Tensor, "n 1 
     if count < 1:
         return gaussians.sh0
     means = gaussians.means.detach().numpy()
-    nearest = torch.from_numpy(cKDTree(means).query(means, k=count + 1)[1][:, 1:])
+    found = cKDTree(means).query(means, k=count + 1)[1]
+    # Itself among them, but where as many others lie in its very place: then one of these is left out.
+    itself = found == np.arange(len(means))[:, None]
+    itself[~itself.any(axis=1), -1] = True
+    nearest = torch.from_numpy(found[~itself].reshape(-1, count))
     own = gaussians.sh0[:, 0].detach()
     weight = (support * gaussians.opacities.detach().sigmoid())[nearest]
     total = weight.sum(dim=1, keepdim=True)

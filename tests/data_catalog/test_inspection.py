@@ -113,6 +113,15 @@ class TestDepthScale:
             check_depth_scale(replace(still, world_from_camera=wandering))
         assert caught.value.field == "world_from_camera"
 
+    @pytest.mark.parametrize("moved", [0.5, 0.2, 0.1, 0.05])
+    def test_another_unit_is_refused_however_little_the_camera_moves(self, clip, moved) -> None:
+        """As a unit where the motion tells, else as positions that fit no better than none."""
+        calm = clip.world_from_camera.copy()
+        calm[:, :3, 3] = calm[0, :3, 3] + moved * (calm[:, :3, 3] - calm[0, :3, 3])
+        depth = (clip.depth_mm / 1000).astype(np.float32)
+        with pytest.raises((SourceError, PoseError), match=r"different units|positions of the cameras"):
+            check_depth_scale(replace(clip, world_from_camera=calm, depth_mm=depth))
+
     def test_no_parallax_no_verdict(self, clip) -> None:
         still = np.repeat(clip.world_from_camera[:1], len(clip), axis=0)
         check_depth_scale(replace(clip, world_from_camera=still))

@@ -128,6 +128,16 @@ class TestAssess:
         assert found["training_hole_share"] > 0.1
         assert assess(scene, seen, config()).measurements["training_hole_share"] < 0.02
 
+    def test_speckled_masks_are_no_empty_views(self):
+        """At half the size every pixel has a part that does not count."""
+        tube = small_tube()
+        speckled = np.ones_like(tube.sequence.mask)
+        speckled[:, ::2, ::2] = False
+        small = config().with_overrides({"explore.render_width": tube.sequence.width // 2})
+        found = assess(tube.scene, replace(tube.sequence, mask=speckled), small).measurements
+        whole = assess(tube.scene, tube.sequence, small).measurements
+        assert found["lacking_share"] == pytest.approx(whole["lacking_share"], abs=0.02)
+
     def test_masks_that_leave_nothing_out_change_nothing(self):
         whole = replace(small_tube().sequence, mask=np.ones_like(small_tube().sequence.mask))
         assert assess(small_tube().scene, whole, config()) == tube_plan()

@@ -10,7 +10,7 @@
 constexpr int kTaps = 5;        // on each side
 constexpr int kPad = 32;        // floats beside a row; at least 3 kTaps, and a vector more on the right
 constexpr int kLossRows = 4;    // taken together by the vertical passes
-constexpr int kMoments = 4;    // maps whose window means SSIM needs
+constexpr int kMoments = 4;     // maps whose window means SSIM needs
 constexpr int kRing = 16;       // rows kept of each map; at least 2 kTaps + kLossRows
 constexpr float kSsimC1 = 1e-4f, kSsimC2 = 9e-4f;
 

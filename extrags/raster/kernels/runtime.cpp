@@ -139,7 +139,7 @@ class Pool {
 
   void wait_for_work(uint64_t last) {
     using clock = std::chrono::steady_clock;
-    // Longer than what Python does between two kernels of a training step: to be woken takes longer still.
+    // Longer than what Python does between two kernels of a training step: being woken costs more than waiting.
     const auto give_up = clock::now() + std::chrono::microseconds(200);
     for (int spins = 1; epoch_.load(std::memory_order_acquire) == last; ++spins) {
       relax();

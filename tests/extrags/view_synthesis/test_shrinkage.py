@@ -78,11 +78,32 @@ class TestShrunkColours:
         scene = with_red(sheet(), 3)
         assert torch.equal(shrunk_sh0(scene, torch.zeros(400)), scene.gaussians.sh0)
 
-    @pytest.mark.parametrize("n", [1, 2, 5])
-    def test_few_gaussians(self, n: int):
-        found = shrunk_sh0(sheet(n), torch.ones(n))
-        assert found.shape == (n, 1, 3)
-        assert torch.isfinite(found).all()
+    def test_one_gaussian_has_no_neighbour(self):
+        scene = with_red(sheet(1), 0)
+        assert torch.equal(shrunk_sh0(scene, torch.ones(1)), scene.gaussians.sh0)
+
+    def test_two_gaussians_are_neighbours_of_each_other(self):
+        scene = with_red(sheet(2), 1)
+        own = scene.gaussians.sh0
+        found = shrunk_sh0(scene, torch.full((2,), PRIOR_PX))
+        torch.testing.assert_close(found, own.mean(dim=0, keepdim=True).expand_as(own))
+
+    @pytest.mark.parametrize("copies", [2, NEIGHBOURS, 3 * NEIGHBOURS])
+    def test_none_is_a_neighbour_of_itself_where_several_share_a_place(self, copies: int):
+        """The only red one of them, without support, takes the others' colour: its own is not in the mean."""
+        scene = sheet()
+        means = scene.gaussians.means.clone()
+        means[:copies] = means[0]
+        alone = replace(scene.gaussians, means=means)
+        for index in (0, copies - 1):
+            red = with_red(Scene(alone), index)
+            support = torch.full((400,), 1e6)
+            support[index] = 0
+            found = colours(shrunk_sh0(red, support))[index]
+            torch.testing.assert_close(found, torch.full((3,), GREY), atol=1e-4, rtol=0)
+            support[index] = 1e6
+            others = colours(shrunk_sh0(red, support))
+            torch.testing.assert_close(others[index], colours(red.gaussians.sh0)[index], atol=1e-4, rtol=0)
 
     def test_support_of_other_gaussians_is_refused(self):
         with pytest.raises(ShapeError, match="support of"):
@@ -103,6 +124,34 @@ class TestSupport:
         distance = np.linalg.norm(tube.scene.gaussians.means.numpy() - camera.centers[0], axis=1)
         near, far = (seen & torch.from_numpy(chosen) for chosen in (distance < 25, distance > 45))
         assert (lit[near] / plain[near]).median() > 1.5 * (lit[far] / plain[far]).median()
+
+    def test_pixels_outside_of_masks_do_not_count(self):
+        """What only they show has no support: where a neighbour has some, its colour alone is taken."""
+        tube = build_tube()
+        left = tube.sequence.mask.copy()
+        left[:, :, left.shape[2] // 2 :] = False
+        masked = replace(tube.sequence, mask=left)
+        whole, part = (
+            gather_references(tube.scene, frames, frames.train, exposure=torch.ones(10))
+            for frames in (tube.sequence, masked)
+        )
+        assert whole.sh0 is not None
+        assert part.sh0 is not None
+        own = tube.scene.gaussians.sh0
+        lost = whole.seen.any(dim=0) & ~part.seen.any(dim=0) & (part.sh0 != own).any(dim=2)[:, 0]
+        assert lost.sum() > 50
+        assert (part.sh0 - own)[lost].abs().mean() > 1.2 * (whole.sh0 - own)[lost].abs().mean()
+
+    def test_without_a_light(self):
+        tube = build_tube()
+        dark = Scene(tube.scene.gaussians)
+        references = gather_references(dark, tube.sequence, tube.sequence.train)
+        camera = tube.sequence.cameras[tube.sequence.test[0]]
+        layers = observe_views(dark, references, camera, count=2).layers
+        with torch.no_grad():
+            shown = references.shown(dark).render(camera).rgb.permute(0, 3, 1, 2).clamp(0, 1)
+        assert references.sh0 is not None
+        assert torch.equal(layers.get("rendered"), shown)
 
     def test_a_rendering_without_visibility_is_refused(self):
         tube = build_tube()
