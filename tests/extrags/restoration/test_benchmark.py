@@ -107,7 +107,7 @@ class TestFigures:
         assert light is not None
         gain = light.interpolated_exposures(tube.sequence.test, tube.sequence.train)
         with torch.no_grad():
-            rendered = tube.scene.render(cameras, exposure=gain).rgb.clamp(0, 1)
+            rendered = tube.references.shown(tube.scene).render(cameras, exposure=gain).rgb.clamp(0, 1)
         rendered = (255 * rendered).round() / 255
         truth = torch.from_numpy(tube.sequence.rgb[tube.sequence.test].astype(np.float32) / 255)
         assert found["psnr"] == pytest.approx(psnr(rendered, truth), abs=1e-6)
@@ -421,12 +421,13 @@ class TestClips:
         last = tube.sequence.test[:1]
         (clip,) = held_out_clips(scene, tube.references, tube.sequence, last, count=2)
         with torch.no_grad():
-            expected = scene.render(tube.sequence.cameras[last], exposure=known[-1:].exp()).rgb
+            shown = tube.references.shown(scene)
+            expected = shown.render(tube.sequence.cameras[last], exposure=known[-1:].exp()).rgb
         assert torch.equal(clip.layers.get("rendered"), expected.permute(0, 3, 1, 2).clamp(0, 1))
         elsewhere = replace(tube.sequence, recording=np.array([0] * 10 + [1] * 2))
         (clip,) = held_out_clips(scene, tube.references, elsewhere, last, count=2)
         with torch.no_grad():
-            expected = scene.render(tube.sequence.cameras[last]).rgb
+            expected = shown.render(tube.sequence.cameras[last]).rgb
         assert torch.equal(clip.layers.get("rendered"), expected.permute(0, 3, 1, 2).clamp(0, 1))
 
     def test_there_must_be_frames(self, tube: Tube) -> None:

@@ -149,7 +149,7 @@ class TestPretrainingScene:
         monkeypatch.setattr(module, 1)
         scene.save(tmp_path / "old.safetensors")
         monkeypatch.undo()
-        with pytest.raises(WeightsError, match=r"old\.safetensors: .* version 1, expected 5"):
+        with pytest.raises(WeightsError, match=r"old\.safetensors: .* version 1, expected 6"):
             PretrainingScene.load(tmp_path / "old.safetensors")
 
     def test_a_foreign_file_is_named(self, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from extrags.restoration.restored_renders import (
     restored_renders,
     restored_shares,
 )
+from extrags.view_synthesis.gather import gather_references
 from tests.extrags.lit_tube import Tube
 from tests.extrags.restoration.test_refinement import untrained
 
@@ -32,6 +33,14 @@ CONFIG = EnhanceConfig(references=4)
 @pytest.fixture(scope="module")
 def renders(tube: Tube) -> RenderedViews:
     return render(tube.scene, tube.sequence)
+
+
+@pytest.fixture(scope="module")
+def shown(tube: Tube) -> RenderedViews:
+    """The coarse scene's views as they are restored: in the colours of `ReferenceViews.shown`."""
+    training = tube.sequence.training_part()
+    references = gather_references(tube.scene, training, training.train)
+    return render(references.shown(tube.scene), tube.sequence)
 
 
 @pytest.fixture
@@ -55,12 +64,12 @@ class Unnamed(AsRendered):
 class TestRestoredRenders:
     @pytest.mark.usefixtures("each_alone")
     def test_a_restorer_that_changes_nothing_leaves_the_mean_of_both_scenes(
-        self, tube: Tube, renders: RenderedViews
+        self, tube: Tube, renders: RenderedViews, shown: RenderedViews
     ) -> None:
         """The restored view is the coarse scene's own, at the exposure of the protocol."""
         bright = replace(renders, rgb=np.full_like(renders.rgb, 0.75), alpha=np.ones_like(renders.alpha))
         mixed = restored(tube, bright, AsRendered())
-        expected = RESTORED_SHARE * renders.rgb.clip(0, 1) + (1 - RESTORED_SHARE) * 0.75
+        expected = RESTORED_SHARE * shown.rgb.clip(0, 1) + (1 - RESTORED_SHARE) * 0.75
         np.testing.assert_allclose(mixed.rgb, expected, atol=1e-5)
 
     @pytest.mark.usefixtures("each_alone")
@@ -68,14 +77,14 @@ class TestRestoredRenders:
         "shares", [RestoredShares(0.1), RestoredShares(0.1, 0.0), RestoredShares(0.6, 0.2)]
     )
     def test_more_of_the_final_scene_is_kept_where_that_was_judged(
-        self, tube: Tube, renders: RenderedViews, shares: RestoredShares
+        self, tube: Tube, renders: RenderedViews, shown: RenderedViews, shares: RestoredShares
     ) -> None:
         bright = replace(renders, rgb=np.full_like(renders.rgb, 0.75), alpha=np.ones_like(renders.alpha))
         training = tube.sequence.training_part()
         mixed = restored_renders(
             tube.scene, bright, tube.sequence, training, AsRendered(), CONFIG, finish="smooth", shares=shares
         )
-        share = np.abs(mixed.rgb - 0.75) / np.abs(renders.rgb.clip(0, 1) - 0.75).clip(1e-3)
+        share = np.abs(mixed.rgb - 0.75) / np.abs(shown.rgb.clip(0, 1) - 0.75).clip(1e-3)
         for expected in (shares.known, shares.invented):
             assert (np.abs(share - expected) < 1e-3).mean() > 0.05
         assert share.max() < max(shares.known, shares.invented) + 1e-2
@@ -98,11 +107,11 @@ class TestRestoredRenders:
 
     @pytest.mark.usefixtures("each_alone")
     def test_the_final_scene_counts_only_where_it_has_a_surface(
-        self, tube: Tube, renders: RenderedViews
+        self, tube: Tube, renders: RenderedViews, shown: RenderedViews
     ) -> None:
         empty = replace(renders, rgb=np.ones_like(renders.rgb), alpha=np.zeros_like(renders.alpha))
         mixed = restored(tube, empty, AsRendered())
-        np.testing.assert_allclose(mixed.rgb, renders.rgb.clip(0, 1), atol=1e-5)
+        np.testing.assert_allclose(mixed.rgb, shown.rgb.clip(0, 1), atol=1e-5)
 
     def test_blending_and_filling_leaves_what_is_known_as_it_was_rendered(
         self, tube: Tube, renders: RenderedViews
