@@ -7,19 +7,18 @@ import math
 
 import numpy as np
 import torch
-from jaxtyping import Bool, UInt32
+from jaxtyping import Bool
 from torch.nn import functional
 
 from extrags.cameras import Cameras, rotation_about
 from extrags.config import AssessConfig, CoverageConfig, PipelineConfig
 from extrags.errors import CaptureError
 from extrags.events import Progress, emit
-from extrags.exploration.coverage import direction_counts, training_coverage, view_pairs
+from extrags.exploration.coverage import direction_counts, training_coverage
 from extrags.exploration.waves import start_views
 from extrags.scene import Scene
 from extrags.scene_plan import ScenePlan, decide
 from extrags.sequence import EndoscopicSequence
-from extrags.view_synthesis.references import visibility_of
 
 __all__ = ["assess", "measure", "probe_views"]
 
@@ -89,7 +88,7 @@ def measure(
     small = cameras.at_most_width(coverage.render_width)
     valid = _valid_pixels(sequence, small)
     depth_unit_mm, training_holes = _training_view_measurements(scene, small, valid, settings)
-    covered = _covered(on_processor, small, valid, coverage)
+    covered = training_coverage(on_processor, small, **coverage.options, mask=valid)
     directions = direction_counts(covered)
     probes = probe_views(on_processor, small.as_pinholes(), depth_unit_mm, settings)
     holes, poor = _lacking_pixels(scene, probes, directions < settings.min_directions, settings)
@@ -182,26 +181,6 @@ def _valid_pixels(sequence: EndoscopicSequence, cameras: Cameras) -> Bool[np.nda
         whole = share > WHOLE
         found[index] = whole if whole.any() else share > 0
     return np.asarray(found & cameras.field)
-
-
-def _covered(
-    scene: Scene, cameras: Cameras, valid: Bool[np.ndarray, "v h w"], coverage: CoverageConfig
-) -> UInt32[np.ndarray, "n"]:
-    """`training_coverage` by the valid pixels alone; by the frustum, masks are not looked at."""
-    if coverage.visibility == "frustum" or valid.all():
-        return training_coverage(scene, cameras, **coverage.options)
-    covered = np.zeros(len(scene.gaussians), dtype=np.uint32)
-    with torch.no_grad():
-        for start in range(0, len(cameras), PROBES_PER_BATCH):
-            batch = slice(start, start + PROBES_PER_BATCH)
-            rendering = scene.render(
-                cameras[batch], sh_degree=0, visibility=True, visibility_mask=torch.from_numpy(valid[batch])
-            )
-            seen = visibility_of(rendering).numpy() > coverage.visible_weight
-            for center, of_view in zip(cameras[batch].centers, seen, strict=True):
-                rows = np.flatnonzero(of_view)
-                covered[rows] |= view_pairs(scene, center, rows, coverage.directions)
-    return covered
 
 
 def _training_view_measurements(

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt32
+from jaxtyping import Bool, Float, Int, UInt32
 
 from extrags.cameras import Cameras
 from extrags.config import Visibility
@@ -102,6 +102,7 @@ def rendered_pairs(
     visible_weight: float,
     n_directions: int,
     visibility: Visibility = "blending",
+    mask: Bool[np.ndarray, "c h w"] | None = None,
 ) -> tuple[Rendering, UInt32[np.ndarray, "c n"]]:
     """Render views in one batch; the images, and the pairs each view covers.
 
@@ -113,9 +114,12 @@ def rendered_pairs(
         visibility: `blending`: a Gaussian counts as seen by its largest blending weight T * alpha, so that
             what lies behind a fold stays unseen although it is inside the frustum; `frustum`: by its
             footprint in the image, occluded or not, as the published code of [ExtraGS] and [Kim2025].
+        mask: of `blending`: pixels that show what is seen; None is all.
     """
     # The diffuse colour is all the search looks at, and saves the harmonics of every Gaussian and view.
-    rendering = scene.render(cameras, visibility=visibility == "blending", sh_degree=0)
+    blending = visibility == "blending"
+    counted = torch.from_numpy(mask) if blending and mask is not None else None
+    rendering = scene.render(cameras, visibility=blending, visibility_mask=counted, sh_degree=0)
     weight = rendering.visibility_max
     seen = rendering.visible if weight is None else weight > visible_weight
     pairs = np.zeros(tuple(seen.shape), dtype=np.uint32)
@@ -132,6 +136,7 @@ def training_coverage(
     visible_weight: float,
     n_directions: int,
     visibility: Visibility = "blending",
+    mask: Bool[np.ndarray, "c h w"] | None = None,
 ) -> UInt32[np.ndarray, "n"]:
     """Coverage by a set of views: M packed to one word per Gaussian.
 
@@ -141,16 +146,19 @@ def training_coverage(
         visible_weight: the largest T * alpha above which a Gaussian is seen.
         n_directions: D.
         visibility: as `rendered_pairs`.
+        mask: as `rendered_pairs`.
     """
     covered = np.zeros(len(scene.gaussians), dtype=np.uint32)
     with torch.no_grad():
         for start in range(0, len(cameras), VIEWS_PER_BATCH):
+            batch = slice(start, start + VIEWS_PER_BATCH)
             _, pairs = rendered_pairs(
                 scene,
-                cameras[start : start + VIEWS_PER_BATCH],
+                cameras[batch],
                 visible_weight=visible_weight,
                 n_directions=n_directions,
                 visibility=visibility,
+                mask=None if mask is None else mask[batch],
             )
             covered |= np.bitwise_or.reduce(pairs, axis=0)
     return covered

@@ -172,10 +172,11 @@ def observe_views(
     """
     # Blending weights and median depth come from the native kernels.
     scene = scene.to("cpu")
+    shown = references.shown(scene)
 
     def observe(view: int) -> Observation:
         gain = None if exposure is None else exposure[[view]]
-        return _observe_one(scene, references, cameras[view], count, reference, gain)
+        return _observe_one(scene, shown, references, cameras[view], count, reference, gain)
 
     parts = in_threads(observe, range(len(cameras)))
     return Observation(
@@ -187,6 +188,7 @@ def observe_views(
 
 def _observe_one(
     scene: Scene,
+    shown: Scene,
     references: ReferenceViews,
     camera: Cameras,
     count: int,
@@ -195,9 +197,7 @@ def _observe_one(
 ) -> Observation:
     scale = references.transfer.scale_mm
     with torch.no_grad():
-        rendering = references.shown(scene).render(
-            camera, exposure=exposure, visibility=True, median_depth=True
-        )
+        rendering = shown.render(camera, exposure=exposure, visibility=True, median_depth=True)
         if rendering.visibility_max is None or rendering.median_depth is None:
             raise ShapeError("the rasteriser returned neither visibility nor median depth")
         alpha = rendering.alpha[:, None]

@@ -24,12 +24,12 @@ def write_video(file: Path, frames: np.ndarray, code: str = "FFV1") -> Path:
     return file
 
 
-def write_coded(file: Path, frames: np.ndarray, codec: str) -> Path:
+def write_coded(file: Path, frames: np.ndarray, codec: str, **options: str) -> Path:
     """In the container that the suffix says, by one of FFmpeg's encoders."""
     import av
 
     with av.open(str(file), "w") as container:
-        stream = container.add_stream(codec, rate=25, options={"b": "8000000"})
+        stream = container.add_stream(codec, rate=25, options={"b": "8000000", **options})
         stream.height, stream.width = frames.shape[1:3]
         stream.pix_fmt = "yuv420p"
         for image in frames:
@@ -40,17 +40,7 @@ def write_coded(file: Path, frames: np.ndarray, codec: str) -> Path:
 
 def write_flagged(file: Path, woven: np.ndarray) -> Path:
     """MPEG-2 whose header says that it is interlaced, as recorders write it."""
-    import av
-
-    with av.open(str(file), "w") as container:
-        options = {"flags": "+ildct+ilme", "b": "8000000"}
-        stream = container.add_stream("mpeg2video", rate=25, options=options)
-        stream.height, stream.width = woven.shape[1:3]
-        stream.pix_fmt = "yuv420p"
-        for image in woven:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(image)))
-        container.mux(stream.encode())
-    return file
+    return write_coded(file, woven, "mpeg2video", flags="+ildct+ilme")
 
 
 def write_late(file: Path, frames: np.ndarray, start_s: float) -> Path:
