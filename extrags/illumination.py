@@ -25,6 +25,7 @@ from extrags.raster.light import (
     apply_response,
     invert_response,
     light_gain,
+    specular_gain,
 )
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
@@ -34,7 +35,10 @@ INITIAL_LOG_SOFTENING = -1.5
 INITIAL_SPREAD = 0.5
 INITIAL_COSINE = 0.5
 INITIAL_LOG_SHOULDER = 0.0
-"""Initial values of the parameters: moderate angular spread, partly Lambertian surfaces, a soft shoulder."""
+INITIAL_SPECULAR = 0.1
+INITIAL_ROUGHNESS = 0.2
+"""Initial values of the parameters: moderate angular spread, partly Lambertian surfaces, a soft shoulder, a
+faint and broad specular lobe."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,8 @@ class NearFieldLight:
         cosine: exponent q of the cosine law at the surface, scalar.
         offset: position of the light in the camera frame, in reference distances, [3].
         log_shoulder: logarithm of the response's shoulder s, scalar; minus infinity is a linear response.
+        log_specular: logarithm of the strength m of the specular lobe, scalar; minus infinity is none.
+        log_roughness: logarithm of the lobe's roughness rho, scalar.
     """
 
     log_softening: Float[Tensor, ""]
@@ -60,6 +66,10 @@ class NearFieldLight:
     cosine: Float[Tensor, ""] = field(default_factory=lambda: torch.zeros(()))
     offset: Float[Tensor, "3"] = field(default_factory=lambda: torch.zeros(3))
     log_shoulder: Float[Tensor, ""] = field(default_factory=lambda: torch.tensor(-math.inf))
+    log_specular: Float[Tensor, ""] = field(default_factory=lambda: torch.tensor(-math.inf))
+    log_roughness: Float[Tensor, ""] = field(
+        default_factory=lambda: torch.tensor(math.log(INITIAL_ROUGHNESS))
+    )
 
     @classmethod
     def initial(
@@ -84,6 +94,7 @@ class NearFieldLight:
             spread=torch.tensor(INITIAL_SPREAD if config.spread else 0.0),
             cosine=torch.tensor(INITIAL_COSINE if config.cosine else 0.0),
             log_shoulder=torch.tensor(INITIAL_LOG_SHOULDER if config.response else -math.inf),
+            log_specular=torch.tensor(math.log(INITIAL_SPECULAR) if config.specular else -math.inf),
         )
 
     def camera_light(self, exposure: Float[Tensor, "c"]) -> CameraLight:
@@ -97,6 +108,8 @@ class NearFieldLight:
             self.offset,
             self.log_shoulder.exp(),
             self.reference_distance,
+            self.log_specular.exp(),
+            self.log_roughness.exp(),
         )
 
     def exposure(self, frame: int | None) -> Float[Tensor, ""]:
@@ -147,7 +160,7 @@ class NearFieldLight:
         axis_cosine: Float[Tensor, "*b"] | None = None,
         facing_cosine: Float[Tensor, "*b"] | None = None,
     ) -> Float[Tensor, "*b"]:
-        """Gain of a light at the optical centre (`offset` is ignored), at unit exposure.
+        """Gain of a light at the optical centre (`offset` is ignored), at unit exposure; no highlights.
 
         Args:
             distance: from the optical centre, in world units.
@@ -168,13 +181,24 @@ class NearFieldLight:
     def gain(
         self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None = None
     ) -> Float[Tensor, "*b"]:
-        """Gain of the light at points, by which albedo is multiplied at unit exposure.
+        """Gain of the light at points, by which albedo is multiplied at unit exposure; no highlights.
 
         Args:
             points: in the camera frame, in world units.
             normals: unit surface normals in the camera frame; None assumes surfaces that face the light.
         """
         return light_gain(points, normals, self._row(points))
+
+    def specular_gain(
+        self, points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"]
+    ) -> Float[Tensor, "*b"]:
+        """What highlights add to the signal, whatever the albedo, at unit exposure.
+
+        Args:
+            points: in the camera frame, in world units.
+            normals: unit surface normals in the camera frame, of either sign.
+        """
+        return specular_gain(points, normals, self._row(points))
 
     def invert_response(self, rgb: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
         """Sensor signal of image values in [0, 1]: the inverse of the camera response."""
@@ -194,6 +218,8 @@ class NearFieldLight:
     ) -> Float[Tensor, "n 3"]:
         """Albedo from image values: the response is inverted and the gain of the light divided out.
 
+        The specular lobe is not taken away: what is a highlight is known to the masks of the frames.
+
         Args:
             rgb: image values in [0, 1], at unit exposure.
             points: the surface points they show, in the camera frame, in world units.
@@ -202,7 +228,7 @@ class NearFieldLight:
         """
         return self.invert_response(rgb) / self.gain(points, normals).clamp_min(min_gain)[:, None]
 
-    def _row(self, like: Tensor) -> Float[Tensor, "12"]:
+    def _row(self, like: Tensor) -> Float[Tensor, "14"]:
         return self.camera_light(self.log_exposure.new_ones(1)).packed()[0].to(like)
 
     def parameters(self) -> dict[str, Tensor]:
@@ -214,6 +240,8 @@ class NearFieldLight:
             "cosine": self.cosine,
             "offset": self.offset,
             "log_shoulder": self.log_shoulder,
+            "log_specular": self.log_specular,
+            "log_roughness": self.log_roughness,
             "log_exposure": self.log_exposure,
         }
 
@@ -241,5 +269,7 @@ class NearFieldLight:
         """Read what `save` wrote, to the processor."""
         group = open_group(path)
         names = [name for name in cls.__dataclass_fields__ if name != "reference_distance"]
+        # Lights of before there were highlights have none.
+        names = [name for name in names if name in group or name not in ("log_specular", "log_roughness")]
         values = {name: torch.from_numpy(read_array(group, name)) for name in names}
         return cls(**values, reference_distance=float(group.attrs["reference_distance"]))  # type: ignore[arg-type]

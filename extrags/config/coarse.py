@@ -19,6 +19,9 @@ class LightConfig(StageConfig):
     spread: bool = Field(True, description="learn how much less the lamp shines to the side")
     cosine: bool = Field(True, description="learn how much darker a surface is that turns away")
     response: bool = Field(True, description="learn the shoulder of the camera's response")
+    specular: bool = Field(
+        True, description="learn strength and roughness of the highlights of a wet surface"
+    )
     exposure: bool = Field(True, description="learn a gain per training frame")
     offset: bool = Field(
         False, description="learn where the lamp stands beside the lens; did not pay where it was measured"
@@ -29,6 +32,11 @@ class LightConfig(StageConfig):
         description="starting exponent e of gain / (c + r^2)^e; about 1 / 2.2 after a display tone curve",
     )
     learning_rate: float = Field(0.04, gt=0, description="of the global light parameters")
+    specular_learning_rate: float = Field(
+        0.005,
+        gt=0,
+        description="of strength and roughness of the highlights; faster, they take their shape from a few",
+    )
     exposure_learning_rate: float = Field(0.005, gt=0, description="of the exposure per frame")
     exposure_prior: float = Field(
         1.0, ge=0, description="weight that holds log-exposures near their mean of zero"

@@ -19,6 +19,7 @@ from torch import Tensor
 from extrags.errors import NonFiniteError, ShapeError
 from extrags.radial_lens import RadialLens
 from extrags.raster import native
+from extrags.raster.light import ROW_LENGTH
 from extrags.raster.loss import huber_depth_gradient
 from extrags.raster.rendering import Rendering, check_near, nonfinite_error
 
@@ -167,7 +168,7 @@ class DirectStep:
     def __init__(self, *, absgrad: bool = False, lit: bool = False) -> None:
         self.gradients: dict[str, Tensor] = {}
         self.visible = torch.empty(0, dtype=torch.bool)
-        self.light_gradient = np.zeros(12, dtype=np.float32)
+        self.light_gradient = np.zeros(ROW_LENGTH, dtype=np.float32)
         self.viewmat_gradient = np.zeros((4, 4), dtype=np.float32)
         self._absgrad, self._lit = absgrad, lit
         self._images: dict[tuple[int, int], _Images] = {}
@@ -214,7 +215,7 @@ class DirectStep:
         target: Target,
         *,
         sh_degree: int,
-        light: Float[np.ndarray, "12"] | None = None,
+        light: Float[np.ndarray, "14"] | None = None,
         dssim_weight: float = 0.2,
         photometric_weight: float = 1.0,
         loss_weight: float = 1.0,

@@ -4,21 +4,27 @@ A Gaussian of albedo a (from its spherical harmonics), at :math:`\mathbf d` from
 frame, in reference distances), with normal n (its shortest axis), has signal x and image value I:
 
 .. math::
-    x = g \, a \left(\frac{1 + c}{|\mathbf d|^2 + c}\right)^{e}
-        \left(\frac{d_z}{|\mathbf d|}\right)^{k}
-        \left(\frac{\cos^2 \alpha + \epsilon}{1 + \epsilon}\right)^{q / 2},
-    \qquad \cos\alpha = \frac{\mathbf n \cdot \mathbf d}{|\mathbf d|},
+    x = g \left(\frac{1 + c}{|\mathbf d|^2 + c}\right)^{e} \left(\frac{d_z}{|\mathbf d|}\right)^{k}
+        \left( a \left(\frac{\cos^2 \beta + \epsilon}{1 + \epsilon}\right)^{q / 2} + m \, S(\beta) \right),
+    \qquad \cos\beta = \frac{\mathbf n \cdot \mathbf d}{|\mathbf d|},
+
+    S(\beta) = \left(\frac{\rho^2}{\rho^2 + (1 - \rho^2) \sin^2 \beta}\right)^2,
     \qquad I = \frac{(1 + s) \, x}{1 + s \, x}
 
 with exposure g (one per colour channel), softening c and exponent e of the fall-off with distance, exponent k
-of the light's angular spread, exponent q of the cosine law at the surface, and shoulder s of the camera
-response. Normalisation: at the reference distance, on the axis and facing the light, x = g a; and I = 1 for
-x = 1. With k = q = s = 0 this is the softened fall-off with distance alone.
+of the light's angular spread, exponent q of the cosine law at the surface, strength m and roughness rho of
+the specular lobe of a wet surface, and shoulder s of the camera response. The lobe is the GGX distribution of
+normals with its peak at one; since the light rides beside the lens, the direction half-way between both is
+that to the camera. It has the colour of the light. Normalisation: at the reference distance, on the axis and
+facing the light, x = g (a + m); and I = 1 for x = 1. With k = q = m = s = 0 this is the softened fall-off
+with distance alone.
+
+Source: GGX after Walter et al., "Microfacet models for refraction through rough surfaces", EGSR 2007.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float
@@ -26,7 +32,21 @@ from torch import Tensor
 
 from extrags.raster.rotations import rotation_matrices
 
-__all__ = ["CameraLight", "apply_response", "invert_response", "light_gain", "lit_colors", "shortest_axes"]
+__all__ = [
+    "LEARNED_LENGTH",
+    "ROW_LENGTH",
+    "CameraLight",
+    "apply_response",
+    "invert_response",
+    "light_gain",
+    "lit_colors",
+    "shortest_axes",
+    "specular_gain",
+]
+
+LEARNED_LENGTH = 13
+"""Numbers of a row that a light may learn; the last one, the reference distance, is a gauge."""
+ROW_LENGTH = LEARNED_LENGTH + 1
 
 SQUARE_MIN = 1e-6
 """Lower bound of the squared distance to the light, in reference distances."""
@@ -36,6 +56,9 @@ SPREAD_MIN = 0.1
 
 COSINE_SOFTENING = 0.04
 """epsilon: surfaces at grazing incidence do not become black, and the gradient of the normal is bounded."""
+
+ROUGHNESS_MIN = 0.02
+"""Lower bound of the roughness: a sharper lobe falls between the Gaussians."""
 
 LOG2_GAIN_MAX = 40.0
 """Gains are clamped to [2^-40, 2^40]."""
@@ -54,6 +77,8 @@ class CameraLight:
         offset: position of the light in the camera frame, in reference distances, [3].
         shoulder: s, not negative, scalar.
         reference_distance: in world units; not learned.
+        specular: m, not negative, scalar; 0 is a surface without highlights.
+        roughness: rho, at most one, scalar.
     """
 
     exposure: Float[Tensor, "c 3"]
@@ -64,14 +89,26 @@ class CameraLight:
     offset: Float[Tensor, "3"]
     shoulder: Float[Tensor, ""]
     reference_distance: float
+    specular: Float[Tensor, ""] = field(default_factory=lambda: torch.zeros(()))
+    roughness: Float[Tensor, ""] = field(default_factory=lambda: torch.ones(()))
 
-    def packed(self) -> Float[Tensor, "c 12"]:
-        """One row per camera: exposure, softening, exponent, spread, cosine, offset, shoulder, reference."""
+    def packed(self) -> Float[Tensor, "c 14"]:
+        """One row per camera.
+
+        Exposure, softening, exponent, spread, cosine, offset, shoulder, specular, roughness, reference.
+        """
         common = torch.cat(
             [
                 torch.stack([self.softening, self.exponent, self.spread, self.cosine]),
                 self.offset,
-                torch.stack([self.shoulder, self.shoulder.new_tensor(self.reference_distance)]),
+                torch.stack(
+                    [
+                        self.shoulder,
+                        self.specular.to(self.shoulder),
+                        self.roughness.to(self.shoulder),
+                        self.shoulder.new_tensor(self.reference_distance),
+                    ]
+                ),
             ]
         )
         return torch.cat([self.exposure, common.expand(len(self.exposure), -1)], dim=1)
@@ -81,7 +118,7 @@ def lit_colors(
     albedo: Float[Tensor, "n 3"],
     points: Float[Tensor, "n 3"],
     normals: Float[Tensor, "n 3"],
-    light: Float[Tensor, "12"],
+    light: Float[Tensor, "14"],
 ) -> Float[Tensor, "n 3"]:
     """Image colours of Gaussians in one camera under its light.
 
@@ -91,28 +128,57 @@ def lit_colors(
         normals: unit normals in the camera frame, of either sign.
         light: a row of `CameraLight.packed`.
     """
-    signal = albedo * light[:3] * light_gain(points, normals, light)[:, None]
-    return apply_response(signal, light[10])
+    signal = albedo * light_gain(points, normals, light)[:, None]
+    if bool(light[11] != 0):
+        signal = signal + specular_gain(points, normals, light)[:, None]
+    return apply_response(light[:3] * signal, light[10])
 
 
 def light_gain(
-    points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None, light: Float[Tensor, "12"]
+    points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"] | None, light: Float[Tensor, "14"]
 ) -> Float[Tensor, "*b"]:
-    """Gain of the light at points in the camera frame, at unit exposure.
+    """Gain of the light at points in the camera frame, at unit exposure and without highlights.
 
     Without normals all surfaces are assumed to face the light.
     """
-    softening, exponent, spread, cosine = light[3:7]
-    offset = points / light[11] - light[7:10]
-    square = offset.square().sum(-1).clamp(SQUARE_MIN, 1e30)
-    fall = torch.log2(1 + softening) - torch.log2(square + softening)
-    axis = torch.log2((offset[..., 2] * square.rsqrt()).clamp_min(SPREAD_MIN))
-    logarithm = exponent * fall + spread * axis
+    offset, square = _from_lamp(points, light)
+    logarithm = _log_arriving(offset, square, light)
     if normals is not None:
         squared_cosine = (normals * offset).sum(-1).square() / square
         facing = torch.log2((squared_cosine + COSINE_SOFTENING) / (1 + COSINE_SOFTENING))
-        logarithm = logarithm + 0.5 * cosine * facing
+        logarithm = logarithm + 0.5 * light[6] * facing
     return torch.exp2(logarithm.clamp(-LOG2_GAIN_MAX, LOG2_GAIN_MAX))
+
+
+def specular_gain(
+    points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], light: Float[Tensor, "14"]
+) -> Float[Tensor, "*b"]:
+    """What highlights add to the signal of a surface of any albedo, at unit exposure."""
+    offset, square = _from_lamp(points, light)
+    squared_roughness = light[12].clamp_min(ROUGHNESS_MIN).square()
+    squared_sine = 1 - (normals * offset).sum(-1).square() / square
+    lobe = squared_roughness / (squared_roughness + (1 - squared_roughness) * squared_sine)
+    arriving = torch.exp2(_log_arriving(offset, square, light).clamp(-LOG2_GAIN_MAX, LOG2_GAIN_MAX))
+    return light[11] * lobe.square() * arriving
+
+
+def _from_lamp(
+    points: Float[Tensor, "*b 3"], light: Float[Tensor, "14"]
+) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
+    """Where points are as the lamp sees them, in reference distances, and the square of how far."""
+    offset = points / light[-1] - light[7:10]
+    return offset, offset.square().sum(-1).clamp(SQUARE_MIN, 1e30)
+
+
+def _log_arriving(
+    offset: Float[Tensor, "*b 3"], square: Float[Tensor, "*b"], light: Float[Tensor, "14"]
+) -> Float[Tensor, "*b"]:
+    """Logarithm to base two of the light that arrives, whichever way the surface faces."""
+    softening, exponent, spread = light[3:6]
+    fall = torch.log2(1 + softening) - torch.log2(square + softening)
+    axis = torch.log2((offset[..., 2] * square.rsqrt()).clamp_min(SPREAD_MIN))
+    logarithm: Tensor = exponent * fall + spread * axis
+    return logarithm
 
 
 def apply_response(signal: Float[Tensor, "*b"], shoulder: Float[Tensor, ""]) -> Float[Tensor, "*b"]:

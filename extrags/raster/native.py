@@ -16,6 +16,7 @@ from torch import Tensor
 
 from extrags.cores import usable_cores
 from extrags.errors import ConfigError, MissingDependencyError, ShapeError
+from extrags.raster.light import ROW_LENGTH
 from extrags.raster.rendering import RasterInputs, RasterOptions, Rendering, nonfinite_error
 
 _kernels: ModuleType | None = None
@@ -321,7 +322,7 @@ class _Rasterize(torch.autograd.Function):
             shared = {name: None if value is None else value.zero_() for name, value in shared.items()}
         g_colors = torch.empty(c, n, 3) if needs[5] else None
         g_viewmats = torch.empty(c, 4, 4) if needs[6] else None
-        g_light = torch.empty(c, 12) if needs[8] else None
+        g_light = torch.empty(c, ROW_LENGTH) if needs[8] else None
         g_means2d = torch.empty(c, n, 2)
         g_absolute = torch.empty(c, n, 2) if call.options.absgrad else None
         for index in range(c):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from extrags.errors import NonFiniteError, ShapeError
 from extrags.radial_lens import RadialLens
+from extrags.raster.light import ROW_LENGTH
 
 __all__ = ["RasterInputs", "RasterOptions", "Rendering", "checked_inputs"]
 
@@ -88,7 +89,7 @@ class RasterInputs:
     Ks: Float[Tensor, "c 3 3"]
     background: Float[Tensor, "c 3"] | Float[Tensor, "3"] | None
     query_points: Float[Tensor, "q 3"] | None
-    light: Float[Tensor, "c 12"] | None = None
+    light: Float[Tensor, "c 14"] | None = None
     visibility_mask: Float[Tensor, "c h w"] | None = None
 
 
@@ -146,7 +147,7 @@ def checked_inputs(
         "viewmats": ((c, 4, 4),),
         "Ks": ((c, 3, 3),),
         "background": ((c, 3),),
-        "light": ((c, 12),),
+        "light": ((c, ROW_LENGTH),),
         "visibility_mask": ((c, height, width),),
     }
     for name, shapes in expected.items():

@@ -73,7 +73,7 @@ def bake_recorded_light(scene: Scene, cameras: Cameras, *, exposure: float = 1.0
     gaussians, light = scene.gaussians.detached(), scene.light.detached()
     normals = shortest_axes(gaussians.quats, gaussians.scales)
     viewmats = torch.from_numpy(cameras.viewmats).float()
-    weight, lit = torch.zeros(len(gaussians)), torch.zeros(len(gaussians))
+    weight, lit, shine = (torch.zeros(len(gaussians)) for _ in range(3))
     nearest = torch.full((len(gaussians),), math.inf)
     facing = torch.zeros(len(gaussians))
     for begun in range(0, len(cameras), _VIEWS_PER_BATCH):
@@ -84,20 +84,29 @@ def bake_recorded_light(scene: Scene, cameras: Cameras, *, exposure: float = 1.0
             rotation, shift = viewmats[begun + index, :3, :3], viewmats[begun + index, :3, 3]
             points = gaussians.means @ rotation.T + shift
             share = torch.zeros(len(gaussians)) if seen is None else seen[index]
-            lit += share * light.gain(points, normals @ rotation.T)
+            turned = normals @ rotation.T
+            lit += share * light.gain(points, turned)
+            shine += share * light.specular_gain(points, turned)
             weight += share
             distance = points.norm(dim=1)
             facing = torch.where(distance < nearest, light.falloff(distance), facing)
             nearest = torch.minimum(nearest, distance)
     gain = torch.where(weight > 0, lit / weight.clamp_min(1e-12), facing)
-    return _lit(gaussians, light, exposure * gain)
+    return _lit(gaussians, light, exposure * gain, exposure * shine / weight.clamp_min(1e-12))
 
 
-def _lit(gaussians: Gaussians, light: NearFieldLight, gain: Float[Tensor, "n"]) -> Gaussians:
+def _lit(
+    gaussians: Gaussians,
+    light: NearFieldLight,
+    gain: Float[Tensor, "n"],
+    shine: Float[Tensor, "n"] | None = None,
+) -> Gaussians:
     light, gain = light.detached(), gain[:, None, None]
     shoulder = light.log_shoulder.exp()
     # The rasteriser clips negative albedo as well.
     signal = gain * (0.5 + SH_C0 * gaussians.sh0).clamp_min(0)
+    if shine is not None:
+        signal = signal + shine[:, None, None]
     slope = gain * (1 + shoulder) / (1 + shoulder * signal) ** 2
     return _with_colors(gaussians, light.apply_response(signal), slope * gaussians.shN)
 

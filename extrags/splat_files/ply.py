@@ -22,6 +22,7 @@ __all__ = ["read_ply_scene", "write_ply_scene"]
 
 _MARK = b"comment extrags_light "
 _LINE_BYTES = 200
+_BY_VALUE = ("shoulder", "specular")
 _HEADER_BYTES = 1 << 22
 
 
@@ -38,8 +39,10 @@ def write_ply_scene(scene: Scene, path: Path) -> None:
     values: dict[str, Any] = {
         name: value.tolist() for name, value in scene.light.detached().parameters().items()
     }
-    # A linear response has a shoulder of zero, whose logarithm JSON cannot say.
-    values["shoulder"] = math.exp(values.pop("log_shoulder"))
+    # A linear response has a shoulder of zero, whose logarithm JSON cannot say; so has a surface without
+    # highlights.
+    for name in _BY_VALUE:
+        values[name] = math.exp(values.pop(f"log_{name}"))
     values["reference_distance"] = scene.light.reference_distance
     text = json.dumps(values, allow_nan=False, separators=(",", ":")).encode("ascii")
     # In several lines: readers keep a line of the header in a buffer of about a thousand bytes.
@@ -70,38 +73,47 @@ _SHAPES: dict[str, tuple[int, ...] | None] = {
     "spread": (),
     "cosine": (),
     "offset": (3,),
-    "log_shoulder": (),
+    "log_roughness": (),
 }
 """Parameters of the light, and how many numbers each is; None: any, one after the other."""
+_LATER = {"specular": 0.0, "log_roughness": 0.0}
+"""What files of before there were highlights leave out, and what it was then."""
 
 
 def _light(text: bytes, path: Path) -> NearFieldLight:
     try:
-        values = json.loads(text)
-        shoulder, reference = float(values.pop("shoulder")), float(values.pop("reference_distance"))
+        values = _LATER | json.loads(text)
+        reference = float(values.pop("reference_distance"))
+        strengths = {name: float(values.pop(name)) for name in _BY_VALUE}
         tensors = {name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()}
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, OverflowError) as error:
         raise SourceError(
             f"the light in the header cannot be read: {error}", file=path, field="extrags_light"
         ) from error
-    tensors["log_shoulder"] = torch.tensor(math.log(shoulder) if shoulder > 0 else -math.inf)
     for name in sorted(_SHAPES.keys() ^ tensors.keys()):
         what = "is missing" if name in _SHAPES else "is unknown"
         raise SourceError(f"the light's {name} {what}", file=path, field="extrags_light")
-    for name, value in tensors.items():
+    for name, tensor in tensors.items():
         shape = _SHAPES[name]
-        fits = value.ndim == 1 if shape is None else tuple(value.shape) == shape
-        if not fits or not (bool(torch.isfinite(value).all()) or name == "log_shoulder"):
+        fits = tensor.ndim == 1 if shape is None else tuple(tensor.shape) == shape
+        if not fits or not bool(torch.isfinite(tensor).all()):
             raise SourceError(
-                f"the light's {name} has shape {tuple(value.shape)} or is not finite",
+                f"the light's {name} has shape {tuple(tensor.shape)} or is not finite",
                 file=path,
                 field=f"extrags_light.{name}",
             )
-    if not (math.isfinite(reference) and reference > 0 and math.isfinite(shoulder)):
+    if not (math.isfinite(reference) and reference > 0):
         raise SourceError(
-            f"the light's reference distance is {reference:g}, its shoulder {shoulder:g}; "
-            "expected a positive and a finite number",
+            f"the light's reference distance is {reference:g}, expected a positive number",
             file=path,
             field="extrags_light.reference_distance",
         )
+    for name, value in strengths.items():
+        if not math.isfinite(value):
+            raise SourceError(
+                f"the light's {name} is {value:g}, expected a finite number",
+                file=path,
+                field=f"extrags_light.{name}",
+            )
+        tensors[f"log_{name}"] = torch.tensor(math.log(value) if value > 0 else -math.inf)
     return NearFieldLight(**tensors, reference_distance=reference)

@@ -55,7 +55,7 @@ class LitScene:
         K: [3, 3].
         target: [H, W, 3].
         depth: [H, W].
-        light: a row of `CameraLight.packed`, [12]; None without light.
+        light: a row of `CameraLight.packed`, [14]; None without light.
     """
 
     parameters: dict[str, Tensor]
@@ -73,7 +73,7 @@ class LitScene:
         """The same scene in another unit of length."""
         light = None if self.light is None else self.light.clone()
         if light is not None:
-            light[11] *= factor
+            light[-1] *= factor
         viewmat = self.viewmat.clone()
         viewmat[:3, 3] *= factor
         means = self.parameters["means"] * factor
@@ -103,7 +103,7 @@ def lit_tube(n: int = 200, width: int = 40, height: int = 32, *, seed: int = 3, 
     generator = torch.Generator().manual_seed(seed)
     depth = 1.0 + 5 * torch.rand(height, width, generator=generator)
     depth[torch.rand(height, width, generator=generator) < 0.2] = 0
-    light = torch.tensor([1.3, 1.1, 0.9, 0.05, 1.0, 1.5, 0.8, 0.05, -0.04, 0.02, 0.6, 2.0])
+    light = torch.tensor([1.3, 1.1, 0.9, 0.05, 1.0, 1.5, 0.8, 0.05, -0.04, 0.02, 0.6, 0.2, 0.15, 2.0])
     parameters = {
         "means": base["means"],
         "quats": base["quats"],
@@ -158,6 +158,8 @@ def random_lit_scene(seed: int, *, wild: bool = False) -> LitScene:
             uniform(0.0, 2.0, 1),
             uniform(-0.1, 0.1, 3),
             uniform(0.0, 4.0, 1),
+            uniform(0.0, 1.0, 1),
+            log_uniform(0.01, 1.0, 1),
             torch.tensor([unit]) * log_uniform(0.3, 3.0, 1),
         ]
     )

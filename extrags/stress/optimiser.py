@@ -232,7 +232,11 @@ def _drift_scene(lit: bool) -> LitScene:
     target = torch.stack(
         [0.5 + 0.4 * torch.sin(0.7 * columns + c) * torch.cos(0.5 * rows - c) for c in range(3)], -1
     )
-    light = torch.tensor([1.2, 1.0, 0.9, 0.05, 1.0, 1.0, 0.6, 0.02, -0.02, 0.0, 0.5, 1.5]) if lit else None
+    light = (
+        torch.tensor([1.2, 1.0, 0.9, 0.05, 1.0, 1.0, 0.6, 0.02, -0.02, 0.0, 0.5, 0.2, 0.15, 1.5])
+        if lit
+        else None
+    )
     truth = 1.2 + 0.03 * columns.float() + 0.02 * rows.float()
     return replace(
         scene, parameters=parameters, viewmat=torch.eye(4), K=K, target=target, depth=truth, light=light

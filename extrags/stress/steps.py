@@ -12,7 +12,7 @@ from torch import Tensor
 
 from extrags.raster.direct import DirectStep, Target
 from extrags.raster.dispatch import rasterize
-from extrags.raster.light import CameraLight
+from extrags.raster.light import LEARNED_LENGTH, CameraLight
 from extrags.raster.loss import inverse_depth_loss, l1_ssim_loss_reference
 from extrags.raster.stability import AXES, FLOAT32_FACTOR, GRADIENT_TOLERANCE, REFUSED, bench_stability
 from extrags.stress.inputs import (
@@ -71,7 +71,7 @@ def native_step(scene: LitScene) -> Found:
         "viewmat": torch.from_numpy(step.viewmat_gradient[:3]),
     }
     found |= {name: value.clone() for name, value in step.gradients.items()}
-    return {**found, "light": torch.from_numpy(step.light_gradient[:11].copy())} if lit else found
+    return {**found, "light": torch.from_numpy(step.light_gradient[:LEARNED_LENGTH].copy())} if lit else found
 
 
 def autograd_step(scene: LitScene, dtype: torch.dtype = torch.float64, *, rounded: bool = True) -> Found:
@@ -113,13 +113,24 @@ def autograd_step(scene: LitScene, dtype: torch.dtype = torch.float64, *, rounde
     pose = torch.zeros(3, 4, dtype=dtype) if viewmat.grad is None else viewmat.grad[:3]
     found |= {"loss": loss.detach(), "viewmat": pose}
     if light is not None:
-        found["light"] = torch.zeros(11, dtype=dtype) if light.grad is None else light.grad[:11]
+        found["light"] = (
+            torch.zeros(LEARNED_LENGTH, dtype=dtype) if light.grad is None else light.grad[:LEARNED_LENGTH]
+        )
     return found
 
 
 def _light(row: Tensor) -> CameraLight:
     return CameraLight(
-        row[None, :3], row[3], row[4], row[5], row[6], row[7:10], row[10], float(row[11].detach())
+        row[None, :3],
+        row[3],
+        row[4],
+        row[5],
+        row[6],
+        row[7:10],
+        row[10],
+        float(row[-1].detach()),
+        row[11],
+        row[12],
     )
 
 
@@ -129,7 +140,7 @@ def _depth_scale(scene: LitScene) -> float:
 
 
 def _near(scene: LitScene) -> float:
-    return 0.01 * (1.0 if scene.light is None else float(scene.light[11]))
+    return 0.01 * (1.0 if scene.light is None else float(scene.light[-1]))
 
 
 def over_allowed(scene: LitScene) -> float:

@@ -57,7 +57,7 @@ class FillingStep:
 
 def filling_schedule(schedule: Schedule) -> Schedule:
     """The same schedule with the number of Gaussians and the light as they are."""
-    learned = ("falloff", "spread", "cosine", "response", "exposure", "offset")
+    learned = ("falloff", "spread", "cosine", "response", "specular", "exposure", "offset")
     return replace(
         schedule,
         densify=schedule.densify.model_copy(update={"enabled": False}),

@@ -11,10 +11,20 @@ from jaxtyping import Float
 
 from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
+from extrags.raster.light import ROW_LENGTH
 
-__all__ = ["DenseAdam", "LightFit", "learned_parameters"]
+__all__ = ["DenseAdam", "LightFit", "learned_parameters", "learning_rate"]
 
-COMMON = ("log_softening", "log_exponent", "spread", "cosine", "offset", "log_shoulder")
+COMMON = (
+    "log_softening",
+    "log_exponent",
+    "spread",
+    "cosine",
+    "offset",
+    "log_shoulder",
+    "log_specular",
+    "log_roughness",
+)
 """Parameters all cameras share, in the order of `CameraLight.packed`; the exposure comes before them."""
 
 
@@ -27,8 +37,16 @@ def learned_parameters(config: LightConfig) -> list[str]:
         "cosine": config.cosine,
         "offset": config.offset,
         "log_shoulder": config.response,
+        "log_specular": config.specular,
+        "log_roughness": config.specular,
     }
     return [name for name, free in switches.items() if free]
+
+
+def learning_rate(name: str, config: LightConfig) -> float:
+    """Of one of the parameters that all cameras share."""
+    specular = name in ("log_specular", "log_roughness")
+    return config.specular_learning_rate if specular else config.learning_rate
 
 
 class DenseAdam:
@@ -36,7 +54,7 @@ class DenseAdam:
 
     Args:
         values: stepped in place, [N].
-        learning_rate: of all entries.
+        learning_rate: of all entries, or of each.
 
     Source: Kingma & Ba, Adam, ICLR 2015.
     """
@@ -44,7 +62,7 @@ class DenseAdam:
     BETAS = (0.9, 0.999)
     EPS = 1e-15
 
-    def __init__(self, values: Float[np.ndarray, "n"], learning_rate: float) -> None:
+    def __init__(self, values: Float[np.ndarray, "n"], learning_rate: float | Float[np.ndarray, "n"]) -> None:
         self.values, self.learning_rate = values, learning_rate
         self._first, self._second = np.zeros_like(values), np.zeros_like(values)
         self._steps = 0
@@ -94,15 +112,17 @@ class LightFit:
         self._common, self._log_exposure = self._tensor.numpy(), self._exposures.numpy()
         self._logarithms = np.zeros(begin, dtype=bool)
         self._free = np.zeros(begin, dtype=np.float32)
+        rates = np.zeros(begin, dtype=np.float32)
         learned = learned_parameters(config)
         for name, slots in self._slots.items():
             self._logarithms[slots.begin : slots.end] = slots.logarithm
             self._free[slots.begin : slots.end] = name in learned
+            rates[slots.begin : slots.end] = learning_rate(name, config)
         self._any_free = bool(self._free.any())
-        self._row = np.zeros(12, dtype=np.float32)
-        self._row[11] = light.reference_distance
+        self._row = np.zeros(ROW_LENGTH, dtype=np.float32)
+        self._row[-1] = light.reference_distance
         self._frame: int | None = None
-        self._adam = DenseAdam(self._common, config.learning_rate)
+        self._adam = DenseAdam(self._common, rates)
         self._exposure_adam = DenseAdam(self._log_exposure, config.exposure_learning_rate)
 
     @property
@@ -116,7 +136,7 @@ class LightFit:
             **values, log_exposure=self._exposures, reference_distance=self._reference_distance
         )
 
-    def row(self, frame: int | None) -> Float[np.ndarray, "12"]:
+    def row(self, frame: int | None) -> Float[np.ndarray, "14"]:
         """What the camera of a training frame carries; None is the mean exposure.
 
         Returns:
@@ -126,7 +146,7 @@ class LightFit:
         row = self._row
         exposures = self._log_exposure
         row[:3] = 1 if frame is None else math.exp(float(exposures[frame]) - self._mean(exposures))
-        common = row[3:11]
+        common = row[3:-1]
         common[:] = self._common
         np.exp(common, out=common, where=self._logarithms)
         return row
@@ -142,7 +162,7 @@ class LightFit:
         exposures = self._log_exposure
         return self._config.exposure_prior * float(exposures @ exposures) / len(exposures)
 
-    def step(self, gradient: Float[np.ndarray, "12"], rate_share: float = 1.0) -> None:
+    def step(self, gradient: Float[np.ndarray, "14"], rate_share: float = 1.0) -> None:
         """Step what is learned.
 
         Args:
@@ -154,13 +174,13 @@ class LightFit:
         if self._config.exposure and self._frame is not None:
             self._exposure_adam.step(self.exposure_gradient(gradient), rate_share)
 
-    def common_gradient(self, gradient: Float[np.ndarray, "12"]) -> Float[np.ndarray, "8"]:
+    def common_gradient(self, gradient: Float[np.ndarray, "14"]) -> Float[np.ndarray, "10"]:
         """Gradient of the parameters all cameras share, in the order of a row; zero where not learned."""
-        common: np.ndarray = gradient[3:11] * self._free
-        np.multiply(common, self._row[3:11], out=common, where=self._logarithms)
+        common: np.ndarray = gradient[3:-1] * self._free
+        np.multiply(common, self._row[3:-1], out=common, where=self._logarithms)
         return common
 
-    def exposure_gradient(self, gradient: Float[np.ndarray, "12"]) -> Float[np.ndarray, "f"]:
+    def exposure_gradient(self, gradient: Float[np.ndarray, "14"]) -> Float[np.ndarray, "f"]:
         """Gradient of the log-exposures, that of the prior included; the last row was of a real frame."""
         count = len(self._log_exposure)
         carried = float(gradient[:3].sum()) * float(self._row[0])

@@ -20,7 +20,7 @@ from extrags.raster.direct import DirectStep, Target
 from extrags.raster.loss import depth_loss
 from extrags.scene import Scene
 from extrags.training.density import DensityStrategy
-from extrags.training.light_fit import LightFit, learned_parameters
+from extrags.training.light_fit import LightFit, learned_parameters, learning_rate
 from extrags.training.schedule import Schedule
 from extrags.training.views import View
 
@@ -287,7 +287,7 @@ def _trainable_light(
         values["log_exposure"].requires_grad_()
     trainable = NearFieldLight(**values, reference_distance=light.reference_distance)
     groups: list[dict[str, Any]] = [
-        {"params": [values[name] for name in learned], "initial_lr": config.learning_rate},
+        *({"params": [values[name]], "initial_lr": learning_rate(name, config)} for name in learned),
         {"params": [values["log_exposure"]], "initial_lr": config.exposure_learning_rate},
     ]
     return trainable, torch.optim.Adam(groups, eps=1e-15)

@@ -162,7 +162,8 @@ class SceneRenderer:
             made = CameraLight(gain, one, zero, zero, zero, torch.zeros(3), zero, 1.0)
         else:
             if not settings.falloff:
-                light = replace(light, log_exponent=torch.tensor(-math.inf), spread=zero, cosine=zero)
+                none = torch.tensor(-math.inf)
+                light = replace(light, log_exponent=none, spread=zero, cosine=zero, log_specular=none)
             made = light.camera_light(torch.tensor([settings.exposure * settings.lamp]))
         moved = {
             name: value.to(self.device) for name, value in vars(made).items() if name != "reference_distance"

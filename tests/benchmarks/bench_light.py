@@ -43,6 +43,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no spread": {"light": {"spread": False}},
     "no cosine": {"light": {"cosine": False}},
     "no response": {"light": {"response": False}},
+    "no highlights": {"light": {"specular": False}},
     "with offset": {"light": {"offset": True}},
     "fall-off only": {"light": {"spread": False, "cosine": False, "response": False}},
     "no light": {"light": {"enabled": False}},

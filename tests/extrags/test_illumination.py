@@ -7,7 +7,9 @@ import pytest
 import torch
 
 from extrags.config import LightConfig
+from extrags.errors import DamagedArtefactError
 from extrags.illumination import NearFieldLight
+from extrags.zarr_io import new_group, write_array
 
 
 def light() -> NearFieldLight:
@@ -45,12 +47,27 @@ class TestNearFieldLight:
         assert bool((light().falloff(distance).diff() < 0).all())
 
     def test_switched_off_parts_start_without_effect(self) -> None:
-        off = {"falloff": False, "spread": False, "cosine": False, "response": False}
+        off = {"falloff": False, "spread": False, "cosine": False, "response": False, "specular": False}
         dark = NearFieldLight.initial(2, 25.0, LightConfig(**off))
         points = torch.tensor([[0.0, 0.0, 3.0], [30.0, 5.0, 40.0]])
         normals = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.6, 0.8]])
         torch.testing.assert_close(dark.gain(points, normals), torch.ones(2))
         assert torch.equal(dark.apply_response(points), points)
+        assert torch.equal(dark.specular_gain(points, normals), torch.zeros(2))
+
+    @pytest.mark.parametrize("missing", ["log_specular", "spread"])
+    def test_of_what_is_stored_only_highlights_may_be_missing(self, missing: str, tmp_path: Path) -> None:
+        """Lights of before there were highlights have none."""
+        with new_group(tmp_path / "light") as group:
+            for name, value in NearFieldLight.initial(2, 25.0).parameters().items():
+                if name not in (missing, "log_roughness"):
+                    write_array(group, name, value.numpy())
+            group.attrs["reference_distance"] = 25.0
+        if missing == "spread":
+            with pytest.raises(DamagedArtefactError, match="spread"):
+                NearFieldLight.load(tmp_path / "light")
+        else:
+            assert float(NearFieldLight.load(tmp_path / "light").log_specular) == -torch.inf
 
     def test_albedo_is_what_the_light_and_the_response_leave(self) -> None:
         start = NearFieldLight.initial(1, 25.0)

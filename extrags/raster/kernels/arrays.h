@@ -79,7 +79,7 @@ struct CameraSettings {
     expect(viewmat.size() == 16, "viewmat");
     expect(K.size() == 9, "K");
     expect(!background || background->size() == 3, "background");
-    expect(!light || light->size() == 12, "light");
+    expect(!light || light->size() == kLightRow, "light");
     expect(!lens || lens->size() * sizeof(float) == sizeof(RadialLens), "lens");
     const float* v = viewmat.data();
     for (int i = 0; i < 3; ++i) {
@@ -167,7 +167,7 @@ struct CameraGradientArrays {
 
   void check(bool lit) const {
     expect(!viewmat || viewmat->size() == 16, "gradient of viewmat");
-    expect(!light || (lit && light->size() == 12), "gradient of light");
+    expect(!light || (lit && light->size() == kLightRow), "gradient of light");
   }
 };
 

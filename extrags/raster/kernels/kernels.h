@@ -47,10 +47,13 @@ struct CameraLight {
   float softening, exponent, spread, cosine;
   float offset[3];
   float shoulder;
+  float specular, roughness;
   float reference_distance;  // a gauge, not learned
 };
-static_assert(sizeof(CameraLight) == 48, "the caller hands over twelve floats");
-constexpr int kPartials = 32;  // floats per chunk of Gaussians: 15 of the pose, 11 of the light from 16 on
+constexpr int kLightLearned = 13, kLightRow = kLightLearned + 1;
+static_assert(sizeof(CameraLight) == sizeof(float) * kLightRow, "the caller hands over a row of floats");
+constexpr int kPartials = 32;  // floats per chunk of Gaussians: 15 of the pose, those of the light from 16 on
+static_assert(16 + kLightLearned <= kPartials);
 
 // Arrays of the caller, row-major and contiguous.
 struct Scene {
@@ -156,7 +159,7 @@ struct SceneGradients {
   float* sh;
   float* colors;      // written
   float* viewmat;     // [4, 4], written
-  float* light;       // [12], written
+  float* light;       // [kLightRow], written
   float* means2d;     // [n, 2], written
   float* absolute2d;  // [n, 2], written
 };

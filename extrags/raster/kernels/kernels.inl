@@ -265,12 +265,12 @@ static void backward(View* view, const Scene* scene, const ImageGradients* in, c
   view->seconds[3] = monotonic_seconds() - carried;
   const float* partials = static_cast<const float*>(view->partials.data);
   if (out->light != nullptr) {
-    double light[11] = {};
+    double light[kLightLearned] = {};
     for (int chunk = 0; chunk < view->chunks; ++chunk) {
-      for (int k = 0; k < 11; ++k) light[k] += static_cast<double>(partials[kPartials * chunk + 16 + k]);
+      for (int k = 0; k < kLightLearned; ++k) light[k] += static_cast<double>(partials[kPartials * chunk + 16 + k]);
     }
-    for (int k = 0; k < 11; ++k) out->light[k] = finite_float(light[k]);
-    out->light[11] = 0;
+    for (int k = 0; k < kLightLearned; ++k) out->light[k] = finite_float(light[k]);
+    out->light[kLightLearned] = 0;
   }
   if (out->viewmat == nullptr) return;
   double pose[15] = {};

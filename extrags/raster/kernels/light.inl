@@ -9,6 +9,8 @@ constexpr float kSpreadMin = 0.1f;
 constexpr float kCosineSoftening = 0.04f;
 // Gains are held within 2^-40 and 2^40.
 constexpr float kLogGainMax = 40.f;
+// No lobe is sharper.
+constexpr float kRoughnessMin = 0.02f;
 
 struct Lit {
   Vec offset[3];             // from the lamp to the Gaussian, in reference distances, camera frame
@@ -21,7 +23,18 @@ struct Lit {
   Vec squared_cosine;        // of the angle between the normal and the ray
   Vec log_fall, log_spread, log_cosine;  // in powers of two
   Vec gain;
+  // Of the specular lobe, where there is one
+  Mask free_lobe_gain;
+  Vec missed;           // 1 - squared cosine
+  Vec inverse_width;    // 1 / (squared roughness + missed (1 - squared roughness))
+  Vec lobe, lobe_gain;  // its shape, 1 at its peak; what a mirror of full strength adds to the albedo
 };
+
+// Its square, held from below
+EXTRAGS_INLINE float squared_roughness(const CameraLight& light) {
+  const float held = light.roughness > kRoughnessMin ? light.roughness : kRoughnessMin;
+  return held * held;
+}
 
 static __attribute__((noinline)) void illuminate(const View* view, const Projected& p, Lit& l) {
   const CameraLight& light = view->light;
@@ -62,13 +75,24 @@ static __attribute__((noinline)) void illuminate(const View* view, const Project
                            fma(Vec(light.spread), l.log_spread, Vec(light.cosine) * l.log_cosine));
   l.free_gain = ge(Vec(kLogGainMax), abs(log_gain));
   l.gain = exp2(min(max(log_gain, Vec(-kLogGainMax)), Vec(kLogGainMax)));
+  if (light.specular == 0.f) return;
+  const float squared = squared_roughness(light);
+  l.missed = one - l.squared_cosine;
+  l.inverse_width = one / fma(l.missed, Vec(1.f - squared), Vec(squared));
+  const Vec root = Vec(squared) * l.inverse_width;
+  l.lobe = root * root;
+  const Vec log_lobe_gain = fma(Vec(light.exponent), l.log_fall, Vec(light.spread) * l.log_spread);
+  l.free_lobe_gain = ge(Vec(kLogGainMax), abs(log_lobe_gain));
+  l.lobe_gain = l.lobe * exp2(min(max(log_lobe_gain, Vec(-kLogGainMax)), Vec(kLogGainMax)));
 }
 
 // Albedo to what reaches the pixel, in place.
 EXTRAGS_INLINE void develop(const View* view, const Lit& l, Vec* color) {
   const CameraLight& light = view->light;
+  const bool shiny = light.specular != 0.f;
   for (int channel = 0; channel < 3; ++channel) {
-    const Vec signal = color[channel] * (l.gain * Vec(light.exposure[channel]));
+    Vec signal = color[channel] * (l.gain * Vec(light.exposure[channel]));
+    if (shiny) signal = fma(l.lobe_gain, Vec(light.specular * light.exposure[channel]), signal);
     color[channel] = signal * Vec(1.f + light.shoulder) / fma(Vec(light.shoulder), signal, Vec(1.f));
   }
 }
@@ -79,23 +103,40 @@ static __attribute__((noinline)) void illuminate_backward(const View* view, cons
                                         Vec* v_point, Vec* v_normal, Vec* v_light) {
   const CameraLight& light = view->light;
   const Vec one(1.f), ln2(kLn2);
-  Vec v_log(0.f);
+  const bool shiny = light.specular != 0.f;
+  Vec v_log(0.f), v_lobe_gain(0.f);
   for (int channel = 0; channel < 3; ++channel) {
-    const Vec lit = albedo[channel] * l.gain, signal = lit * Vec(light.exposure[channel]);
+    const Vec diffuse = albedo[channel] * l.gain;
+    const Vec lit = shiny ? fma(l.lobe_gain, Vec(light.specular), diffuse) : diffuse;
+    const Vec signal = lit * Vec(light.exposure[channel]);
     const Vec inverse = one / fma(Vec(light.shoulder), signal, one), squared = inverse * inverse;
     const Vec v_signal = v_color[channel] * Vec(1.f + light.shoulder) * squared;
     v_light[10] = fma(v_color[channel] * squared, signal * (one - signal), v_light[10]);
     v_light[channel] = fma(v_signal, lit, v_light[channel]);
-    v_log = fma(v_signal, signal, v_log);
+    v_log = fma(v_signal, diffuse * Vec(light.exposure[channel]), v_log);
+    if (shiny) v_lobe_gain = fma(v_signal, Vec(light.exposure[channel]), v_lobe_gain);
     v_color[channel] = v_signal * (l.gain * Vec(light.exposure[channel]));
   }
   v_log = keep(l.free_gain, v_log);
+  v_light[6] = fma(v_log * ln2, l.log_cosine, v_light[6]);
+  Vec v_cosine = v_log * Vec(0.5f * light.cosine) / (l.squared_cosine + Vec(kCosineSoftening));
+  if (shiny) {
+    const float squared = squared_roughness(light);
+    const Vec v_specular = v_lobe_gain * l.lobe_gain, v_log_lobe = v_specular * Vec(light.specular);
+    v_light[11] = v_light[11] + v_specular;
+    if (light.roughness > kRoughnessMin) {
+      // Of the logarithm of the lobe: 2 missed / (squared (squared + missed (1 - squared)))
+      const Vec slope = l.missed * l.inverse_width * Vec(4.f * light.roughness / squared);
+      v_light[12] = fma(v_log_lobe, slope, v_light[12]);
+    }
+    v_cosine = fma(v_log_lobe * Vec(2.f * (1.f - squared)), l.inverse_width, v_cosine);
+    v_log = v_log + keep(l.free_lobe_gain, v_log_lobe);
+  }
+  // From here on what the lobe and the rest have in common
   v_light[3] = fma(v_log * Vec(light.exponent), Vec(1.f / (1.f + light.softening)) - l.inverse_shifted, v_light[3]);
   v_light[4] = fma(v_log * ln2, l.log_fall, v_light[4]);
   v_light[5] = fma(v_log * ln2, l.log_spread, v_light[5]);
-  v_light[6] = fma(v_log * ln2, l.log_cosine, v_light[6]);
   const Vec v_spread = keep(l.free_spread, v_log * Vec(light.spread));
-  const Vec v_cosine = v_log * Vec(0.5f * light.cosine) / (l.squared_cosine + Vec(kCosineSoftening));
   const Vec v_along = Vec(2.f) * v_cosine * l.along * l.inverse_square;
   Vec v_square = negated(v_log * Vec(light.exponent) * l.inverse_shifted);
   v_square = fnma(Vec(0.5f) * v_spread, l.inverse_square, v_square);

@@ -54,9 +54,9 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
   const int begin = chunk * view->chunk;
   const int end = begin + view->chunk < scene->n ? begin + view->chunk : scene->n;
   const Vec zero(0.f), two(2.f);
-  Vec pose[15], v_light[11];
+  Vec pose[15], v_light[kLightLearned];
   for (int k = 0; k < 15; ++k) pose[k] = zero;
-  for (int k = 0; k < 11; ++k) v_light[k] = zero;
+  for (int k = 0; k < kLightLearned; ++k) v_light[k] = zero;
   for (int first = begin; first < end; first += 16) {
     const int rows = rows_of(end, first);
     if constexpr (!kColors) prefetch_coefficients(scene, first + 16, end);
@@ -252,6 +252,6 @@ static void project_chunk_backward(View* view, const Scene* scene, const SceneGr
     for (int k = 0; k < 15; ++k) partial[k] = sum(pose[k]);
   }
   if (view->lit) {
-    for (int k = 0; k < 11; ++k) partial[16 + k] = sum(finite(v_light[k]));
+    for (int k = 0; k < kLightLearned; ++k) partial[16 + k] = sum(finite(v_light[k]));
   }
 }

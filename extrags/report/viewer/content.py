@@ -197,7 +197,8 @@ def _header(
         row = scene.light.detached().camera_light(scene.light.exposure(None)[None]).packed()[0].tolist()
         names = ("softening", "exponent", "spread", "cosine")
         light = dict(zip(names, row[3:7], strict=True))
-        light |= {"offset": row[7:10], "shoulder": row[10], "reference": row[11]}
+        light |= dict(zip(("shoulder", "specular", "roughness", "reference"), row[10:], strict=True))
+        light["offset"] = row[7:10]
     return {
         "name": name,
         "element": element,

@@ -2,16 +2,36 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
 
 from extrags.errors import NonFiniteError
 from extrags.raster import CameraLight, set_num_threads
-from extrags.raster.light import apply_response, invert_response, light_gain, lit_colors, shortest_axes
+from extrags.raster.light import (
+    ROUGHNESS_MIN,
+    apply_response,
+    invert_response,
+    light_gain,
+    lit_colors,
+    shortest_axes,
+    specular_gain,
+)
 from tests.extrags.raster.scenes import RasterScene, relative_l2, tube, weighted_sum
 
-LEARNED = ("exposure", "softening", "exponent", "spread", "cosine", "offset", "shoulder")
+LEARNED = (
+    "exposure",
+    "softening",
+    "exponent",
+    "spread",
+    "cosine",
+    "offset",
+    "shoulder",
+    "specular",
+    "roughness",
+)
 
 
 def a_light(cameras: int, dtype: torch.dtype, *, gradients: bool = False) -> CameraLight:
@@ -24,6 +44,8 @@ def a_light(cameras: int, dtype: torch.dtype, *, gradients: bool = False) -> Cam
         "cosine": torch.tensor(0.5),
         "offset": torch.tensor([0.08, -0.05, 0.03]),
         "shoulder": torch.tensor(0.8),
+        "specular": torch.tensor(0.4),
+        "roughness": torch.tensor(0.3),
     }
     leaves = {k: v.to(dtype).requires_grad_(gradients) for k, v in values.items()}
     return CameraLight(**leaves, reference_distance=1.7)
@@ -169,3 +191,51 @@ def test_a_light_that_is_not_finite_is_refused() -> None:
     )
     with pytest.raises(NonFiniteError, match="light"):
         scene.render("native", light=broken)
+
+
+def test_highlights_are_the_distribution_of_ggx() -> None:
+    """Against the distribution as it is published, over its own peak, and whatever the albedo."""
+    light = a_light(1, torch.float64)
+    row = light.packed()[0].clone()
+    row[7:10] = 0
+    angles = torch.linspace(0, 1.5, 40, dtype=torch.float64)
+    normals = torch.stack([torch.sin(angles), torch.zeros_like(angles), torch.cos(angles)], dim=1)
+    points = torch.tensor([[0.0, 0.0, 1.2]], dtype=torch.float64).expand(40, 3)
+    squared = 0.3**2
+    density = squared / (torch.pi * (torch.cos(angles) ** 2 * (squared - 1) + 1) ** 2)
+    arriving = light_gain(points[:1], None, row)
+    expected = 0.4 * arriving * density / density[0]
+    torch.testing.assert_close(specular_gain(points, normals, row), expected)
+    black = torch.zeros(40, 3, dtype=torch.float64)
+    signal = invert_response(lit_colors(black, points, normals, row), row[10])
+    torch.testing.assert_close(signal, expected[:, None] * row[:3])
+
+
+def test_a_lobe_is_no_sharper_than_its_bound(isa: str) -> None:
+    scene = tube(64, 24, 20, seed=4).to(torch.float32, gradients=True)
+    light = a_light(1, torch.float32, gradients=True)
+    sharp, bound = (
+        CameraLight(
+            **{n: getattr(light, n) for n in LEARNED if n != "roughness"},
+            roughness=torch.tensor(value).requires_grad_(),
+            reference_distance=1.7,
+        )
+        for value in (1e-9, ROUGHNESS_MIN)
+    )
+    rendering = scene.render("native", light=sharp)
+    assert torch.equal(rendering.rgb, scene.render("native", light=bound).rgb)
+    weighted_sum(rendering).backward()
+    assert sharp.roughness.grad == 0
+
+
+def test_without_strength_there_are_no_highlights_and_no_gradient_of_their_shape(isa: str) -> None:
+    scene = tube(64, 24, 20, seed=4).to(torch.float32, gradients=True)
+    light = a_light(1, torch.float32, gradients=True)
+    kept = {n: getattr(light, n) for n in LEARNED if n not in ("specular", "roughness")}
+    roughness = torch.tensor(0.3).requires_grad_()
+    matt = CameraLight(**kept, reference_distance=1.7)
+    none = replace(matt, specular=torch.zeros(()).requires_grad_(), roughness=roughness)
+    rendering = scene.render("native", light=none)
+    assert torch.equal(rendering.rgb, scene.render("native", light=matt).rgb)
+    weighted_sum(rendering).backward()
+    assert roughness.grad == 0

@@ -64,7 +64,7 @@ int main(int, char** given) {
   view.camera.cx = kWidth / 2.f;
   view.camera.cy = kHeight / 2.f;
   view.lit = true;
-  view.light = {{1.1f, 0.9f, 1.f}, 0.5f, 1.8f, 0.3f, 0.6f, {0.2f, -0.1f, 0.f}, 0.4f, 6.f};
+  view.light = {{1.1f, 0.9f, 1.f}, 0.5f, 1.8f, 0.3f, 0.6f, {0.2f, -0.1f, 0.f}, 0.4f, 0.3f, 0.2f, 6.f};
 
   std::vector<float> rgb(3 * pixels), alpha(pixels), depth(pixels), median(pixels), means2d(2 * n), radius(n),
       most(n), sum(n);
@@ -85,7 +85,7 @@ int main(int, char** given) {
   const double depth_loss = kernels.inverse_depth(&depth_images, &working, &compared);
 
   std::vector<float> v_means(3 * n), v_quats(4 * n), v_scales(3 * n), v_opacities(n),
-      v_sh(3 * kCoefficients * n), v_viewmat(16), v_light(12), v_means2d(2 * n), absolute(2 * n);
+      v_sh(3 * kCoefficients * n), v_viewmat(16), v_light(kLightRow), v_means2d(2 * n), absolute(2 * n);
   const ImageGradients in{v_rgb.data(), nullptr, v_depth.data(), depth.data()};
   const SceneGradients out{false,          v_means.data(),   v_quats.data(), v_scales.data(),  v_opacities.data(),
                            v_sh.data(),    nullptr,          v_viewmat.data(), v_light.data(), v_means2d.data(),

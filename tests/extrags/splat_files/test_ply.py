@@ -25,11 +25,12 @@ def lit(lit: Scene) -> Scene:
 
 
 def changed(path: Path, **values: object) -> None:
-    """Other numbers in the light of a file."""
+    """Other numbers in the light of a file; None takes one away."""
     mark = b"comment extrags_light "
     head, *parts = path.read_bytes().split(mark)
     last, end, body = parts.pop().partition(b"\n")
     light = {**json.loads(b"".join([*(part.rstrip(b"\n") for part in parts), last])), **values}
+    light = {name: value for name, value in light.items() if value is not None}
     # In one line, as files had it before.
     path.write_bytes(head + mark + json.dumps(light).encode() + end + body)
 
@@ -82,6 +83,25 @@ class TestLight:
         assert back.light is not None
         assert float(back.light.log_shoulder) == -torch.inf
 
+    def test_highlights(self, lit: Scene, tmp_path: Path) -> None:
+        from dataclasses import replace
+
+        assert lit.light is not None
+        shiny = replace(lit.light, log_specular=torch.tensor(-1.5), log_roughness=torch.tensor(-2.0))
+        write_ply_scene(Scene(lit.gaussians, shiny), tmp_path / "a.ply")
+        back = read_ply_scene(tmp_path / "a.ply").light
+        assert back is not None
+        assert float(back.log_specular) == pytest.approx(-1.5, rel=1e-6)
+        assert float(back.log_roughness) == -2.0
+
+    def test_files_of_before_there_were_highlights_have_none(self, lit: Scene, tmp_path: Path) -> None:
+        write_ply_scene(lit, tmp_path / "a.ply")
+        changed(tmp_path / "a.ply", specular=None, log_roughness=None)
+        assert b"specular" not in (tmp_path / "a.ply").read_bytes()
+        back = read_ply_scene(tmp_path / "a.ply").light
+        assert back is not None
+        assert float(back.log_specular) == -torch.inf
+
     def test_without_light_the_header_says_nothing(self, lit: Scene, tmp_path: Path) -> None:
         write_ply_scene(Scene(lit.gaussians), tmp_path / "a.ply")
         assert b"extrags_light" not in (tmp_path / "a.ply").read_bytes()
@@ -96,6 +116,7 @@ class TestLight:
             ("reference_distance", 0.0, "reference_distance"),
             ("reference_distance", "far", "extrags_light"),
             ("colour", 1.0, "extrags_light"),
+            ("specular", float("inf"), "extrags_light.specular"),
         ],
     )
     def test_a_wrong_light_is_refused(

@@ -20,7 +20,7 @@ def _light() -> NearFieldLight:
 
 
 def _gradient() -> np.ndarray:
-    return np.random.default_rng(4).normal(size=12).astype(np.float32)
+    return np.random.default_rng(4).normal(size=14).astype(np.float32)
 
 
 @pytest.mark.parametrize("frame", [None, 0, 3])
@@ -39,7 +39,16 @@ def test_gradients_are_those_of_autograd() -> None:
     prior = EVERYTHING.exposure_prior * light.log_exposure.square().mean()
     (row @ torch.from_numpy(gradient) + prior).backward()
     assert fit.prior() == pytest.approx(float(prior.detach()), rel=1e-6)
-    names = ("log_softening", "log_exponent", "spread", "cosine", "offset", "log_shoulder")
+    names = (
+        "log_softening",
+        "log_exponent",
+        "spread",
+        "cosine",
+        "offset",
+        "log_shoulder",
+        "log_specular",
+        "log_roughness",
+    )
     expected = np.concatenate([values[name].grad.reshape(-1).numpy() for name in names])  # type: ignore[union-attr]
     np.testing.assert_allclose(fit.common_gradient(gradient), expected, rtol=1e-5)
     exposure = values["log_exposure"].grad
@@ -48,7 +57,7 @@ def test_gradients_are_those_of_autograd() -> None:
 
 
 def test_what_is_not_learned_stays() -> None:
-    config = LightConfig(falloff=False, response=False, exposure=False)
+    config = LightConfig(falloff=False, response=False, specular=False, exposure=False)
     light = NearFieldLight.initial(4, 10.0, config)
     fit = LightFit(light, config)
     for _ in range(3):

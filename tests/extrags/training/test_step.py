@@ -13,6 +13,7 @@ from extrags.gaussians import Gaussians
 from extrags.raster import native, set_num_threads
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
+from extrags.training.light_fit import COMMON
 from extrags.training.optimise import optimise
 from extrags.training.reconstruction import coarse_schedule
 from extrags.training.schedule import Schedule
@@ -115,7 +116,7 @@ class TestOneStep:
             assert expected.light is not None
             row = native_step.direct.light_gradient
             common = native_step.light_fit.common_gradient(row)
-            names = ("log_softening", "log_exponent", "spread", "cosine", "offset", "log_shoulder")
+            names = COMMON
             flat = [expected.light.parameters()[name].grad for name in names]
             joined = torch.cat([value.reshape(-1) for value in flat if value is not None])
             assert _relative(torch.from_numpy(common), joined) < 1e-5

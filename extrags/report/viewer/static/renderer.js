@@ -118,6 +118,7 @@ class Renderer {
     gl.uniform4f(places.falloff, light.softening, light.exponent, light.spread, light.cosine);
     gl.uniform4f(places.place, ...light.offset, light.reference);
     gl.uniform1f(places.shoulder, light.shoulder);
+    gl.uniform2f(places.gloss, light.specular, light.roughness);
     gl.uniform1i(places.shade, state.shade);
     gl.bindVertexArray(this.splatArray);
     if (this.count) gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.count);

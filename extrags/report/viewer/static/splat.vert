@@ -20,6 +20,7 @@ uniform float exposure;
 uniform vec4 falloff;         // softening, exponent, spread, cosine
 uniform vec4 place;           // offset of the lamp, reference distance
 uniform float shoulder;
+uniform vec2 gloss;           // strength and roughness of the specular lobe
 uniform int shade;            // 0 colour, 1 and more: a quantity
 out vec2 offset;
 flat out vec3 conic;
@@ -75,8 +76,12 @@ vec3 under_light(vec3 a, vec3 mean, vec3 normal) {
   float axis = log2(max(d.z * inversesqrt(square), 0.1));
   float cosine = dot(mat3(lamp) * normal, d);
   float facing = log2((cosine * cosine / square + 0.04) / 1.04);
-  float gain = exp2(clamp(falloff.y * fall + falloff.z * axis + 0.5 * falloff.w * facing, -40.0, 40.0));
-  vec3 signal = a * exposure * gain;
+  float arriving = falloff.y * fall + falloff.z * axis;
+  float gain = exp2(clamp(arriving + 0.5 * falloff.w * facing, -40.0, 40.0));
+  float rough = max(gloss.y, 0.02) * max(gloss.y, 0.02);
+  float lobe = rough / (rough + (1.0 - rough) * (1.0 - cosine * cosine / square));
+  float shine = gloss.x * lobe * lobe * exp2(clamp(arriving, -40.0, 40.0));
+  vec3 signal = exposure * (a * gain + shine);
   return (1.0 + shoulder) * signal / (1.0 + shoulder * signal);
 }
 

@@ -86,11 +86,14 @@ def test_the_light_moves(tab: Browser, drawn: ReportInputs) -> None:
 
     do(tab, "jump(0, 0)")
     do(tab, "setLight({exposure: 1, exponent: 1.4, cosine: 1.2, offset: [0.3, 0.1, 0]})")
+    do(tab, "setLight({specular: 0.5, roughness: 0.3})")
     scene = drawn.final_scene
     light = with_values(
         scene.light,
         log_exponent=torch.tensor(1.4).log(),
         cosine=torch.tensor(1.2),
+        log_specular=torch.tensor(0.5).log(),
+        log_roughness=torch.tensor(0.3).log(),
         offset=torch.tensor([0.3, 0.1, 0]),
     )
     camera = drawn.sequence.cameras[int(drawn.sequence.train[0])]
