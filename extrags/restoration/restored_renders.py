@@ -58,9 +58,13 @@ of both is nearer to the truth than either."""
 MOSTLY = 0.5
 """Pixels that are invented to more than this share tell how much of the restored view serves where it is
 invented, all others how much where the scene knows the surface."""
-TOLERATED_LOSS_DB = 1.0
+TOLERATED_LOSS_DB = 2.0
 """Left-out frames lie near the path, where a scene knows best: on two phantoms held-out views gained a
-decibel where left-out frames told of neither gain nor loss."""
+decibel where left-out frames told of neither gain nor loss, and still half of one where they told of a loss
+of two."""
+CERTAIN_LOSS_DB = 3.0
+"""From here on left-out frames decide alone; between both the shares pass gradually, since a seed changes what
+such frames tell by some tenths of a decibel."""
 LEAST_PIXELS = 500
 """Fewer pixels of a kind tell nothing."""
 DEPTH_SMOOTHING_SHARE = 0.02
@@ -184,9 +188,10 @@ def restored_shares(
     """How much of the restored views to take, as left-out frames tell.
 
     `RESTORED_SHARE`, unless known pixels lose more than `TOLERATED_LOSS_DB` by it against the final scene's
-    views alone: what is known well is only blurred by a network. Then the share with which mixtures of both
-    are nearest to the frames, by least squares; and the same is asked of invented pixels. These alone decide
-    nothing: left-out frames have few of them, and squared errors prefer what is smooth there.
+    views alone: what is known well is only blurred by a network. From `CERTAIN_LOSS_DB` on it is the share
+    with which mixtures of both are nearest to the frames, by least squares, and between both losses it passes
+    from one to the other; and the same is asked of invented pixels. These alone decide nothing: left-out
+    frames have few of them, and squared errors prefer what is smooth there.
 
     Frames are restored as they are mixed, without agreement and texture, and at the size of the trials.
 
@@ -225,10 +230,11 @@ def restored_shares(
             known.add(view, truth, solid * (1 - view.invented) * ~mostly)
             invented.add(view, truth, solid * view.invented * mostly)
             done += len(clip)
-    of_known = known.share("known", error_share)
-    if of_known == RESTORED_SHARE:
+    of_known, certainty = known.share("known", error_share)
+    if certainty == 0:
         return RestoredShares()
-    return RestoredShares(of_known, invented.share("invented", error_share))
+    of_invented, _ = invented.share("invented", error_share)
+    return RestoredShares(of_known, RESTORED_SHARE + certainty * (of_invented - RESTORED_SHARE))
 
 
 @dataclass
@@ -250,22 +256,28 @@ class _Errors:
         self.restored += float((weight * restored.square()).double().sum())
         self.product += float((weight * rendered * restored).double().sum())
 
-    def share(self, kind: str, error_share: float) -> float:
-        """Of the restored view, for pixels of this kind; see `restored_shares`."""
+    def share(self, kind: str, error_share: float) -> tuple[float, float]:
+        """Of the restored view, for pixels of this kind, and how much left-out frames decide it.
+
+        See `restored_shares`.
+        """
         rendered, product = error_share * self.rendered, math.sqrt(error_share) * self.product
         if self.pixels < LEAST_PIXELS:
-            return RESTORED_SHARE
+            return RESTORED_SHARE, 0.0
         if rendered == 0:
             # Nothing is nearer than what is right.
-            return 0.0 if self.restored > 0 else RESTORED_SHARE
+            return (0.0, 1.0) if self.restored > 0 else (RESTORED_SHARE, 0.0)
         own = 1 - RESTORED_SHARE
         mixed = own**2 * rendered + RESTORED_SHARE**2 * self.restored + 2 * own * RESTORED_SHARE * product
         loss_db = 10 * math.log10(max(mixed / rendered, LEAST_SHARE))
         emit(MetricRecorded("finetune", f"{kind}_loss_db", loss_db))
-        if loss_db <= TOLERATED_LOSS_DB:
-            return RESTORED_SHARE
+        certainty = (loss_db - TOLERATED_LOSS_DB) / (CERTAIN_LOSS_DB - TOLERATED_LOSS_DB)
+        certainty = min(max(certainty, 0.0), 1.0)
+        if certainty == 0:
+            return RESTORED_SHARE, 0.0
         nearest = (rendered - product) / (rendered + self.restored - 2 * product)
-        return min(max(nearest, 0.0), RESTORED_SHARE)
+        share = min(max(nearest, 0.0), RESTORED_SHARE)
+        return RESTORED_SHARE + certainty * (share - RESTORED_SHARE), certainty
 
 
 def _part_of(renders: RenderedViews, part: slice) -> RenderedViews:

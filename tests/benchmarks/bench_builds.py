@@ -19,8 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-LIGHT = (1, 1, 1, 0.1, 1, 1, 0.5, 0, 0, 0, 0.2, 1)
-"""Exposure, softening, exponent, spread, cosine, offset, shoulder and reference distance."""
+LIGHT = (1, 1, 1, 0.1, 1, 1, 0.5, 0, 0, 0, 0.2)
+"""Exposure, softening, exponent, spread, cosine, offset and shoulder."""
+HIGHLIGHTS = (0.2, 0.15)
+"""Strength and roughness, which builds of before there were highlights do not take."""
+REFERENCE_DISTANCE = 1
 
 
 def serve(root: Path, width: int, height: int, n_gaussians: int, threads: int, gradients: Path) -> None:
@@ -50,7 +53,10 @@ def serve(root: Path, width: int, height: int, n_gaussians: int, threads: int, g
     target = Target(scene["viewmats"][0].numpy(), scene["Ks"][0].numpy(), scene["target"][0])
     step = DirectStep(lit=True)
     step.bind(parameters)
-    light = np.array(LIGHT, dtype=np.float32)
+    row = [*LIGHT, *HIGHLIGHTS, REFERENCE_DISTANCE]
+    if len(step.light_gradient) < len(row):
+        row = [*LIGHT, REFERENCE_DISTANCE]
+    light = np.array(row, dtype=np.float32)
     for index, _ in enumerate(sys.stdin):
         wall, processor = time.perf_counter(), time.process_time()
         step.run(target, sh_degree=3, light=light)
@@ -88,6 +94,7 @@ def compare(roots: list[Path], case: list[int], rounds: int) -> None:
         differences = {
             name: float(np.linalg.norm(old[name] - new[name]) / max(np.linalg.norm(old[name]), 1e-30))
             for name in old.files
+            if old[name].shape == new[name].shape  # The light has had fewer parameters.
         }
     width, height, n_gaussians, threads = case
     print(f"{width}x{height}, {n_gaussians} Gaussians, {threads} threads, {rounds} rounds")
