@@ -63,8 +63,8 @@ TOLERATED_LOSS_DB = 2.0
 decibel where left-out frames told of neither gain nor loss, and still half of one where they told of a loss
 of two."""
 CERTAIN_LOSS_DB = 3.0
-"""From here on left-out frames decide alone; between both the shares pass gradually, since a seed changes what
-such frames tell by some tenths of a decibel."""
+"""From here on left-out frames decide alone; between both the shares pass gradually, since a seed changes
+what such frames tell by some tenths of a decibel."""
 LEAST_PIXELS = 500
 """Fewer pixels of a kind tell nothing."""
 DEPTH_SMOOTHING_SHARE = 0.02
