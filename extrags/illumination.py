@@ -218,7 +218,7 @@ class NearFieldLight:
     ) -> Float[Tensor, "n 3"]:
         """Albedo from image values: the response is inverted and the gain of the light divided out.
 
-        The specular lobe is not taken away: what is a highlight is known to the masks of the frames.
+        Highlights are taken away where normals are given; without, nothing tells which surfaces have them.
 
         Args:
             rgb: image values in [0, 1], at unit exposure.
@@ -226,7 +226,10 @@ class NearFieldLight:
             normals: unit surface normals in the camera frame; None assumes surfaces that face the light.
             min_gain: lower bound of the gain, so that noise in dark regions is not amplified.
         """
-        return self.invert_response(rgb) / self.gain(points, normals).clamp_min(min_gain)[:, None]
+        signal = self.invert_response(rgb)
+        if normals is not None:
+            signal = (signal - self.specular_gain(points, normals)[:, None]).clamp_min(0)
+        return signal / self.gain(points, normals).clamp_min(min_gain)[:, None]
 
     def _row(self, like: Tensor) -> Float[Tensor, "14"]:
         return self.camera_light(self.log_exposure.new_ones(1)).packed()[0].to(like)

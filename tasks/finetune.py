@@ -62,7 +62,7 @@ def judge(
     slot.counts["amount"] = judgement.amount
 
 
-@stage("finetune", version=12)
+@stage("finetune", version=13)
 def finetune(
     slot: Slot,
     scene: Ref,

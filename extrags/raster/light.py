@@ -58,7 +58,8 @@ COSINE_SOFTENING = 0.04
 """epsilon: surfaces at grazing incidence do not become black, and the gradient of the normal is bounded."""
 
 ROUGHNESS_MIN = 0.02
-"""Lower bound of the roughness: a sharper lobe falls between the Gaussians."""
+"""Lower bound of the roughness: a sharper lobe falls between the Gaussians. The upper one is 1, where the
+lobe is the same in all directions."""
 
 LOG2_GAIN_MAX = 40.0
 """Gains are clamped to [2^-40, 2^40]."""
@@ -77,8 +78,9 @@ class CameraLight:
         offset: position of the light in the camera frame, in reference distances, [3].
         shoulder: s, not negative, scalar.
         reference_distance: in world units; not learned.
-        specular: m, not negative, scalar; 0 is a surface without highlights.
-        roughness: rho, at most one, scalar.
+        specular: m, not negative, scalar; 0 is a surface without highlights, where the kernels give it no
+            gradient.
+        roughness: rho, scalar; held between `ROUGHNESS_MIN` and 1.
     """
 
     exposure: Float[Tensor, "c 3"]
@@ -129,8 +131,7 @@ def lit_colors(
         light: a row of `CameraLight.packed`.
     """
     signal = albedo * light_gain(points, normals, light)[:, None]
-    if bool(light[11] != 0):
-        signal = signal + specular_gain(points, normals, light)[:, None]
+    signal = signal + specular_gain(points, normals, light)[:, None]
     return apply_response(light[:3] * signal, light[10])
 
 
@@ -155,8 +156,8 @@ def specular_gain(
 ) -> Float[Tensor, "*b"]:
     """What highlights add to the signal of a surface of any albedo, at unit exposure."""
     offset, square = _from_lamp(points, light)
-    squared_roughness = light[12].clamp_min(ROUGHNESS_MIN).square()
-    squared_sine = 1 - (normals * offset).sum(-1).square() / square
+    squared_roughness = light[12].clamp(ROUGHNESS_MIN, 1).square()
+    squared_sine = (1 - (normals * offset).sum(-1).square() / square).clamp_min(0)
     lobe = squared_roughness / (squared_roughness + (1 - squared_roughness) * squared_sine)
     arriving = torch.exp2(_log_arriving(offset, square, light).clamp(-LOG2_GAIN_MAX, LOG2_GAIN_MAX))
     return light[11] * lobe.square() * arriving

@@ -27,7 +27,8 @@ def bake_light(scene: Scene, *, distance: float | None = None, exposure: float =
     viewer's camera does afterwards. The gain g of the light is then the same for all, and the colour of
     degree 0, a, becomes :math:`I(g a)` with the camera's response I. Higher degrees are multiplied by
     :math:`g I'(g a)`, the slope of the response there: exact while the response is linear, of first order
-    where it is not. What a viewer cannot show any more is the fall-off with distance and angle.
+    where it is not. What a viewer cannot show any more is the fall-off with distance and angle;
+    there are no highlights.
 
     Args:
         scene: with or without light; without one nothing but `exposure` is applied.
@@ -53,10 +54,10 @@ def bake_light(scene: Scene, *, distance: float | None = None, exposure: float =
 def bake_recorded_light(scene: Scene, cameras: Cameras, *, exposure: float = 1.0) -> Gaussians:
     """The Gaussians with the light that fell on them, on average, when these cameras saw them.
 
-    The gain of each Gaussian is the mean over the views, weighted by the largest blending weight it has in
-    each. Seen from where the recording was made it looks like the recording; where a viewer's camera comes
-    nearer than that, or turns, the brightness does not follow. Gaussians that no view shows take the gain of
-    the nearest camera, as if they faced it.
+    The gain of each Gaussian, and what highlights add, are means over the views, weighted by the largest
+    blending weight it has in each. Seen from where the recording was made it looks like the recording; where
+    a viewer's camera comes nearer than that, or turns, the brightness does not follow. Gaussians that no view
+    shows take the gain of the nearest camera, as if they faced it.
 
     Args:
         scene: with or without light.

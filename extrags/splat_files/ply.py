@@ -15,7 +15,7 @@ import torch
 
 from extrags.errors import SourceError
 from extrags.gaussians import Gaussians
-from extrags.illumination import NearFieldLight
+from extrags.illumination import INITIAL_ROUGHNESS, NearFieldLight
 from extrags.scene import Scene
 
 __all__ = ["read_ply_scene", "write_ply_scene"]
@@ -76,7 +76,7 @@ _SHAPES: dict[str, tuple[int, ...] | None] = {
     "log_roughness": (),
 }
 """Parameters of the light, and how many numbers each is; None: any, one after the other."""
-_LATER = {"specular": 0.0, "log_roughness": 0.0}
+_LATER = {"specular": 0.0, "log_roughness": math.log(INITIAL_ROUGHNESS)}
 """What files of before there were highlights leave out, and what it was then."""
 
 
@@ -109,9 +109,9 @@ def _light(text: bytes, path: Path) -> NearFieldLight:
             field="extrags_light.reference_distance",
         )
     for name, value in strengths.items():
-        if not math.isfinite(value):
+        if not (math.isfinite(value) and value >= 0):
             raise SourceError(
-                f"the light's {name} is {value:g}, expected a finite number",
+                f"the light's {name} is {value:g}, expected a number from 0 on",
                 file=path,
                 field=f"extrags_light.{name}",
             )

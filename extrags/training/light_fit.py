@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
-from extrags.raster.light import ROW_LENGTH
+from extrags.raster.light import ROUGHNESS_MIN, ROW_LENGTH
 
-__all__ = ["DenseAdam", "LightFit", "learned_parameters", "learning_rate"]
+__all__ = ["LOG_ROUGHNESS_MIN", "DenseAdam", "LightFit", "learned_parameters", "learning_rate"]
 
 COMMON = (
     "log_softening",
@@ -26,6 +26,9 @@ COMMON = (
     "log_roughness",
 )
 """Parameters all cameras share, in the order of `CameraLight.packed`; the exposure comes before them."""
+
+
+LOG_ROUGHNESS_MIN = math.log(ROUGHNESS_MIN)
 
 
 def learned_parameters(config: LightConfig) -> list[str]:
@@ -171,6 +174,9 @@ class LightFit:
         """
         if self._any_free:
             self._adam.step(self.common_gradient(gradient), rate_share)
+            # Beyond its bounds a roughness has no gradient that would bring it back.
+            at = self._slots["log_roughness"].begin
+            self._common[at] = min(max(self._common[at], LOG_ROUGHNESS_MIN), 0.0)
         if self._config.exposure and self._frame is not None:
             self._exposure_adam.step(self.exposure_gradient(gradient), rate_share)
 

@@ -20,7 +20,7 @@ from extrags.raster.direct import DirectStep, Target
 from extrags.raster.loss import depth_loss
 from extrags.scene import Scene
 from extrags.training.density import DensityStrategy
-from extrags.training.light_fit import LightFit, learned_parameters, learning_rate
+from extrags.training.light_fit import LOG_ROUGHNESS_MIN, LightFit, learned_parameters, learning_rate
 from extrags.training.schedule import Schedule
 from extrags.training.views import View
 
@@ -152,6 +152,9 @@ class AutogradStep:
                 group["lr"] = share * group["initial_lr"]
             self._light_adam.step()
             self._light_adam.zero_grad(set_to_none=True)
+            assert self.light is not None
+            with torch.no_grad():
+                self.light.log_roughness.clamp_(LOG_ROUGHNESS_MIN, 0.0)
 
 
 class NativeStep:

@@ -45,7 +45,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "no response": {"light": {"response": False}},
     "no highlights": {"light": {"specular": False}},
     "with offset": {"light": {"offset": True}},
-    "fall-off only": {"light": {"spread": False, "cosine": False, "response": False}},
+    "fall-off only": {"light": {"spread": False, "cosine": False, "response": False, "specular": False}},
     "no light": {"light": {"enabled": False}},
     "round start": {"thickness": 1.0},
     "no depth": {"depth_weight": 0.0},
@@ -114,6 +114,8 @@ def recovered(scene: Scene) -> dict[str, float]:
         "spread": float(light.spread),
         "cosine": float(light.cosine),
         "shoulder": float(light.log_shoulder.exp()),
+        "specular": float(light.log_specular.exp()),
+        "roughness": float(light.log_roughness.exp()),
     }
 
 

@@ -74,7 +74,9 @@ class TestNearFieldLight:
         albedo = torch.tensor([[0.2, 0.4, 0.6], [0.9, 0.5, 0.1]])
         points = torch.tensor([[4.0, -3.0, 20.0], [0.0, 10.0, 60.0]])
         normals = torch.nn.functional.normalize(torch.tensor([[0.3, 0.2, -1.0], [0.0, -1.0, 0.3]]), dim=-1)
-        seen = start.apply_response(albedo * start.gain(points, normals)[:, None])
+        highlights = start.specular_gain(points, normals)
+        assert float(highlights.max()) > 1e-3
+        seen = start.apply_response(albedo * start.gain(points, normals)[:, None] + highlights[:, None])
         torch.testing.assert_close(start.albedo(seen, points, normals), albedo)
 
     def test_falloff_is_the_gain_of_surfaces_that_face_the_lens(self) -> None:

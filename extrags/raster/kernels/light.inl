@@ -30,10 +30,10 @@ struct Lit {
   Vec lobe, lobe_gain;  // its shape, 1 at its peak; what a mirror of full strength adds to the albedo
 };
 
-// Its square, held from below
+// Its square, held between the bound and one, where the lobe is the same in all directions
 EXTRAGS_INLINE float squared_roughness(const CameraLight& light) {
   const float held = light.roughness > kRoughnessMin ? light.roughness : kRoughnessMin;
-  return held * held;
+  return held < 1.f ? held * held : 1.f;
 }
 
 static __attribute__((noinline)) void illuminate(const View* view, const Projected& p, Lit& l) {
@@ -77,7 +77,7 @@ static __attribute__((noinline)) void illuminate(const View* view, const Project
   l.gain = exp2(min(max(log_gain, Vec(-kLogGainMax)), Vec(kLogGainMax)));
   if (light.specular == 0.f) return;
   const float squared = squared_roughness(light);
-  l.missed = one - l.squared_cosine;
+  l.missed = max(one - l.squared_cosine, Vec(0.f));
   l.inverse_width = one / fma(l.missed, Vec(1.f - squared), Vec(squared));
   const Vec root = Vec(squared) * l.inverse_width;
   l.lobe = root * root;
@@ -124,7 +124,7 @@ static __attribute__((noinline)) void illuminate_backward(const View* view, cons
     const float squared = squared_roughness(light);
     const Vec v_specular = v_lobe_gain * l.lobe_gain, v_log_lobe = v_specular * Vec(light.specular);
     v_light[11] = v_light[11] + v_specular;
-    if (light.roughness > kRoughnessMin) {
+    if (light.roughness > kRoughnessMin && light.roughness < 1.f) {
       // Of the logarithm of the lobe: 2 missed / (squared (squared + missed (1 - squared)))
       const Vec slope = l.missed * l.inverse_width * Vec(4.f * light.roughness / squared);
       v_light[12] = fma(v_log_lobe, slope, v_light[12]);

@@ -298,8 +298,15 @@ def _crude_gaussians(views: ReferenceViews, generator: np.random.Generator) -> G
     )
     falloff = views.transfer.falloff(*seen).numpy()
     signal = views.transfer.invert_response(torch.from_numpy(packed[chosen, :3])).numpy()
+    signal = signal / views.exposure.numpy()[view, None]
+    if views.transfer.light is not None:
+        turned = views.cameras.world_from_camera[view, :3, :3]
+        in_camera = (
+            torch.from_numpy(np.einsum("nji,nj->ni", turned, values).astype(np.float32))
+            for values in (offsets, normals)
+        )
+        signal = (signal - views.transfer.light.specular_gain(*in_camera).detach().numpy()[:, None]).clip(0)
     albedo = signal / np.maximum(falloff, MIN_GAIN)[:, None]
-    albedo = albedo / views.exposure.numpy()[view, None]
     # Without a light the fall-off cannot be divided out: the colour stays as it was seen.
     colors = albedo if views.transfer.light is not None else packed[chosen, :3]
     # Standard deviation of a Gaussian that covers the area of one point.

@@ -25,6 +25,8 @@ LIGHT = CameraLight(
     torch.tensor([0.1, -0.2, 0.05]),
     torch.tensor(0.2),
     1.0,
+    torch.tensor(0.3),
+    torch.tensor(0.4),
 )
 
 

@@ -215,6 +215,23 @@ class TestRestoredShares:
         # Of independent errors the weights are the inverse squares.
         assert better.known == pytest.approx(0.1 * 0.10**2 / (0.1 * 0.10**2 + 0.09**2), abs=0.05)
 
+    @pytest.mark.parametrize(("certainty", "expected"), [(0.0, 0.6), (0.25, 0.5), (1.0, 0.2)])
+    def test_invented_pixels_follow_as_far_as_known_ones_decide(
+        self,
+        tube: Tube,
+        renders: RenderedViews,
+        certainty: float,
+        expected: float,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        told = {"known": (0.4, certainty), "invented": (0.2, 1.0)}
+        monkeypatch.setattr(restored_renders_module._Errors, "share", lambda _self, kind, _share: told[kind])
+        shown = renders.rgb.clip(0, 1)
+        found = restored_shares([(tube.scene, renders, tube.sequence)], Shifted(shown, 0.0), CONFIG)
+        assert found is not None
+        assert found.known == (0.4 if certainty else RESTORED_SHARE)
+        assert found.invented == pytest.approx(expected)
+
     def test_blending_and_filling_needs_none(self, tube: Tube, renders: RenderedViews) -> None:
         assert restored_shares([(tube.scene, renders, tube.sequence)], ClassicalEnhancer(), CONFIG) is None
 

@@ -56,6 +56,17 @@ def test_the_recorded_light_looks_like_the_recording(tube: Tube) -> None:
     assert recorded > 20
 
 
+def test_highlights_are_baked_as_the_views_saw_them_on_average() -> None:
+    scene, camera = wall(20.0)
+    assert scene.light is not None
+    light = replace(scene.light, log_specular=torch.tensor(0.3).log(), log_roughness=torch.tensor(0.6).log())
+    shiny = Scene(scene.gaussians, light)
+    with_highlights = psnr(Scene(bake_recorded_light(shiny, camera)), shiny, camera)
+    without = psnr(Scene(bake_recorded_light(scene, camera)), shiny, camera)
+    assert with_highlights > 35
+    assert with_highlights > without + 10
+
+
 def test_what_no_view_shows_takes_the_nearest_camera(tube: Tube) -> None:
     """Half of the tube lies behind the only camera: its light is that of a lamp at its distance."""
     train = tube.sequence.training_cameras[:1]

@@ -117,6 +117,7 @@ class TestLight:
             ("reference_distance", "far", "extrags_light"),
             ("colour", 1.0, "extrags_light"),
             ("specular", float("inf"), "extrags_light.specular"),
+            ("specular", -0.1, "extrags_light.specular"),
         ],
     )
     def test_a_wrong_light_is_refused(

@@ -97,7 +97,7 @@ def test_switched_off_there_are_none(glossy: EndoscopicSequence) -> None:
     assert float(light.log_specular) == -math.inf
 
 
-def test_a_matt_surface_stays_matt(glossy: EndoscopicSequence) -> None:
+def test_a_matt_surface_loses_little(glossy: EndoscopicSequence) -> None:
     light = NearFieldLight(
         torch.tensor(-2.0), torch.tensor(0.8).log(), torch.zeros(FRAMES), 20.0, cosine=torch.tensor(0.8)
     )

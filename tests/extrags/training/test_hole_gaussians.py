@@ -159,7 +159,12 @@ class TestHoleGaussians:
         holes[2] = False
         blind = replace(sequence, mask=np.zeros_like(sequence.mask))
         light = replace(
-            tube_light(), spread=torch.tensor(0.4), cosine=torch.tensor(0.7), log_shoulder=torch.tensor(-0.3)
+            tube_light(),
+            spread=torch.tensor(0.4),
+            cosine=torch.tensor(0.7),
+            log_shoulder=torch.tensor(-0.3),
+            log_specular=torch.tensor(0.05).log(),
+            log_roughness=torch.tensor(0.3).log(),
         )
         # A slanted plane n x = d before the first camera: normals and depths are known.
         n, d = np.array([0.3, -0.2, 0.9]) / math.sqrt(0.94), 14.0
@@ -183,7 +188,11 @@ class TestHoleGaussians:
         axis = np.maximum(points[:, 2] / np.sqrt(square), 0.1)
         gain = ((1 + c) / (square + c)) ** e * axis**0.4 * facing**0.35
         assert gain.min() > finetuning.MIN_GAIN
-        signal = albedo * gain[:, None]
+        # Highlights are part of the target, not of the albedo.
+        lobe = (0.09 / (0.09 + 0.91 * (1 - (points @ n) ** 2 / square))) ** 2
+        highlight = 0.05 * lobe * ((1 + c) / (square + c)) ** e * axis**0.4
+        assert highlight.max() > 0.01
+        signal = albedo * gain[:, None] + highlight[:, None]
         image = (1 + shoulder) * signal / (1 + shoulder * signal)
         tolerance = 100 * np.finfo(np.float32).eps
         np.testing.assert_allclose(image, pseudo.target[0][row, column], rtol=tolerance, atol=tolerance)

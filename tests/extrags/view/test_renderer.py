@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,6 +57,9 @@ def test_lamp_and_exposure_multiply(scene: Scene, camera: Cameras) -> None:
 
 def test_without_fall_off_everything_is_lit_alike(scene: Scene, camera: Cameras) -> None:
     """Albedo under the camera's response, which is linear here."""
+    assert scene.light is not None
+    shiny = replace(scene.light, log_specular=torch.tensor(0.5).log(), log_roughness=torch.tensor(0.9).log())
+    scene = Scene(scene.gaussians, shiny)
     made = SceneRenderer(scene).render(camera, ViewSettings(falloff=False))
     albedo = rendered(Scene(scene.gaussians), camera)
     assert np.abs(made.astype(int) - albedo.astype(int)).max() <= 1

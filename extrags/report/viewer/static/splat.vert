@@ -78,8 +78,8 @@ vec3 under_light(vec3 a, vec3 mean, vec3 normal) {
   float facing = log2((cosine * cosine / square + 0.04) / 1.04);
   float arriving = falloff.y * fall + falloff.z * axis;
   float gain = exp2(clamp(arriving + 0.5 * falloff.w * facing, -40.0, 40.0));
-  float rough = max(gloss.y, 0.02) * max(gloss.y, 0.02);
-  float lobe = rough / (rough + (1.0 - rough) * (1.0 - cosine * cosine / square));
+  float rough = pow(clamp(gloss.y, 0.02, 1.0), 2.0);
+  float lobe = rough / (rough + (1.0 - rough) * max(1.0 - cosine * cosine / square, 0.0));
   float shine = gloss.x * lobe * lobe * exp2(clamp(arriving, -40.0, 40.0));
   vec3 signal = exposure * (a * gain + shine);
   return (1.0 + shoulder) * signal / (1.0 + shoulder * signal);

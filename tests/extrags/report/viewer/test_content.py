@@ -54,6 +54,9 @@ def test_scenes_in_the_page_are_those_of_the_run(html: str, drawn: ReportInputs)
         assert set(levels) == {"observed", "directions", "uncertainty", "expected_error"}
         assert header["light"]["reference"] == 12.0
         assert np.allclose(header["light"]["offset"], [0.1, -0.05, 0])
+        assert header["light"]["shoulder"] == pytest.approx(1)
+        assert header["light"]["specular"] == pytest.approx(0.1)
+        assert header["light"]["roughness"] == pytest.approx(0.2)
 
 
 def test_cameras_have_the_exposures_of_the_evaluation(html: str, drawn: ReportInputs) -> None:
