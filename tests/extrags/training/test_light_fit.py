@@ -6,7 +6,7 @@ import torch
 
 from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
-from extrags.training.light_fit import DenseAdam, LightFit
+from extrags.training.light_fit import COMMON, LOG_ROUGHNESS_MIN, DenseAdam, LightFit
 
 EVERYTHING = LightConfig(offset=True)
 
@@ -39,17 +39,7 @@ def test_gradients_are_those_of_autograd() -> None:
     prior = EVERYTHING.exposure_prior * light.log_exposure.square().mean()
     (row @ torch.from_numpy(gradient) + prior).backward()
     assert fit.prior() == pytest.approx(float(prior.detach()), rel=1e-6)
-    names = (
-        "log_softening",
-        "log_exponent",
-        "spread",
-        "cosine",
-        "offset",
-        "log_shoulder",
-        "log_specular",
-        "log_roughness",
-    )
-    expected = np.concatenate([values[name].grad.reshape(-1).numpy() for name in names])  # type: ignore[union-attr]
+    expected = np.concatenate([values[name].grad.reshape(-1).numpy() for name in COMMON])  # type: ignore[union-attr]
     np.testing.assert_allclose(fit.common_gradient(gradient), expected, rtol=1e-5)
     exposure = values["log_exposure"].grad
     assert exposure is not None
@@ -100,3 +90,13 @@ def test_dense_adam_is_that_of_torch() -> None:
         own.step(gradient)
         expected.step()
     np.testing.assert_allclose(values, leaf.detach().numpy(), rtol=1e-5, atol=1e-6)
+
+
+def test_a_roughness_does_not_leave_its_bounds() -> None:
+    """Beyond them it would have no gradient that brings it back."""
+    for slope, bound in ((1.0, LOG_ROUGHNESS_MIN), (-1.0, 0.0)):
+        fit = LightFit(_light(), LightConfig(specular_learning_rate=0.5))
+        for _ in range(20):
+            fit.row(0)
+            fit.step(np.full(14, slope, dtype=np.float32))
+        assert float(fit.light.log_roughness) == pytest.approx(bound)
