@@ -15,7 +15,11 @@ from extrags.restoration.diffusion.embedded import EmbeddedEnhancer
 from extrags.restoration.diffusion.network import build_network
 from extrags.restoration.diffusion.pretraining import PretrainingConfig, _mixed_sampler, pretrain
 from extrags.restoration.training_data.parallel import drawn_in_processes
-from extrags.restoration.training_data.pretraining_scenes import PretrainingScene, make_pretraining_scene
+from extrags.restoration.training_data.pretraining_scenes import (
+    PRETRAINING_DATA_VERSION,
+    PretrainingScene,
+    make_pretraining_scene,
+)
 from extrags.view_synthesis.conditioning import CONDITION_CHANNELS, INVENTED_CHANNELS, Layers
 from extrags.view_synthesis.gamut import Gamut
 from extrags.view_synthesis.references import LightTransfer
@@ -149,7 +153,8 @@ class TestPretrainingScene:
         monkeypatch.setattr(module, 1)
         scene.save(tmp_path / "old.safetensors")
         monkeypatch.undo()
-        with pytest.raises(WeightsError, match=r"old\.safetensors: .* version 1, expected 6"):
+        expected = rf"old\.safetensors: .* version 1, expected {PRETRAINING_DATA_VERSION};"
+        with pytest.raises(WeightsError, match=expected):
             PretrainingScene.load(tmp_path / "old.safetensors")
 
     def test_a_foreign_file_is_named(self, tmp_path: Path) -> None:
