@@ -60,8 +60,8 @@ MOSTLY = 0.5
 invented, all others how much where the scene knows the surface."""
 TOLERATED_LOSS_DB = 2.0
 """Left-out frames lie near the path, where a scene knows best: on two phantoms held-out views gained a
-decibel where left-out frames told of neither gain nor loss, and still half of one where they told of a loss
-of two."""
+decibel where left-out frames told of neither gain nor loss, and whole views .2 of one where they told of a
+loss of 2.2."""
 CERTAIN_LOSS_DB = 3.0
 """From here on left-out frames decide alone; between both the shares pass gradually, since a seed changes
 what such frames tell by some tenths of a decibel."""

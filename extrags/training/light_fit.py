@@ -26,9 +26,8 @@ COMMON = (
     "log_roughness",
 )
 """Parameters all cameras share, in the order of `CameraLight.packed`; the exposure comes before them."""
-
-
 LOG_ROUGHNESS_MIN = math.log(ROUGHNESS_MIN)
+"""A learned roughness is kept between this and one: beyond, it has no gradient that would bring it back."""
 
 
 def learned_parameters(config: LightConfig) -> list[str]:
@@ -174,7 +173,7 @@ class LightFit:
         """
         if self._any_free:
             self._adam.step(self.common_gradient(gradient), rate_share)
-            # Beyond its bounds a roughness has no gradient that would bring it back.
+        if self._config.specular:
             at = self._slots["log_roughness"].begin
             self._common[at] = min(max(self._common[at], LOG_ROUGHNESS_MIN), 0.0)
         if self._config.exposure and self._frame is not None:

@@ -152,9 +152,9 @@ class AutogradStep:
                 group["lr"] = share * group["initial_lr"]
             self._light_adam.step()
             self._light_adam.zero_grad(set_to_none=True)
-            assert self.light is not None
-            with torch.no_grad():
-                self.light.log_roughness.clamp_(LOG_ROUGHNESS_MIN, 0.0)
+            if self.light is not None and self._schedule.light.specular:
+                with torch.no_grad():
+                    self.light.log_roughness.clamp_(LOG_ROUGHNESS_MIN, 0.0)
 
 
 class NativeStep:

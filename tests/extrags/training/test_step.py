@@ -116,8 +116,7 @@ class TestOneStep:
             assert expected.light is not None
             row = native_step.direct.light_gradient
             common = native_step.light_fit.common_gradient(row)
-            names = COMMON
-            flat = [expected.light.parameters()[name].grad for name in names]
+            flat = [expected.light.parameters()[name].grad for name in COMMON]
             joined = torch.cat([value.reshape(-1) for value in flat if value is not None])
             assert _relative(torch.from_numpy(common), joined) < 1e-5
             if view.frame is not None:
