@@ -154,7 +154,15 @@ def light_gain(
 def specular_gain(
     points: Float[Tensor, "*b 3"], normals: Float[Tensor, "*b 3"], light: Float[Tensor, "14"]
 ) -> Float[Tensor, "*b"]:
-    """What highlights add to the signal of a surface of any albedo, at unit exposure."""
+    """What highlights add to the signal of a surface of any albedo, at unit exposure.
+
+    Args:
+        points: in the camera frame, in world units.
+        normals: unit normals in the camera frame, of either sign.
+        light: a row of `CameraLight.packed`.
+
+    Source: GGX, see the module docstring.
+    """
     offset, square = _from_lamp(points, light)
     squared_roughness = light[12].clamp(ROUGHNESS_MIN, 1).square()
     squared_sine = (1 - (normals * offset).sum(-1).square() / square).clamp_min(0)
