@@ -161,7 +161,7 @@ def specular_gain(
         normals: unit normals in the camera frame, of either sign.
         light: a row of `CameraLight.packed`.
 
-    Source: GGX, see the module docstring.
+    Source: GGX after Walter et al., EGSR 2007.
     """
     offset, square = _from_lamp(points, light)
     squared_roughness = light[12].clamp(ROUGHNESS_MIN, 1).square()
