@@ -118,7 +118,7 @@ def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=19, ignore=("given",))
+@stage("enhance-train", version=20, ignore=("given",))
 def train(
     slot: Slot,
     scene: Ref,
@@ -164,7 +164,7 @@ def train(
     train_enhancer(shown, frames, config, coarse).save(slot.path / RESTORER)
 
 
-@stage("enhance-keyframes", version=6)
+@stage("enhance-keyframes", version=7)
 def keyframes(
     slot: Slot, scene: Ref, sequence: Ref, explore: Ref, restorer: Ref, config: EnhanceConfig
 ) -> None:

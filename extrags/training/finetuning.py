@@ -23,7 +23,7 @@ from extrags.training.filling import FillingStep, filling_schedule
 from extrags.training.frame_weights import FrameWeights, weighted_views
 from extrags.training.optimise import TrainingResult, optimise
 from extrags.training.reconstruction import coarse_schedule, scene_extent, smallest_footprint
-from extrags.training.starting import median_depth, surface_normals, thin_out
+from extrags.training.starting import LEAST_COLOR, median_depth, surface_normals, thin_out
 from extrags.training.views import View, epochs, in_steps, real_views
 
 __all__ = ["finetune", "hole_gaussians", "virtual_steps", "virtual_views"]
@@ -304,7 +304,7 @@ def hole_gaussians(
         return None
     return Gaussians.from_points(
         points,
-        rgb.clip(0, None),
+        rgb.clip(LEAST_COLOR, None),
         radius,
         opacity=0.3,
         sh_degree=scene.gaussians.sh_degree,

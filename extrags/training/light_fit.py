@@ -13,7 +13,7 @@ from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
 from extrags.raster.light import ROUGHNESS_MIN, ROW_LENGTH
 
-__all__ = ["LOG_ROUGHNESS_MIN", "DenseAdam", "LightFit", "learned_parameters", "learning_rate"]
+__all__ = ["LOG_ROUGHNESS_BOUNDS", "DenseAdam", "LightFit", "learned_parameters", "learning_rate"]
 
 COMMON = (
     "log_softening",
@@ -26,8 +26,9 @@ COMMON = (
     "log_roughness",
 )
 """Parameters all cameras share, in the order of `CameraLight.packed`; the exposure comes before them."""
-LOG_ROUGHNESS_MIN = math.log(ROUGHNESS_MIN)
-"""A learned roughness is kept between this and one: beyond, it has no gradient that would bring it back."""
+LOG_ROUGHNESS_BOUNDS = (math.log(ROUGHNESS_MIN) + 1e-3, -1e-3)
+"""A learned roughness is kept inside those of the lobe: at them, and beyond, it has no gradient that would bring
+it back."""
 
 
 def learned_parameters(config: LightConfig) -> list[str]:
@@ -175,7 +176,7 @@ class LightFit:
             self._adam.step(self.common_gradient(gradient), rate_share)
         if self._config.specular:
             at = self._slots["log_roughness"].begin
-            self._common[at] = min(max(self._common[at], LOG_ROUGHNESS_MIN), 0.0)
+            self._common[at] = np.clip(self._common[at], *LOG_ROUGHNESS_BOUNDS)
         if self._config.exposure and self._frame is not None:
             self._exposure_adam.step(self.exposure_gradient(gradient), rate_share)
 

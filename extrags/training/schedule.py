@@ -28,7 +28,7 @@ class Schedule:
     depth_weight: float
     depth_weight_final_share: float
     depth_scale: float
-    sh_every: int
+    sh_every: int | None
     seed: int
     photometric_weight: float = 1.0
     """Factor of the L1 and SSIM terms of every view; the depth term is beside it."""
@@ -63,7 +63,11 @@ class Schedule:
 
     def resumed(self, *, seed: int) -> Schedule:
         """The schedule for a scene that exists already: all harmonics are active from the first step."""
-        return replace(self, sh_every=1, seed=seed)
+        return replace(self, sh_every=None, seed=seed)
+
+    def sh_degree_at(self, iteration: int, highest: int) -> int:
+        """Degree of the harmonics in use, for a scene with harmonics up to `highest`."""
+        return highest if self.sh_every is None else min(iteration // self.sh_every, highest)
 
     def depth_weight_at(self, iteration: int) -> float:
         """Weight of the depth term, falling log-linearly."""

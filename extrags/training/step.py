@@ -20,7 +20,7 @@ from extrags.raster.direct import DirectStep, Target
 from extrags.raster.loss import depth_loss
 from extrags.scene import Scene
 from extrags.training.density import DensityStrategy
-from extrags.training.light_fit import LOG_ROUGHNESS_MIN, LightFit, learned_parameters, learning_rate
+from extrags.training.light_fit import LOG_ROUGHNESS_BOUNDS, LightFit, learned_parameters, learning_rate
 from extrags.training.schedule import Schedule
 from extrags.training.views import View
 
@@ -112,7 +112,7 @@ class AutogradStep:
         rendering = scene.render(
             view.camera,
             exposure=exposure,
-            sh_degree=iteration // schedule.sh_every,
+            sh_degree=schedule.sh_degree_at(iteration, scene.gaussians.sh_degree),
             viewmats=None if pose is None else pose[None],
             absgrad=density.needs_absgrad,
         )
@@ -154,7 +154,7 @@ class AutogradStep:
             self._light_adam.zero_grad(set_to_none=True)
             if self.light is not None and self._schedule.light.specular:
                 with torch.no_grad():
-                    self.light.log_roughness.clamp_(LOG_ROUGHNESS_MIN, 0.0)
+                    self.light.log_roughness.clamp_(*LOG_ROUGHNESS_BOUNDS)
 
 
 class NativeStep:
@@ -194,7 +194,7 @@ class NativeStep:
             target.viewmat[...] = viewmat
         loss = direct.run(
             target,
-            sh_degree=min(iteration // schedule.sh_every, self._sh_degree),
+            sh_degree=schedule.sh_degree_at(iteration, self._sh_degree),
             light=None if self.light_fit is None else self.light_fit.row(view.frame),
             dssim_weight=schedule.dssim_weight,
             photometric_weight=schedule.photometric_weight,

@@ -14,8 +14,16 @@ from extrags.config import CoarseConfig, DensifyConfig, LightConfig
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
+from extrags.raster import native_isa
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.training import reconstruct
+from extrags.training.density import DensityStrategy
+from extrags.training.filling import filling_schedule
+from extrags.training.optimise import optimise
+from extrags.training.reconstruction import coarse_schedule
+from extrags.training.starting import LEAST_COLOR, starting_gaussians
+from extrags.training.step import AutogradStep, NativeStep
+from extrags.training.views import View, real_views
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 8
 STRENGTH, ROUGHNESS = 0.4, 0.25
@@ -35,18 +43,22 @@ def wavy_wall() -> Gaussians:
     )
 
 
-@pytest.fixture(scope="module")
-def glossy() -> EndoscopicSequence:
-    """Photographs from a row of cameras, of which two of the middle are held out."""
-    light = NearFieldLight(
+def glossy_light(frames: int = FRAMES) -> NearFieldLight:
+    return NearFieldLight(
         torch.tensor(-2.0),
         torch.tensor(0.8).log(),
-        torch.zeros(FRAMES),
+        torch.zeros(frames),
         20.0,
         cosine=torch.tensor(0.8),
         log_specular=torch.tensor(STRENGTH).log(),
         log_roughness=torch.tensor(ROUGHNESS).log(),
     )
+
+
+@pytest.fixture(scope="module")
+def glossy() -> EndoscopicSequence:
+    """Photographs from a row of cameras, of which two of the middle are held out."""
+    light = glossy_light()
     centres = [np.array([2.0 * frame - 7.0, 1.5 * math.sin(frame), 0.0]) for frame in range(FRAMES)]
     poses = np.stack([look_at(c, c * [0.6, 0.6, 1] + [0, 0, 20], np.array([0, -1.0, 0])) for c in centres])
     K = np.tile([[45.0, 0, WIDTH / 2], [0, 45.0, HEIGHT / 2], [0, 0, 1]], (FRAMES, 1, 1))
@@ -109,3 +121,53 @@ def test_a_matt_surface_loses_little(glossy: EndoscopicSequence) -> None:
     start = NearFieldLight.initial(1, 20.0)
     assert float(with_highlights.light.log_specular) < float(start.log_specular)
     assert held_out_psnr(with_highlights, matt) > max(45, held_out_psnr(without, matt) - 1)
+
+
+@pytest.mark.parametrize("log_roughness", [0.0, 1.0, math.log(0.02), math.log(0.01)])
+@pytest.mark.parametrize("step_kind", [NativeStep, AutogradStep])
+def test_a_roughness_at_a_bound_comes_back(
+    glossy: EndoscopicSequence, step_kind: type[NativeStep | AutogradStep], log_roughness: float
+) -> None:
+    """Where the lobe is held it has no gradient: the bounds of what is learned lie inside."""
+    if step_kind is NativeStep and native_isa() is None:
+        pytest.skip("the native kernels are not built")
+    config = settings(specular=True)
+    config = config.model_copy(
+        update={"light": config.light.model_copy(update={"specular_learning_rate": 0.04})}
+    )
+    light = replace(glossy_light(len(glossy.train)), log_roughness=torch.tensor(log_roughness))
+    step = step_kind(Scene(wavy_wall(), light), coarse_schedule(config, 20.0, 20.0, "coarse"))
+    views = real_views(glossy, glossy.train)
+    for iteration in range(8):
+        observation = step.differentiate(views[iteration % len(views)], iteration, DensityStrategy())
+        step.update(observation, iteration)
+    assert step.light is not None
+    found = float(step.light.log_roughness.detach())
+    assert found < -0.1 if log_roughness >= 0 else found > math.log(0.02) + 0.1
+
+
+class TestStart:
+    def test_takes_no_highlight_for_tissue(self, glossy: EndoscopicSequence) -> None:
+        """With the light known, a start from depth is the wall's own colours, at its highlights too."""
+        light = glossy_light(len(glossy.train))
+        start = starting_gaussians(glossy, glossy.train, 1500, light=light, thickness=0.1)
+        found = start.sh0[:, 0] * 0.28209479177387814 + 0.5
+        wall = wavy_wall()
+        nearest = torch.cdist(start.means, wall.means).argmin(dim=1)
+        error = found - (wall.sh0[nearest, 0] * 0.28209479177387814 + 0.5)
+        # Of colours of 0.15 to 0.55; where highlights are taken for tissue and slopes for shade, it is 0.07.
+        assert float(error.abs().mean()) < 0.04
+
+    def test_a_color_is_never_zero_and_so_can_be_learned(self, glossy: EndoscopicSequence) -> None:
+        """A highlight believed stronger than a pixel takes all of a channel."""
+        light = replace(glossy_light(len(glossy.train)), log_specular=torch.tensor(2.0).log())
+        start = starting_gaussians(glossy, glossy.train, 1500, light=light, thickness=0.1)
+        dark = start.sh0[:, 0] * 0.28209479177387814 + 0.5 < LEAST_COLOR * 1.001
+        assert 0.01 < float(dark.any(dim=1).float().mean()) < 0.9
+        views: list[View] = real_views(glossy, glossy.train)
+        schedule = filling_schedule(coarse_schedule(settings(specular=True), 20.0, 20.0, "coarse"))
+        schedule = replace(schedule, iterations=30)
+        scene = Scene(start, glossy_light(len(glossy.train)))
+        learned = optimise(scene, lambda i: views[i % len(views)], schedule).scene.gaussians.sh0[:, 0]
+        moved = (learned - start.sh0[:, 0]).abs() > 1e-4
+        assert float(moved[dark].float().mean()) > 0.9

@@ -8,7 +8,7 @@ import torch
 
 from extrags.config import LightConfig
 from extrags.illumination import NearFieldLight
-from extrags.training.light_fit import COMMON, LOG_ROUGHNESS_MIN, DenseAdam, LightFit
+from extrags.training.light_fit import COMMON, LOG_ROUGHNESS_BOUNDS, DenseAdam, LightFit
 
 EVERYTHING = LightConfig(offset=True)
 
@@ -105,7 +105,7 @@ def test_a_roughness_that_is_not_learned_stays_where_it_is() -> None:
 
 def test_a_roughness_does_not_leave_its_bounds() -> None:
     """Beyond them it would have no gradient that brings it back."""
-    for slope, bound in ((1.0, LOG_ROUGHNESS_MIN), (-1.0, 0.0)):
+    for slope, bound in zip((1.0, -1.0), LOG_ROUGHNESS_BOUNDS, strict=True):
         fit = LightFit(_light(), LightConfig(specular_learning_rate=0.5))
         for _ in range(20):
             fit.row(0)

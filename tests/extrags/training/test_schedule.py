@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,3 +67,13 @@ class TestDepthWeight:
         schedule = coarse_schedule(config, EXTENT, 20.0, "coarse")
         weights = [schedule.depth_weight_at(iteration) for iteration in (0, 500, 1000)]
         assert weights == pytest.approx([0.2, 0.1, 0.05])
+
+
+class TestHarmonics:
+    def test_their_degree_grows_with_the_iterations(self) -> None:
+        schedule = replace(schedule_with(None), sh_every=400)
+        assert [schedule.sh_degree_at(i, 3) for i in (0, 399, 400, 800, 1200, 5000)] == [0, 0, 1, 2, 3, 3]
+        assert schedule.sh_degree_at(1200, 1) == 1
+
+    def test_all_are_active_from_the_first_step_where_a_scene_exists(self) -> None:
+        assert schedule_with(None).resumed(seed=1).sh_degree_at(0, 3) == 3
