@@ -14,7 +14,7 @@ from torch import Tensor
 
 from extrags.config import EvaluateConfig, IouSet
 from extrags.errors import ShapeError, WeightsError
-from extrags.metrics.lpips import Lpips
+from extrags.metrics.lpips import MIN_SIDE_PX, Lpips
 from extrags.metrics.perceptual import perceptual_map
 from extrags.threads import in_threads
 
@@ -112,6 +112,19 @@ class PerceptualDifference:
             if config.lpips_weights is not None:
                 raise
             return cls(None, str(error))
+
+    def for_images(self, width: int, height: int) -> PerceptualDifference:
+        """The measure for images of a size: `perceptual_map`, with the reason, where they are too small for LPIPS.
+
+        Raises:
+            ShapeError: when they are, and it is raw.
+        """
+        if self.lpips is None or min(width, height) >= MIN_SIDE_PX:
+            return self
+        reason = f"LPIPS needs images of at least {MIN_SIDE_PX} px a side, these have {width} x {height}"
+        if self.raw:
+            raise ShapeError(f"enhance.pixel_confidence=raw is LPIPS itself: {reason}")
+        return PerceptualDifference(None, reason)
 
     @property
     def name(self) -> str:

@@ -212,6 +212,8 @@ def judge_finetuning(
             small = [cameras.at_most_width(settings.max_width) for cameras in trajectories]
             views = _restored(start, part, small, enhancer, enhance, settings.views, measure)
         arms.append((part, start, views))
+    if not arms:
+        return Judgement(1.0, "not judged: no training frame that can be left out has a valid pixel")
     brief = config.model_copy(
         update={"iterations": max(1, round(settings.iterations_share * config.iterations))}
     )
@@ -264,13 +266,17 @@ def _without_some_frames(
 ) -> Iterator[tuple[EndoscopicSequence, Int[np.ndarray, "m"]]]:
     """The sequence with splits that hold out some training frames, and their positions among these.
 
-    One split leaves out a share of the frames; where that makes fewer than `MIN_LEFT_OUT`, others follow.
+    One split leaves out a share of the frames; where that makes fewer than `MIN_LEFT_OUT`, others follow. Frames
+    without a valid pixel tell nothing: they are not among those left out.
     """
     folds = leave_out_folds(frames, every)
     # From the middle: the first fold would leave out the ends of the path, which nothing surrounds.
     count = 0
     for fold in sorted(range(len(folds)), key=lambda fold: (abs(fold - len(folds) // 2), -fold)):
         kept, left = folds[fold]
+        left = left[[bool(sequence.mask[frame].any()) for frame in left]]
+        if not len(left):
+            continue
         yield replace(sequence, split=Split("leave-out", kept, left)), np.flatnonzero(np.isin(frames, left))
         count += len(left)
         if count >= MIN_LEFT_OUT:

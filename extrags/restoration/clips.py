@@ -219,6 +219,7 @@ def make_pseudo_observations(
 
 def _pseudo_observation(clip: Clip, restoration: Restoration, measure: PerceptualDifference) -> PseudoViews:
     rendered = as_images(clip.layers.get("rendered").clamp(0, 1))
+    measure = measure.for_images(rendered.shape[2], rendered.shape[1])
     target, uncertainty = keep_known(rendered, restoration.rgb, as_planes(clip.layers.get("uncertainty")))
     depth = restoration.depth_mm
     if depth is None:

@@ -402,7 +402,9 @@ def _detail_of(rgb: Float[Tensor, "n 3 s s"], solid: Float[Tensor, "n 1 s s"]) -
 def _hashed(cell: Int[Tensor, "n 2"], axis: int, seed: int) -> Int[Tensor, "n"]:
     """A number for each cell of a plane's lattice that its neighbours say nothing about."""
     mask = 0x7FFFFFFF
-    mixed = (cell[:, 0] * 73856093) ^ (cell[:, 1] * 19349663) ^ ((axis + 1) * 83492791) ^ (seed * 2654435761)
+    # The seed's product in Python, where a large one does not overflow
+    constant = ((axis + 1) * 83492791) ^ ((seed * 2654435761) & mask)
+    mixed = (cell[:, 0] * 73856093) ^ (cell[:, 1] * 19349663) ^ constant
     for factor in (0x2C1B3C6D, 0x297A2D39):
         mixed = mixed & mask
         mixed = ((mixed >> 15) ^ mixed) * factor

@@ -93,6 +93,16 @@ class TestPixelConfidence:
         with pytest.raises(WeightsError, match=r"pixel_confidence=raw is LPIPS itself: no weights"):
             PerceptualDifference(None, "no weights", raw=True)
 
+    def test_images_too_small_for_lpips_are_compared_by_the_map(self, shared_data: Path) -> None:
+        weights = next((shared_data / "lpips_weights").glob("*alex*.npz"))
+        measure = PerceptualDifference.available(EvaluateConfig(lpips_weights=str(weights)))
+        assert measure.for_images(32, 40) is measure
+        small = measure.for_images(40, 31)
+        assert (small.name, small.lpips) == ("perceptual_map", None)
+        assert "at least 32 px a side, these have 40 x 31" in small.reason
+        with pytest.raises(ShapeError, match="pixel_confidence=raw is LPIPS itself"):
+            replace(measure, raw=True).for_images(31, 40)
+
     def test_a_named_file_must_work(self, tmp_path: Path) -> None:
         with pytest.raises(WeightsError):
             PerceptualDifference.available(EvaluateConfig(lpips_weights=str(tmp_path / "none.npz")))

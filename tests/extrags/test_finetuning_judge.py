@@ -217,6 +217,25 @@ def test_the_fewest_frames_that_can_be_judged(tube: Tube) -> None:
     assert np.isfinite(found.trials[0].gain_db)
 
 
+def test_frames_without_valid_pixels_do_not_judge(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(finetuning_judge, "MIN_LEFT_OUT", 1)
+    before = judged(tube, None).left_out
+    mask = tube.sequence.mask.copy()
+    mask[tube.sequence.train[list(before)]] = False
+    found = judged(replace(tube, sequence=replace(tube.sequence, mask=mask)), None)
+    assert len(found.left_out) > 0
+    assert not set(found.left_out) & set(before)
+    assert np.isfinite(found.trials[0].gain_db)
+    monkeypatch.setattr(
+        finetuning_judge,
+        "leave_out_folds",
+        lambda *_: [(tube.sequence.train, tube.sequence.train[list(before)])],
+    )
+    nothing = judged(replace(tube, sequence=replace(tube.sequence, mask=mask)), None)
+    assert (nothing.amount, nothing.trials) == (1.0, ())
+    assert nothing.reason.startswith("not judged: no training frame that can be left out")
+
+
 def test_off_or_too_few_frames_keep_everything(tube: Tube) -> None:
     off = judged(tube, None, FINETUNE.model_copy(update={"judge": JudgeConfig(enabled=False)}))
     assert (off.amount, off.trials) == (1.0, ())

@@ -88,6 +88,9 @@ def better_of_both(
             by which no error can be larger than expected.
     """
     chosen = validation_pairs(pairs)
+    if not bool((pairs.weight > 0).any()):
+        logger.warning("the restorer is not judged: no pair has a valid pixel")
+        return enhancer
     # By their means: a drawn view has texture of its own, which costs PSNR wherever it is right.
     means = restored_pairs(replace(enhancer, drawing=False), chosen or pairs, transfer)
     scores = scores_of([means], transfer)

@@ -98,10 +98,11 @@ def scores_of(restored: list[RestoredPairs], transfer: LightTransfer) -> dict[st
 
 
 def validation_pairs(pairs: Pairs) -> Pairs | None:
-    """Validation pairs; the leave-out ones alone where there are any. None where there are none at all."""
-    chosen = np.flatnonzero(pairs.validation & ~pairs.synthetic)
+    """Validation pairs with valid pixels; the leave-out ones alone where there are any. None where there are none."""
+    telling = pairs.validation & (pairs.weight > 0).any(dim=(1, 2, 3)).numpy()
+    chosen = np.flatnonzero(telling & ~pairs.synthetic)
     if len(chosen) == 0:
-        chosen = np.flatnonzero(pairs.validation)
+        chosen = np.flatnonzero(telling)
     return pairs.subset(chosen) if len(chosen) else None
 
 

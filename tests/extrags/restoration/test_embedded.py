@@ -294,6 +294,22 @@ class TestEmbedded:
         assert "on leave-out pairs of this scene" in provenance["reason"]
         assert provenance["judged"]["restored_db"] < provenance["judged"]["filled_db"]
 
+    def test_without_a_valid_pixel_it_is_not_judged(
+        self, trained: EmbeddedEnhancer, tube_pairs: Pairs, tube: Tube
+    ) -> None:
+        hidden = replace(tube_pairs, weight=torch.zeros_like(tube_pairs.weight))
+        assert validation_pairs(hidden) is None
+        assert better_of_both(trained, hidden, tube.references.transfer) is trained
+
+    def test_validation_pairs_have_valid_pixels(self, tube_pairs: Pairs) -> None:
+        chosen = np.flatnonzero(tube_pairs.validation)
+        weight = tube_pairs.weight.clone()
+        weight[chosen[0]] = 0
+        found, before = validation_pairs(replace(tube_pairs, weight=weight)), validation_pairs(tube_pairs)
+        assert found is not None
+        assert before is not None
+        assert len(found) == len(before) - 1
+
     def test_error_over_what_was_expected(
         self, tube: Tube, tube_pairs: Pairs, trained: EmbeddedEnhancer
     ) -> None:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from extrags.cameras import Cameras, pixel_rays
-from extrags.restoration.surface_texture import DARKNESS, MOST_DETAIL, SurfaceTexture
+from extrags.restoration.surface_texture import DARKNESS, MOST_DETAIL, SurfaceTexture, _hashed
 from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 
 WIDTH, HEIGHT, FOCAL_PX, DEPTH_MM = 120, 96, 100.0, 50.0
@@ -41,6 +41,12 @@ def noise() -> SurfaceTexture:
     generator = torch.Generator().manual_seed(3)
     tiles = torch.randn(40, 3, 32, 32, generator=generator) * 0.1
     return SurfaceTexture(tiles - tiles.mean(dim=(2, 3), keepdim=True), PIXEL_MM)
+
+
+def test_any_seed_places_texture() -> None:
+    cells = torch.arange(12).reshape(6, 2)
+    assert torch.equal(_hashed(cells, 0, 5), _hashed(cells, 0, 5))
+    assert not torch.equal(_hashed(cells, 0, 5), _hashed(cells, 0, 2**40 + 6))
 
 
 def detail(texture: SurfaceTexture, camera: Cameras) -> torch.Tensor:
