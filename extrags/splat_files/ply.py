@@ -22,7 +22,9 @@ __all__ = ["read_ply_scene", "write_ply_scene"]
 
 _MARK = b"comment extrags_light "
 _LINE_BYTES = 200
-_BY_VALUE = ("shoulder", "specular")
+_BY_VALUE = ("exponent", "shoulder", "specular")
+"""Written as they are, not as logarithms: light without fall-off has an exponent of zero, a linear response a
+shoulder of zero, a surface without highlights a strength of zero, and JSON cannot say minus infinity."""
 _HEADER_BYTES = 1 << 22
 
 
@@ -33,14 +35,12 @@ def write_ply_scene(scene: Scene, path: Path) -> None:
         scene: its colours are albedo where it has a light.
         path: file to write.
     """
-    scene.gaussians.write_ply(path)
     if scene.light is None:
+        scene.gaussians.write_ply(path)
         return
     values: dict[str, Any] = {
         name: value.tolist() for name, value in scene.light.detached().parameters().items()
     }
-    # A linear response has a shoulder of zero, whose logarithm JSON cannot say; so has a surface without
-    # highlights.
     for name in _BY_VALUE:
         values[name] = math.exp(values.pop(f"log_{name}"))
     values["reference_distance"] = scene.light.reference_distance
@@ -48,6 +48,7 @@ def write_ply_scene(scene: Scene, path: Path) -> None:
     # In several lines: readers keep a line of the header in a buffer of about a thousand bytes.
     parts = (text[start : start + _LINE_BYTES] for start in range(0, len(text), _LINE_BYTES))
     lines = b"".join(_MARK + part + b"\n" for part in parts)
+    scene.gaussians.write_ply(path)
     head, end, body = path.read_bytes().partition(b"element vertex")
     path.write_bytes(head + lines + end + body)
 
@@ -68,7 +69,6 @@ def read_ply_scene(path: Path) -> Scene:
 
 _SHAPES: dict[str, tuple[int, ...] | None] = {
     "log_softening": (),
-    "log_exponent": (),
     "log_exposure": None,
     "spread": (),
     "cosine": (),
@@ -83,6 +83,8 @@ _LATER = {"specular": 0.0, "log_roughness": math.log(INITIAL_ROUGHNESS)}
 def _light(text: bytes, path: Path) -> NearFieldLight:
     try:
         values = _LATER | json.loads(text)
+        if "log_exponent" in values:  # as files of before have it
+            values["exponent"] = math.exp(values.pop("log_exponent"))
         reference = float(values.pop("reference_distance"))
         strengths = {name: float(values.pop(name)) for name in _BY_VALUE}
         tensors = {name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()}

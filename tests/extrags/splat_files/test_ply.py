@@ -72,20 +72,28 @@ class TestLight:
         vertex = PlyData.read(str(tmp_path / "a.ply"))["vertex"]
         assert torch.equal(torch.from_numpy(vertex["f_dc_1"].copy()), lit.gaussians.sh0[:, 0, 1])
 
-    def test_a_linear_response(self, lit: Scene, tmp_path: Path) -> None:
-        """The logarithm of its shoulder is minus infinity, which JSON cannot say."""
-        from dataclasses import replace
-
+    @pytest.mark.parametrize("name", ["log_shoulder", "log_exponent", "log_specular"])
+    def test_what_is_zero_has_no_logarithm_that_json_can_say(
+        self, name: str, lit: Scene, tmp_path: Path
+    ) -> None:
+        """A linear response, a light without fall-off, a surface without highlights."""
         assert lit.light is not None
-        linear = replace(lit.light, log_shoulder=torch.tensor(-torch.inf))
-        write_ply_scene(Scene(lit.gaussians, linear), tmp_path / "a.ply")
+        without = replace(lit.light, **{name: torch.tensor(-torch.inf)})
+        write_ply_scene(Scene(lit.gaussians, without), tmp_path / "a.ply")
         back = read_ply_scene(tmp_path / "a.ply")
         assert back.light is not None
-        assert float(back.light.log_shoulder) == -torch.inf
+        assert float(back.light.parameters()[name]) == -torch.inf
+
+    def test_the_logarithm_of_the_exponent_in_files_of_before_is_read(
+        self, lit: Scene, tmp_path: Path
+    ) -> None:
+        write_ply_scene(lit, tmp_path / "a.ply")
+        changed(tmp_path / "a.ply", exponent=None, log_exponent=-0.5)
+        back = read_ply_scene(tmp_path / "a.ply").light
+        assert back is not None
+        assert float(back.log_exponent) == pytest.approx(-0.5, rel=1e-6)
 
     def test_highlights(self, lit: Scene, tmp_path: Path) -> None:
-        from dataclasses import replace
-
         assert lit.light is not None
         shiny = replace(lit.light, log_specular=torch.tensor(-1.5), log_roughness=torch.tensor(-2.0))
         write_ply_scene(Scene(lit.gaussians, shiny), tmp_path / "a.ply")
