@@ -141,9 +141,9 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
 
     Returns:
         Plain JSON: for phantom and caverns their settings and generator version; for a folder the reader's
-        name and version, and name, size and BLAKE2b digest of each file the reader looks at; for two videos
-        under a split manifest the same of both, and the manifest's line. Where the settings name a
-        calibration file, size and digest of it, and the version of what reads it.
+        name and version, name, size and BLAKE2b digest of each file the reader looks at, and what it chooses
+        that is in no file; for two videos under a split manifest the files of both, and the manifest's line.
+        Where the settings name a calibration file, size and digest of it, and the version of what reads it.
 
     Raises:
         SourceError: the folder is not readable as a sequence.

@@ -2,8 +2,8 @@
 
 What is refused: non-finite or mirrored poses, intrinsics that are no pinhole, depth with NaN, infinity or
 negative values (0 is the one mark for "unknown"; a reader whose format has others turns them into 0), a
-frame without any valid depth or mask, a split that leaks or points outside, and camera axes or a depth scale
-that depth itself contradicts. What is readable but questionable is reported by `data_catalog.diagnostics`.
+frame without any valid depth or mask, a split that leaks, and camera axes or a depth scale that depth itself
+contradicts. What is readable but questionable is reported by `data_catalog.diagnostics`.
 """
 
 from __future__ import annotations
@@ -249,14 +249,7 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
 
 
 def _check_split(sequence: EndoscopicSequence, file: object) -> None:
-    frames = len(sequence)
     for name, indices in (("train", sequence.train), ("test", sequence.test)):
-        if indices.size and (indices.min() < 0 or indices.max() >= frames):
-            raise SourceError(
-                f"the {name} split names frame {int(indices.max())}, there are {frames} frames",
-                file=file,
-                field="split",
-            )
         if np.unique(indices).size != indices.size:
             raise SourceError(f"the {name} split names a frame twice", file=file, field="split")
     if not sequence.train.size:

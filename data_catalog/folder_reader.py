@@ -61,6 +61,8 @@ class FolderReader:
         notes: what reading has to find out about this folder, as sentences; raises what `frames` raises.
         named_sets: sequences of the catalogue in this layout, each a folder below a data root.
         known_name: the catalogue's name for a folder, where it has one; None goes by `named_sets`.
+        chosen: what `frames` goes by that is in none of these files, such as a camera that the folder's name
+            tells, as plain JSON; part of cache keys. None, or nothing in it, where there is nothing.
     """
 
     name: str
@@ -73,6 +75,7 @@ class FolderReader:
     notes: Callable[[Path], tuple[str, ...]] | None = None
     named_sets: tuple[Descriptor, ...] = ()
     known_name: Callable[[Path], str | None] | None = None
+    chosen: Callable[[Path], dict[str, Any]] | None = None
 
     def read(self, place: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
         """The sequence in a folder, under a name.
@@ -85,7 +88,11 @@ class FolderReader:
             return assembled(self.frames(place, config), config, name)
 
     def fingerprint(self, place: Path) -> dict[str, Any]:
-        """What a folder or file contributes to a cache key: reader, and content of each file it looks at.
+        """What a folder or file contributes to a cache key.
+
+        Returns:
+            Name and version of the reader, content of each file it looks at, and what it chooses that is in
+            none of them.
 
         Raises:
             SourceError: not readable as a sequence.
@@ -100,7 +107,8 @@ class FolderReader:
             (f"source{file.suffix}" if file == place else file.relative_to(root).as_posix(), file)
             for file in self.files(place)
         ]
-        return {"format": self.name, "version": self.version, "files": file_digests(listed)}
+        chosen = {} if self.chosen is None else self.chosen(place)
+        return {"format": self.name, "version": self.version, "files": file_digests(listed), **chosen}
 
     def name_of(self, place: Path) -> str:
         """What the catalogue calls a folder or file: a set's name where it is one, else its own."""

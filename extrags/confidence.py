@@ -114,7 +114,7 @@ class PerceptualDifference:
             return cls(None, str(error))
 
     def for_images(self, width: int, height: int) -> PerceptualDifference:
-        """The measure for images of a size: `perceptual_map`, with the reason, where they are too small for LPIPS.
+        """The measure for images of a size: `perceptual_map`, with the reason, for too small ones.
 
         Raises:
             ShapeError: when they are, and it is raw.

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
+from extrags.errors import ShapeError
 from extrags.events import Progress, emit
 from extrags.frame_stacks import FrameStack
 from extrags.metrics.lpips import LpipsByNet, available_lpips
@@ -119,6 +120,8 @@ def evaluate(
     Raises:
         ShapeError: when there is no held-out frame.
     """
+    if not len(sequence.test):
+        raise ShapeError(f"{sequence.name}: split.test is empty: there is no held-out frame to evaluate on")
     mesh = None if true_surface is None else scene_surface(scene, sequence)
     return evaluate_renders(
         render(scene, sequence),

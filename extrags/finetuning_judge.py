@@ -266,8 +266,8 @@ def _without_some_frames(
 ) -> Iterator[tuple[EndoscopicSequence, Int[np.ndarray, "m"]]]:
     """The sequence with splits that hold out some training frames, and their positions among these.
 
-    One split leaves out a share of the frames; where that makes fewer than `MIN_LEFT_OUT`, others follow. Frames
-    without a valid pixel tell nothing: they are not among those left out.
+    One split leaves out a share of the frames; where that makes fewer than `MIN_LEFT_OUT`, others follow.
+    Frames without a valid pixel tell nothing: they are not among those left out.
     """
     folds = leave_out_folds(frames, every)
     # From the middle: the first fold would leave out the ends of the path, which nothing surrounds.

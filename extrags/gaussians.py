@@ -12,13 +12,16 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from extrags.array_files import load_ply_vertices
-from extrags.errors import ShapeError, SourceError, SourceNotFoundError
+from extrags.errors import CaptureError, ShapeError, SourceError, SourceNotFoundError
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
 __all__ = ["SH_C0", "Gaussians"]
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic."""
+
+_HIGHER = (0, 3, 8, 15)
+"""SH coefficients above degree 0, by degree: files and kernels know no other."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,11 @@ class Gaussians:
         scales: logarithm of the standard deviations, [N, 3].
         opacities: logits, [N].
         sh0: constant SH coefficient per colour, [N, 1, 3].
-        shN: higher SH coefficients, [N, K - 1, 3]; K - 1 may be 0.
+        shN: higher SH coefficients, [N, K - 1, 3]; K - 1 is 0, 3, 8 or 15, for degrees 0 to 3.
 
     Raises:
-        ShapeError: when the arrays do not describe the same number of Gaussians.
+        ShapeError: when the arrays do not describe the same number of Gaussians, or the coefficients no
+            degree.
     """
 
     means: Float[Tensor, "n 3"]
@@ -58,6 +62,11 @@ class Gaussians:
                 raise ShapeError(f"{name} has shape {tuple(getattr(self, name).shape)}, expected {shape}")
         if self.shN.ndim != 3 or self.shN.shape[0] != n or self.shN.shape[2] != 3:
             raise ShapeError(f"shN has shape {tuple(self.shN.shape)}, expected ({n}, K - 1, 3)")
+        if self.shN.shape[1] not in _HIGHER:
+            raise ShapeError(
+                f"shN has {self.shN.shape[1]} coefficients per colour; expected 0, 3, 8 or 15, for degrees "
+                "0 to 3"
+            )
 
     def __len__(self) -> int:
         return int(self.means.shape[0])
@@ -157,35 +166,51 @@ class Gaussians:
         group = open_group(path)
         return cls(**{f.name: torch.from_numpy(read_array(group, f.name)) for f in fields(cls)})
 
+    def for_file(self, path: Path) -> Gaussians:
+        """A copy as writers of files take it: on the processor, without gradient history.
+
+        Args:
+            path: file to write, for the error message.
+
+        Raises:
+            CaptureError: when there are no Gaussians, which readers of none of the formats expect.
+        """
+        if not len(self):
+            raise CaptureError(f"there are no Gaussians to write into {path}")
+        return self.detached().to("cpu")
+
     def write_ply(self, path: Path) -> None:
-        """Write the PLY format of 3DGS (opens in SuperSplat and brush).
+        """Write the PLY format of 3DGS (opens in SuperSplat and brush); from any device.
 
         Colours are written as stored. In a scene with near-field light they are albedo, so a viewer does not
         show the brightness of the recording unless the light was baked into the colours before.
+
+        Raises:
+            CaptureError: when there are no Gaussians.
         """
         from plyfile import PlyData, PlyElement
 
         n = len(self)
+        values = {name: value.numpy() for name, value in self.for_file(path).parameters().items()}
         columns: dict[str, np.ndarray] = {}
-        means = self.means.detach().numpy()
         for axis, name in enumerate("xyz"):
-            columns[name] = means[:, axis]
+            columns[name] = values["means"][:, axis]
         for name in ("nx", "ny", "nz"):
             columns[name] = np.zeros(n, np.float32)
         for axis in range(3):
-            columns[f"f_dc_{axis}"] = self.sh0.detach().numpy()[:, 0, axis]
+            columns[f"f_dc_{axis}"] = values["sh0"][:, 0, axis]
         # 3DGS stores the higher coefficients channel by channel.
-        rest = self.shN.detach().numpy().transpose(0, 2, 1).reshape(n, -1)
+        rest = values["shN"].transpose(0, 2, 1).reshape(n, -1)
         for k in range(rest.shape[1]):
             columns[f"f_rest_{k}"] = rest[:, k]
-        columns["opacity"] = self.opacities.detach().numpy()
+        columns["opacity"] = values["opacities"]
         for axis in range(3):
-            columns[f"scale_{axis}"] = self.scales.detach().numpy()[:, axis]
+            columns[f"scale_{axis}"] = values["scales"][:, axis]
         for axis in range(4):
-            columns[f"rot_{axis}"] = self.quats.detach().numpy()[:, axis]
+            columns[f"rot_{axis}"] = values["quats"][:, axis]
         table = np.empty(n, dtype=[(name, "f4") for name in columns])
-        for name, values in columns.items():
-            table[name] = values
+        for name, column in columns.items():
+            table[name] = column
         PlyData([PlyElement.describe(table, "vertex")]).write(str(path))
 
     @classmethod

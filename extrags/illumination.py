@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from extrags.config import LightConfig
+from extrags.errors import ShapeError
 from extrags.raster.light import (
     COSINE_SOFTENING,
     SPREAD_MIN,
@@ -140,7 +141,14 @@ class NearFieldLight:
             frames: indices of the frames in the sequence.
             train: indices of the training frames, in the order of `log_exposure`.
             recording: recording of every frame of the sequence; None for a single recording.
+
+        Raises:
+            ShapeError: when there is not one exposure for each training frame.
         """
+        if len(self.log_exposure) != len(train):
+            raise ShapeError(
+                f"log_exposure has {len(self.log_exposure)} exposures, there are {len(train)} training frames"
+            )
         owner = (
             np.zeros(int(max(frames.max(initial=0), train.max())) + 1, int)
             if recording is None

@@ -19,11 +19,13 @@ from extrags.raster import CameraLight, Rendering, rasterize
 from extrags.store.storable import Storable
 from extrags.zarr_io import group_exists
 
-__all__ = ["NEAR", "Scene"]
+__all__ = ["NEAR", "SHALLOWEST", "Scene"]
 
 
 NEAR = 0.01
 """Depth in world units up to which nothing is rendered; see `Scene.near`."""
+SHALLOWEST = 20 * NEAR
+"""Typical depth, in world units, below which the near plane would cut off parts of a scene without light."""
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,7 @@ class EndoscopicSequence(Storable):
         lens: of all frames, where they are the original pixels of a wide lens; None for pinholes.
 
     Raises:
-        ShapeError: when sizes do not fit each other.
+        ShapeError: when sizes or types do not fit, or the split names frames that are not there.
     """
 
     stored_as: ClassVar[str] = "sequence"
@@ -138,19 +138,29 @@ class EndoscopicSequence(Storable):
 
     def __post_init__(self) -> None:
         frames, height, width = self.rgb.shape[:3]
-        for name, array, shape in (
-            ("mask", self.mask, (frames, height, width)),
-            ("K", self.K, (frames, 3, 3)),
-            ("world_from_camera", self.world_from_camera, (frames, 4, 4)),
-            ("depth_mm", self.depth_mm, (frames, height, width)),
-            ("withheld_depth_mm", self.withheld_depth_mm, (frames, height, width)),
-            ("depth_error", self.depth_error, (frames, height, width)),
-            ("observed", self.observed, (frames, height, width)),
-            ("specular", self.specular, (frames, height, width)),
-            ("recording", self.recording, (frames,)),
+        images = (frames, height, width)
+        for name, array, shape, kind in (
+            ("rgb", self.rgb, (*images, 3), np.uint8),
+            ("mask", self.mask, images, np.bool_),
+            ("K", self.K, (frames, 3, 3), np.floating),
+            ("world_from_camera", self.world_from_camera, (frames, 4, 4), np.floating),
+            ("depth_mm", self.depth_mm, images, np.floating),
+            ("withheld_depth_mm", self.withheld_depth_mm, images, np.floating),
+            ("depth_error", self.depth_error, images, np.floating),
+            ("observed", self.observed, images, np.bool_),
+            ("specular", self.specular, images, np.bool_),
+            ("recording", self.recording, (frames,), np.integer),
         ):
-            if array is not None and array.shape != shape:
-                raise ShapeError(f"{self.name}: {name} has shape {array.shape}, expected {shape}")
+            if array is not None and (array.shape != shape or not np.issubdtype(array.dtype, kind)):
+                raise ShapeError(
+                    f"{self.name}: {name} is {array.dtype} {array.shape}, expected {kind.__name__} {shape}"
+                )
+        for name, index in (("train", self.split.train), ("test", self.split.test)):
+            if len(index) and not 0 <= int(np.min(index)) <= int(np.max(index)) < frames:
+                raise ShapeError(
+                    f"{self.name}: split.{name} has indices from {np.min(index)} to {np.max(index)}, "
+                    f"there are {frames} frames"
+                )
         if self.frame_names and len(self.frame_names) != frames:
             raise ShapeError(f"{self.name}: {len(self.frame_names)} frame names for {frames} frames")
 

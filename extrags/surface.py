@@ -98,6 +98,8 @@ def fuse_surface(scene: Scene, cameras: Cameras, config: SurfaceConfig | None = 
         CaptureError: when the views see no surface.
     """
     config = SurfaceConfig() if config is None else config
+    if not len(cameras):
+        raise CaptureError("no views to fuse the surface from")
     views, depth = rendered_depth(scene, cameras, config)
     return fuse_depth(views, depth, config)
 

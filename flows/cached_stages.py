@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from data_catalog.names import plain_name
 from extrags.config import PipelineConfig
 from extrags.errors import ArtefactGoneError, DamagedArtefactError, ExtragsError
 from extrags.pipeline import STAGES, Pipeline, StageName
@@ -16,7 +17,7 @@ from extrags.store.runs import RunRecord, recorded_run
 from flows.damage import again_after_damage
 from flows.estimate import expected_seconds
 from flows.outcome import Part, SequenceOutcome, StageRow
-from flows.runners import Call, NotInStoreError, Runner, StoreRunner
+from flows.runners import Call, NotInStoreError, Result, Runner, StoreRunner
 from flows.workloads import frames_work
 from tasks.progress import StageProgress, notify
 
@@ -34,7 +35,7 @@ class CachedStages(Pipeline):
     keeps what they made in `refs`.
 
     Args:
-        name: of the sequence.
+        name: of the sequence; of a path, artefacts get the plain spelling (`data_catalog.names`).
         config: settings of all stages.
         store: root of the store.
         runner: how artefacts are made.
@@ -54,7 +55,7 @@ class CachedStages(Pipeline):
     ) -> None:
         super().__init__(config, leave_out)
         self.check_frames: Callable[[Mapping[str, Any]], object] = dict  # Of the counts of `ingest`.
-        self.outcome = SequenceOutcome(name)
+        self.outcome = SequenceOutcome(plain_name(name))
         self.store = Store(store)
         self.runner = runner
         self.profile = profile
@@ -128,6 +129,17 @@ class CachedStages(Pipeline):
 
     def _run_tasks(self, row: StageRow, calls: list[Call]) -> list[Ref]:
         results = self.runner.run(calls, self.outcome.name)
+        self._count(row, results)
+        return [result.ref for result in results]
+
+    def _count_found(self, row: StageRow, key: str) -> None:
+        """Count an artefact of a former run that no task of this one looks up; nothing where it is gone."""
+        found = None if key in row.made else self.store.find(key)
+        if found is not None:
+            self._count(row, [Result(found, "cached")])
+
+    def _count(self, row: StageRow, results: list[Result]) -> None:
+        """Account for artefacts in a row, and in the record of the run."""
         self._note([result.ref for result in results])
         for result in results:
             manifest = self.store.manifest(result.ref)
@@ -147,7 +159,6 @@ class CachedStages(Pipeline):
             if result.state == "ran":
                 row.spent_seconds += manifest.seconds
                 row.state = "ran"
-        return [result.ref for result in results]
 
     def _manifest(self, part: Part) -> Manifest:
         return self.store.manifest(self.refs[part])

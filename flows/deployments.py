@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -11,7 +12,7 @@ import yaml
 
 from extrags.errors import ConfigError
 
-__all__ = ["FILE", "Declared", "declared_deployments", "usual_file"]
+__all__ = ["FILE", "Declared", "chosen_deployments", "declared_deployments", "usual_file"]
 
 FILE = "prefect.yaml"
 SERVED = (
@@ -57,6 +58,15 @@ class Declared:
     tags: tuple[str, ...] = ()
     environment: dict[str, str] = field(default_factory=dict)
     unserved: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """`FLOW/NAME`, as Prefect calls it.
+
+        Raises:
+            ConfigError: for an entrypoint that is no flow of an installed module.
+        """
+        return f"{self.flow().name}/{self.name}"
 
     def error(self, what: str) -> ConfigError:
         """That something is wrong with it."""
@@ -112,6 +122,31 @@ def declared_deployments(file: Path) -> list[Declared]:
     if not isinstance(entries, list) or not entries:
         raise ConfigError(f"{file} declares no deployments")
     return [_declared(entry, file) for entry in entries]
+
+
+def chosen_deployments(declared: Sequence[Declared], names: Sequence[str]) -> list[Declared]:
+    """Those that are named, in the order of their file; all without names.
+
+    Args:
+        declared: of one file.
+        names: `FLOW/NAME`, or `NAME` where only one is called so.
+
+    Raises:
+        ConfigError: for a name that none has, or that deployments of several flows have.
+    """
+    if not names:
+        return list(declared)
+    chosen = []
+    for name in names:
+        found = [item for item in declared if name == (item.title if "/" in name else item.name)]
+        if not found:
+            known = ", ".join(item.title for item in declared)
+            raise ConfigError(f"no deployment {name!r}; known: {known}")
+        if len(found) > 1:
+            choices = ", ".join(item.title for item in found)
+            raise ConfigError(f"{name!r} names {len(found)} deployments; give one of {choices}")
+        chosen += found
+    return [item for item in declared if item in chosen]
 
 
 def _declared(entry: Any, file: Path) -> Declared:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import takewhile
 from statistics import median
 
+from data_catalog.names import comparable_name
 from extrags.config import PipelineConfig
 from extrags.cores import usable_cores
 from extrags.errors import ConfigError
@@ -67,7 +68,7 @@ def expectations(
     pace = _pace(list(records.values()))
     by_sequence: dict[str, list[OutcomeRecord]] = {}
     for record in records.values():
-        by_sequence.setdefault(str(record["sequence"]), []).append(record)
+        by_sequence.setdefault(comparable_name(str(record["sequence"])), []).append(record)
     found = []
     for case in cases:
         config = case.config()
@@ -77,7 +78,7 @@ def expectations(
             continue
         left_out = METHODS[case.method].leave_out
         wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in left_out]
-        earlier = [*([own] if own is not None else []), *by_sequence.get(case.sequence, [])]
+        earlier = [*([own] if own is not None else []), *by_sequence.get(comparable_name(case.sequence), [])]
         times = _measured(earlier)
         local = _pace(earlier) or pace or _usual_pace()
         work, possible = _work(case.sequence, config, earlier)

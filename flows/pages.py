@@ -50,6 +50,9 @@ def dataset_page(outcomes: Sequence[SequenceOutcome], name: str, profile: str, r
         "profile": profile,
         "sequences": [outcome.title for outcome in outcomes],
         "metrics": metrics,
+        "reports": {
+            outcome.title: outcome.refs["report"] for outcome in outcomes if "report" in outcome.refs
+        },
         "failures": failures,
         "rows": [outcome.to_json() for outcome in outcomes],
     }

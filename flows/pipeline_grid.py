@@ -2,8 +2,9 @@
 
 All cells of a repeat share one store that begins empty, so that what several cells have in common (the same
 frames, the same coarse scene) is made once; each is charged the seconds that were really spent on it within
-this grid. Nothing is taken from any other store. What is finished stands in the folder of the grid: the same
-command goes on where it was interrupted.
+this grid. Nothing is taken from any other store. What is finished stands in the folder of the grid, by its
+settings and by the content of its source: the same command goes on where it was interrupted, and measures
+anew what was changed meanwhile.
 """
 
 from __future__ import annotations
@@ -17,15 +18,18 @@ from dataclasses import asdict, dataclass
 from itertools import product
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, ExtragsError
 from extrags.store import digest_of
 from flows.budgets import Budget, reaching
 from flows.history import SAME_MACHINE
 from flows.selection import Chosen
 
-__all__ = ["FORMAT", "Cell", "cells_of", "in_own_process", "run_cell", "run_grid"]
+if TYPE_CHECKING:
+    from extrags.config import PipelineConfig
+
+__all__ = ["FORMAT", "Cell", "cells_of", "content_of", "in_own_process", "run_cell", "run_grid"]
 
 log = logging.getLogger(__name__)
 
@@ -60,8 +64,18 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """A name for its file: the digest of everything that makes it."""
+        """The digest of everything that makes it, but for what it reads (`content_of`)."""
         return digest_of({**asdict(self), "budget": ""})
+
+    def config(self) -> PipelineConfig:
+        """All of its settings.
+
+        Raises:
+            ConfigError: for an unknown method or profile, or a setting that is wrong.
+        """
+        from flows.methods import method_config
+
+        return method_config(self.method, self.profile, {**self.settings, **self.changed}, self.seed)
 
 
 def cells_of(
@@ -112,6 +126,25 @@ def cells_of(
     return list(found.values())
 
 
+def content_of(cell: Cell) -> str | None:
+    """Digest of what a cell reads: its source, with a calibration file, and a scene that is imported.
+
+    Returns:
+        None where it cannot be read: the cell's run then says why.
+    """
+    from data_catalog.catalog import source_fingerprint
+    from tasks.imported import scene_digest
+
+    config = cell.config()
+    try:
+        source = source_fingerprint(cell.sequence, config.ingest)
+        scene = None if config.imported.scene is None else scene_digest(config.imported)
+    except ExtragsError as error:
+        log.debug("%s cannot be read: %s", cell.sequence, error)
+        return None
+    return digest_of({"source": source, "scene": scene})
+
+
 def run_grid(
     cells: Sequence[Cell],
     folder: Path,
@@ -142,13 +175,15 @@ def run_grid(
     _claim(folder, about, separate)
     cases = []
     for number, cell in enumerate(cells, 1):
-        file = folder / "cells" / f"{cell.key}.json"
-        if file.exists():
+        content = content_of(cell)
+        name = digest_of([cell.key, content])
+        file = folder / "cells" / f"{name}.json"
+        if content is not None and file.exists():
             cases.append(json.loads(file.read_text(encoding="utf-8")))
             continue
         where = f"{cell.sequence}, {cell.method}, {cell.profile}, {cell.budget}, seed {cell.seed}"
         log.info("cell %d of %d: %s", number, len(cells), where)
-        store = folder / "stores" / (cell.key if separate else f"repeat-{cell.repeat}")
+        store = folder / "stores" / (name if separate else f"repeat-{cell.repeat}")
         case = run(cell, str(store.absolute()))
         if not case["error"]:
             # A cell that failed is tried again by the same command.
@@ -188,14 +223,13 @@ def run_cell(cell: Cell, store: str) -> dict[str, Any]:
         shared_seconds}` of each, evaluation too.
     """
     from extrags.store import Store
-    from flows.methods import METHODS, method_config
+    from flows.methods import METHODS
     from flows.runners import DirectRunner
     from flows.wiring import run_sequence
 
-    config = method_config(cell.method, cell.profile, {**cell.settings, **cell.changed}, cell.seed)
     outcome = run_sequence(
         cell.sequence,
-        config,
+        cell.config(),
         store,
         DirectRunner(store),
         profile=cell.profile,

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
+from data_catalog.names import comparable_name
 from data_catalog.patterns import is_named
 from extrags.errors import ConfigError, StoreError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
@@ -117,7 +118,8 @@ def chosen_runs(
             found[key] = RecordedRun(manifest, record)
             continue
         for record in records:
-            if record["sequence"] != name or not _wanted(record, methods, profiles, seeds):
+            same = comparable_name(str(record["sequence"])) == comparable_name(name)
+            if not same or not _wanted(record, methods, profiles, seeds):
                 continue
             key = _key_of(record)
             manifest = None if key is None else _manifest(store, key)
@@ -126,7 +128,7 @@ def chosen_runs(
             else:
                 unfinished += 1
     runs = list(found.values())
-    sequences = sorted({run.sequence for run in runs})
+    sequences = sorted({comparable_name(run.sequence): run.sequence for run in runs}.values())
     if len(sequences) > 1:
         raise ConfigError(
             f"runs of one sequence are compared; these are of {', '.join(sequences)} "

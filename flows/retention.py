@@ -75,7 +75,7 @@ def retention(
     if not place.exists():
         raise StoreError(f"there is no store {store}")
     with run_lease(store):
-        leftovers = place.gc(all_stage_versions(), dry_run=dry_run)
+        leftovers = place.gc(dry_run=dry_run)
         if not dry_run:
             leftovers += sweep_locks(place.locks)
         policy = Policy(
@@ -83,6 +83,7 @@ def retention(
             max_bytes=None if max_gib is None else int(max_gib * 2**30),
             keep_last=keep_last,
             unreachable=unreachable,
+            versions=all_stage_versions(),
         )
         removed = planned_removals(place, policy)[0] if dry_run else apply_policy(place, policy)
         for item in removed:

@@ -11,6 +11,7 @@ from typing import Any
 
 import yaml
 
+from data_catalog.names import comparable_name, plain_name
 from data_catalog.patterns import is_pattern, matching_names
 from extrags.errors import ConfigError
 from extrags.store import digest_of
@@ -28,7 +29,7 @@ class Chosen:
     """A sequence, and what a manifest sets for it alone.
 
     Args:
-        name: as in the catalogue, or a path.
+        name: as in the catalogue, or a path in its plain spelling (`data_catalog.names`).
         settings: overrides by dotted name.
     """
 
@@ -54,7 +55,7 @@ def chosen_sequences(given: Sequence[str]) -> list[Chosen]:
     found: dict[str, Chosen] = {}
     literal: set[str] = set()
     for item in _without_manifests(given):
-        names: Sequence[str] = [item.name]
+        names: Sequence[str] = [plain_name(item.name)]
         if is_pattern(item.name):
             names, elsewhere = matching_names(item.name)
             if elsewhere:
@@ -65,7 +66,7 @@ def chosen_sequences(given: Sequence[str]) -> list[Chosen]:
                     len(elsewhere) + len(names),
                 )
         else:
-            place = str(Path(item.name))
+            place = comparable_name(item.name)
             if place in literal:
                 raise ConfigError(f"a sequence is named twice: {item.name}")
             literal.add(place)

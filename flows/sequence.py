@@ -9,6 +9,7 @@ from prefect import flow
 from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
+from data_catalog.names import plain_name
 from extrags.config import ProfileName
 from extrags.pipeline import StageName
 from extrags.store import Store
@@ -65,6 +66,7 @@ def reconstruct_sequence(
     Raises:
         SequenceFailedError: when a stage failed; what was finished stays in the store.
     """
+    sequence = plain_name(sequence)
     case = SequenceCase(sequence, method, profile, seed, settings or {}, variant or {})
     config = case.config()
     store = run_store(store)

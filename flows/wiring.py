@@ -391,7 +391,13 @@ class SequenceRun(CachedStages):
                 Call(measure, {**call.inputs, "views": views if ref.digest in waiting else None})
                 for ref, call in zip(renders, calls, strict=True)
             ]
-        return self._run_tasks(row, calls)
+        figures = self._run_tasks(row, calls)
+        # What figures of a former run were made from is looked up by no task: it is in use all the same.
+        for figure in figures:
+            measured = self.store.manifest(figure).input_keys.get("views")
+            if measured is not None:
+                self._count_found(row, measured)
+        return figures
 
     def _restored_renders(self, row: StageRow, renders: Ref) -> Ref | None:
         """The final scene's held-out views, restored; None without a restorer."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import PurePath
 
+from data_catalog.names import comparable_name
 from extrags.config import CoarseConfig
 from extrags.errors import ConfigError, DamagedArtefactError
 from extrags.store import Manifest, Ref, Slot, Store
@@ -50,7 +52,7 @@ class Search:
     def told(self) -> str:
         """Why there is none, in a line: the first refusals."""
         if not self.refusals:
-            return "the store has no other coarse scene of that name"
+            return "the store has no other coarse scene of that name or path"
         first = [f"{key}: {why}" for key, why in list(self.refusals.items())[:3]]
         more = len(self.refusals) - len(first)
         return "; ".join([*first, *([f"and {more} more"] if more > 0 else [])])
@@ -134,7 +136,8 @@ def nearest_scene(store: Store, label: str, frames: Ref, config: CoarseConfig) -
 
     Args:
         store: where to look.
-        label: display name of the sequence; scenes of the same source have it too, but for the setting.
+        label: display name of the sequence; scenes of the same source have it too, but for the setting, or
+            are of the same path.
         frames: the run's training frames.
         config: settings of the reconstruction.
 
@@ -214,4 +217,6 @@ def found_whole(store: Store, key: str) -> Ref | None:
 
 def _source(label: str) -> str:
     """The name of a sequence without its setting: training frames are shared by settings."""
-    return label.split("@")[0]
+    path = PurePath(label)
+    # Of a path, the last part alone has a setting.
+    return comparable_name(str(path.parent / path.name.partition("@")[0]))

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import fcntl
+import logging
 import os
 import threading
 import time
@@ -18,7 +19,11 @@ from typing import Any
 
 from prefect.locking.protocol import LockManager
 
+from extrags.errors import StoreError
+
 __all__ = ["FlockManager", "sweep_locks"]
+
+log = logging.getLogger(__name__)
 
 POLL_SECONDS = 0.05
 
@@ -56,6 +61,9 @@ class FlockManager(LockManager):
         """Acquire the lock of a key; waits for `acquire_timeout` seconds, or without limit.
 
         `hold_timeout` is not needed: a lock never outlives its process.
+
+        Raises:
+            StoreError: when the lock's file may not be opened.
         """
         if self.is_lock_holder(key, holder):
             return True
@@ -98,7 +106,8 @@ class FlockManager(LockManager):
             if key in self._held:
                 return True
         try:
-            descriptor = os.open(self._path(key), os.O_RDWR)
+            # Read alone: the file may be another user's.
+            descriptor = os.open(self._path(key), os.O_RDONLY)
         except FileNotFoundError:
             return False
         try:
@@ -133,11 +142,22 @@ class FlockManager(LockManager):
 
 
 def _lock_file(path: Path, timeout: float | None) -> int | None:
-    """Open and lock the file at a path, retrying if it is replaced meanwhile; None on timeout."""
+    """Open and lock the file at a path, retrying if it is replaced meanwhile; None on timeout.
+
+    Raises:
+        StoreError: when the file may not be opened, as one of another user.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     end = None if timeout is None else time.monotonic() + timeout
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            # For all who may write what is written here: the umask says who they are.
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        except PermissionError as error:
+            raise StoreError(
+                f"the lock {path} cannot be opened: {error.strerror}. Users who share a store need a group "
+                "that may write its folders and files (umask 002)"
+            ) from error
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if os.path.samestat(os.fstat(descriptor), os.stat(path)):
@@ -155,12 +175,24 @@ def _lock_file(path: Path, timeout: float | None) -> int | None:
 
 
 def sweep_locks(directory: Path) -> list[str]:
-    """Remove the lock files that killed processes left (they lock nothing any more)."""
+    """Remove the lock files that killed processes left (they lock nothing any more).
+
+    Those that may not be opened or removed, as those of another user, stay.
+    """
     removed = []
     for path in sorted(directory.glob("*.lock")) if directory.is_dir() else []:
-        descriptor = _lock_file(path, 0.0)
-        if descriptor is not None:
+        try:
+            descriptor = _lock_file(path, 0.0)
+        except StoreError as error:
+            log.debug("%s", error)
+            continue
+        if descriptor is None:
+            continue
+        try:
             path.unlink(missing_ok=True)
-            os.close(descriptor)
             removed.append(f"{directory.name}/{path.name}")
+        except PermissionError as error:
+            log.debug("the lock %s cannot be removed: %s", path, error.strerror)
+        finally:
+            os.close(descriptor)
     return removed

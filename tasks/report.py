@@ -45,7 +45,7 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=12, ignore=("rows",))
+@stage("report", version=13, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
@@ -156,6 +156,7 @@ def dataset_report(
     profile: str,
     sequences: list[str],
     metrics: dict[str, Ref],
+    reports: dict[str, Ref],
     failures: dict[str, str],
     rows: list[dict[str, Any]],
 ) -> None:
@@ -167,8 +168,9 @@ def dataset_report(
         profile: name of the profile of the settings.
         sequences: their names, with the variant where there is one, in the order they are shown.
         metrics: artefacts with the metrics of each sequence, by `NAME coarse` and `NAME final`.
+        reports: artefacts with the pages that are linked, by sequence; they stay as long as this page does.
         failures: error messages by sequence.
-        rows: `SequenceOutcome.to_json()` of each: times, states and links, not part of the cache key.
+        rows: `SequenceOutcome.to_json()` of each: times and states, not part of the cache key.
     """
     from extrags.report.dataset import DatasetRow, build_dataset_report
 
@@ -187,7 +189,7 @@ def dataset_report(
             final=figures(sequence, "final"),
             stages=row["stages"],
             error=failures.get(sequence, ""),
-            link=_neighbour(row["report"]),
+            link=_neighbour(reports.get(sequence)),
         )
         for sequence, row in zip(sequences, rows, strict=True)
     ]
@@ -203,6 +205,6 @@ def _without_seed(variant: str, seed: int | None) -> str:
     return ", ".join(word for word in variant.split(", ") if word != f"seed {seed}")
 
 
-def _neighbour(page: str | None) -> str:
+def _neighbour(report: Ref | None) -> str:
     """Relative URL of another artefact's page: artefacts are sibling directories."""
-    return "" if page is None else "/".join(["..", *page.rsplit("/", 2)[1:]])
+    return "" if report is None else f"../{report.uri.rsplit('/', 1)[-1]}/{PAGE}"

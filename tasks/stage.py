@@ -176,7 +176,14 @@ def stage(
             # Here, because it loads torch, which looking up an artefact must not.
             from extrags.threads import kernel_threads, one_torch_thread
 
-            refs, settings = _split({name: value for name, value in inputs.items() if name not in ignore})
+            # What a key ignores may be an artefact all the same: the lineage has it, the settings have not.
+            refs, settings = _split(
+                {
+                    name: value
+                    for name, value in inputs.items()
+                    if name not in ignore or isinstance(value, Ref)
+                }
+            )
             with (
                 run_log(),
                 stage_page(),

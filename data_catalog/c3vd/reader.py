@@ -101,6 +101,12 @@ def _known_name(folder: Path) -> str | None:
     return None if video is None else video.name
 
 
+def _chosen(folder: Path) -> dict[str, Any]:
+    """The published camera, which may go by the folder's name; one of the video's own is among its files."""
+    calibration = Video.open(folder).calibration
+    return {} if calibration == CALIBRATION_FILE else {"calibration": calibration}
+
+
 READER = FolderReader(
     name="c3vd",
     version=1,
@@ -112,6 +118,7 @@ READER = FolderReader(
     "column-major as published, which is checked; z-depth, 16 bit over 100 mm, 0 and 65535 unknown",
     notes=_notes,
     known_name=_known_name,
+    chosen=_chosen,
 )
 
 

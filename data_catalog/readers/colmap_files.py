@@ -23,7 +23,7 @@ from extrags.cameras import compose, invert_poses
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.lens import LENS_PARAMETERS, Lens
 
-__all__ = ["ColmapImage", "ColmapModel", "read_model", "write_model"]
+__all__ = ["ColmapImage", "ColmapModel", "read_image_names", "read_model", "write_model"]
 
 _MODEL_NAMES = dict(enumerate(LENS_PARAMETERS))
 """COLMAP numbers its models in this order."""
@@ -117,6 +117,16 @@ def read_model(folder: Path) -> ColmapModel:
             raise SourceError("the image is listed twice", file=files[1], frame=image.name, field="name")
         seen.add(image.name)
     return ColmapModel(lenses, images, points, colours)
+
+
+def read_image_names(folder: Path) -> list[str]:
+    """Names of the registered images, in the order of the file; points and cameras are not looked at.
+
+    Raises:
+        SourceError: the list of images is damaged.
+    """
+    binary, text = folder / "images.bin", folder / "images.txt"
+    return [name for name, *_ in (_binary_images(binary) if binary.is_file() else _text_images(text))]
 
 
 def write_model(model: ColmapModel, folder: Path, *, binary: bool = True) -> None:

@@ -6,7 +6,8 @@
         sparse/0/{cameras,images,points3D}.bin      or .txt; also sparse/, colmap/sparse/0/, beside images/;
                                                     of dense/sparse/, all that follows lies in dense/
         images/NAME                                 as named in the model; also rgb/, or the folder itself
-        masks/NAME.png                              optional: COLMAP's camera masks, white is tissue
+        masks/NAME.png                              optional: COLMAP's camera masks, white is tissue; also
+                                                    without NAME's suffix, and with that of any image
         stereo/depth_maps/NAME.geometric.bin        optional: COLMAP's depth maps, z-depth in the model's unit
         train_list.txt, test_list.txt               optional: frames by name, one to a line; those in neither
                                                     of two lists are left out
@@ -16,12 +17,15 @@ COLMAP's poses are camera-from-world in OpenCV axes with pixel centres at +0.5; 
 reading and nothing else is turned or scaled. Every model of `extrags.lens` is understood; images of
 distorted cameras are resampled to a pinhole, those of pinhole cameras are taken as they are. Of several
 models (`sparse/0`, `sparse/1`, ...) the one with the most images is read. The sparse points become the
-starting points. Images that the model does not name have no pose and are left out, which the log says.
+starting points. Images that the model does not name have no pose and are left out, which the log says; so it
+does of frames without a mask where others have one. Frames without a mask are tissue throughout.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -32,8 +36,14 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, natural_key, save_images
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
-from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
-from data_catalog.readers.frame_list import listed_split, present_frames
+from data_catalog.readers.colmap_files import (
+    ColmapImage,
+    ColmapModel,
+    read_image_names,
+    read_model,
+    write_model,
+)
+from data_catalog.readers.frame_list import FilesBeside, listed_split, present_frames, warn_of_unmasked
 from extrags.cameras import pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
@@ -95,7 +105,63 @@ def _workspace(folder: Path, model: Path) -> Path:
 def _image_root(folder: Path, names: list[str]) -> Path:
     places = [folder / "images", folder / "rgb", folder]
     existing = [place for place in places if place.is_dir()]
-    return max(existing, key=lambda place: sum((place / name).is_file() for name in names[:20]))
+    return max(existing, key=lambda place: sum(_lies_in(place, name) for name in names[:20]))
+
+
+def _lies_in(place: Path, name: str) -> bool:
+    # An absolute name is the same file whatever folder it is looked for in.
+    root = os.path.abspath(place)
+    file = os.path.normpath(os.path.join(root, name))
+    return file.startswith(os.path.join(root, "")) and os.path.isfile(file)
+
+
+@dataclass(frozen=True)
+class _ImageFiles:
+    """What lies on disk for an image of the model.
+
+    Args:
+        name: its path below the folder of the images.
+        colour: the image, which may be absent.
+        mask: None where there is none.
+        depth: None where there is none.
+    """
+
+    name: str
+    colour: Path
+    mask: Path | None
+    depth: Path | None
+
+
+def _located(folder: Path, names: list[str], pose_file: Path) -> tuple[Path, dict[str, _ImageFiles]]:
+    """The folder of the images, and the files of each, by its name in the model.
+
+    Raises:
+        SourceError: a name leads out of the folder, or two mean one file.
+    """
+    for name in names:
+        inside(folder, name, file=pose_file, frame=name, field="name")
+    root = _image_root(folder, names)
+    masks = FilesBeside(folder / "masks")
+    found: dict[str, _ImageFiles] = {}
+    seen: set[Path] = set()
+    for name in names:
+        colour = inside(root, name, file=pose_file, frame=name, field="name")
+        if colour in seen:
+            raise SourceError("the image is listed twice", file=pose_file, frame=name, field="name")
+        seen.add(colour)
+        # Joined to another folder, an absolute name would lead back to the image itself.
+        below = colour.relative_to(root)
+        found[name] = _ImageFiles(
+            name=below.as_posix(),
+            colour=colour,
+            mask=masks.find(dict.fromkeys((below, below.parent / below.stem)), COLOUR_SUFFIXES),
+            depth=_depth_file(folder, below.as_posix()),
+        )
+    return root, found
+
+
+def _pose_file(model: Path) -> Path:
+    return next(file for file in (model / "images.bin", model / "images.txt") if file.is_file())
 
 
 def _files(folder: Path) -> list[Path]:
@@ -107,13 +173,10 @@ def _files(folder: Path) -> list[Path]:
     fixed += [
         model / f"{name}.{suffix}" for name in ("cameras", "images", "points3D") for suffix in ("bin", "txt")
     ]
-    found = {file for file in fixed if file.is_file()}
-    images = (folder / "images", folder / "rgb", folder / "masks", folder / "stereo" / "depth_maps")
-    for place in images:
-        if place.is_dir():
-            found |= {file for file in place.rglob("*") if file.is_file()}
-    found |= {file for file in folder.iterdir() if file.suffix.lower() in COLOUR_SUFFIXES}
-    return sorted(found)
+    _, located = _located(folder, read_image_names(model), _pose_file(model))
+    of_images = [(item.colour, item.mask, item.depth) for item in located.values() if item.colour.is_file()]
+    listed = [*fixed, *(file for files in of_images for file in files if file is not None)]
+    return sorted({file for file in listed if file.is_file()})
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
@@ -121,33 +184,30 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     if place is None:
         raise SourceNotFoundError("no COLMAP model in this folder", file=folder)
     folder = _workspace(folder, place)
-    model = read_model(place)
-    pose_file = next(file for file in (place / "images.bin", place / "images.txt") if file.is_file())
+    model, pose_file = read_model(place), _pose_file(place)
     listed = sorted(model.images, key=lambda image: natural_key(image.name))
-    for image in listed:
-        inside(folder, image.name, file=pose_file, frame=image.name, field="name")
-    root = _image_root(folder, [image.name for image in listed])
-    _tell_about_unposed(root, {image.name for image in listed})
-    files = {
-        image.name: inside(root, image.name, file=pose_file, frame=image.name, field="name")
-        for image in listed
-    }
+    root, located = _located(folder, [image.name for image in listed], pose_file)
+    _tell_about_unposed(root, {item.name for item in located.values()})
+    files = {name: item.colour for name, item in located.items()}
     present = present_frames(files, config.max_absent_share, listing=pose_file)
     splits = _splits(folder, listed)
     images = [image for image in listed if image.name in present and (not splits or image.name in splits)]
-    recordings = sorted({str(Path(image.name).parent) for image in images}, key=natural_key)
+    used = [located[image.name] for image in images]
+    _tell_about_unmasked(folder, used)
+    folders = [str(Path(item.name).parent) for item in used]
+    recordings = sorted(set(folders), key=natural_key)
     frames = [
         PosedFrame(
-            name=image.name,
-            file=files[image.name],
+            name=item.name,
+            file=item.colour,
             lens=model.lenses[image.camera],
             world_from_camera=image.world_from_camera,
-            mask_file=_mask_file(folder, image.name),
-            depth_file=_depth_file(folder, image.name),
-            recording=recordings.index(str(Path(image.name).parent)),
+            mask_file=item.mask,
+            depth_file=item.depth,
+            recording=recordings.index(parent),
             split=splits.get(image.name),
         )
-        for image in images
+        for image, item, parent in zip(images, used, folders, strict=True)
     ]
     return SourceFrames(
         frames,
@@ -162,7 +222,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="colmap",
-    version=4,
+    version=5,
     summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/readers/colmap_model.py",
     recognises=_recognises,
     files=_files,
@@ -295,11 +355,6 @@ def write_depth_map(file: Path, depth: Float[np.ndarray, "h w"]) -> None:
     file.write_bytes(header + np.ascontiguousarray(depth, dtype="<f4").tobytes())
 
 
-def _mask_file(folder: Path, name: str) -> Path | None:
-    candidates = (folder / "masks" / f"{name}.png", folder / "masks" / Path(name).with_suffix(".png"))
-    return next((file for file in candidates if file.is_file()), None)
-
-
 def _depth_file(folder: Path, name: str) -> Path | None:
     places = (folder / "stereo" / "depth_maps" / f"{name}.{kind}.bin" for kind in _DEPTH_KINDS)
     return next((file for file in places if file.is_file()), None)
@@ -358,3 +413,10 @@ def _tell_about_unposed(root: Path, posed: set[str]) -> None:
             len(present),
             unposed[0],
         )
+
+
+def _tell_about_unmasked(folder: Path, frames: list[_ImageFiles]) -> None:
+    if (folder / "masks").is_dir():
+        warn_of_unmasked(folder / "masks", {item.name: item.mask for item in frames})
+    elif (folder / "mask").is_dir():
+        logger.warning("%s is not read; masks are looked for in masks/", folder / "mask")

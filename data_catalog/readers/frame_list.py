@@ -1,10 +1,10 @@
-"""What readers of listed frames share: the list itself, frames it has and disk has not, matrices, splits."""
+"""What readers of listed frames share: the list, absent frames, files beside them, matrices, splits."""
 
 from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,12 +14,58 @@ from jaxtyping import Float
 from data_catalog.images import natural_key
 from extrags.errors import SourceError, SourceNotFoundError
 
-__all__ = ["listed_split", "load_frame_list", "matrix_of", "present_frames"]
+__all__ = [
+    "FilesBeside",
+    "listed_split",
+    "load_frame_list",
+    "matrix_of",
+    "present_frames",
+    "warn_of_unmasked",
+]
 
 logger = logging.getLogger(__name__)
 
-NAMED_ABSENT = 5
-"""A warning names so many absent frames."""
+NAMED_FRAMES = 5
+"""A warning names so many frames."""
+
+
+class FilesBeside:
+    """Files of frames in a folder of their own, such as masks, found by the names of the frames.
+
+    Args:
+        folder: with the files, also in folders below it; there need not be any.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._listed: dict[Path, dict[tuple[str, str], Path]] = {}
+
+    def find(self, stems: Iterable[str | Path], suffixes: Sequence[str]) -> Path | None:
+        """The file of the first stem that has one, with the first of its suffixes; None without any.
+
+        Args:
+            stems: paths below the folder, without suffix.
+            suffixes: in lower case; files may have them in upper case as well.
+        """
+        for stem in stems:
+            place = self.folder / stem
+            listed = self._files_of(place.parent)
+            found = next(
+                (listed[place.name, suffix] for suffix in suffixes if (place.name, suffix) in listed), None
+            )
+            if found is not None:
+                return found
+        return None
+
+    def _files_of(self, folder: Path) -> dict[tuple[str, str], Path]:
+        """Files directly in a folder by stem and suffix."""
+        if folder not in self._listed:
+            # Of two suffixes that differ in case alone the lower one comes last, and is taken.
+            files = sorted(folder.iterdir()) if folder.is_dir() else []
+            self._listed[folder] = {
+                (file.stem, file.suffix.lower()): file for file in files if file.is_file()
+            }
+        return self._listed[folder]
 
 
 def load_frame_list(file: Path, key: str) -> dict[str, Any]:
@@ -76,17 +122,37 @@ def present_frames(files: Mapping[str, Path], max_absent_share: float, *, listin
             frame=absent[0],
             field="file",
         )
-    named = ", ".join(absent[:NAMED_ABSENT])
-    more = f" and {len(absent) - NAMED_ABSENT} more" if len(absent) > NAMED_ABSENT else ""
     logger.warning(
-        "%s lists %d frames; %d of them are absent and left out: %s%s",
+        "%s lists %d frames; %d of them are absent and left out: %s",
         listing,
         len(files),
         len(absent),
-        named,
-        more,
+        _named(absent),
     )
     return present
+
+
+def warn_of_unmasked(folder: Path, masks: Mapping[str, Path | None]) -> None:
+    """Say which frames have no mask although there are masks: nothing is left out of them.
+
+    Args:
+        folder: with the masks.
+        masks: of each frame, by its name.
+    """
+    without = [name for name, file in masks.items() if file is None]
+    if without:
+        logger.warning(
+            "%s: %d of %d frames have no mask and are tissue throughout: %s",
+            folder,
+            len(without),
+            len(masks),
+            _named(without),
+        )
+
+
+def _named(frames: Sequence[str]) -> str:
+    more = f" and {len(frames) - NAMED_FRAMES} more" if len(frames) > NAMED_FRAMES else ""
+    return ", ".join(frames[:NAMED_FRAMES]) + more
 
 
 def matrix_of(

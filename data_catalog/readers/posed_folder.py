@@ -25,8 +25,9 @@
 Camera axes are OpenCV's (x right, y down, z forward), matrices map camera to world, row by row; K is in
 pixels of the files with pixel centres at +0.5. Every image in `rgb/` needs an entry, every entry an image.
 Depth is looked for as `depth/<name>.npy|.tiff|.tif|.png`, for all frames or for none, and masks as
-`mask/<name>` with the suffix of any image; <name> is the path below `rgb/`, else its last part, without
-suffix. No two frames share a file. Frames without a mask are tissue throughout, which the log says.
+`mask/<name>` with the suffix of any image, in upper or lower case; <name> is the path below `rgb/`, else its
+last part, without suffix. No two frames share a file. Frames without a mask are tissue throughout, which the
+log says. A frame's `file` may be absolute, or go through `..`, where it leads to a file below the folder.
 Frames without `split` are split by holding out every n-th. Nothing is turned or scaled; where depth shows
 that the poses are in other axes, the sequence is refused and the axes that fit are named.
 """
@@ -42,7 +43,7 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, colour_files, image_size
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
-from data_catalog.readers.frame_list import load_frame_list, matrix_of
+from data_catalog.readers.frame_list import FilesBeside, load_frame_list, matrix_of, warn_of_unmasked
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
@@ -62,20 +63,19 @@ def _recognises(folder: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    file = folder / POSES_FILE
-    found = {file}
-    for part in ("rgb", "depth", "mask"):
-        if (folder / part).is_dir():
-            found |= set((folder / part).rglob("*"))
-    # Images may lie elsewhere below the folder.
-    for entry in load_frame_list(file, "file")["frames"]:
-        found.add(inside(folder, entry["file"], file=file, frame=entry["file"], field="file"))
-    return sorted(item for item in found if item.is_file())
+    content = _load(folder)
+    # Absent images are refused on reading; nothing is read beside them.
+    names = [entry["file"] for entry in content["frames"] if (folder / entry["file"]).is_file()]
+    beside = _beside(folder, "depth", names, _DEPTH_SUFFIXES) + _beside(
+        folder, "mask", names, COLOUR_SUFFIXES
+    )
+    found = {folder / POSES_FILE, *(folder / name for name in names), *(file for file in beside if file)}
+    return sorted(found)
 
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / POSES_FILE
-    content = _load(file)
+    content = _load(folder)
     entries = content["frames"]
     _check_count(folder, entries)
     _check_splits(entries, file)
@@ -85,7 +85,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         frames=[
             PosedFrame(
                 name=entry["file"],
-                file=inside(folder, entry["file"], file=file, frame=entry["file"], field="file"),
+                file=folder / entry["file"],
                 lens=_lens(folder, entry, content, file),
                 world_from_camera=matrix_of(
                     entry, "world_from_camera", 4, file=file, frame=entry["file"], error=PoseError
@@ -104,7 +104,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="extrags",
-    version=5,
+    version=6,
     summary=f"{POSES_FILE} with rgb/ (and depth/, mask/), described in data_catalog/readers/posed_folder.py",
     recognises=_recognises,
     files=_files,
@@ -113,7 +113,9 @@ READER = FolderReader(
 )
 
 
-def _load(file: Path) -> dict[str, Any]:
+def _load(folder: Path) -> dict[str, Any]:
+    """What `poses.json` holds, with the file of each frame as its path below the folder."""
+    file = folder / POSES_FILE
     content = load_frame_list(file, "file")
     unit = content.get("length_unit", "mm")
     if unit not in _LENGTH_UNITS:
@@ -122,17 +124,24 @@ def _load(file: Path) -> dict[str, Any]:
             file=file,
             field="length_unit",
         )
-    return content
+    # By one spelling: joined to another folder, an absolute path would lead back to the image itself.
+    frames: dict[str, dict[str, Any]] = {}
+    for entry in content["frames"]:
+        place = inside(folder, entry["file"], file=file, frame=entry["file"], field="file")
+        name = place.relative_to(folder).as_posix()
+        if name in frames:
+            raise SourceError("the frame is listed twice", file=file, frame=name, field="file")
+        frames[name] = {**entry, "file": name}
+    return {**content, "frames": list(frames.values())}
 
 
 def _check_count(folder: Path, frames: list[dict[str, Any]]) -> None:
     listed = [entry["file"] for entry in frames]
     for name in listed:
-        place = inside(folder, name, file=folder / POSES_FILE, frame=name, field="file")
-        if not place.is_file():
+        if not (folder / name).is_file():
             raise SourceNotFoundError(
                 f"{POSES_FILE} lists this frame, but there is no such file",
-                file=place,
+                file=folder / name,
                 frame=name,
                 field="file",
             )
@@ -156,11 +165,10 @@ def _beside(folder: Path, part: str, names: list[str], suffixes: tuple[str, ...]
     """
     found: list[Path | None] = []
     owner: dict[Path, str] = {}
+    files = FilesBeside(folder / part)
     for name in names:
         inner = Path(name).relative_to("rgb") if Path(name).is_relative_to("rgb") else Path(name)
-        stems = dict.fromkeys((inner.with_suffix(""), Path(inner.stem)))
-        places = [folder / part / f"{stem}{suffix}" for stem in stems for suffix in suffixes]
-        file = next((place for place in places if place.is_file()), None)
+        file = files.find(dict.fromkeys((inner.with_suffix(""), Path(inner.stem))), suffixes)
         if file is not None and owner.setdefault(file, name) != name:
             raise SourceError(
                 f"this file would belong to {owner[file]} as well; expected one for each at the path of its "
@@ -194,15 +202,7 @@ def _mask_files(folder: Path, names: list[str]) -> list[Path | None]:
             logger.warning("%s is not read; masks are looked for in mask/", folder / "masks")
         return [None] * len(names)
     found = _beside(folder, "mask", names, COLOUR_SUFFIXES)
-    without = [name for name, file in zip(names, found, strict=True) if file is None]
-    if without:
-        logger.warning(
-            "%s: %d of %d frames have no mask and are tissue throughout; the first is %s",
-            folder / "mask",
-            len(without),
-            len(names),
-            without[0],
-        )
+    warn_of_unmasked(folder / "mask", dict(zip(names, found, strict=True)))
     return found
 
 

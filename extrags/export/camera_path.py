@@ -17,6 +17,8 @@ from extrags.errors import ExtragsError, SourceError, SourceNotFoundError
 __all__ = ["CameraPath", "flight_through", "read_camera_path", "write_camera_path"]
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_PINHOLE = "perspective"
+"""As the layout calls it; others are `fisheye` and `equirectangular`."""
 _LARGEST_SIDE_PX = 8192
 _LARGEST_COUNT = 100_000
 
@@ -64,7 +66,7 @@ def write_camera_path(path: CameraPath, file: Path) -> None:
         for pose, K in zip(cameras.world_from_camera, cameras.K, strict=True)
     ]
     content = {
-        "camera_type": "perspective",
+        "camera_type": _PINHOLE,
         "render_width": cameras.width,
         "render_height": cameras.height,
         "fps": path.fps,
@@ -79,7 +81,8 @@ def read_camera_path(file: Path) -> CameraPath:
 
     Raises:
         SourceNotFoundError: when there is no such file.
-        SourceError: when it is no camera path, or a number in it is wrong.
+        SourceError: when it is no camera path, its cameras are no pinholes (`camera_type` other than
+            perspective), or a number in it is wrong.
     """
     if not file.is_file():
         raise SourceNotFoundError("no such file", file=file)
@@ -87,11 +90,18 @@ def read_camera_path(file: Path) -> CameraPath:
         content = json.loads(file.read_text(encoding="utf-8"))
         width, height = int(content["render_width"]), int(content["render_height"])
         fps = float(content.get("fps", 24.0))
+        kind = content.get("camera_type", _PINHOLE)
         entries = content["camera_path"]
         if not isinstance(entries, list):
             raise TypeError("camera_path is no list")
     except (ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
         raise SourceError(f"no camera path: {type(error).__name__}: {error}", file=file) from error
+    if kind != _PINHOLE:
+        raise SourceError(
+            f"{json.dumps(kind)[:80]}; expected {_PINHOLE}: other cameras are not rendered",
+            file=file,
+            field="camera_type",
+        )
     if not (0 < width <= _LARGEST_SIDE_PX and 0 < height <= _LARGEST_SIDE_PX):
         raise SourceError(f"images of {width} x {height} pixels", file=file, field="render_width")
     if not 0 < len(entries) <= _LARGEST_COUNT:

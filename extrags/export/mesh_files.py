@@ -22,12 +22,13 @@ _ARRAY, _ELEMENTS = 34962, 34963
 _METRES = 0.001
 
 
-def write_mesh(colored: ColoredMesh, path: Path, *, metric: bool = True) -> None:
+def write_mesh(colored: ColoredMesh, path: Path, *, metric: bool = True) -> tuple[Path, ...]:
     """Write a mesh in the format that the name ends with.
 
     * `.glb`: texture, or colours of vertices without one; vertex attribute `_INVENTED`; metres (a scaled
       node) where the world's unit is millimetres, world units otherwise.
-    * `.obj`: with `.mtl` and `.png` beside it where there is a texture; colours behind the positions;
+    * `.obj`: where there is a texture, its material and image beside it, `NAME_texture.mtl` and
+      `NAME_texture.png`, with white space in the name as underscores; colours behind the positions;
       groups `observed` and `invented`, since the format has no attributes; world units.
     * `.ply`: colours and `invented` of vertices; the format has no texture that viewers agree on; world
       units.
@@ -37,6 +38,9 @@ def write_mesh(colored: ColoredMesh, path: Path, *, metric: bool = True) -> None
         path: its suffix chooses the format.
         metric: the world's unit is millimetres.
 
+    Returns:
+        The files written, `path` first.
+
     Raises:
         ConfigError: for another suffix.
     """
@@ -44,13 +48,14 @@ def write_mesh(colored: ColoredMesh, path: Path, *, metric: bool = True) -> None
     if suffix == ".glb":
         path.write_bytes(_glb(colored, metric))
     elif suffix == ".obj":
-        _write_obj(colored, path)
+        return path, *_write_obj(colored, path)
     elif suffix == ".ply":
         _write_ply(colored, path)
     else:
         raise ConfigError(
             f"a mesh is written as {', '.join(MESH_FORMATS)}; {path.name} ends in none of these"
         )
+    return (path,)
 
 
 def _write_ply(colored: ColoredMesh, path: Path) -> None:
@@ -74,13 +79,15 @@ def _write_ply(colored: ColoredMesh, path: Path) -> None:
     PlyData(elements, byte_order="<").write(str(path))
 
 
-def _write_obj(colored: ColoredMesh, path: Path) -> None:
+def _write_obj(colored: ColoredMesh, path: Path) -> tuple[Path, ...]:
+    """Write the mesh; returns what was written beside it."""
     mesh, uv = colored.mesh, colored.uv
+    beside: tuple[Path, ...] = ()
     lines = ["# extrags; v: x y z red green blue"]
     if colored.texture is not None:
-        # Both formats end a name at white space.
-        beside = path.with_name("_".join(path.stem.split()) or "surface")
-        picture, material = (beside.with_name(f"{beside.name}{suffix}") for suffix in (".png", ".mtl"))
+        # Both formats end a name at white space. Pictures called as the mesh are often there already.
+        stem = "_".join([*path.stem.split(), "texture"])
+        material, picture = beside = path.with_name(f"{stem}.mtl"), path.with_name(f"{stem}.png")
         picture.write_bytes(_png(colored.texture))
         material.write_text(
             f"newmtl surface\nKa 0 0 0\nKd 1 1 1\nKs 0 0 0\nillum 1\nmap_Kd {picture.name}\n",
@@ -107,6 +114,7 @@ def _write_obj(colored: ColoredMesh, path: Path) -> None:
                     "f " + " ".join(f"{corner}/{3 * index + k + 1}" for k, corner in enumerate(corners))
                 )
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return beside
 
 
 def _glb(colored: ColoredMesh, metric: bool) -> bytes:

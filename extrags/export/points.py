@@ -31,7 +31,7 @@ def write_points(gaussians: Gaussians, path: Path, *, min_opacity: float = 0.5) 
     """
     from plyfile import PlyData, PlyElement
 
-    kept = gaussians.subset(gaussians.opacities.sigmoid() >= min_opacity).detached()
+    kept = gaussians.subset(gaussians.opacities.sigmoid() >= min_opacity).detached().to("cpu")
     if not len(kept):
         raise CaptureError(f"no Gaussian has an opacity of {min_opacity:g} or more; there are no points")
     rows = np.empty(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,8 +68,10 @@ def colored_mesh(
     Args:
         mesh: the surface.
         scene: colours it; without light (`extrags.splat_files.bake_light`), or seams of brightness stay.
+            It is rendered on the processor, wherever it is.
         train: the training views.
-        virtual: further views, which colour what training views do not see.
+        virtual: further views, which colour what training views do not see; of any size, with or without a
+            lens.
         texture: make an image of the surface as well, not only colours of vertices.
 
     Raises:
@@ -81,26 +83,26 @@ def colored_mesh(
     normals = np.zeros_like(vertices)
     for corner in range(3):
         np.add.at(normals, mesh.triangles[:, corner], faces)
-    views = train if virtual is None or not len(virtual) else Cameras.concatenated([train, virtual])
+    parts = [train] if virtual is None or not len(virtual) else [train, virtual]
     atlas: _Atlas | None = None
     on_vertices, on_texels = _Seen(vertices, normals), _Seen(vertices[:0], normals[:0])
     owner = np.zeros(0, dtype=np.int64)
     if texture:
-        pixels = len(views) * views.width * views.height
+        pixels = sum(len(views) * views.width * views.height for views in parts)
         atlas = _Atlas.of(len(mesh.triangles), _TEXELS_PER_PIXEL * pixels)
         texels, owner = atlas.positions(corners)
         on_texels = _Seen(texels, faces[owner])
     slack = _SEEN_EDGES * float(np.median(np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)))
     training = np.zeros(len(vertices), dtype=bool)
     # Vertices and texels are coloured together: every view is rendered once.
-    for index, view in enumerate(_rendered(scene, views)):
+    for index, view in enumerate(_rendered(scene, parts)):
         shown = on_vertices.add(view, slack)
         if index < len(train):
             training |= shown
         # A triangle is about as large as a pixel: where none of its corners is visible, little of it is.
         on_texels.add(view, slack, np.flatnonzero(shown[mesh.triangles].any(axis=1)[owner]))
     if not (on_vertices.weight > 0).any():
-        raise CaptureError(f"none of the {len(views)} views sees any of the mesh")
+        raise CaptureError(f"none of the {sum(map(len, parts))} views sees any of the mesh")
     known = on_vertices.points[on_vertices.weight > 0], on_vertices.means()[on_vertices.weight > 0]
     colors = on_vertices.filled(*known)
     invented = np.where(training, 0, 1).astype(np.float32)
@@ -200,15 +202,20 @@ class _View:
     alpha: Float[np.ndarray, "h w"]
 
 
-def _rendered(scene: Scene, views: Cameras) -> Iterator[_View]:
-    for begun in range(0, len(views), _VIEWS_PER_BATCH):
-        batch = views[begun : begun + _VIEWS_PER_BATCH]
-        with torch.no_grad():
-            rendering = scene.render(batch, median_depth=True)
-        depths, alphas = np.asarray(rendering.median_depth), rendering.alpha.numpy()
-        for index, image in enumerate(rendering.rgb.numpy()):
-            yield _View(batch[index], image, depths[index], alphas[index])
-        emit(Progress("export", min(begun + _VIEWS_PER_BATCH, len(views)), len(views)))
+def _rendered(scene: Scene, parts: Sequence[Cameras]) -> Iterator[_View]:
+    # The median depth comes from the native kernels.
+    scene = scene.to("cpu")
+    done, total = 0, sum(map(len, parts))
+    for views in parts:
+        for begun in range(0, len(views), _VIEWS_PER_BATCH):
+            batch = views[begun : begun + _VIEWS_PER_BATCH]
+            with torch.no_grad():
+                rendering = scene.render(batch, median_depth=True)
+            depths, alphas = np.asarray(rendering.median_depth), rendering.alpha.numpy()
+            for index, image in enumerate(rendering.rgb.numpy()):
+                yield _View(batch[index], image, depths[index], alphas[index])
+            done += len(batch)
+            emit(Progress("export", done, total))
 
 
 class _Seen:

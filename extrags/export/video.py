@@ -34,8 +34,9 @@ def unobserved(scene: Scene, train: Cameras) -> Float[Tensor, "n"]:
         scene: the scene.
         train: the training views.
     """
+    # Coverage is counted on the processor.
     covered = training_coverage(
-        scene,
+        scene.to("cpu"),
         train.at_most_width(160),
         visible_weight=_VISIBLE_WEIGHT,
         n_directions=_DIRECTIONS,
@@ -78,12 +79,12 @@ def fly_through(
         columns = []
         with torch.no_grad():
             for scene in scenes if colors else ():
-                rgb = scene.render(camera, exposure=gain).rgb[0].clamp(0, 1).numpy()
+                rgb = scene.render(camera, exposure=gain).rgb[0].clamp(0, 1).cpu().numpy()
                 columns.append(np.rint(rgb * 255).astype(np.uint8))
             if lacking is not None:
                 shown, alpha = scenes[-1].render_attributes(camera, lacking[:, None])
                 # Where the scene holds nothing, nothing is known.
-                unknown = (shown[0, ..., 0] + 1 - alpha[0]).clamp(0, 1).numpy()
+                unknown = (shown[0, ..., 0] + 1 - alpha[0]).clamp(0, 1).cpu().numpy()
                 columns.append(_colored(unknown))
         yield np.concatenate(columns, axis=1)
         emit(Progress("export", index + 1, len(path)))

@@ -59,11 +59,13 @@ def carve(
         The grid, aligned with the principal axes of mesh and cameras.
 
     Raises:
-        CaptureError: when no voxel is free.
+        CaptureError: when no voxel is free, or there is no view to carve from.
 
     Source: [ExtraGS, section "Scene Initialization and Feasible Region Estimation"], see docs/references.md.
     """
     config = FreespaceConfig() if config is None else config
+    if not len(cameras):
+        raise CaptureError("no views to carve free space from")
     # Transmittance at points comes from the native kernels, and the grid is on the processor.
     scene = scene.to("cpu")
     size = config.grid_size

@@ -47,7 +47,7 @@ def bake_light(scene: Scene, *, distance: float | None = None, exposure: float =
         signal = exposure * (0.5 + SH_C0 * gaussians.sh0)
         return _with_colors(gaussians, signal, exposure * gaussians.shN)
     at = light.reference_distance if distance is None else distance
-    gain = light.detached().falloff(torch.tensor(float(at))).expand(len(gaussians))
+    gain = light.detached().falloff(gaussians.means.new_tensor(float(at))).expand(len(gaussians))
     return _lit(gaussians, light, exposure * gain)
 
 
@@ -73,10 +73,9 @@ def bake_recorded_light(scene: Scene, cameras: Cameras, *, exposure: float = 1.0
         raise ConfigError(f"the exposure of baked light is {exposure:g}; expected a positive number")
     gaussians, light = scene.gaussians.detached(), scene.light.detached()
     normals = shortest_axes(gaussians.quats, gaussians.scales)
-    viewmats = torch.from_numpy(cameras.viewmats).float()
-    weight, lit, shine = (torch.zeros(len(gaussians)) for _ in range(3))
-    nearest = torch.full((len(gaussians),), math.inf)
-    facing = torch.zeros(len(gaussians))
+    viewmats = torch.from_numpy(cameras.viewmats).float().to(gaussians.device)
+    none = gaussians.means.new_zeros(len(gaussians))
+    weight, lit, shine, facing, nearest = none, none, none, none, torch.full_like(none, math.inf)
     for begun in range(0, len(cameras), _VIEWS_PER_BATCH):
         batch = cameras[begun : begun + _VIEWS_PER_BATCH]
         with torch.no_grad():
@@ -84,11 +83,11 @@ def bake_recorded_light(scene: Scene, cameras: Cameras, *, exposure: float = 1.0
         for index in range(len(batch)):
             rotation, shift = viewmats[begun + index, :3, :3], viewmats[begun + index, :3, 3]
             points = gaussians.means @ rotation.T + shift
-            share = torch.zeros(len(gaussians)) if seen is None else seen[index]
+            share = none if seen is None else seen[index]
             turned = normals @ rotation.T
-            lit += share * light.gain(points, turned)
-            shine += share * light.specular_gain(points, turned)
-            weight += share
+            lit = lit + share * light.gain(points, turned)
+            shine = shine + share * light.specular_gain(points, turned)
+            weight = weight + share
             distance = points.norm(dim=1)
             facing = torch.where(distance < nearest, light.falloff(distance), facing)
             nearest = torch.minimum(nearest, distance)

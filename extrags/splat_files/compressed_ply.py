@@ -27,11 +27,14 @@ def write_compressed_ply(gaussians: Gaussians, path: Path) -> None:
     Args:
         gaussians: with colours, not albedo (`bake_light`).
         path: file to write; viewers expect it to end in `.ply`.
+
+    Raises:
+        CaptureError: when there are no Gaussians.
     """
     from plyfile import PlyData, PlyElement
 
     n = len(gaussians)
-    gaussians = gaussians.detached()
+    gaussians = gaussians.for_file(path)
     order = morton_order(gaussians.means.numpy())
     means = gaussians.means.numpy()[order].astype(np.float64)
     scales = gaussians.scales.numpy()[order].astype(np.float64).clip(-_SCALE_LIMIT, _SCALE_LIMIT)

@@ -12,8 +12,9 @@ from jaxtyping import Float
 
 from extrags.config import ImportedConfig
 from extrags.errors import PoseError, SourceError
+from extrags.frame_quantiles import median_of_frames
 from extrags.gaussians import Gaussians
-from extrags.scene import Scene
+from extrags.scene import NEAR, SHALLOWEST, Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.splat_files.reading import read_splat_file
 
@@ -23,6 +24,8 @@ _FARTHEST = 1e7
 _LARGEST_LOG_SCALE = 16.0
 _MIN_SEEN_SHARE = 0.05
 _LARGEST_RATIO = 2.0
+_SAMPLE = 20_000
+"""So many Gaussians tell how far away a scene is."""
 _WIDTH_PX = 160
 _VIEWS_PER_BATCH = 8
 
@@ -58,8 +61,9 @@ def import_scene(
         config: scale of the file's unit.
 
     Raises:
-        SourceError: when the file is damaged, numbers are out of range, or scene and cameras do not fit each
-            other: the message says how, and names the scale.
+        SourceError: when the file is damaged, numbers are out of range, scene and cameras do not fit each
+            other, or the unit of both is too large for a scene without light: the message says how, and names
+            the scale.
         PoseError: when the sequence's poses are not those of its source: estimated ones have their own world.
     """
     config = ImportedConfig() if config is None else config
@@ -78,6 +82,15 @@ def import_scene(
             f"{len(sequence.train)} training frames: they start from the mean"
         )
         scene = Scene(scene.gaussians, replace(scene.light, log_exposure=torch.zeros(len(sequence.train))))
+    depth = None if scene.light is not None else _typical_depth(scene, sequence)
+    if depth is not None and depth < SHALLOWEST:
+        raise SourceError(
+            f"the typical depth in {sequence.name} is {depth:.3g} units, too small without light, as nothing "
+            f"nearer than {NEAR:g} is rendered; scale its poses and depth up, and imported.scale, now "
+            f"{config.scale:g}, by the same factor",
+            file=path,
+            field="imported.scale",
+        )
     seen, error, ratio = _compared(scene, sequence)
     if seen < _MIN_SEEN_SHARE:
         raise SourceError(_elsewhere(scene, sequence, seen), file=path, field="means")
@@ -130,6 +143,25 @@ def _in_range(scene: Scene, path: Path) -> Scene:
             field="scales",
         )
     return scene
+
+
+def _typical_depth(scene: Scene, sequence: EndoscopicSequence) -> float | None:
+    """Median depth of the training frames, or of the Gaussians in their views; None where there are none."""
+    known = sequence.depth_mm
+    if known is not None:
+        given = median_of_frames(
+            lambda: (known[k][(known[k] > 0) & sequence.mask[k]] for k in sequence.train.tolist())
+        )
+        if given is not None:
+            return given
+    means = scene.gaussians.means.numpy().astype(np.float64)
+    points = means[:: -(-len(means) // _SAMPLE)]
+    cameras, found = sequence.training_cameras, [np.zeros(0)]
+    for index in range(len(cameras)):
+        pixels, depth = cameras[index].project(points)
+        found.append(depth[cameras.contains(pixels)])
+    depths = np.concatenate(found)
+    return float(np.median(depths)) if len(depths) else None
 
 
 def _compared(scene: Scene, sequence: EndoscopicSequence) -> tuple[float, float, float | None]:

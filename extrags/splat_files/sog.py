@@ -36,8 +36,11 @@ def write_sog(gaussians: Gaussians, path: Path) -> None:
     Args:
         gaussians: with colours, not albedo (`bake_light`).
         path: file to write; viewers expect it to end in `.sog`.
+
+    Raises:
+        CaptureError: when there are no Gaussians.
     """
-    gaussians = gaussians.detached()
+    gaussians = gaussians.for_file(path)
     order = morton_order(gaussians.means.numpy())
     images: dict[str, UInt8[np.ndarray, "h w 4"]] = {}
     width = -(-int(np.ceil(np.sqrt(len(order)))) // 4) * 4

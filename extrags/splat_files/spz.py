@@ -45,35 +45,36 @@ def write_spz(gaussians: Gaussians, path: Path) -> None:
     """Write SPZ of version 3.
 
     Positions get as many fractional bits as the scene's size leaves of 24, at most 20; scales reach from
-    e^-10 to e^5.9 world units; SH coefficients lie in [-1, 1), in steps of 1/8 (degree 1: 1/32) as the
-    format's own tools round them.
+    e^-10 to e^5.9 world units, colours from -0.44 to 1.44; SH coefficients lie in [-1, 1), in steps of 1/8
+    (degree 1: 1/16) as the format's own tools round them.
 
     Args:
         gaussians: with colours, not albedo (`bake_light`).
         path: file to write.
 
     Raises:
+        CaptureError: when there are no Gaussians.
         SourceError: for positions that 24 bits cannot hold.
     """
-    n = len(gaussians)
-    means = gaussians.means.detach().double().numpy() * [1, -1, -1]
+    gaussians, n = gaussians.for_file(path), len(gaussians)
+    means = gaussians.means.double().numpy() * [1, -1, -1]
     reach = float(np.abs(means).max(initial=0.0))
     bits = 20 if reach == 0 else min(20, int(np.floor(np.log2((2**23 - 1) / reach))))
     if bits < 0 or not np.isfinite(reach):
         raise SourceError(f"positions reach to {reach:g}; SPZ holds at most 2^23 units", field="means")
     fixed = np.rint(means * (1 << bits)).astype("<i4")
     positions = fixed.view(np.uint8).reshape(n, 3, 4)[:, :, :3]
-    opacities = _bytes(gaussians.opacities.detach().sigmoid().numpy() * 255)
-    sh0 = gaussians.sh0.detach().numpy()[:, 0]
+    opacities = _bytes(gaussians.opacities.sigmoid().numpy() * 255)
+    sh0 = gaussians.sh0.numpy()[:, 0]
     colors = _bytes((sh0 * _COLOR_SCALE + 0.5) * 255)
-    scales = _bytes((gaussians.scales.detach().numpy() + 10) * 16)
+    scales = _bytes((gaussians.scales.numpy() + 10) * 16)
     # Components in the format's order x, y, z, w.
-    quats = unit_quaternions(gaussians.quats.detach().numpy())[:, [1, 2, 3, 0]] * [1, -1, -1, 1]
+    quats = unit_quaternions(gaussians.quats.numpy())[:, [1, 2, 3, 0]] * [1, -1, -1, 1]
     largest, rest = largest_component(quats)
     magnitude = np.rint(np.abs(rest) * np.sqrt(2) * _QUAT_MAX).astype(np.uint32).clip(0, _QUAT_MAX)
     parts = magnitude | ((rest < 0).astype(np.uint32) << 9)
     packed = largest.astype(np.uint32) << 30 | parts[:, 0] << 20 | parts[:, 1] << 10 | parts[:, 2]
-    shN = gaussians.shN.detach().numpy() * _FLIPPED[: gaussians.shN.shape[1], None]
+    shN = gaussians.shN.numpy() * _FLIPPED[: gaussians.shN.shape[1], None]
     harmonics = np.rint(shN * 128 + 128)
     # Steps of 8 for degree 1, of 16 above: gzip does the rest.
     step = np.where(np.arange(shN.shape[1]) < 3, 8, 16)[:, None]

@@ -501,17 +501,12 @@ class Store:
         """
         return self.backend.sweep(older_than_hours)
 
-    def gc(
-        self,
-        current: Mapping[str, int] | None = None,
-        *,
-        older_than_hours: float = 24.0,
-        dry_run: bool = False,
-    ) -> list[str]:
-        """Garbage collection: `sweep`, files of failures, damaged artefacts, and those of outdated versions.
+    def gc(self, *, older_than_hours: float = 24.0, dry_run: bool = False) -> list[str]:
+        """Garbage collection: `sweep`, files of failures and damaged artefacts that were set aside.
+
+        Which whole artefacts go is the matter of `extrags.store.retention`.
 
         Args:
-            current: version of each stage; artefacts of other versions are removed. None keeps all.
             older_than_hours: as in `sweep`.
             dry_run: remove nothing.
 
@@ -524,13 +519,7 @@ class Store:
             removed += [f"failed/{entry.name}" for entry in sorted(failures.iterdir())]
             if not dry_run:
                 shutil.rmtree(failures)
-        removed += self.backend.remove_damaged(dry_run=dry_run)
-        for manifest in self.ls() if current is not None else []:
-            wanted = current.get(manifest.stage) if current is not None else None
-            outdated = wanted is not None and wanted != manifest.version
-            if outdated and (dry_run or self.backend.discard(manifest.key)):
-                removed.append(f"artefacts/{manifest.key}")
-        return removed
+        return removed + self.backend.remove_damaged(dry_run=dry_run)
 
 
 def _matches(manifest: Manifest, pattern: str) -> bool:

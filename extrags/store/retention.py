@@ -1,4 +1,4 @@
-"""Which artefacts to keep: by age, size, runs and reachability; and what each sequence uses.
+"""Which artefacts to keep: by age, size, version, runs and reachability; and what each sequence uses.
 
 Nothing is removed that a run which is going on has used, that was used a moment ago, or that a kept artefact
 was made from. What is removed all the same while a run looks for it is made anew by that run: artefacts
@@ -12,7 +12,7 @@ import logging
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from extrags.store.artefacts import Store
 from extrags.store.manifest import Manifest, stage_of
@@ -28,6 +28,10 @@ MOMENT_S = 600.0
 FINAL_STAGES = frozenset({"report", "dataset-report", "benchmark-report"})
 """Where a run has no record, its page stands for it, with what that was made from."""
 
+INTERMEDIATE_STAGES = frozenset({"evaluate-views"})
+"""Figures of the views of several scenes, from which the metrics of each are taken. They stay with the
+metrics, which other runs may share, but do not keep the other scenes."""
+
 
 @dataclass(frozen=True)
 class Policy:
@@ -39,6 +43,8 @@ class Policy:
         keep_last: of each sequence, what only runs before its last so many runs used; a run that found the
             same artefacts as a former one counts once, one that did not come to its figures not at all.
         unreachable: what none of the runs that are kept used: settings that were tried and left.
+        versions: what an earlier version of its stage made, by the current version of each stage. What a
+            later one made stays: programs of several versions may share a store.
         with_inputs: also what kept artefacts were made from.
     """
 
@@ -46,17 +52,8 @@ class Policy:
     max_bytes: int | None = None
     keep_last: int | None = None
     unreachable: bool = False
+    versions: Mapping[str, int] = field(default_factory=dict)
     with_inputs: bool = False
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether no rule is given."""
-        return (
-            self.older_than_s is None
-            and self.max_bytes is None
-            and self.keep_last is None
-            and not self.unreachable
-        )
 
 
 @dataclass(frozen=True)
@@ -106,9 +103,8 @@ class _Contents:
             key = waiting.pop()
             if key not in found:
                 found.add(key)
-                waiting += [
-                    name for name in self.manifests[key].input_keys.values() if name in self.manifests
-                ]
+                inputs = self.manifests[key].input_keys.values() if not _is_intermediate(key) else ()
+                waiting += [name for name in inputs if name in self.manifests]
         return found
 
     def in_order_of_use(self) -> list[str]:
@@ -146,7 +142,11 @@ def _planned(
     runs = [replace(run, ended=max(run.ended, _last_time(run, contents))) for run in runs]
     kept_runs, former = _last_runs(_with_pages(runs, contents), policy.keep_last)
     of_kept = {key for run in kept_runs for key in run.keys}
-    reasons: dict[str, str] = {}
+    reasons = {
+        key: f"of version {item.version} of its stage, which is at {policy.versions[item.stage]}"
+        for key, item in contents.manifests.items()
+        if item.version < policy.versions.get(item.stage, item.version)
+    }
     if policy.older_than_s is not None:
         limit = now - policy.older_than_s
         reasons |= {
@@ -242,7 +242,8 @@ def _with_pages(runs: list[Run], contents: _Contents) -> list[Run]:
 
 def _last_time(run: Run, contents: _Contents) -> str:
     """A run that only finds what is there may leave no record: when all that it needs was last used."""
-    return _date(min((contents.used[key] for key in run.keys if key in contents.used), default=0.0))
+    used = [contents.used[key] for key in _looked_up(run) if key in contents.used]
+    return _date(min(used, default=0.0))
 
 
 def _last_runs(runs: list[Run], count: int | None) -> tuple[list[Run], list[Run]]:
@@ -258,13 +259,28 @@ def _last_runs(runs: list[Run], count: int | None) -> tuple[list[Run], list[Run]
         by_sequence[run.sequence].append(run)
     kept = []
     for each in by_sequence.values():
-        whole = [place for place, run in enumerate(each) if _has_figures(run)] or list(range(len(each)))
+        # Of those that used the same the last one stands for all.
+        last = {_looked_up(run): place for place, run in enumerate(each) if _has_figures(run)}
+        whole = sorted(last.values()) or list(range(len(each)))
         kept += each[whole[-min(count, len(whole))] :]
     return kept, [run for run in runs if run not in kept]
 
 
 def _has_figures(run: Run) -> bool:
     return any(stage_of(key) in {"evaluate", *FINAL_STAGES} for key in run.keys)
+
+
+def _looked_up(run: Run) -> frozenset[str]:
+    """What every run of the same settings looks up.
+
+    Metrics of earlier versions do not say which figures they were taken from: these are used by the first run
+    alone.
+    """
+    return frozenset(key for key in run.keys if not _is_intermediate(key))
+
+
+def _is_intermediate(key: str) -> bool:
+    return stage_of(key) in INTERMEDIATE_STAGES
 
 
 def _made(manifest: Manifest) -> float:

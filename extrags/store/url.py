@@ -12,8 +12,9 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -77,15 +78,17 @@ class UrlBackend:
             raise StoreError(f"the store {self.url} cannot be read: {error}") from error
 
     def check_writable(self) -> None:
-        """Try one write to the local cache and one to the remote store.
+        """Try one write to the local cache and one to the remote store, where an artefact's files would be.
 
         Raises:
             StoreError: when either fails, with the reason.
         """
-        name = f"{self.prefix}/probe-{secrets.token_hex(4)}"
+        place = f"{self.prefix}/probe-{secrets.token_hex(4)}"
+        name = f"{place}/{secrets.token_hex(8)}/written"
         try:
-            self.fs.pipe_file(name, b"x")
+            self._put(name, b"x")
             self.fs.rm_file(name)
+            self._remove_empty(place)
             with private_directory(self.scratch, "probe"):
                 pass
         except Exception as error:
@@ -219,14 +222,14 @@ class UrlBackend:
         place = f"{self.prefix}/{DAMAGED}/{key}.{secrets.token_hex(4)}"
         manifest = f"{self.prefix}/{key}/{MANIFEST}"
         try:
-            self.fs.pipe_file(f"{place}/artefact/{MANIFEST}", self.fs.cat_file(manifest))
+            self._put(f"{place}/artefact/{MANIFEST}", self.fs.cat_file(manifest))
             self.fs.rm_file(manifest)
         except FileNotFoundError:
             return None
-        self.fs.pipe_file(f"{place}/{RECORD}", json.dumps(record, indent=1).encode())
+        self._put(f"{place}/{RECORD}", json.dumps(record, indent=1).encode())
         for name in self.fs.find(f"{self.prefix}/{key}"):
             relative = str(name).removeprefix(f"{self.prefix}/{key}").lstrip("/")
-            self.fs.mv(str(name), f"{place}/artefact/{relative}")
+            self._write(f"{place}/artefact/{relative}", partial(self.fs.mv, str(name)))
         self._remove_empty(f"{self.prefix}/{key}")
         return f"{self.url}/{DAMAGED}/{place.rsplit('/', 1)[-1]}"
 
@@ -262,7 +265,7 @@ class UrlBackend:
     def write_record(self, name: str, text: bytes) -> None:
         """Write `records/<name>` with one put, which replaces one that is there."""
         with self._as_store_errors(f"the record {name} cannot be written"):
-            self.fs.pipe_file(f"{self.prefix}/{RECORDS}/{name}", text)
+            self._put(f"{self.prefix}/{RECORDS}/{name}", text)
 
     def read_records(self, prefix: str) -> dict[str, bytes]:
         """Records by name, of those whose name begins so."""
@@ -308,7 +311,7 @@ class UrlBackend:
         if present is not None and same_content(present, manifest):
             if renew:
                 present = manifest.model_copy(update={"data": present.data})
-                self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest_text(present))
+                self._put(f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest_text(present))
             return present
         attempt = secrets.token_hex(8)
         manifest = manifest.model_copy(update={"data": attempt})
@@ -317,13 +320,38 @@ class UrlBackend:
                 if path.is_file():
                     name = path.relative_to(scratch).as_posix()
                     # In parts where it is large; not through the memory.
-                    self.fs.put_file(str(path), f"{self.prefix}/{manifest.key}/{attempt}/{name}")
-            self.fs.pipe_file(f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest_text(manifest))
+                    target = f"{self.prefix}/{manifest.key}/{attempt}/{name}"
+                    self._write(target, partial(self.fs.put_file, str(path)))
+            self._put(f"{self.prefix}/{manifest.key}/{MANIFEST}", manifest_text(manifest))
         except Exception as error:
             # As above.
             raise StoreError(f"the store {self.url} cannot be written: {error}") from error
         self._drop_copies(manifest.key, but=self._copy_of(manifest).name)
         return manifest
+
+    def _put(self, name: str, text: bytes) -> None:
+        self._write(name, lambda target: self.fs.pipe_file(target, text))
+
+    def _write(self, name: str, write: Callable[[str], object]) -> None:
+        """Write an object; once more where its folder was missing, which object stores have none of."""
+        try:
+            write(name)
+        except Exception:
+            # Each fsspec backend raises its own kinds. Folders are made only where one is missing: asked for
+            # one, object stores look for the bucket.
+            folder = name.rpartition("/")[0]
+            if self.fs.isdir(folder):
+                raise
+            self._make_folder(folder)
+            write(name)
+
+    def _make_folder(self, place: str) -> None:
+        """Make a folder and those above it; but no bucket, which the first part of the path may be."""
+        if "/" not in place or self.fs.isdir(place):
+            return
+        self._make_folder(place.rpartition("/")[0])
+        with suppress(FileExistsError):  # Another process has made it meanwhile.
+            self.fs.mkdir(place, create_parents=False)
 
     def discard(self, key: str) -> bool:
         """Remove an artefact: its manifest first, so that it disappears atomically, then the files it names.
@@ -385,6 +413,7 @@ class UrlBackend:
                 if all(self._modified(name) <= limit for name in self.fs.find(place)):
                     if not dry_run:
                         self.fs.rm(place, recursive=True)
+                        self._remove_empty(f"{self.prefix}/{key}")
                     removed.append(f"{key}/{attempt}")
         for name, key in copies:
             if name not in stored and key not in unreadable and (dry_run or self._drop_unless_refused(name)):

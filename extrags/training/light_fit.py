@@ -27,8 +27,7 @@ COMMON = (
 )
 """Parameters all cameras share, in the order of `CameraLight.packed`; the exposure comes before them."""
 LOG_ROUGHNESS_BOUNDS = (math.log(ROUGHNESS_MIN) + 1e-3, -1e-3)
-"""A learned roughness is kept inside those of the lobe: at them, and beyond, it has no gradient that would bring
-it back."""
+"""A learned roughness is kept inside those of the lobe: at them it has no gradient that brings it back."""
 
 
 def learned_parameters(config: LightConfig) -> list[str]:

@@ -13,7 +13,7 @@ from extrags.cameras import Cameras
 from extrags.config import CoarseConfig, DensifyConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.illumination import NearFieldLight
-from extrags.scene import NEAR, Scene
+from extrags.scene import NEAR, SHALLOWEST, Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training.continuing import EarlierScene, continued_schedule, continued_start
 from extrags.training.footprint import SmallestFootprint
@@ -28,9 +28,6 @@ from extrags.training.views import epochs
 __all__ = ["coarse_schedule", "reconstruct", "refines_poses", "scene_extent", "smallest_footprint"]
 
 logger = logging.getLogger(__name__)
-
-SHALLOWEST = 20 * NEAR
-"""Typical depth, in world units, below which the near plane would cut off parts of a scene without light."""
 
 
 def reconstruct(

@@ -107,8 +107,8 @@ def starting_gaussians(
     Unsure pixels of estimated depth beside sure ones start none: where depth jumps, an estimate lies between
     both surfaces, and Gaussians there would hang in front of what was never seen.
 
-    Each point carries the mean albedo of its pixels: the colour with light and response divided out, on known
-    surfaces its shading and highlights too. Radii follow the distance to the three nearest neighbours. Random points lie in the cameras' frusta; they
+    Each point carries the mean albedo of its pixels: the colour with light and response divided out.
+    Radii follow the distance to the three nearest neighbours. Random points lie in the cameras' frusta; they
     are round and faint, and a warning says so.
 
     Args:
@@ -161,16 +161,10 @@ def starting_gaussians(
     view = chosen // (sequence.width * sequence.height)
     points = cameras.centers[view] + z[:, None] * rays
     rgb = _of_frames(sequence.rgb, frames).reshape(-1, 3)[chosen].astype(np.float64) / 255
-    cell = _cells(points, max_points)
-    seen_points, points = points, _means(points, cell)
-    normals = None if at_random else surface_normals(points)
     if light is not None:
-        into_camera = cameras.world_from_camera[view, :3, :3]
-        local = np.einsum("nji,nj->ni", into_camera, seen_points - cameras.centers[view])
-        facing = None
-        if normals is not None:
-            facing = torch.from_numpy(np.einsum("nji,nj->ni", into_camera, normals[cell]))
-        rgb = light.albedo(torch.from_numpy(rgb), torch.from_numpy(local), facing).detach().numpy()
+        local = np.einsum("nji,nj->ni", cameras.world_from_camera[view, :3, :3], z[:, None] * rays)
+        rgb = light.albedo(torch.from_numpy(rgb), torch.from_numpy(local)).detach().numpy()
+    points, rgb = thin_out(points, rgb, max_points)
     neighbours = min(4, len(points))
     distance, _ = cKDTree(points).query(points, k=neighbours)
     distance = np.atleast_2d(distance.reshape(len(points), -1))
@@ -178,11 +172,11 @@ def starting_gaussians(
     floor = 1e-3 * float(np.median(z))
     return Gaussians.from_points(
         points,
-        _means(rgb, cell).clip(LEAST_COLOR, None),
+        np.clip(rgb, LEAST_COLOR, None),
         np.maximum(radius, floor),
         opacity=RANDOM_OPACITY if at_random else SURFACE_OPACITY,
         sh_degree=sh_degree,
-        normals=None if thickness == 1 else normals,
+        normals=None if at_random or thickness == 1 else surface_normals(points),
         thickness=1.0 if at_random else thickness,
     )
 
@@ -204,14 +198,8 @@ def thin_out(
 
     The voxel size is found by bisection: on a surface the number of voxels falls with its square.
     """
-    cell = _cells(points, max_points)
-    return _means(points, cell), _means(values, cell)
-
-
-def _cells(points: Float[np.ndarray, "n 3"], max_points: int) -> Int[np.ndarray, "n"]:
-    """Number of each point's voxel; of each point its own where there are no more than `max_points`."""
     if len(points) <= max_points:
-        return np.arange(len(points))
+        return points, values
     low, high = 0.0, float(np.ptp(points, axis=0).max())
     origin = points.min(axis=0)
     for _ in range(24):
@@ -223,14 +211,14 @@ def _cells(points: Float[np.ndarray, "n 3"], max_points: int) -> Int[np.ndarray,
             high = middle
         if high - low < 0.01 * high:
             break
-    keys = _cell_keys(np.floor((points - origin) / high).astype(np.int64))
-    return np.asarray(np.unique(keys, return_inverse=True)[1])
+    _, owner = np.unique(_cell_keys(np.floor((points - origin) / high).astype(np.int64)), return_inverse=True)
+    weight = np.bincount(owner).astype(np.float64)
 
+    def averaged(array: np.ndarray) -> np.ndarray:
+        columns = [np.bincount(owner, weights=array[:, k]) for k in range(array.shape[1])]
+        return np.asarray(np.stack(columns, axis=1) / weight[:, None])
 
-def _means(values: Float[np.ndarray, "n c"], cell: Int[np.ndarray, "n"]) -> Float[np.ndarray, "m c"]:
-    """Mean of the values in each cell."""
-    sums = [np.bincount(cell, weights=values[:, k]) for k in range(values.shape[1])]
-    return np.asarray(np.stack(sums, axis=1) / np.bincount(cell)[:, None])
+    return averaged(points), averaged(values)
 
 
 def _cell_keys(cells: Int[np.ndarray, "n 3"]) -> Int[np.ndarray, "n"]:

@@ -41,7 +41,8 @@ class PathRecorder:
         """One more view.
 
         Args:
-            camera: one camera of any size.
+            camera: one camera of any size; one with a lens is recorded as a pinhole, since camera paths
+                have none.
             after_s: since the view before, above 0; of no account for the first view.
             rests: whether, when that was long, the camera stood still and moved at the end alone. Otherwise
                 it glides all the time.
@@ -51,6 +52,7 @@ class PathRecorder:
         """
         if len(camera) != 1:
             raise ConfigError(f"a view is that of one camera, not of {len(camera)}")
+        camera = camera.as_pinholes()
         if not self._views:
             self._views, self._times = [camera], [0.0]
             return

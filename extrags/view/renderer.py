@@ -16,7 +16,7 @@ from extrags.cameras import Cameras
 from extrags.errors import ConfigError
 from extrags.export.video import unobserved
 from extrags.raster import CameraLight, Rendering, rasterize
-from extrags.scene import Scene
+from extrags.scene import NEAR, SHALLOWEST, Scene
 from extrags.view.viewpoints import overview, typical_depth
 
 __all__ = ["LAYERS", "SceneRenderer", "ViewSettings"]
@@ -36,8 +36,8 @@ class ViewSettings:
         exposure: gain of the camera, above 0; 1 is the mean of the training frames.
         lamp: brightness of the lamp, 0 is off; 1 is that of the recording. It multiplies as the exposure
             does; a scene without a lamp has none to change.
-        falloff: False lights everything as on the axis at the light's reference distance, facing the lamp:
-            albedo under the camera's response.
+        falloff: False lights everything as on the axis at the light's reference distance, facing the lamp,
+            without highlights: albedo under the camera's response.
         layer: color; alpha, how opaque; depth, from near (red) to far (blue); uncertainty, how little the
             training views say (black: well known, yellow: unknown).
         mix: share of a layer other than colour, the rest of which is colour, 0 to 1.
@@ -66,8 +66,12 @@ class ViewSettings:
 class SceneRenderer:
     """Renders one scene for any number of viewers, from any thread, one picture at a time.
 
-    With the settings that hold at first a picture is exactly that of `Scene.render`. What `Scene.render`
-    makes of the parameters for every picture is made once here, and lies on the device that renders.
+    With the settings that hold at first a picture is exactly that of `Scene.render`, through a lens as well.
+    What `Scene.render` makes of the parameters for every picture is made once here, and lies on the device
+    that renders.
+
+    One exception: a scene without light whose typical depth is below `SHALLOWEST`, which reconstruction and
+    import refuse, is rendered from a hundredth of that depth on. `Scene.render` would leave surface out.
 
     Args:
         scene: the scene.
@@ -149,8 +153,17 @@ class SceneRenderer:
             camera.height,
             colors=colors,
             light=light,
-            near=self.scene.near,
+            near=self._near,
+            lens=camera.lens,
         )
+
+    @cached_property
+    def _near(self) -> float:
+        if self.scene.light is not None or not len(self.scene.gaussians):
+            return self.scene.near
+        depth = self._depth_unit
+        # As `Scene.near` has it of the light's reference distance.
+        return self.scene.near if depth >= SHALLOWEST else NEAR * depth
 
     def _light(self, settings: ViewSettings) -> CameraLight | None:
         light = self.scene.light

@@ -280,7 +280,7 @@ def _sized(camera: Cameras, width: int) -> Cameras:
 
 def _same(first: Cameras, second: Cameras) -> bool:
     return (
-        (first.width, first.height) == (second.width, second.height)
+        (first.width, first.height, first.lens) == (second.width, second.height, second.lens)
         and np.array_equal(first.world_from_camera, second.world_from_camera)
         and np.array_equal(first.K, second.K)
     )

@@ -61,9 +61,8 @@ def overview(scene: Scene, width: int) -> Cameras:
     # Strays, which reconstructions have, do not count: three quarters of the Gaussians are in view.
     distance = np.linalg.norm(offsets, axis=1)
     reach = max(float(np.quantile(distance, 0.75)), 1e-6)
-    axes = (
-        np.linalg.svd(offsets[distance <= 2 * reach], full_matrices=True)[2] if len(points) > 3 else np.eye(3)
-    )
+    inner = offsets[distance <= 2 * reach]
+    axes = np.linalg.svd(inner, full_matrices=False)[2] if len(points) > 3 else np.eye(3)
     pose = look_at(middle - axes[2] * reach / math.tan(math.radians(_FOV_DEG / 2)) * 1.5, middle, axes[1])
     return pinhole(pose, math.radians(_FOV_DEG), 4 / 3, width)
 

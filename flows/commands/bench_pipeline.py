@@ -33,8 +33,8 @@ def add_arguments(parser: Parser) -> None:
     parser.description = (
         "Run every method with every budget, measure what it costs and how good it is, and find the runs "
         "that no other beats in both. Each run is measured in a process of its own; nothing is taken from "
-        "any store but the grid's, which begins empty. Called again, it goes on where it was. Exit code 1 "
-        "when a run failed."
+        "any store but the grid's, which begins empty. Called again, it goes on where it was, and runs anew "
+        "what reads files that were changed. Exit code 1 when a run failed."
     )
     parser.add_argument("sequences", nargs="+", metavar="SEQUENCE")
     parser.add_argument("--methods", nargs="+", default=["coarse", "extrags"], metavar="METHOD")
@@ -116,11 +116,10 @@ def pipeline(given: argparse.Namespace) -> int:
 
 def _check_models(cells: Any, preflight: Any) -> None:
     """Missing models and weights are said before the first run."""
-    from flows.methods import METHODS, method_config
+    from flows.methods import METHODS
 
     for cell in {(cell.method, cell.profile, cell.budget): cell for cell in cells}.values():
-        config = method_config(cell.method, cell.profile, {**cell.settings, **cell.changed}, cell.seed)
-        preflight(config, "evaluate", METHODS[cell.method].leave_out)
+        preflight(cell.config(), "evaluate", METHODS[cell.method].leave_out)
 
 
 def grid_markdown(found: dict[str, Any]) -> str:

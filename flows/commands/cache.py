@@ -57,7 +57,7 @@ def add_arguments(parser: Parser) -> None:
         gc,
         "remove what can never be used again, and what the options say",
         description="Remove what killed runs left, debugging files of failures, damaged artefacts that were "
-        "set aside, and artefacts of former versions of their stage. Each option removes more; never what a "
+        "set aside, and artefacts of earlier versions of their stage. Each option removes more; never what a "
         "run that is going on uses, what was used within the last ten minutes, or what a kept artefact was "
         "made from.",
     )
@@ -233,25 +233,27 @@ def gc(given: argparse.Namespace) -> int:
 
     from extrags.store.retention import Policy, apply_policy, planned_removals
 
-    policy = Policy(
-        older_than_s=None if given.older_than is None else age_s(given.older_than),
-        max_bytes=None if given.max_size is None else size_bytes(given.max_size),
-        keep_last=given.keep_last,
-        unreachable=given.unreachable,
-        with_inputs=given.with_inputs,
-    )
-    if policy.keep_last is not None and policy.keep_last < 1:
-        raise ConfigError(f"--keep-last {policy.keep_last}: expected 1 or more")
+    older_than_s = None if given.older_than is None else age_s(given.older_than)
+    max_bytes = None if given.max_size is None else size_bytes(given.max_size)
+    if given.keep_last is not None and given.keep_last < 1:
+        raise ConfigError(f"--keep-last {given.keep_last}: expected 1 or more")
     store = _existing_store(given)
+    # Here, because they load Prefect, which wrong usage must not wait for.
     from tasks.locks import sweep_locks
     from tasks.stage import all_stage_versions
 
-    leftovers = store.gc(all_stage_versions(), dry_run=given.dry_run)
+    leftovers = store.gc(dry_run=given.dry_run)
     if not given.dry_run:
         leftovers += sweep_locks(store.locks)
-    removed = []
-    if not policy.is_empty:
-        removed = planned_removals(store, policy)[0] if given.dry_run else apply_policy(store, policy)
+    policy = Policy(
+        older_than_s=older_than_s,
+        max_bytes=max_bytes,
+        keep_last=given.keep_last,
+        unreachable=given.unreachable,
+        versions=all_stage_versions(),
+        with_inputs=given.with_inputs,
+    )
+    removed = planned_removals(store, policy)[0] if given.dry_run else apply_policy(store, policy)
     if given.json != "-":
         for name in leftovers:
             print(name)
@@ -259,9 +261,8 @@ def gc(given: argparse.Namespace) -> int:
             print(f"artefacts/{item.key}  {item.sequence}  {size_text(item.bytes)}  {item.reason}")
         would = "would be " if given.dry_run else ""
         print(f"{len(leftovers)} leftovers {would}removed from {store.root}")
-        if not policy.is_empty:
-            freed = size_text(sum(item.bytes for item in removed))
-            print(f"{len(removed)} artefacts of {freed} {would}removed")
+        freed = size_text(sum(item.bytes for item in removed))
+        print(f"{len(removed)} artefacts of {freed} {would}removed")
     rows = [asdict(item) for item in removed]
     write_json({"dry_run": given.dry_run, "leftovers": leftovers, "artefacts": rows}, given.json)
     return 0

@@ -130,12 +130,15 @@ def finished_run(given: argparse.Namespace, until: StageName, otherwise: str = "
 
 def _on_record(root: str, sequence: str) -> str:
     """What settings finished runs of a sequence had, for who has left some out; empty without such runs."""
+    from data_catalog.names import comparable_name
     from extrags.store import Store
     from flows.outcome_records import outcome_records
 
+    wanted = comparable_name(sequence)
     found: dict[str, None] = {}
     for record in outcome_records(Store(root)).values():
-        if record["sequence"] == sequence and record["status"] == "ok" and record.get("report"):
+        same = comparable_name(str(record["sequence"])) == wanted
+        if same and record["status"] == "ok" and record.get("report"):
             method = "" if record["method"] == "extrags" else f" --method {record['method']}"
             seed = "" if record["seed"] is None else f" --seed {record['seed']}"
             found[f"--profile {record['profile']}{method}{seed}"] = None

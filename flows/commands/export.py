@@ -60,7 +60,8 @@ def add_arguments(parser: Parser) -> None:
         choices=(*COLORED, *FLOWN, *SEQUENCES),
         default="ply",
         help="ply, compressed-ply, spz, sog: Gaussians, from the largest to the smallest file; mesh: surface "
-        "with texture, of the kind that FILE ends with (.glb, .obj, .ply); points: centres of the Gaussians; "
+        "with texture, of the kind that FILE ends with (.glb, .ply, .obj: then NAME_texture.mtl and "
+        "NAME_texture.png are written beside NAME.obj); points: centres of the Gaussians; "
         "camera-path: JSON of nerfstudio's viewer; video: H.264; colmap, colmap-text, transforms: the "
         "sequence (default: ply)",
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,14 +41,29 @@ def export_scene(given: argparse.Namespace) -> int:
     write = {"camera-path": _camera_path, "video": _video, "mesh": _mesh, "points": _points}
     with _progress(given):
         try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            said = write.get(given.to, _gaussians)(given, target)
+            with _folder(target.parent):
+                said = write.get(given.to, _gaussians)(given, target)
         except StoreError:
             raise
         except OSError as error:
             raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
     print(f"{target}: {said}")
     return 0
+
+
+@contextmanager
+def _folder(wanted: Path) -> Iterator[None]:
+    """Make a folder, and take back what was made where nothing comes to lie in it."""
+    made = [folder for folder in (wanted, *wanted.parents) if not folder.exists()]
+    # At once: a place that cannot be written must not be found out after all the work.
+    wanted.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        with suppress(OSError):
+            for folder in made:
+                folder.rmdir()
+        raise
 
 
 @contextmanager
@@ -139,6 +154,7 @@ def _gaussians(given: argparse.Namespace, target: Path) -> str:
 def _mesh(given: argparse.Namespace, target: Path) -> str:
     from extrags.cameras import Cameras
     from extrags.export import colored_mesh, write_mesh
+    from extrags.radial_lens import WIDE_FIELD_DEG
     from extrags.scene import Scene
     from extrags.surface import fuse_surface
 
@@ -148,16 +164,19 @@ def _mesh(given: argparse.Namespace, target: Path) -> str:
     # Virtual views show what they have added to the final scene; there is nothing of it in the coarse one.
     flights = finished.virtual() if (given.scene or "final") == "final" and finished.fine_tuned else []
     virtual = Cameras.concatenated(flights) if flights else None
-    views = train if virtual is None else Cameras.concatenated([train, virtual])
+    # Virtual views are pinholes, frames may have a lens; the surface is fused from pinholes.
+    views = Cameras.concatenated([train.as_pinholes(WIDE_FIELD_DEG), *flights])
     mesh = fuse_surface(scene, views, finished.config.surface)
     baked = Scene(_baked(given, finished, scene))
     # PLY has no texture that viewers agree on.
     texture = given.texture is not False and target.suffix.lower() != ".ply"
     colored = colored_mesh(mesh, baked, train, virtual, texture=texture)
-    write_mesh(colored, target, metric=frames.metric)
+    written = write_mesh(colored, target, metric=frames.metric)
+    beside = f", beside it {' and '.join(file.name for file in written[1:])}" if written[1:] else ""
     return (
         f"{len(mesh.vertices)} vertices, {len(mesh.triangles)} triangles, "
-        f"{100 * float((colored.invented > 0).mean()):.1f} % of the vertices invented, {_megabytes(target)}"
+        f"{100 * float((colored.invented > 0).mean()):.1f} % of the vertices invented, "
+        f"{_megabytes(*written)}{beside}"
     )
 
 
@@ -181,7 +200,7 @@ def _camera_path(given: argparse.Namespace, target: Path) -> str:
 def _video(given: argparse.Namespace, target: Path) -> str:
     from extrags.export import fly_through, write_video
 
-    finished = _finished(given, "finetune")
+    finished = _finished(given, _shown_until(given))
     path = _flight(given)
     if given.panels is None:
         panels = ["coarse", "final", "uncertainty"] if finished.fine_tuned else ["final", "uncertainty"]
@@ -196,6 +215,12 @@ def _video(given: argparse.Namespace, target: Path) -> str:
     count = write_video(pictures, target, fps=path.fps)
     names = [*shown, *(["uncertainty"] if train is not None else [])]
     return f"{count} frames of {', '.join(names)}, {count / path.fps:.1f} s, {_megabytes(target)}"
+
+
+def _shown_until(given: argparse.Namespace) -> StageName:
+    """The stage that makes the last scene of a video; `uncertainty` alone is that of the final scene."""
+    panels = [] if given.panels is None else given.panels.split(",")
+    return "coarse" if "coarse" in panels and "final" not in panels else "finetune"
 
 
 def _flight(given: argparse.Namespace) -> CameraPath:
@@ -239,8 +264,8 @@ def _cameras(given: argparse.Namespace, along: str, steps: int) -> Cameras:
     )
 
 
-def _megabytes(target: Path) -> str:
-    return f"{target.stat().st_size / 1e6:.2f} MB"
+def _megabytes(*files: Path) -> str:
+    return f"{sum(file.stat().st_size for file in files) / 1e6:.2f} MB"
 
 
 def posed_sequence(given: argparse.Namespace) -> EndoscopicSequence:

@@ -29,6 +29,7 @@ from flows.outcome import DatasetFailedError, DatasetOutcome
 if TYPE_CHECKING:
     from extrags.pipeline import StageName
     from flows.cases import SequenceCase
+    from flows.outcome import SequenceOutcome
 
 __all__ = ["Several", "add_arguments", "execute", "parsed_matrix", "parsed_methods", "run"]
 
@@ -319,7 +320,10 @@ def _may_be_finished(root: str, sequence: str, until: StageName) -> bool:
 
 
 def _from_store(cases: Sequence[SequenceCase], root: str, until: StageName) -> DatasetOutcome | None:
-    """Outcomes from the store alone; None as soon as anything is missing or wrong."""
+    """Outcomes from the store alone; None as soon as anything is missing or wrong.
+
+    They are left on record as those of a flow run are.
+    """
     from flows.methods import METHODS, profile_label
     from flows.pages import dataset_page
     from flows.runners import NotInStoreError, StoreRunner
@@ -351,7 +355,22 @@ def _from_store(cases: Sequence[SequenceCase], root: str, until: StageName) -> D
             page = dataset_page(outcomes, "dataset", label, runner) if until == "report" else None
     except (NotInStoreError, DamagedArtefactError):
         return None
+    for case, outcome in zip(cases, outcomes, strict=True):
+        _record(case, outcome, root, until)
     return DatasetOutcome(outcomes, page)
+
+
+def _record(case: SequenceCase, outcome: SequenceOutcome, root: str, until: StageName) -> None:
+    """Leave on record how a run ended and what it used, if the store can be written."""
+    from extrags.store import Store
+    from extrags.store.runs import recorded_run
+    from flows.cases import record_outcome_quietly
+
+    store = Store(root)
+    with recorded_run(store, case.sequence) as used:
+        if used is not None:
+            used.add(key for row in outcome.stages for key in row.made)
+    record_outcome_quietly(store, case, outcome, until, case.config())
 
 
 def _check_names(sequences: list[str]) -> None:

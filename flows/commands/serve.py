@@ -25,7 +25,11 @@ def add_arguments(parser: Parser) -> None:
     )
     parser.set_defaults(command=serve)
     parser.add_argument(
-        "names", nargs="*", metavar="NAME", help="deployments to serve, e.g. nightly (default: all)"
+        "names",
+        nargs="*",
+        metavar="NAME",
+        help="deployments to serve: FLOW/NAME, e.g. benchmark/weekly, or NAME where only one is called so "
+        "(default: all)",
     )
     parser.add_argument("--file", metavar="FILE", help="where they are declared (default: those of extrags)")
     parser.add_argument(
@@ -41,22 +45,20 @@ def serve(given: argparse.Namespace) -> int:
     """`extrags serve`; returns when it is interrupted.
 
     Raises:
-        ConfigError: without a server, for an unknown name, or a file that is wrong.
+        ConfigError: without a server, for an unknown or ambiguous name, or a file that is wrong.
     """
-    from flows.deployments import declared_deployments, usual_file
+    from flows.deployments import chosen_deployments, declared_deployments, usual_file
 
     if given.limit < 1:
         raise ConfigError(f"--limit is {given.limit}; expected 1 or more")
     declared = declared_deployments(Path(given.file) if given.file else usual_file())
-    known = [item.name for item in declared]
-    for name in given.names:
-        if name not in known:
-            raise ConfigError(f"no deployment {name!r}; known: {', '.join(known)}")
     set_up_logging(debug=given.debug, terminal=False)
     # Runs are processes with another working directory: what they find by is absolute.
     if given.store or os.environ.get("EXTRAGS_STORE"):
         os.environ["EXTRAGS_STORE"] = store_root(given)
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # Loads the flows, where names alone do not decide.
+    chosen = chosen_deployments(declared, given.names)
     from prefect import serve as prefect_serve
     from prefect.settings import PREFECT_API_URL
 
@@ -65,7 +67,6 @@ def serve(given: argparse.Namespace) -> int:
             "extrags serve needs a Prefect server that lasts: start one (prefect server start), and set "
             "PREFECT_API_URL to its address, http://127.0.0.1:4200/api"
         )
-    chosen = [item for item in declared if not given.names or item.name in given.names]
     prefect_serve(
         *[_deployment(item, schedules=given.schedules) for item in chosen],
         limit=given.limit,

@@ -186,10 +186,6 @@ class TestChecks:
         with pytest.raises(SourceError, match="1 frames both train and evaluate"):
             check_sequence(leaking)
 
-    def test_split_beyond_the_frames(self, sparse) -> None:
-        with pytest.raises(SourceError, match="names frame 48, there are 48 frames"):
-            check_sequence(replace(sparse, split=Split("bad", np.arange(20), np.arange(20, 49))))
-
     def test_empty_mask(self, sparse) -> None:
         mask = sparse.mask.copy()
         mask[2] = False

@@ -15,6 +15,7 @@ from data_catalog.c3vd.video import Video
 from data_catalog.catalog import (
     read,
     resolve,
+    source_fingerprint,
 )
 from extrags.cameras import invert_poses
 from extrags.config import IngestConfig
@@ -80,6 +81,20 @@ class TestLayouts:
         ):
             folder = Path(shutil.copytree(pristine.folder, tmp_path / name))
             assert Video.open(folder).calibration == f"as published with {expected}"
+
+    def test_the_lens_that_is_chosen_is_part_of_the_fingerprint(self, pristine, tmp_path) -> None:
+        folders = [
+            Path(shutil.copytree(pristine.folder, tmp_path / name))
+            for name in ("c1_cecum_t1_v1", "my_recording", "cecum_t1_a")
+        ]
+        named, plain, other = (source_fingerprint(folder) for folder in folders)
+        assert named == plain
+        assert other != plain
+        assert other["files"] == plain["files"]
+        for folder in folders:
+            write_calibration(folder / "calibration.json", 270, 216)
+        named, plain, other = (source_fingerprint(folder) for folder in folders)
+        assert named == plain == other
 
     def test_row_major_poses_are_noticed(self, tmp_path) -> None:
         written = write_video(tmp_path / "rows", frames=3, row_major=True)

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from data_catalog.catalog import read, resolve, source_fingerprint
 from data_catalog.readers.colmap_files import ColmapImage, ColmapModel, read_model, write_model
 from data_catalog.readers.colmap_model import model_folder, points_of, read_depth_map, write_colmap
 from extrags.config import IngestConfig
+from extrags.errors import SourceError
 from extrags.lens import Lens, Undistortion
 from extrags.sequence import Split
 from tests.data_catalog.layouts import carried_error_mm, same_frames
@@ -203,6 +208,113 @@ class TestReading:
         (tmp_path / "two" / "length_unit.txt").write_text("arbitrary")
         assert source_fingerprint(tmp_path / "two") != first
         assert read(tmp_path / "two").metric is False
+
+
+@pytest.fixture
+def workspace(varied, tmp_path) -> Path:
+    """Two recordings in folders of their own, with masks and depth, and a picture beside them."""
+    place = tmp_path / "workspace"
+    write_colmap(replace(varied, recording=np.repeat([0, 1], 5)), place)
+    return place
+
+
+def rename_images(workspace: Path, change: Callable[[str], str]) -> None:
+    """Other names in the model, and without lists of what trains."""
+    place = workspace / "sparse" / "0"
+    model = read_model(place)
+    write_model(replace(model, images=[replace(one, name=change(one.name)) for one in model.images]), place)
+    for name in ("train", "test"):
+        (workspace / f"{name}_list.txt").unlink(missing_ok=True)
+
+
+PARTS = {
+    "images": "images/recording_1/0007.png",
+    "masks": "masks/recording_1/0007.png.png",
+    "depth": "stereo/depth_maps/recording_1/0007.png.geometric.bin",
+}
+
+
+class TestFingerprint:
+    @pytest.mark.parametrize("linked", [False, True])
+    @pytest.mark.parametrize("part", PARTS)
+    def test_every_file_that_is_read_counts(self, workspace, tmp_path, part, linked) -> None:
+        file = workspace / PARTS[part]
+        if linked:
+            file.parent.rename(tmp_path / "elsewhere")
+            file.parent.symlink_to(tmp_path / "elsewhere")
+        before = source_fingerprint(workspace)
+        assert PARTS[part] in [name for name, *_ in before["files"]]
+        other = file.with_name(file.name.replace("0007", "0008"))
+        file.write_bytes(other.read_bytes()[:-1] + b"7")
+        assert source_fingerprint(workspace) != before
+
+    def test_images_below_the_folder_itself_count(self, workspace) -> None:
+        for folder in ("recording_0", "recording_1"):
+            (workspace / "images" / folder).rename(workspace / folder)
+        (workspace / "images").rmdir()
+        assert len(read(workspace)) == 10
+        before = source_fingerprint(workspace)
+        file = workspace / "recording_1" / "0007.png"
+        file.write_bytes((workspace / "recording_1" / "0008.png").read_bytes())
+        assert source_fingerprint(workspace) != before
+
+    def test_what_is_not_read_does_not_count(self, workspace) -> None:
+        before = source_fingerprint(workspace)
+        shutil.copyfile(workspace / PARTS["images"], workspace / "images" / "without_pose.png")
+        shutil.copyfile(workspace / PARTS["images"], workspace / "contact_sheet.png")
+        (workspace / "masks" / "notes.txt").write_text("painted by hand")
+        assert source_fingerprint(workspace) == before
+
+
+class TestMasks:
+    @pytest.mark.parametrize("renamed", ["0000.png.PNG", "0000.png", "0000.PNG", "0000.bmp", "0000.Tif"])
+    def test_names_that_are_found(self, varied, tmp_path, renamed) -> None:
+        write_colmap(varied, tmp_path)
+        expected = read(tmp_path).mask
+        assert not expected.all()
+        for file in sorted((tmp_path / "masks").iterdir()):
+            picture = Image.open(file)
+            picture.load()
+            file.unlink()
+            kind = "png" if renamed.lower().endswith("png") else Path(renamed).suffix[1:]
+            picture.save(
+                file.with_name(renamed.replace("0000", file.name[:4])), format=kind.replace("Tif", "tiff")
+            )
+        np.testing.assert_array_equal(read(tmp_path).mask, expected)
+
+    def test_frames_without_one_are_named(self, workspace, caplog) -> None:
+        (workspace / "masks" / "recording_1" / "0007.png.png").unlink()
+        assert read(workspace).mask[7].all()
+        assert caplog.text.count("have no mask") == 1
+        assert "1 of 10 frames have no mask and are tissue throughout: recording_1/0007.png" in caplog.text
+
+    def test_another_folder_of_masks_is_told_of(self, workspace, caplog) -> None:
+        (workspace / "masks").rename(workspace / "mask")
+        assert read(workspace).mask.all()
+        assert "mask is not read; masks are looked for in masks/" in caplog.text
+
+
+class TestNames:
+    @pytest.mark.parametrize("place", ["images", "rgb"])
+    def test_absolute_names_are_those_below_the_folder(self, workspace, place) -> None:
+        """Joined to masks/, an absolute name would be the image's own: it would be its mask."""
+        for file in sorted((workspace / "masks").rglob("*.png.png")):
+            file.rename(file.with_name(file.name.removesuffix(".png")))
+        rename_images(workspace, str)
+        expected = read(workspace)
+        if place != "images":
+            (workspace / "images").rename(workspace / place)
+            (workspace / "images").mkdir()
+        rename_images(workspace, lambda name: f"{workspace.resolve()}/{place}/{name}")
+        found = read(workspace)
+        same_frames(found, expected, atol=ROUNDING)
+        np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
+        np.testing.assert_array_equal(found.recording, expected.recording)
+
+    def test_two_spellings_of_one_image_are_refused(self, workspace) -> None:
+        rename_images(workspace, lambda name: name.replace("0007", "./0008"))
+        with pytest.raises(SourceError, match=r"images\.bin, frame .*0008\.png, field name: .*listed twice"):
+            read(workspace)
 
 
 class TestPoints:

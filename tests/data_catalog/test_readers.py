@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_catalog.catalog import read
+from data_catalog.catalog import read, source_fingerprint
 from data_catalog.content import view_mask
 from data_catalog.images import Resampling, natural_key, spread
 from data_catalog.readers.sinus import read_points, read_view_names
@@ -304,8 +304,85 @@ class TestPosedFolder:
         (posed_folder / "masks").rename(posed_folder / "mask")
         read(posed_folder)
         assert (
-            "9 of 10 frames have no mask and are tissue throughout; the first is rgb/0001.png" in caplog.text
+            "9 of 10 frames have no mask and are tissue throughout: rgb/0001.png, rgb/0002.png, "
+            "rgb/0003.png, rgb/0004.png, rgb/0005.png and 4 more" in caplog.text
         )
+
+    @pytest.mark.parametrize("spelling", ["{folder}/{name}", "./{name}", "depth/../{name}"])
+    @pytest.mark.parametrize("images", ["rgb", "frames"])
+    def test_spellings_of_a_path_are_one_file(self, posed_folder, edit_poses, images, spelling) -> None:
+        """Joined to depth/ and mask/, an absolute path would be the image's own."""
+        self.write_masks(posed_folder)
+        expected = read(posed_folder)
+        assert not expected.mask.all()
+        (posed_folder / "rgb").rename(posed_folder / images)
+
+        def spelt(content) -> None:
+            for entry in content["frames"]:
+                name = f"{images}/{entry['file'].removeprefix('rgb/')}"
+                entry["file"] = spelling.format(folder=posed_folder.resolve(), name=name)
+
+        edit_poses(spelt)
+        found = read(posed_folder)
+        np.testing.assert_array_equal(found.rgb, expected.rgb)
+        np.testing.assert_array_equal(found.mask, expected.mask)
+        np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
+        assert found.frame_names == expected.frame_names
+
+    def test_two_spellings_of_one_frame_are_refused(self, posed_folder, edit_poses) -> None:
+        edit_poses(lambda content: content["frames"][1].update(file="./rgb/0000.png"))
+        with pytest.raises(SourceError, match=r"frame rgb/0000\.png, field file: the frame is listed twice"):
+            read(posed_folder)
+
+    def test_suffixes_in_upper_case_are_found(self, posed_folder, caplog) -> None:
+        self.write_masks(posed_folder)
+        expected = read(posed_folder)
+        for kind in ("depth", "mask"):
+            for file in sorted((posed_folder / kind).iterdir()):
+                file.rename(file.with_suffix(file.suffix.upper()))
+        found = read(posed_folder)
+        np.testing.assert_array_equal(found.mask, expected.mask)
+        np.testing.assert_array_equal(found.depth_mm, expected.depth_mm)
+        assert "no mask" not in caplog.text
+
+    @pytest.mark.parametrize("part", ["rgb", "depth", "mask"])
+    def test_what_links_lead_to_counts_in_the_fingerprint(
+        self, posed_folder, edit_poses, tmp_path, part
+    ) -> None:
+        self.write_masks(posed_folder)
+        for kind in ("rgb", "depth", "mask"):
+            (posed_folder / kind).rename(posed_folder / "left")
+            (posed_folder / kind).mkdir()
+            (posed_folder / "left").rename(posed_folder / kind / "left")
+        (posed_folder / part / "left").rename(tmp_path / "elsewhere")
+        (posed_folder / part / "left").symlink_to(tmp_path / "elsewhere")
+
+        def moved(content) -> None:
+            for entry in content["frames"]:
+                entry["file"] = entry["file"].replace("rgb/", "rgb/left/")
+
+        edit_poses(moved)
+        assert not read(posed_folder).mask.all()
+        before = source_fingerprint(posed_folder)
+        first, second, *_ = sorted((tmp_path / "elsewhere").iterdir())
+        first.write_bytes(second.read_bytes())
+        assert source_fingerprint(posed_folder) != before
+
+    def test_what_is_not_read_does_not_count(self, posed_folder) -> None:
+        before = source_fingerprint(posed_folder)
+        (posed_folder / "depth" / "notes.txt").write_text("measured on Monday")
+        (posed_folder / "rgb" / "thumbnails").mkdir()
+        shutil.copyfile(posed_folder / "rgb" / "0000.png", posed_folder / "rgb" / "thumbnails" / "0000.png")
+        assert source_fingerprint(posed_folder) == before
+
+    @staticmethod
+    def write_masks(folder) -> None:
+        """One of each frame, each another."""
+        (folder / "mask").mkdir(exist_ok=True)
+        for k, file in enumerate(sorted((folder / "rgb").iterdir())):
+            white = np.full((40, 48), 255, np.uint8)
+            white[: k + 2] = 0
+            Image.fromarray(white).save(folder / "mask" / file.name)
 
     def test_without_depth(self, posed_folder) -> None:
         shutil.rmtree(posed_folder / "depth")

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData
 
-from extrags.errors import ShapeError, SourceError, SourceNotFoundError
+from extrags.errors import CaptureError, ShapeError, SourceError, SourceNotFoundError
 from extrags.gaussians import SH_C0, Gaussians
 
 
@@ -86,6 +86,22 @@ class TestGaussians:
         good = random_gaussians(3, 1).parameters()
         with pytest.raises(ShapeError, match="quats"):
             Gaussians(**{**good, "quats": good["quats"][:2]})
+
+    @pytest.mark.parametrize("count", [1, 2, 4, 24])
+    def test_coefficients_of_no_degree_are_refused(self, count: int) -> None:
+        good = random_gaussians(3, 0).parameters()
+        with pytest.raises(ShapeError, match=f"shN has {count} coefficients per colour"):
+            Gaussians(**{**good, "shN": torch.zeros(3, count, 3)})
+
+    def test_a_ply_without_gaussians_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(CaptureError, match=r"no Gaussians to write into .*a\.ply"):
+            random_gaussians(0, 1).write_ply(tmp_path / "a.ply")
+        assert not (tmp_path / "a.ply").exists()
+
+    def test_ply_of_gaussians_elsewhere(self, tmp_path: Path, elsewhere: torch.device) -> None:
+        gaussians = random_gaussians(5, 2)
+        gaussians.to(elsewhere).write_ply(tmp_path / "a.ply")
+        assert_equal(Gaussians.read_ply(tmp_path / "a.ply"), gaussians)
 
     def test_ply_errors(self, tmp_path: Path) -> None:
         with pytest.raises(SourceNotFoundError):

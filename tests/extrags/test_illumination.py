@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from extrags.config import LightConfig
-from extrags.errors import DamagedArtefactError
+from extrags.errors import DamagedArtefactError, ShapeError
 from extrags.illumination import NearFieldLight
 from extrags.zarr_io import new_group, write_array
 
@@ -94,3 +94,11 @@ class TestNearFieldLight:
         expected = torch.stack([(own[0] + own[1]) / 2, (own[1] + own[2]) / 2, own[0] * 0, own[0] * 0])
         torch.testing.assert_close(gains.log(), expected)
         torch.testing.assert_close(light().interpolated_exposures(train, train), light().exposures())
+
+    def test_exposures_of_other_frames_are_refused(self) -> None:
+        exposures = len(light().log_exposure)
+        train = np.arange(exposures + 1)
+        with pytest.raises(
+            ShapeError, match=f"log_exposure has {exposures} exposures, there are {exposures + 1}"
+        ):
+            light().interpolated_exposures(train, train)

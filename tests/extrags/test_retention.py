@@ -130,6 +130,45 @@ class TestRuns:
             age(three, name, -0.001)
         assert planned(three, keep_last=1) == ["judged1", "judged2", "final1", "final2"]
 
+    def test_figures_that_no_run_looks_up_again_make_none_older(self, store: Store) -> None:
+        """As metrics of earlier versions left them: these do not say which figures they were taken from."""
+        for name, days in (("tried", 30), ("again", 20)):
+            metrics = put(store, name, days=days)
+            used = [Path(metrics.uri).name]
+            if name == "tried":
+                used.append(Path(put(store, "evaluate-views", days=days).uri).name)
+            with recorded_run(store, "phantom/0") as record:
+                assert record is not None
+                record.add(used)
+        age(store, "tried", -0.001)
+        assert planned(store, keep_last=1) == ["again"]
+
+    def test_a_run_without_the_figures_of_the_first_is_the_same_run(self, store: Store) -> None:
+        figures = Path(put(store, "evaluate-views", days=30).uri).name
+        for name, days in (("tried", 30), ("again", 20)):
+            with store.slot(stage="evaluate", version=1, key=f"evaluate-v1-{name}"):
+                pass
+            moment = time.time() - days * DAY_S
+            os.utime(Path(store.root) / "artefacts" / f"evaluate-v1-{name}", (moment, moment))
+        for used in (["evaluate-v1-tried", figures], ["evaluate-v1-again"], ["evaluate-v1-tried"]):
+            with recorded_run(store, "phantom/0") as record:
+                assert record is not None
+                record.add(used)
+        assert len(runs_of(store)) == 3
+        assert planned(store, keep_last=2) == ["evaluate-views"]
+        assert planned(store, keep_last=1) == ["evaluate-v1-again", "evaluate-views"]
+
+    def test_figures_of_views_stay_with_metrics_and_keep_no_other_scene(self, store: Store) -> None:
+        """Of two scenes that were measured together, the metrics of one are those of a later run as well."""
+        shared, other = put(store, "shared", days=9), put(store, "other", days=9)
+        views = put(store, "evaluate-views", days=9, shared=shared, other=other)
+        metrics = put(store, "metrics", days=1, renders=shared, views=views)
+        with recorded_run(store, "phantom/0") as record:
+            assert record is not None
+            record.add(Path(ref.uri).name for ref in (shared, metrics))
+        assert planned(store, older_than_s=5 * DAY_S) == ["other"]
+        assert planned(store, unreachable=True) == ["other"]
+
     def test_a_run_that_ended_early_takes_the_place_of_none(self, store: Store) -> None:
         """A plan, or a failure, after a run to the end; then another run to the end."""
         for number, days in ((0, 30), (1, 20)):
@@ -201,6 +240,33 @@ class TestRuns:
         assert len(planned_removals(store, Policy(older_than_s=3600.0), now=later)[0]) == 3
         remove_record(store, runs_of(store)[0].name)
         assert runs_of(store) == []
+
+
+class TestVersions:
+    def test_what_earlier_versions_made_goes_and_what_later_ones_made_stays(self, chain: Store) -> None:
+        assert planned(chain, versions={"report": 1, "elsewhere": 7}) == []
+        assert planned(chain, versions={"report": 0, "other": 0}) == []
+        (found,), _ = planned_removals(chain, Policy(versions={"report": 2}))
+        assert (found.key, found.reason) == ("report-v1-00", "of version 1 of its stage, which is at 2")
+        assert names(apply_policy(chain, Policy(versions={"report": 2}))) == ["report"]
+        assert len(chain.keys()) == 3
+
+    def test_what_a_kept_artefact_was_made_from_stays(self, chain: Store) -> None:
+        assert planned(chain, versions={"ingest": 2, "coarse": 2, "other": 2}) == ["other"]
+        assert planned(chain, versions={"coarse": 2}, with_inputs=True) == ["coarse"]
+        assert planned(chain, versions={"coarse": 2, "report": 2}) == ["report", "coarse"]
+
+    def test_what_a_run_in_progress_uses_stays(self, chain: Store) -> None:
+        """It began before the program was replaced by a later one."""
+        with recorded_run(chain, "phantom/0") as record:
+            assert record is not None
+            record.add(["other-v1-00"])
+            assert apply_policy(chain, Policy(versions={"other": 2})) == []
+        assert names(apply_policy(chain, Policy(versions={"other": 2}))) == ["other"]
+
+    def test_what_was_used_a_moment_ago_stays(self, chain: Store) -> None:
+        assert chain.find("other-v1-00") is not None
+        assert planned(chain, versions={"other": 2}) == []
 
 
 def test_nothing_is_removed_that_a_run_has_begun_to_use_since(

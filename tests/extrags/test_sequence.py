@@ -135,6 +135,29 @@ class TestSequence:
             replace(sequence, **{field: getattr(sequence, field)[:-1]})
 
     @pytest.mark.usefixtures("unchecked")
+    @pytest.mark.parametrize(
+        ("field", "dtype", "message"),
+        [
+            ("rgb", np.float32, "rgb is float32 .* expected uint8"),
+            ("mask", np.uint8, "mask is uint8 .* expected bool"),
+            ("depth_mm", np.uint16, "depth_mm is uint16 .* expected floating"),
+            ("recording", np.float64, "recording is float64 .* expected integer"),
+        ],
+    )
+    def test_wrong_type_is_refused_by_name(self, field: str, dtype: type, message: str) -> None:
+        """Colours in [0, 1] would be trained on, and then be compared with what is divided by 255."""
+        sequence = small_sequence()
+        with pytest.raises(ShapeError, match=message):
+            replace(sequence, **{field: getattr(sequence, field).astype(dtype)})
+
+    @pytest.mark.parametrize("name", ["train", "test"])
+    @pytest.mark.parametrize("index", [-1, 50])
+    def test_a_split_of_frames_that_are_not_there_is_refused(self, name: str, index: int) -> None:
+        sequence = small_sequence()
+        with pytest.raises(ShapeError, match=rf"split.{name} has indices"):
+            replace(sequence, split=replace(sequence.split, **{name: np.array([0, index])}))
+
+    @pytest.mark.usefixtures("unchecked")
     def test_wrong_number_of_names(self) -> None:
         with pytest.raises(ShapeError, match="frame names"):
             replace(small_sequence(), frame_names=("a",))

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from pydantic import BaseModel
 
 from extrags.config import CoarseConfig
-from extrags.errors import ConfigError, MissingDependencyError, StoreError
+from extrags.errors import ConfigError, DamagedArtefactError, MissingDependencyError, StoreError
 from extrags.store import MANIFEST, Ref, Store, canonical, content_digest, digest_of
 
 plain = st.recursive(
@@ -130,10 +130,13 @@ class TestCanonical:
         assert digest_of(value) == "b319363c676d28c24377cfb85da55656"
 
 
-@pytest.fixture(params=["directory", "memory"])
+@pytest.fixture(params=["directory", "folders", "memory"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
     if request.param == "directory":
         yield Store(tmp_path / "store")
+    elif request.param == "folders":
+        # Behind a URL, but a file system with real directories, as SFTP is.
+        yield Store(f"local://{tmp_path}/new/store", cache=tmp_path / "cache")
     else:
         made = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path / "cache")
         yield made
@@ -164,6 +167,14 @@ class TestStore:
         assert (manifest.files, manifest.bytes) == (1, 5)
         assert "python" in manifest.software
         assert store.verify(ref)
+
+    def test_a_check_leaves_nothing(self, store: Store) -> None:
+        store.check_writable()
+        assert store.keys() == []
+        assert list(store.backend.scratch.iterdir()) == []
+        put(store)
+        store.check_writable()
+        assert store.keys() == ["toy-v1-aa"]
 
     def test_an_absent_key_is_none(self, store: Store) -> None:
         assert store.find("toy-v1-none") is None
@@ -248,11 +259,6 @@ class TestStore:
         assert [manifest.key for manifest in store.ls()] == ["toy-v1-b"]
         assert store.rm("toy") == ["toy-v1-b"]
 
-    def test_gc_removes_superseded_versions_only(self, store: Store) -> None:
-        put(store)
-        assert store.gc({"toy": 1, "other": 5}) == []
-        assert store.gc({"toy": 2}) == ["artefacts/toy-v1-aa"]
-
     def test_nested_refs_survive_a_moved_store(self, tmp_path: Path) -> None:
         ref = put(Store(tmp_path / "first"))
         (tmp_path / "first").rename(tmp_path / "second")
@@ -324,6 +330,27 @@ def _put_many(root: str) -> list[Ref]:
 
 
 class TestUrl:
+    def test_folders_of_a_file_system_come_and_go(self, tmp_path: Path) -> None:
+        store = Store(f"local://{tmp_path}/store", cache=tmp_path / "cache")
+        put(store)
+        (damaged,) = (tmp_path / "store" / "toy-v1-aa").rglob("file.txt")
+        damaged.write_text("jello")
+        with pytest.raises(DamagedArtefactError) as caught:
+            store.open(store.find("toy-v1-aa"))  # type: ignore[arg-type]
+        place = store.set_aside(caught.value)
+        assert place is not None
+        assert len(list(Path(place.removeprefix("local://")).rglob("file.txt"))) == 1
+        unfinished = tmp_path / "store" / "toy-v1-bb" / "attempt"
+        unfinished.mkdir(parents=True)
+        (unfinished / "half").write_text("x")
+        assert store.sweep(older_than_hours=-0.1) == ["toy-v1-bb/attempt"]
+        assert sorted(path.name for path in (tmp_path / "store").iterdir()) == ["damaged"]
+
+    def test_a_file_system_that_cannot_be_written_is_said_when_checked(self, tmp_path: Path) -> None:
+        (tmp_path / "file").write_text("x")
+        with pytest.raises(StoreError, match="cannot be written"):
+            Store(f"local://{tmp_path}/file/store", cache=tmp_path / "cache").check_writable()
+
     def test_an_upload_without_manifest_is_invisible_and_swept(self, tmp_path: Path) -> None:
         store = Store(f"memory://{uuid.uuid4().hex}", cache=tmp_path)
         ref = put(store)
@@ -342,7 +369,7 @@ class TestUrl:
         assert (removed.exists(), kept.exists()) == (False, True)
         changed = store.open(put(store, "toy-v1-ab", "changed"))
         assert (kept.exists(), changed.exists()) == (False, True)
-        assert store.gc({"toy": 2}) == ["artefacts/toy-v1-ab"]
+        assert store.rm("toy-v1-ab") == ["toy-v1-ab"]
         assert not changed.exists()
 
     def test_copies_of_what_another_machine_removed_are_swept(self, tmp_path: Path) -> None:

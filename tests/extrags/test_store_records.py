@@ -54,7 +54,8 @@ class TestRecords:
         write_record(store, "outcome.a", {"n": 2})
         assert store.keys() == ["toy-v1-a"]
         assert [manifest.key for manifest in store.ls()] == ["toy-v1-a"]
-        store.gc({"toy": 2}, older_than_hours=0.0)
+        store.gc(older_than_hours=0.0)
+        store.rm("toy*")
         assert store.keys() == []
         assert read_records(store) == {"outcome.a": {"n": 2}}
 

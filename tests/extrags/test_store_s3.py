@@ -136,6 +136,15 @@ def test_a_removal_beside_an_upload_spares_it(store: Store, tmp_path: Path) -> N
     assert attempts(store) == ["of-another"]
 
 
+def test_a_bucket_that_is_missing_is_not_made(tmp_path: Path) -> None:
+    import s3fs
+
+    for prefix in ("", "/prefix"):
+        with pytest.raises(StoreError, match="cannot be written"):
+            Store(f"s3://missing-bucket{prefix}", cache=tmp_path).check_writable()
+    assert not s3fs.S3FileSystem().exists("missing-bucket")
+
+
 def test_a_server_that_does_not_answer_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import s3fs
 

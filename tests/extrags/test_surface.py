@@ -91,6 +91,11 @@ class TestFuseDepth:
         with pytest.raises(CaptureError, match="none of the 2 views sees a surface"):
             fuse_depth(cameras, 0 * depth, SurfaceConfig())
 
+    def test_no_views_are_refused(self):
+        tube = small_tube()
+        with pytest.raises(CaptureError, match="no views to fuse"):
+            fuse_surface(tube.scene, tube.cameras[[]])
+
     def test_only_specks_are_refused(self):
         cameras, depth = sphere_views(2, 32)
         with pytest.raises(CaptureError, match="min_cluster_triangles = 1000000"):

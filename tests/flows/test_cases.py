@@ -191,6 +191,12 @@ class TestExpected:
         (same,) = expectations([folder], store, "surface")
         assert found.seconds == same.seconds < with_depth.seconds
 
+    def test_a_path_is_measured_in_any_spelling(self, tmp_path: Path) -> None:
+        store = str(tmp_path / "store")
+        leave(store, case(f"{tmp_path}/colon/"), StageRow("ingest", "ran", made_seconds=2.0))
+        assert expectations([case(f"{tmp_path}/colon")], store, "coarse")[0].measured
+        assert not expectations([case(f"{tmp_path}/col")], store, "coarse")[0].measured
+
     def test_in_words(self) -> None:
         found = [Expectation(case(), 3600.0, measured=True), Expectation(case(), 600.0, measured=False)]
         assert (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,11 +18,14 @@ from extrags.config import PROFILES, PipelineConfig
 from extrags.config.settings import settings_of
 from extrags.errors import ConfigError, MissingDependencyError
 from extrags.store import Store
+from extrags.store.runs import runs_of
 from extrags.stress import Effort, Row
 from extrags.stress.rows import Trial
+from flows.cases import SequenceCase, record_outcome
 from flows.cli import VERBS, main, parser
 from flows.commands.common import parsed_settings, run_config
-from flows.outcome import SequenceOutcome
+from flows.outcome import SequenceOutcome, StageRow
+from flows.outcome_records import outcome_records
 from tests.flows.tiny import SEQUENCE, TINY
 
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
@@ -328,6 +332,40 @@ class TestFinished:
         assert sequence["metrics"] == first.metrics
         assert "9 cached, 2 skipped" in capsys.readouterr().err
 
+    def test_it_is_left_on_record(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        shutil.copytree(Path(finished[0]) / "artefacts", tmp_path / "store" / "artefacts")
+        store = Store(tmp_path / "store")
+        case = SequenceCase(SEQUENCE, profile="quick", settings=TINY)
+        failure = SequenceOutcome(SEQUENCE, "failed", [StageRow("ingest", "failed", reason="no")])
+        record_outcome(store, case, failure, "coarse", case.config())
+        assert main(["status", "--store", store.root]) == 1
+        arguments = ["run", SEQUENCE, *settled(store.root), "--until", "coarse"]
+        assert main([*arguments, "--only", "failed"]) == 0
+        assert main(["status", "--store", store.root]) == 0
+        (record,) = outcome_records(store).values()
+        assert (record["status"], record["until"]) == ("ok", "coarse")
+        capsys.readouterr()
+        assert main([*arguments, "--only", "failed"]) == 0
+        assert "no sequence is failed" in capsys.readouterr().err
+        # What it used is kept with it; the same run again replaces both records.
+        (used,) = runs_of(store)
+        assert used.keys == {key for row in record["stages"] for key in row["artefacts"]}
+        assert main(arguments) == 0
+        (again,) = runs_of(store)
+        assert (again.name, again.keys) == (used.name, used.keys)
+        assert again.ended > used.ended
+
+    def test_a_store_that_takes_no_record_is_read_all_the_same(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        shutil.copytree(Path(finished[0]) / "artefacts", tmp_path / "store" / "artefacts")
+        for name in ("records", "runs"):
+            (tmp_path / "store" / name).write_text("")
+        arguments = ["run", SEQUENCE, *settled(str(tmp_path / "store")), "--until", "coarse"]
+        assert main(arguments) == 0
+
     def test_quiet_says_nothing_where_all_is_well(
         self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
     ) -> None:
@@ -451,6 +489,10 @@ class TestCache:
     def test_gc_removes_former_versions(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
         with Store(store).slot(stage="coarse", version=0, key="coarse-v0-a"):
             pass
+        assert main(["cache", "gc", "--store", store]) == 0
+        # It was made a moment ago: a run may have it in hand.
+        assert "artefacts/coarse-v0-a" not in capsys.readouterr().out
+        os.utime(Path(store) / "artefacts" / "coarse-v0-a", (0, 0))
         assert main(["cache", "gc", "--store", store]) == 0
         assert "artefacts/coarse-v0-a" in capsys.readouterr().out
         assert len(Store(store).ls()) == 3

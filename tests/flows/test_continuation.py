@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from extrags.config import CoarseConfig
 from extrags.errors import ConfigError
-from extrags.store import Manifest, Store
+from extrags.store import Manifest, Ref, Store
 from extrags.store.retention import Policy, planned_removals
 from flows.outcome import SequenceOutcome, StageRow
 from flows.runners import DirectRunner, StoreRunner
 from flows.wiring import run_sequence
+from tasks.continuation import nearest_scene
 from tests.extrags.training.textured_plane import textured_plane
 from tests.flows.tiny import tiny_config
 
@@ -179,6 +181,47 @@ def test_another_folder_is_another_source(folder: Path, store: str, tmp_path: Pa
     elsewhere = folder.rename(tmp_path / "elsewhere")
     grow(elsewhere, 8)
     assert "the store has no other coarse scene of that name" in coarse_row(run(elsewhere, store)).reason
+
+
+@pytest.mark.parametrize(("first", "second"), [("{}", "{}/"), ("{}/", "{}"), ("{}/../growing", "growing")])
+def test_spellings_of_a_path_are_one_source(
+    first: str, second: str, folder: Path, store: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder.parent)
+    config = tiny_config(**SETTINGS)
+
+    def outcome(spelling: str) -> SequenceOutcome:
+        name = spelling.format(folder)
+        return run_sequence(name, config, store, DirectRunner(store), until="coarse")
+
+    earlier = made(outcome(first), store)
+    assert not earlier.label.endswith("/")
+    grow(folder, 8)
+    assert made(outcome(second), store).counts["continued_from"] == earlier.key
+
+
+def test_labels_of_earlier_versions_are_the_same_source(folder: Path, store: str) -> None:
+    """They end in a slash where the user ended the path in one."""
+    config = CoarseConfig()
+    frames = Ref(uri="none", digest="none")
+    there = Store(store)
+    with there.slot(stage="coarse", version=1, key="coarse-v1-0", label=f"{folder}/"):
+        pass
+    assert set(nearest_scene(there, str(folder), frames, config).refusals) == {"coarse-v1-0"}
+    assert not nearest_scene(there, f"{folder.parent}/other", frames, config).refusals
+
+
+def test_an_at_in_a_folder_is_no_setting(tmp_path: Path) -> None:
+    there = Store(tmp_path / "store")
+    with there.slot(stage="coarse", version=1, key="coarse-v1-0", label="/data/me@here/a@sparse"):
+        pass
+
+    def looked_at(label: str) -> bool:
+        search = nearest_scene(there, label, Ref(uri="none", digest="none"), CoarseConfig())
+        return bool(search.refusals)
+
+    assert looked_at("/data/me@here/a@distanced")
+    assert not looked_at("/data/me@there/b@sparse")
 
 
 def test_what_it_went_on_from_is_kept(folder: Path, store: str) -> None:

@@ -19,7 +19,7 @@ import pytest
 
 from extrags.errors import ConfigError
 from flows.cli import main
-from flows.deployments import declared_deployments, usual_file
+from flows.deployments import chosen_deployments, declared_deployments, usual_file
 from tests.flows.tiny import SEQUENCE, TINY
 
 REPOSITORY = Path(__file__).parents[2]
@@ -71,8 +71,30 @@ class TestServe:
     def test_wrong_usage(self, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
         monkeypatch.delenv("EXTRAGS_STORE", raising=False)
         assert main(["serve", "nightli"]) == 2
-        assert "no deployment 'nightli'; known: one, nightly, weekly" in capsys.readouterr().err
+        said = capsys.readouterr().err
+        assert "no deployment 'nightli'; known: reconstruct-sequence/one, reconstruct-dataset/nightly" in said
         assert main(["serve", "--limit", "0"]) == 2
+
+    def test_a_name_that_several_flows_have_is_refused(self, capsys: pytest.CaptureFixture[str]) -> None:
+        """Otherwise who asks for the weekly benchmark would have the store cleaned as well."""
+        assert main(["serve", "nightly", "weekly", "--schedules"]) == 2
+        said = capsys.readouterr().err
+        assert "'weekly' names 2 deployments; give one of benchmark/weekly, retention/weekly" in said
+
+    def test_each_is_named_by_its_flow_or_where_that_suffices_by_its_name(self) -> None:
+        declared = declared_deployments(usual_file())
+
+        def titles(*names: str) -> list[str]:
+            return [item.title for item in chosen_deployments(declared, names)]
+
+        assert titles("benchmark/weekly", "nightly") == ["reconstruct-dataset/nightly", "benchmark/weekly"]
+        assert titles("retention/weekly") == ["retention/weekly"]
+        assert titles("nightly", "reconstruct-dataset/nightly") == ["reconstruct-dataset/nightly"]
+        assert len(titles()) == len(declared)
+        with pytest.raises(
+            ConfigError, match=r"no deployment 'benchmark/nightly'; known: .*retention/weekly"
+        ):
+            titles("benchmark/nightly")
 
     @pytest.mark.parametrize("schedules", [False, True])
     def test_what_it_serves(self, schedules: bool, monkeypatch: pytest.MonkeyPatch) -> None:

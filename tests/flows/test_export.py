@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import av
@@ -17,15 +18,19 @@ import trimesh
 from plyfile import PlyData
 
 from extrags.export import read_camera_path
+from extrags.radial_lens import RadialLens
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.splat_files import read_ply_scene
 from extrags.store import Store
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
+from flows.commands import export_scene
 from flows.outcome import SequenceOutcome
+from flows.runners import DirectRunner
+from flows.wiring import run_sequence
 from tests.extrags.splat_files import decoders
-from tests.flows.tiny import SEQUENCE, TINY
+from tests.flows.tiny import SEQUENCE, TINY, tiny_config
 
 Finished = tuple[str, SequenceOutcome]
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
@@ -113,6 +118,31 @@ class TestSurface:
         # Virtual views have shown more than training views have, but not all.
         assert 0 < invented.mean() < 0.9
 
+    def test_mesh_of_frames_with_a_lens(
+        self,
+        finished: Finished,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        """Virtual views have none."""
+        lens = RadialLens((-0.05, 0.002, 0.0, 0.0), float(np.radians(60)))
+        given = replace(frames(finished), lens=lens)
+        monkeypatch.setattr(export_scene._Finished, "frames", lambda _: given)
+        target = tmp_path / "a.ply"
+        assert export(finished, "--to", "mesh", "-o", str(target)) == 0
+        assert "% of the vertices invented" in capsys.readouterr().out
+        assert 0 < PlyData.read(str(target))["vertex"]["invented"].mean() < 0.9
+
+    def test_files_beside_an_obj_are_named(
+        self, finished: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        (tmp_path / "a.png").write_text("mine")
+        arguments = ["--to", "mesh", "--scene", "coarse", "-o", str(tmp_path / "a.obj")]
+        assert export(finished, *arguments) == 0
+        assert ", beside it a_texture.mtl and a_texture.png" in capsys.readouterr().out
+        assert (tmp_path / "a.png").read_text() == "mine"
+
     def test_points(self, finished: Finished, tmp_path: Path) -> None:
         assert export(finished, "--to", "points", "--min-opacity", "0", "-o", str(tmp_path / "a.ply")) == 0
         assert len(trimesh.load(tmp_path / "a.ply").vertices) == len(final_scene(finished).gaussians)
@@ -149,6 +179,26 @@ class TestFlights:
         store, outcome = finished
         explored = Store(store).load(Exploration, outcome.refs["explore"])
         assert len(read_camera_path(target).cameras) == len(explored.cameras)
+
+    def test_of_a_run_that_ended_after_the_coarse_scene(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store = str(tmp_path / "store")
+        outcome = run_sequence(
+            SEQUENCE, tiny_config(), store, DirectRunner(store), profile="quick", until="coarse"
+        )
+        ended = store, outcome
+        for panels, width in (("coarse", 48), ("coarse,uncertainty", 96)):
+            target = tmp_path / f"{width}.mp4"
+            assert export(ended, "--to", "video", "--panels", panels, "-o", str(target)) == 0
+            with av.open(str(target)) as container:
+                assert container.streams.video[0].width == width
+        capsys.readouterr()
+        for panels in ("final", "coarse,final", "uncertainty"):
+            target = tmp_path / "new" / "folder" / "a.mp4"
+            assert export(ended, "--to", "video", "--panels", panels, "-o", str(target)) == 1
+            assert "is not finished" in capsys.readouterr().err
+            assert not (tmp_path / "new").exists()
 
     def test_uncertainty_alone(self, finished: Finished, tmp_path: Path) -> None:
         target = tmp_path / "a.mp4"
@@ -237,6 +287,16 @@ class TestUsage:
         assert export(finished, "--to", "camera-path", "--along", along, "-o", str(target)) == code
         assert message in capsys.readouterr().err
         assert not target.exists()
+
+    def test_folders_are_made_for_what_is_written_alone(self, finished: Finished, tmp_path: Path) -> None:
+        target = tmp_path / "there" / "new" / "a.json"
+        target.parents[1].mkdir()
+        arguments = ["--to", "camera-path", "-o", str(target)]
+        assert export(finished, *arguments, "--along", "sideways") == 2
+        assert target.parents[1].is_dir()
+        assert not target.parent.exists()
+        assert export(finished, *arguments) == 0
+        assert target.is_file()
 
     def test_a_folder_that_cannot_be_written(
         self, finished: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]

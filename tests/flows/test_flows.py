@@ -23,6 +23,7 @@ from extrags.pipeline import STAGES
 from extrags.store import Store
 from flows.dataset import reconstruct_dataset
 from flows.outcome import DatasetFailedError, SequenceFailedError, SequenceOutcome
+from flows.outcome_records import outcome_records
 from flows.sequence import open_store, reconstruct_sequence
 from flows.settings import pipeline_config, task_runner
 from tasks.run_page import artifact_key
@@ -69,6 +70,14 @@ class TestSequence:
         assert isinstance(failure, SequenceFailedError)
         assert states(failure.outcome)["ingest"] == "failed"
         assert Store(tmp_path / "store").ls() == []
+
+    def test_a_path_has_one_name_on_record(self, tmp_path: Path) -> None:
+        (tmp_path / "empty").mkdir()
+        for spelling in ("empty", "empty/"):
+            name = f"{tmp_path}/{spelling}"
+            reconstruct_sequence(sequence=name, store=str(tmp_path / "store"), return_state=True)
+        (record,) = outcome_records(Store(tmp_path / "store")).values()
+        assert record["sequence"] == str(tmp_path / "empty")
 
     def test_a_store_that_cannot_be_written_stops_it_at_once(self, tmp_path: Path) -> None:
         (tmp_path / "file").write_text("x")

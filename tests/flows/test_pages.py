@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
+from extrags.store import Ref, Store
+from extrags.store.retention import Policy, planned_removals
 from flows.outcome import SequenceOutcome
 from flows.pages import dataset_page
 from flows.runners import DirectRunner
+from tasks.report import PAGE
 from tests.extrags.report.pages import Page
 
 
@@ -21,3 +25,36 @@ def test_several_seeds_have_a_table_of_their_spread(tmp_path: Path) -> None:
     spread = page.text.split("Spread over seeds")[1]
     assert "phantom/0@sparse [3dgs] 2" in spread
     assert "phantom/0@sparse [extrags] 2" in spread
+
+
+def test_it_links_the_pages_of_this_run_and_keeps_them(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+
+    def outcome(views: str) -> SequenceOutcome:
+        ref = report(store, views)
+        return SequenceOutcome("phantom/0@sparse", refs={"report": ref}, report=f"{ref.uri}/{PAGE}")
+
+    first, second = (
+        Path(dataset_page([outcome(views)], "dataset", "quick", DirectRunner(store.root)))
+        for views in ("one", "three")
+    )
+    assert first != second
+    for page, key in ((first, "report-v12-one"), (second, "report-v12-three")):
+        assert f'href="../{key}/{PAGE}"' in page.read_text()
+        assert (page.parent / ".." / key / PAGE).exists()
+    for place in (first.parent, first.parent.with_name("report-v12-one")):
+        os.utime(place, (1e9, 1e9))
+    former, old = Policy(keep_last=1, unreachable=True), Policy(older_than_s=86400.0)
+    for policy in (former, old):
+        gone, _ = planned_removals(store, policy)
+        assert {item.key for item in gone} == {"report-v12-one", first.parent.name}
+    # A page that is kept keeps what it links to, however old.
+    os.utime(first.parent)
+    assert planned_removals(store, old)[0] == []
+
+
+def report(store: Store, views: str) -> Ref:
+    """A sequence's page, made with so many views."""
+    with store.slot(stage="report", version=12, key=f"report-v12-{views}", label="phantom/0@sparse") as slot:
+        (slot.path / PAGE).write_text(views)
+    return slot.ref

@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from extrags.errors import ConfigError
 from flows.budgets import Budget
@@ -100,6 +102,43 @@ class TestGrid:
         run_grid(cells(), tmp_path, run=lambda cell, _: tried.append(cell) or _case(cell))
         assert len(tried) == 2
 
+    def test_what_reads_changed_files_is_measured_anew(self, tmp_path: Path) -> None:
+        source, scene = tmp_path / "source", tmp_path / "theirs.ply"
+        (source / "rgb").mkdir(parents=True)
+        posed_frame(source, grey=90)
+        scene.write_bytes(b"content")
+        ran: list[str] = []
+
+        def run(cell: Cell, store: str) -> dict[str, Any]:
+            ran.append(cell.sequence)
+            return _case(cell)
+
+        def measured(sequence: str, **settings: Any) -> int:
+            ran.clear()
+            given = {name.replace("__", "."): value for name, value in settings.items()}
+            found = cells_of([Chosen(sequence)], ["coarse"], [("quick", [Budget()])], [0], 1, given)
+            run_grid(found, tmp_path / "grid", run=run)
+            return len(ran)
+
+        assert [measured(str(source)) for _ in range(2)] == [1, 0]
+        posed_frame(source, grey=91)
+        assert [measured(str(source)) for _ in range(2)] == [1, 0]
+        # What it was before is measured already.
+        posed_frame(source, grey=90)
+        assert measured(str(source)) == 0
+        imported = {"imported__scene": str(scene)}
+        assert [measured(SEQUENCE, **imported) for _ in range(2)] == [1, 0]
+        scene.write_bytes(b"cOntent")
+        assert [measured(SEQUENCE, **imported) for _ in range(2)] == [1, 0]
+
+    def test_a_source_that_cannot_be_read_is_a_cell_that_fails(self, tmp_path: Path) -> None:
+        (tmp_path / "empty").mkdir()
+        found = cells_of(
+            [Chosen(str(tmp_path / "empty"))], ["coarse"], [("quick", [Budget()])], [0], 1, SMALL
+        )
+        (case,) = run_grid(found, tmp_path / "grid", run=run_cell)["cases"]
+        assert "the folder is empty" in case["error"]
+
     def test_another_machine_needs_another_folder(self, tmp_path: Path) -> None:
         run_grid(cells(), tmp_path, run=lambda cell, _: _case(cell))
         claim = json.loads((tmp_path / "grid.json").read_text())
@@ -148,6 +187,14 @@ def test_the_table_says_what_failed(tmp_path: Path) -> None:
     assert table.count("seed 0 failed in ingest: no such file\n") == 2
     fine = run_grid(cells(), tmp_path / "fine", run=lambda cell, _: _case(cell))
     assert "failed" not in grid_markdown(fine)
+
+
+def posed_frame(folder: Path, *, grey: int) -> None:
+    """A folder with one posed frame of one colour."""
+    Image.fromarray(np.full((40, 48, 3), grey, np.uint8)).save(folder / "rgb" / "0.png")
+    frame = {"file": "rgb/0.png", "world_from_camera": np.eye(4).tolist()}
+    content = {"K": [[40, 0, 24], [0, 40, 20], [0, 0, 1]], "frames": [frame]}
+    (folder / "poses.json").write_text(json.dumps(content))
 
 
 def _never(cell: Cell, store: str) -> dict[str, Any]:

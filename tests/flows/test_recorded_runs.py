@@ -18,7 +18,7 @@ from extrags.sequence import EndoscopicSequence
 from extrags.store import Store, write_record
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
-from flows.commands.common import parsed_settings
+from flows.commands.common import _on_record, parsed_settings
 from flows.commands.gallery import _options
 from flows.outcome import SequenceOutcome
 from flows.outcome_records import OUTCOME, outcome_records
@@ -69,6 +69,21 @@ def test_a_sequence_stands_for_its_finished_runs(store: Store) -> None:
     runs = chosen_runs(store, [SEQUENCE])
     assert len(runs) == 2
     assert sorted(run_names(runs)) == ["report.held_out_views = 2", "run"]
+
+
+def test_a_path_stands_for_runs_of_all_its_spellings(store: Store, tmp_path: Path) -> None:
+    root = tmp_path / "store"
+    shutil.copytree(store.root, root)
+    copy = Store(str(root))
+    for index, (name, record) in enumerate(sorted(outcome_records(store).items())):
+        write_record(copy, name, {**record, "sequence": f"{tmp_path}/colon{'/' * (index % 2)}"})
+    for spelling in ("colon", "colon/", "./colon"):
+        assert len(chosen_runs(copy, [f"{tmp_path}/{spelling}"])) == 2
+        assert "Finished runs of it had --profile quick --seed 0" in _on_record(
+            str(root), f"{tmp_path}/{spelling}"
+        )
+    with pytest.raises(ConfigError, match="0 finished runs"):
+        chosen_runs(copy, [f"{tmp_path}/col"])
 
 
 def test_pages_are_named_by_file_folder_or_key(store: Store) -> None:

@@ -14,11 +14,11 @@ import pytest
 
 from extrags.errors import StoreError
 from extrags.store import Store
-from extrags.store.retention import Policy, apply_policy
-from extrags.store.runs import active_runs, runs_of
+from extrags.store.retention import Policy, apply_policy, planned_removals
+from extrags.store.runs import active_runs, recorded_run, runs_of
 from flows.cli import main
 from flows.outcome import SequenceOutcome
-from flows.runners import DirectRunner
+from flows.runners import DirectRunner, StoreRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
 
@@ -45,6 +45,15 @@ def test_a_tiny_sequence_is_few_files_and_one_record(finished: tuple[str, Sequen
     usual = [key for key in run.keys if not key.startswith("enhance-keyframes")]
     files = [path for key in usual for path in (Path(root) / "artefacts" / key).rglob("*") if path.is_file()]
     assert 40 < len(files) < 70
+
+
+def test_a_run_that_only_finds_everything_uses_everything(
+    store: Store, finished: tuple[str, SequenceOutcome]
+) -> None:
+    run_sequence(SEQUENCE, tiny_config(), store.root, StoreRunner(store.root), profile="quick")
+    removals, _ = planned_removals(store, Policy(older_than_s=30 * 86400.0), now=time.time() + 3600.0)
+    made = {key for row in finished[1].stages for key in row.made}
+    assert not made & {item.key for item in removals}
 
 
 @pytest.mark.parametrize(
@@ -132,6 +141,19 @@ class TestCommand:
         assert main(["cache", "gc", "--store", store.root]) == 0
         assert not place.exists()
         assert any(item.stage == "report" for item in store.ls())
+
+    def test_a_run_in_progress_keeps_what_an_earlier_version_made(self, store: Store) -> None:
+        key = "benchmark-report-v0-0123456789abcdef"
+        with store.slot(stage="benchmark-report", version=0, key=key, label="weekly"):
+            pass
+        os.utime(Path(store.root) / "artefacts" / key, (time.time() - 40 * 86400,) * 2)
+        with recorded_run(store, "weekly") as record:
+            assert record is not None
+            record.add([key])
+            assert main(["cache", "gc", "--store", store.root]) == 0
+            assert len(store.ls(key)) == 1
+        assert main(["cache", "gc", "--store", store.root]) == 0
+        assert store.ls(key) == []
 
     def test_max_size(self, store: Store, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["cache", "gc", "--max-size", "4MiB", "--store", store.root]) == 0

@@ -43,6 +43,17 @@ def test_what_several_patterns_match_is_there_once(tmp_path: Path) -> None:
     assert names([str(tmp_path)]) == [str(tmp_path)]
 
 
+def test_a_path_has_one_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "grow").mkdir()
+    monkeypatch.chdir(tmp_path)
+    for spelling in ("grow/", "./grow", "grow//"):
+        assert names([spelling]) == ["grow"]
+    assert names(["./phantom/1"]) == ["./phantom/1"]
+    for twice in (["grow", "grow/"], ["grow", str(tmp_path / "grow")]):
+        with pytest.raises(ConfigError, match="named twice"):
+            names(twice)
+
+
 def test_a_text_has_one_a_line(tmp_path: Path) -> None:
     file = manifest(tmp_path, "night.txt", TEXT)
     assert names([file]) == ["phantom/0@sparse", "phantom/1@sparse", "phantom/1@distanced"]

@@ -72,6 +72,13 @@ def test_second_run_is_all_cached_and_the_same(finished: tuple[str, SequenceOutc
     assert states(second) == {**dict.fromkeys(STAGES, "cached"), **SKIPPED}
     assert second.digests == first.digests
     assert second.metrics == first.metrics
+    # The figures of all views as well, which no task looks up where there are metrics.
+    (now, then) = (outcome.row("evaluate") for outcome in (second, first))
+    assert now is not None
+    assert then is not None
+    assert any(key.startswith("evaluate-views-v") for key in then.made)
+    assert (now.made, now.tasks) == (then.made, then.tasks)
+    assert now.made_seconds == pytest.approx(then.made_seconds)
 
 
 def test_what_counts_as_seen_is_measured_again(finished: tuple[str, SequenceOutcome]) -> None:

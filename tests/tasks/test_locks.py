@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import copy
+import errno
 import multiprocessing
+import os
 import pickle
 import signal
+import stat
 import subprocess
 import sys
 import threading
@@ -15,6 +18,7 @@ from pathlib import Path
 import pytest
 from prefect.locking.protocol import LockManager
 
+from extrags.errors import StoreError
 from tasks.locks import FlockManager, sweep_locks
 
 
@@ -84,6 +88,46 @@ def test_sigkill_frees_the_lock_and_sweep_removes_its_file(tmp_path: Path) -> No
     manager.release_lock("k", "b")
     manager.release_lock("held", "me")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_lock_is_for_all_who_may_write_there(tmp_path: Path) -> None:
+    manager, before = FlockManager(tmp_path), os.umask(0o002)
+    try:
+        manager.acquire_lock("k", "a")
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "k.lock").stat().st_mode) == 0o664
+    manager.release_lock("k", "a")
+
+
+def test_a_lock_of_another_user_stays_and_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("k", "ours"):
+        (tmp_path / f"{name}.lock").touch()
+    opened = os.open
+
+    def refusing(path: str | Path, flags: int, *mode: int) -> int:
+        if Path(path).name == "k.lock" and flags & os.O_RDWR:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return opened(path, flags, *mode)
+
+    monkeypatch.setattr(os, "open", refusing)
+    assert sweep_locks(tmp_path) == [f"{tmp_path.name}/ours.lock"]
+    manager = FlockManager(tmp_path)
+    assert not manager.is_locked("k")
+    with pytest.raises(StoreError, match=r"k\.lock cannot be opened: Permission denied"):
+        manager.acquire_lock("k", "b", acquire_timeout=0.0)
+
+
+def test_a_lock_that_may_not_be_removed_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "k.lock").touch()
+
+    def refused(path: Path, **_: bool) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted", str(path))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "unlink", refused)
+        assert sweep_locks(tmp_path) == []
+    assert sweep_locks(tmp_path) == [f"{tmp_path.name}/k.lock"]
 
 
 def test_many_processes_never_hold_it_together(tmp_path: Path) -> None:

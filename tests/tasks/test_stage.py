@@ -138,6 +138,19 @@ def test_ignored_arguments_are_in_neither_key_nor_manifest(tmp_path: Path) -> No
     assert Store(tmp_path).manifest(first).config == {"digest": "d"}
 
 
+def test_an_artefact_that_the_key_ignores_stands_in_the_lineage(tmp_path: Path) -> None:
+    @stage("toy-aided", version=1, ignore=("aid",))
+    def aided(slot: Slot, number: Ref, aid: Ref | None = None) -> None:
+        (slot.path / "aided").write_text(str(aid is not None))
+
+    number, aid = (source.fn(store=str(tmp_path), seed=seed) for seed in (1, 2))
+    ref = aided.fn(store=str(tmp_path), number=number, aid=aid)
+    assert aided.fn(store=str(tmp_path), number=number) == ref
+    manifest = Store(tmp_path).manifest(ref)
+    assert manifest.inputs == {"number": number.digest, "aid": aid.digest}
+    assert manifest.config == {}
+
+
 def test_one_name_has_one_version() -> None:
     assert stage_versions()["toy-double"] == 3
     with pytest.raises(ConfigError, match="two versions of stage toy-double"):

@@ -98,7 +98,7 @@ def scores_of(restored: list[RestoredPairs], transfer: LightTransfer) -> dict[st
 
 
 def validation_pairs(pairs: Pairs) -> Pairs | None:
-    """Validation pairs with valid pixels; the leave-out ones alone where there are any. None where there are none."""
+    """Validation pairs with valid pixels, the leave-out ones alone where there are any; None without any."""
     telling = pairs.validation & (pairs.weight > 0).any(dim=(1, 2, 3)).numpy()
     chosen = np.flatnonzero(telling & ~pairs.synthetic)
     if len(chosen) == 0:

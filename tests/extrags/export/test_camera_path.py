@@ -59,7 +59,7 @@ def test_a_path_of_another_program_has_no_intrinsics(tmp_path: Path) -> None:
     file, content = written(tmp_path, cameras)
     for entry in content["camera_path"]:
         del entry["K"]
-    del content["fps"]
+    del content["fps"], content["camera_type"]
     file.write_text(json.dumps(content))
     back = read_camera_path(file)
     np.testing.assert_allclose(back.cameras.K, cameras.K, rtol=1e-9)
@@ -83,6 +83,12 @@ class TestRefused:
         [
             ({"render_width": 0}, "field render_width"),
             ({"render_width": 1e400}, "no camera path"),
+            (
+                {"camera_type": "equirectangular"},
+                r"field camera_type: .equirectangular.; expected perspective",
+            ),
+            ({"camera_type": "fisheye"}, "field camera_type"),
+            ({"camera_type": None}, "field camera_type"),
             ({"camera_path": []}, "0 cameras"),
             ({"camera_path": {}}, "no list"),
             ({"camera_path": [{"fov": 50}]}, "frame 0, field camera_path"),

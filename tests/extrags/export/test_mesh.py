@@ -15,6 +15,7 @@ from extrags.cameras import Cameras, pixel_rays
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.export import ColoredMesh, colored_mesh, write_mesh
+from extrags.radial_lens import RadialLens
 from extrags.scene import Scene
 from extrags.splat_files import bake_recorded_light
 from extrags.surface import Mesh, fuse_surface
@@ -65,6 +66,12 @@ def rendered(mesh: trimesh.Trimesh, camera: Cameras) -> tuple[np.ndarray, np.nda
     return picture.reshape(camera.height, camera.width, 3), hit.reshape(camera.height, camera.width)
 
 
+def shown(mesh: Mesh, cameras: Cameras) -> np.ndarray:
+    """Which vertices lie in any of the pictures, hidden or not."""
+    pixels, depth = cameras.project(mesh.vertices.astype(np.float64))
+    return np.asarray((cameras.contains(pixels) & (depth > 0)).any(axis=0))
+
+
 def agreement(mesh: trimesh.Trimesh, scene: Scene, cameras: Cameras) -> float:
     """PSNR over the pixels that show the mesh, in dB."""
     errors = []
@@ -99,18 +106,26 @@ class TestFiles:
         np.testing.assert_allclose(mesh.bounds[1], colored.mesh.vertices.max(axis=0), rtol=1e-6)
 
     def test_obj(self, colored: ColoredMesh, baked: Scene, tube: Tube, tmp_path: Path) -> None:
-        write_mesh(colored, tmp_path / "a.obj")
-        assert {file.name for file in tmp_path.iterdir()} == {"a.obj", "a.mtl", "a.png"}
+        mine = {tmp_path / "a.png": "a picture", tmp_path / "a.mtl": "a material"}
+        for file, text in mine.items():
+            file.write_text(text)
+        written = write_mesh(colored, tmp_path / "a.obj")
+        assert {file: file.read_text() for file in mine} == mine
+        for file in mine:
+            file.unlink()
+        assert [file.name for file in written] == ["a.obj", "a_texture.mtl", "a_texture.png"]
+        assert {file.name for file in tmp_path.iterdir()} == {"a.obj", "a_texture.mtl", "a_texture.png"}
         mesh = trimesh.load(tmp_path / "a.obj", process=False, force="mesh")
         assert len(mesh.faces) == len(colored.mesh.triangles)
         assert agreement(mesh, baked, tube.sequence.training_cameras[::3]) > LEAST_DB
 
     def test_obj_whose_name_has_a_space(self, colored: ColoredMesh, tmp_path: Path) -> None:
         """Of the names in OBJ and MTL white space is the end."""
-        write_mesh(colored, tmp_path / "my scene.obj")
-        assert {file.name for file in tmp_path.iterdir()} == {"my scene.obj", "my_scene.mtl", "my_scene.png"}
-        assert "mtllib my_scene.mtl\n" in (tmp_path / "my scene.obj").read_text()
-        assert "map_Kd my_scene.png\n" in (tmp_path / "my_scene.mtl").read_text()
+        written = write_mesh(colored, tmp_path / "my scene.obj")
+        assert set(tmp_path.iterdir()) == set(written)
+        assert [file.name for file in written[1:]] == ["my_scene_texture.mtl", "my_scene_texture.png"]
+        assert "mtllib my_scene_texture.mtl\n" in written[0].read_text()
+        assert "map_Kd my_scene_texture.png\n" in written[1].read_text()
 
     def test_ply(self, colored: ColoredMesh, baked: Scene, tube: Tube, tmp_path: Path) -> None:
         write_mesh(colored, tmp_path / "a.ply")
@@ -130,8 +145,8 @@ class TestFiles:
         linear = linear / 255 if linear.max() > 1 else linear
         encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
         assert np.abs(encoded - plain.colors / 255).mean() < 0.02
-        write_mesh(plain, tmp_path / "a.obj")
-        assert not (tmp_path / "a.png").exists()
+        assert write_mesh(plain, tmp_path / "a.obj") == (tmp_path / "a.obj",)
+        assert {file.name for file in tmp_path.iterdir()} == {"a.glb", "a.obj"}
         assert len(trimesh.load(tmp_path / "a.obj", process=False).faces) == len(surface.triangles)
 
     def test_another_suffix(self, colored: ColoredMesh, tmp_path: Path) -> None:
@@ -150,13 +165,29 @@ class TestInvented:
         back = Cameras(train.K, turned, train.width, train.height)
         mesh = fuse_surface(tube.scene, Cameras.concatenated([train, back]), SurfaceConfig(voxel_share=0.02))
         found = colored_mesh(mesh, baked, train, back, texture=False)
-        pixels, depth = train.project(mesh.vertices.astype(np.float64))
-        outside = ~(train.contains(pixels) & (depth > 0)).any(axis=0)
+        outside = ~shown(mesh, train)
         assert outside.mean() > 0.1
         assert 0.05 < float(found.invented.mean()) < 0.95
         assert float(found.invented[outside].min()) == 1.0
         # Its colours are those of the virtual views, not black.
         assert float(found.colors[found.invented > 0].mean()) > 20
+
+    def test_training_views_with_a_lens(self, tube: Tube, baked: Scene) -> None:
+        """Virtual views have none; what the wider views of the lens have shown is not invented."""
+        lens = RadialLens((-0.05, 0.0, 0.0, 0.0), float(np.radians(70)))
+        flat = tube_cameras(3, start_mm=25.0)
+        train = Cameras(flat.K * [[0.5], [0.5], [1]], flat.world_from_camera, 64, 48, lens)
+        virtual = tube_cameras(5, start_mm=25.0).resized(48, 36)
+        mesh = fuse_surface(tube.scene, tube_cameras(10), SurfaceConfig(voxel_share=0.02))
+        joined = colored_mesh(mesh, baked, train, virtual)
+        assert joined.texture is not None
+        alone = colored_mesh(mesh, baked, train, texture=False)
+        np.testing.assert_array_equal(joined.invented, alone.invented)
+        by_lens, by_pinhole = (shown(mesh, cameras) for cameras in (train, train.as_pinholes(60.0)))
+        assert float(joined.invented[~by_lens].min()) == 1
+        beyond = by_lens & ~by_pinhole
+        assert beyond.mean() > 0.1
+        assert float(joined.invented[beyond].mean()) < 0.5
 
     def test_groups_of_obj(self, tube: Tube, baked: Scene, tmp_path: Path) -> None:
         mesh = Mesh(
@@ -176,3 +207,10 @@ def test_a_mesh_that_no_view_sees(tube: Tube, baked: Scene) -> None:
     )
     with pytest.raises(CaptureError, match="none of the 10 views"):
         colored_mesh(away, baked, tube.sequence.training_cameras)
+
+
+def test_a_scene_elsewhere(
+    surface: Mesh, baked: Scene, colored: ColoredMesh, tube: Tube, elsewhere: torch.device
+) -> None:
+    found = colored_mesh(surface, baked.to(elsewhere), tube.sequence.training_cameras, texture=False)
+    np.testing.assert_array_equal(found.colors, colored.colors)

@@ -40,3 +40,10 @@ def test_faint_gaussians_are_left_out(tube: Tube, tmp_path: Path) -> None:
     assert write_points(gaussians, tmp_path / "a.ply", min_opacity=0.2) == len(gaussians)
     with pytest.raises(CaptureError, match=r"opacity of 0\.99"):
         write_points(gaussians, tmp_path / "a.ply", min_opacity=0.99)
+
+
+def test_gaussians_elsewhere(tube: Tube, elsewhere: torch.device, tmp_path: Path) -> None:
+    baked = bake_light(tube.scene)
+    write_points(baked, tmp_path / "a.ply")
+    write_points(baked.to(elsewhere), tmp_path / "b.ply")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()

@@ -16,6 +16,7 @@ import torch
 from extrags.errors import ConfigError, ShapeError, StoreError
 from extrags.export import fly_through, write_video
 from extrags.export.video import unobserved
+from extrags.scene import Scene
 from tests.extrags.lit_tube import Tube
 
 
@@ -83,6 +84,20 @@ def test_what_training_views_have_not_seen(tube: Tube) -> None:
     (unknown,) = fly_through([tube.scene], path, train=tube.sequence.training_cameras[:1], colors=False)
     assert known.shape == (48, 64, 3)
     assert unknown.mean() > known.mean() + 20
+
+
+@pytest.mark.usefixtures("without_kernels")
+def test_a_scene_elsewhere(tube: Tube, elsewhere: torch.device) -> None:
+    few = Scene(tube.scene.gaussians.subset(torch.arange(0, 4600, 20)), tube.scene.light)
+    train, path = (
+        tube.sequence.training_cameras[:2].resized(32, 24),
+        tube.sequence.cameras[:1].resized(32, 24),
+    )
+    (here,), (there,) = (
+        list(fly_through([few.to(device)], path, train=train)) for device in ("cpu", elsewhere)
+    )
+    assert here.shape == there.shape == (24, 2 * 32, 3)
+    assert np.abs(here.astype(int) - there.astype(int)).max() <= 1
 
 
 class TestRefused:

@@ -237,6 +237,11 @@ class TestCarve:
         ahead = tube.cameras.centers[4] + 5 * tube.cameras.forward[4]
         assert space.lookup(ahead) == FREE
 
+    def test_no_views_are_refused(self):
+        tube = small_tube()
+        with pytest.raises(CaptureError, match="no views to carve"):
+            carve(tube.scene, small_mesh(), tube.cameras[[]], FreespaceConfig(grid_size=8))
+
     def test_a_volume_without_extent_is_refused(self):
         tube = small_tube()
         point = Mesh(tube.cameras.centers[[0, 0, 0]].astype(np.float32), np.array([[0, 1, 2]], np.int32))

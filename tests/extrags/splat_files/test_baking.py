@@ -110,3 +110,12 @@ def test_wrong_numbers(value: float, tube: Tube) -> None:
         bake_light(tube.scene, exposure=value)
     with pytest.raises(ConfigError, match="exposure"):
         bake_recorded_light(tube.scene, tube.sequence.training_cameras, exposure=value)
+
+
+@pytest.mark.usefixtures("without_kernels")
+def test_a_scene_elsewhere(elsewhere: torch.device) -> None:
+    scene, camera = wall(20.0)
+    for bake in (bake_light, lambda lit: bake_recorded_light(lit, camera)):
+        here, there = bake(scene), bake(scene.to(elsewhere))
+        assert there.device == elsewhere
+        torch.testing.assert_close(there.to("cpu").sh0, here.sh0)

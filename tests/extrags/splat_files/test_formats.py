@@ -12,7 +12,8 @@ import pytest
 import torch
 
 from extrags.cameras import Cameras
-from extrags.gaussians import Gaussians
+from extrags.errors import CaptureError
+from extrags.gaussians import SH_C0, Gaussians
 from extrags.scene import Scene
 from extrags.splat_files import (
     bake_light,
@@ -100,6 +101,50 @@ def test_few_gaussians(
     assert float(distance.max()) < 0.05
     assert len(set(nearest.tolist())) == count
     assert torch.allclose(back.scales, few.scales[nearest], atol=0.05)
+
+
+@pytest.mark.parametrize(("write", "read", "name", "least_db"), FORMATS)
+def test_no_gaussians(
+    write: Writer, read: object, name: str, least_db: float, baked: Gaussians, tmp_path: Path
+) -> None:
+    with pytest.raises(CaptureError, match="there are no Gaussians to write"):
+        write(baked.subset(torch.arange(0)), tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+@pytest.mark.parametrize(("write", "read", "name", "least_db"), FORMATS)
+def test_gaussians_elsewhere(
+    write: Writer,
+    read: object,
+    name: str,
+    least_db: float,
+    baked: Gaussians,
+    elsewhere: torch.device,
+    tmp_path: Path,
+) -> None:
+    few = baked.subset(torch.arange(400))
+    here, there = tmp_path / name, tmp_path / f"there_{name}"
+    write(few, here)
+    write(few.to(elsewhere), there)
+    assert here.read_bytes() == there.read_bytes()
+
+
+def test_what_spz_holds(baked: Gaussians, tmp_path: Path) -> None:
+    """The bounds and steps that docs/export.md names."""
+    many = torch.linspace(-5, 5, 400)
+    values = baked.subset(torch.arange(400)).parameters()
+    values["sh0"] = many[:, None, None].expand(-1, 1, 3)
+    values["shN"] = many[:, None, None].expand(-1, 8, 3) / 3
+    write_spz(Gaussians(**values), tmp_path / "a.spz")
+    back = decoders.spz(tmp_path / "a.spz")
+    colors = 0.5 + SH_C0 * back.sh0
+    assert (float(colors.min()), float(colors.max())) == pytest.approx((-0.44, 1.44), abs=0.005)
+    # Two that the half turn between the format's axes and ours leaves as they are.
+    for coefficient, step in ((2, 1 / 16), (4, 1 / 8)):
+        levels = back.shN[:, coefficient].unique()
+        assert (float(levels[0]), float(levels[-1])) == (-1, 127 / 128)
+        # The last step is cut off by the bound.
+        assert levels.diff()[:-1].unique().tolist() == [step]
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +15,7 @@ from extrags.errors import ConfigError, PoseError, SourceError
 from extrags.gaussians import Gaussians
 from extrags.in_memory_pipeline import run_pipeline
 from extrags.scene import Scene
+from extrags.sequence import EndoscopicSequence
 from extrags.splat_files import bake_recorded_light, import_scene, write_ply_scene, write_spz
 from tests.extrags.lit_tube import Tube
 
@@ -75,6 +77,15 @@ class TestAccepted:
         assert found.psnr == pytest.approx(import_scene(tmp_path / "b.ply", tube.sequence).psnr, abs=0.05)
 
 
+def in_unit(sequence: EndoscopicSequence, factor: float) -> EndoscopicSequence:
+    """The same in a unit so many times as small."""
+    assert sequence.depth_mm is not None
+    assert sequence.world_from_camera is not None
+    poses = sequence.world_from_camera.copy()
+    poses[:, :3, 3] *= factor
+    return replace(sequence, world_from_camera=poses, depth_mm=sequence.depth_mm * np.float32(factor))
+
+
 def import_scene_without_light(tube: Tube, tmp_path: Path) -> float:
     write_ply_scene(Scene(tube.scene.gaussians), tmp_path / "albedo.ply")
     return import_scene(tmp_path / "albedo.ply", tube.sequence).psnr
@@ -92,6 +103,25 @@ class TestRefused:
     def test_another_unit(self, scale: float, message: str, file: Path, tube: Tube) -> None:
         with pytest.raises(SourceError, match=message):
             import_scene(file, tube.sequence, ImportedConfig(scale=scale))
+
+    @pytest.mark.parametrize("with_depth", [True, False])
+    def test_a_unit_too_large_without_light(
+        self, with_depth: bool, baked: Gaussians, tube: Tube, tmp_path: Path
+    ) -> None:
+        """Nothing nearer than `Scene.near` is rendered: surface would be missing without a word."""
+        small = in_unit(tube.sequence, 0.002)
+        if not with_depth:
+            small = replace(small, depth_mm=None)
+        write_ply_scene(Scene(baked), tmp_path / "a.ply")
+        with pytest.raises(
+            SourceError, match=r"field imported\.scale: the typical depth in test/tube is 0\.0"
+        ):
+            import_scene(tmp_path / "a.ply", small, ImportedConfig(scale=0.002))
+        write_ply_scene(tube.scene, tmp_path / "lit.ply")
+        assert import_scene(tmp_path / "lit.ply", small, ImportedConfig(scale=0.002)).seen_share > 0.7
+        # Far enough for both, and less than reconstruction takes.
+        enough = in_unit(tube.sequence, 0.02)
+        assert import_scene(tmp_path / "a.ply", enough, ImportedConfig(scale=0.02)).seen_share > 0.7
 
     def test_another_place(self, baked: Gaussians, tube: Tube, tmp_path: Path) -> None:
         away = changed(baked, means=baked.means + torch.tensor([500.0, 0, 0]))

@@ -13,17 +13,14 @@ from extrags.cameras import Cameras, look_at
 from extrags.config import CoarseConfig, DensifyConfig, LightConfig
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
-from extrags.scene import Scene
 from extrags.raster import native_isa
+from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.training import reconstruct
 from extrags.training.density import DensityStrategy
-from extrags.training.filling import filling_schedule
-from extrags.training.optimise import optimise
 from extrags.training.reconstruction import coarse_schedule
-from extrags.training.starting import LEAST_COLOR, starting_gaussians
 from extrags.training.step import AutogradStep, NativeStep
-from extrags.training.views import View, real_views
+from extrags.training.views import real_views
 
 WIDTH, HEIGHT, FRAMES = 64, 48, 8
 STRENGTH, ROUGHNESS = 0.4, 0.25
@@ -144,30 +141,3 @@ def test_a_roughness_at_a_bound_comes_back(
     assert step.light is not None
     found = float(step.light.log_roughness.detach())
     assert found < -0.1 if log_roughness >= 0 else found > math.log(0.02) + 0.1
-
-
-class TestStart:
-    def test_takes_no_highlight_for_tissue(self, glossy: EndoscopicSequence) -> None:
-        """With the light known, a start from depth is the wall's own colours, at its highlights too."""
-        light = glossy_light(len(glossy.train))
-        start = starting_gaussians(glossy, glossy.train, 1500, light=light, thickness=0.1)
-        found = start.sh0[:, 0] * 0.28209479177387814 + 0.5
-        wall = wavy_wall()
-        nearest = torch.cdist(start.means, wall.means).argmin(dim=1)
-        error = found - (wall.sh0[nearest, 0] * 0.28209479177387814 + 0.5)
-        # Of colours of 0.15 to 0.55; where highlights are taken for tissue and slopes for shade, it is 0.07.
-        assert float(error.abs().mean()) < 0.04
-
-    def test_a_color_is_never_zero_and_so_can_be_learned(self, glossy: EndoscopicSequence) -> None:
-        """A highlight believed stronger than a pixel takes all of a channel."""
-        light = replace(glossy_light(len(glossy.train)), log_specular=torch.tensor(2.0).log())
-        start = starting_gaussians(glossy, glossy.train, 1500, light=light, thickness=0.1)
-        dark = start.sh0[:, 0] * 0.28209479177387814 + 0.5 < LEAST_COLOR * 1.001
-        assert 0.01 < float(dark.any(dim=1).float().mean()) < 0.9
-        views: list[View] = real_views(glossy, glossy.train)
-        schedule = filling_schedule(coarse_schedule(settings(specular=True), 20.0, 20.0, "coarse"))
-        schedule = replace(schedule, iterations=30)
-        scene = Scene(start, glossy_light(len(glossy.train)))
-        learned = optimise(scene, lambda i: views[i % len(views)], schedule).scene.gaussians.sh0[:, 0]
-        moved = (learned - start.sh0[:, 0]).abs() > 1e-4
-        assert float(moved[dark].float().mean()) > 0.9

@@ -4,18 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
+from extrags.config import CoarseConfig, DensifyConfig
 from extrags.errors import CaptureError
+from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training import starting
+from extrags.training.optimise import optimise
 from extrags.training.random_start import depth_range
+from extrags.training.reconstruction import coarse_schedule
 from extrags.training.starting import (
+    LEAST_COLOR,
     depth_from_points,
     median_depth,
     starting_gaussians,
     starts_at_random,
     thin_out,
 )
+from extrags.training.views import real_views
 
 
 class TestStartingGaussians:
@@ -138,3 +145,18 @@ class TestThinOut:
         thinned, values = thin_out(points, 2 * points, 400)
         assert 200 < len(thinned) <= 400
         np.testing.assert_allclose(values, 2 * thinned, atol=1e-12)
+
+
+def test_a_black_channel_can_be_learned(tube_sequence: EndoscopicSequence) -> None:
+    """A colour of zero has no gradient: what starts black in the frames would stay so."""
+    black = tube_sequence.rgb.copy()
+    black[..., 2] = 0
+    start = starting_gaussians(replace(tube_sequence, rgb=black), tube_sequence.train, 300)
+    blue = start.sh0[:, 0, 2] * 0.28209479177387814 + 0.5
+    torch.testing.assert_close(blue, torch.full_like(blue, LEAST_COLOR), rtol=1e-4, atol=0)
+    views = real_views(tube_sequence, tube_sequence.train)
+    schedule = coarse_schedule(CoarseConfig(densify=DensifyConfig(enabled=False)), 20.0, 15.0, "coarse")
+    schedule = replace(schedule, iterations=40)
+    learned = optimise(Scene(start), lambda i: views[i % len(views)], schedule).scene.gaussians
+    brighter = learned.sh0[:, 0, 2] > start.sh0[:, 0, 2] + 1e-3
+    assert float(brighter.float().mean()) > 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,7 @@ from extrags.cameras import Cameras
 from extrags.errors import ConfigError
 from extrags.export import fly_through
 from extrags.gaussians import Gaussians
+from extrags.radial_lens import RadialLens
 from extrags.raster import available_backends
 from extrags.scene import Scene
 from extrags.view import SceneRenderer, ViewSettings, overview, pinhole, renderer, typical_depth
@@ -45,6 +47,36 @@ def test_pictures_are_exactly_those_of_the_scene(scene: Scene, camera: Cameras, 
         np.testing.assert_array_equal(
             made.render(camera, ViewSettings(exposure=exposure)), rendered(shown, camera, exposure)
         )
+
+
+def test_pictures_through_a_lens_are_those_of_the_scene(scene: Scene, camera: Cameras) -> None:
+    lens = RadialLens((-0.1, 0.0, 0.0, 0.0), math.radians(60))
+    through = replace(camera, lens=lens)
+    made = SceneRenderer(scene).render(through, ViewSettings())
+    np.testing.assert_array_equal(made, rendered(scene, through))
+    assert np.abs(made.astype(int) - rendered(scene, camera).astype(int)).max() > 20
+
+
+def test_a_scene_of_a_small_unit_without_light_shows_its_near_surface(camera: Cameras, scene: Scene) -> None:
+    """Nothing nearer than 0.01 is rendered of a scene without light; here that would be most of it."""
+    factor = 0.0005
+    poses = camera.world_from_camera.copy()
+    poses[:, :3, 3] *= factor
+    values = scene.gaussians.parameters()
+    small = Gaussians(
+        **{**values, "means": values["means"] * factor, "scales": values["scales"] + math.log(factor)}
+    )
+    closer = replace(camera, world_from_camera=poses)
+    expected = rendered(Scene(scene.gaussians), camera).astype(int)
+    assert (rendered(Scene(small), closer).max(axis=2) < 8).mean() > 0.3
+    for train in (None, closer):
+        made = SceneRenderer(Scene(small), train=train).render(closer, ViewSettings())
+        assert np.abs(made.astype(int) - expected).mean() < 0.5
+
+
+def test_a_scene_without_gaussians_is_black(scene: Scene, camera: Cameras) -> None:
+    nothing = Scene(scene.gaussians.subset(torch.arange(0)))
+    assert SceneRenderer(nothing).render(camera, ViewSettings()).max() == 0
 
 
 def test_lamp_and_exposure_multiply(scene: Scene, camera: Cameras) -> None:
@@ -176,6 +208,20 @@ class TestViewpoints:
         assert depth.min() > 0
         # The tube is long: along the image's width.
         assert np.ptp(pixels[0, :, 0]) > 1.5 * np.ptp(pixels[0, :, 1])
+
+    def test_an_overview_of_many_gaussians(self) -> None:
+        """What finds their axes must not grow with the square of their number."""
+        points = np.random.default_rng(2).normal(size=(6000, 3)) * [4, 1, 2]
+        many = Scene(Gaussians.from_points(points, np.full((len(points), 3), 0.5), np.ones(len(points))))
+        tracemalloc.start()
+        try:
+            camera = overview(many, 160)
+            peak = tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+        assert peak < 5e7
+        # It looks along the direction in which they extend least, with the longest one across.
+        np.testing.assert_allclose(np.abs(camera.world_from_camera[0, :3, :3]).argmax(axis=0), [0, 2, 1])
 
     @pytest.mark.parametrize("count", [1, 2, 5])
     def test_an_overview_of_few_gaussians(self, count: int) -> None:

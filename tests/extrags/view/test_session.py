@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from extrags.cameras import Cameras
 from extrags.errors import ConfigError
 from extrags.export import read_camera_path, write_camera_path
+from extrags.radial_lens import RadialLens
 from extrags.scene import Scene
 from extrags.view import RateMeter, SceneRenderer, ViewSession, ViewSettings
 from tests.extrags.lit_tube import build_tube, tube_cameras
@@ -96,6 +98,15 @@ def test_the_same_camera_again_is_no_movement(session: ViewSession) -> None:
     session.change(ViewSettings())
     session.resize(64)
     assert session.next_picture(0.0) is None
+
+
+def test_the_same_camera_through_a_lens_is_another(session: ViewSession, scene: Scene, clock: Clock) -> None:
+    through = replace(session.camera, lens=RadialLens((-0.1, 0.0, 0.0, 0.0), np.radians(60)))
+    session.look(through)
+    clock.now += 1
+    picture = session.next_picture(0.0)
+    assert picture is not None
+    np.testing.assert_array_equal(picture.rgb, rendered(scene, through))
 
 
 def test_the_width_is_the_sessions_and_the_aspect_the_cameras(session: ViewSession, clock: Clock) -> None:
@@ -194,6 +205,15 @@ class TestRecording:
         assert session.recorded == (0, 0.0)
         with pytest.raises(ConfigError, match="no view was recorded"):
             session.path()
+
+    def test_views_through_a_lens_are_recorded_as_pinholes(self, session: ViewSession) -> None:
+        """Camera paths have no lens."""
+        through = replace(session.camera, lens=RadialLens((-0.1, 0.0, 0.0, 0.0), np.radians(60)))
+        session.look(through)
+        session.add_view()
+        recorded, pinhole = session.path().cameras, through.as_pinholes()
+        np.testing.assert_allclose(recorded.K, pinhole.K)
+        assert np.abs(recorded.K - through.K).max() > 1
 
     def test_nothing_is_recorded_unasked(self, session: ViewSession, clock: Clock) -> None:
         session.look(tube_cameras(4)[1])

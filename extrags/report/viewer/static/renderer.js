@@ -117,6 +117,7 @@ class Renderer {
     gl.uniform1f(places.exposure, light.exposure);
     gl.uniform4f(places.falloff, light.softening, light.exponent, light.spread, light.cosine);
     gl.uniform4f(places.place, ...light.offset, light.reference);
+    gl.uniform3fv(places.home, light.home);
     gl.uniform1f(places.shoulder, light.shoulder);
     gl.uniform2f(places.gloss, light.specular, light.roughness);
     gl.uniform1i(places.shade, state.shade);

@@ -19,6 +19,7 @@ uniform bool lit;
 uniform float exposure;
 uniform vec4 falloff;         // softening, exponent, spread, cosine
 uniform vec4 place;           // offset of the lamp, reference distance
+uniform vec3 home;            // offset that the scene was made with, from the camera that looks
 uniform float shoulder;
 uniform vec2 gloss;           // strength and roughness of the specular lobe
 uniform int shade;            // 0 colour, 1 and more: a quantity
@@ -68,7 +69,8 @@ vec3 albedo(int id, vec3 d) {
   return max(sum + 0.5, 0.0);
 }
 
-// As extrags.raster.light.lit_colors.
+// As extrags.raster.light.lit_colors while the lamp is where the scene has it. That takes the direction to the lamp
+// for the one half-way to the camera; a lamp that was moved or left behind is half-way from there.
 vec3 under_light(vec3 a, vec3 mean, vec3 normal) {
   vec3 d = (lamp * vec4(mean, 1.0)).xyz / place.w - place.xyz;
   float square = max(dot(d, d), 1e-6);
@@ -79,7 +81,11 @@ vec3 under_light(vec3 a, vec3 mean, vec3 normal) {
   float arriving = falloff.y * fall + falloff.z * axis;
   float gain = exp2(clamp(arriving + 0.5 * falloff.w * facing, -40.0, 40.0));
   float rough = pow(clamp(gloss.y, 0.02, 1.0), 2.0);
-  float lobe = rough / (rough + (1.0 - rough) * max(1.0 - cosine * cosine / square, 0.0));
+  vec3 e = (view * vec4(mean, 1.0)).xyz / place.w - home;
+  vec3 between = d * inversesqrt(square) * mat3(lamp) + e * inversesqrt(max(dot(e, e), 1e-6)) * mat3(view);
+  float along = dot(normal, between);
+  float missed = max(1.0 - along * along / max(dot(between, between), 1e-6), 0.0);
+  float lobe = rough / (rough + (1.0 - rough) * missed);
   float shine = gloss.x * lobe * lobe * exp2(clamp(arriving, -40.0, 40.0));
   vec3 signal = exposure * (a * gain + shine);
   return (1.0 + shoulder) * signal / (1.0 + shoulder * signal);

@@ -5,13 +5,18 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
+from torch.nn import functional
 
 from extrags.cameras import pixel_rays
 from extrags.config import ReportConfig
+from extrags.raster.light import apply_response, light_gain, shortest_axes, specular_gain
+from extrags.raster.spherical_harmonics import sh_basis
 from extrags.report import ReportInputs, build_report
 from tests.browser import Browser, browser
 
@@ -80,15 +85,13 @@ def test_training_cameras_have_their_own_exposure(tab: Browser, drawn: ReportInp
 
 
 def test_the_light_moves(tab: Browser, drawn: ReportInputs) -> None:
-    from dataclasses import replace as with_values
-
-    import torch
-
     do(tab, "jump(0, 0)")
-    do(tab, "setLight({exposure: 1, exponent: 1.4, cosine: 1.2, offset: [0.3, 0.1, 0]})")
+    # `home`: as if the scene had been made with a lamp there, which is what the rasteriser draws.
+    place = "offset: [0.3, 0.1, 0], home: [0.3, 0.1, 0]"
+    do(tab, f"setLight({{exposure: 1, exponent: 1.4, cosine: 1.2, {place}}})")
     do(tab, "setLight({specular: 0.5, roughness: 0.3})")
     scene = drawn.final_scene
-    light = with_values(
+    light = replace(
         scene.light,
         log_exponent=torch.tensor(1.4).log(),
         cosine=torch.tensor(1.2),
@@ -97,21 +100,64 @@ def test_the_light_moves(tab: Browser, drawn: ReportInputs) -> None:
         offset=torch.tensor([0.3, 0.1, 0]),
     )
     camera = drawn.sequence.cameras[int(drawn.sequence.train[0])]
-    expected = with_values(scene, light=light).render(camera).rgb[0].clamp(0, 1).numpy()
+    expected = replace(scene, light=light).render(camera).rgb[0].clamp(0, 1).numpy()
     moved = picture(tab)
     assert psnr(moved, expected) >= 45
     do(tab, "resetLight()")
     assert psnr(picture(tab), moved) < 35
 
 
-def test_a_lamp_left_behind_does_not_follow(tab: Browser) -> None:
+def test_a_lamp_left_behind_does_not_follow(tab: Browser, drawn: ReportInputs) -> None:
     do(tab, "jump(0, 0)")
+    do(tab, "setLight({exposure: 1, specular: 2, roughness: 0.6})")
+    riding = picture(tab)
     do(tab, "pinLamp(true)")
+    # It stays where it was: that alone changes nothing.
+    assert psnr(picture(tab), riding) > 60
     do(tab, "jump(0, 3)")
+    do(tab, "setLight({exposure: 1})")
     behind = picture(tab)
+    for half_way in (True, False):
+        expected = lit_from_elsewhere(drawn, specular=2.0, roughness=0.6, half_way=half_way)
+        assert (psnr(behind, expected) >= 45) == half_way
     do(tab, "pinLamp(false)")
     assert psnr(picture(tab), behind) < 35
     do(tab, "resetLight()")
+
+
+def lit_from_elsewhere(
+    drawn: ReportInputs, *, specular: float, roughness: float, half_way: bool
+) -> np.ndarray:
+    """The final scene from training camera 3, its lamp on camera 0, [H, W, 3].
+
+    Highlights lie half-way between lamp and camera, or, as on a lamp that rides, in the lamp's direction.
+    """
+    scene, sequence = drawn.final_scene, drawn.sequence
+    gaussians, light = scene.gaussians, scene.light
+    here, there = (sequence.cameras[int(sequence.train[k])] for k in (3, 0))
+    means = gaussians.means.double()
+    normals = shortest_axes(gaussians.quats, gaussians.scales).double()
+    row = replace(light, log_specular=torch.tensor(specular).log(), log_roughness=torch.tensor(1.0).log())
+    row = row.camera_light(torch.ones(1)).packed()[0].double()
+    turn, shift = (torch.from_numpy(part) for part in (there.viewmats[0, :3, :3], there.viewmats[0, :3, 3]))
+    from_lamp = means @ turn.T + shift, normals @ turn.T
+    toward = []
+    for camera in (there, here):
+        pose = torch.from_numpy(camera.world_from_camera[0])
+        # Seen from where the scene has the lamp of either camera.
+        offset = means - pose[:3, 3] - light.reference_distance * pose[:3, :3] @ row[7:10]
+        toward.append(functional.normalize(offset, dim=1))
+    direction = functional.normalize(toward[0] + toward[1], dim=1) if half_way else toward[0]
+    squared = roughness**2
+    missed = 1 - (normals * direction).sum(1).square()
+    lobe = (squared / (squared + (1 - squared) * missed)).square()
+    seen = functional.normalize(means - torch.from_numpy(here.centers[0]), dim=1)
+    basis = sh_basis(seen, gaussians.sh_degree)
+    albedo = (torch.einsum("nk,nkc->nc", basis, gaussians.sh.double()) + 0.5).clamp_min(0)
+    # A roughness of one has the peak of its lobe in all directions.
+    signal = albedo * light_gain(*from_lamp, row)[:, None] + (lobe * specular_gain(*from_lamp, row))[:, None]
+    colors = apply_response(signal, row[10]).float()
+    return scene.render_attributes(here, colors)[0][0].clamp(0, 1).numpy()
 
 
 def test_orbit_by_pointer_and_keys(tab: Browser) -> None:
