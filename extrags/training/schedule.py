@@ -29,6 +29,7 @@ class Schedule:
     depth_weight_final_share: float
     depth_scale: float
     sh_every: int | None
+    """Iterations between two raises of the degree of the harmonics; None: all are in use from the start."""
     seed: int
     photometric_weight: float = 1.0
     """Factor of the L1 and SSIM terms of every view; the depth term is beside it."""
