@@ -247,7 +247,7 @@ def execute(
         return DatasetOutcome([])
     if not always:
         # Nothing to make: no need to wait for a server.
-        found = _from_store(cases, root, until)
+        found = _from_store(cases, root, until, several_seeds=len(several.seeds) > 1)
         if found is not None:
             stop_early()
             return found
@@ -319,7 +319,9 @@ def _may_be_finished(root: str, sequence: str, until: StageName) -> bool:
     return False
 
 
-def _from_store(cases: Sequence[SequenceCase], root: str, until: StageName) -> DatasetOutcome | None:
+def _from_store(
+    cases: Sequence[SequenceCase], root: str, until: StageName, *, several_seeds: bool = False
+) -> DatasetOutcome | None:
     """Outcomes from the store alone; None as soon as anything is missing or wrong.
 
     They are left on record as those of a flow run are.
@@ -350,6 +352,7 @@ def _from_store(cases: Sequence[SequenceCase], root: str, until: StageName) -> D
                 if outcome.status == "failed":
                     return None
                 outcome.variant = case.variant
+                outcome.seed = case.seed if several_seeds else None
                 outcomes.append(outcome)
             label = profile_label(cases[0].profile, ", ".join(dict.fromkeys(case.method for case in cases)))
             page = dataset_page(outcomes, "dataset", label, runner) if until == "report" else None

@@ -112,6 +112,22 @@ def test_a_run_that_is_not_whole_in_the_store_is_no_finished_run(
     assert _from_store(*arguments) is None
 
 
+def test_outcomes_from_the_store_tell_several_seeds_apart(
+    finished: tuple[str, SequenceOutcome], store: Store
+) -> None:
+    from flows.cases import SequenceCase
+    from flows.commands.run import _from_store
+
+    # Frames do not depend on the seed: what one run has read serves both.
+    cases = [SequenceCase(SEQUENCE, profile="quick", seed=seed, settings=TINY) for seed in (0, 1)]
+    several = _from_store(cases, store.root, "ingest", several_seeds=True)
+    one = _from_store(cases[:1], store.root, "ingest")
+    assert several is not None
+    assert one is not None
+    assert [outcome.seed for outcome in several.sequences] == [0, 1]
+    assert one.sequences[0].seed is None
+
+
 @pytest.mark.usefixtures("prefect_server")
 def test_a_flow_goes_on(
     finished: tuple[str, SequenceOutcome], store: Store, caplog: pytest.LogCaptureFixture
