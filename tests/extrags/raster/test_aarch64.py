@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import extrags.raster
+from extrags.raster.light import ROW_LENGTH
 
 KERNELS = Path(extrags.raster.__file__).parent / "kernels"
 STEP = Path(__file__).with_name("training_step.cpp")
@@ -39,7 +40,7 @@ RESULTS = {
     "gradient of opacities": GAUSSIANS,
     "gradient of sh": 3 * COEFFICIENTS * GAUSSIANS,
     "gradient of viewmat": 16,
-    "gradient of light": 12,
+    "gradient of light": ROW_LENGTH,
     "gradient of means2d": 2 * GAUSSIANS,
     "absolute gradient of means2d": 2 * GAUSSIANS,
     "transmittance": 64,
