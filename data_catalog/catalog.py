@@ -23,6 +23,7 @@ from data_catalog.readers.video import VIDEO_SUFFIXES
 from data_catalog.specular import with_specular
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
+from extrags.redaction import without_credentials
 from extrags.sequence import EndoscopicSequence
 
 __all__ = [
@@ -184,6 +185,9 @@ def _dataset(source: Source) -> Dataset:
 
 
 def _unknown(name: str) -> UnknownSequenceError:
+    if "://" in name:
+        # Before it is taken for a path: one slash less, and its password would be no credential any more.
+        return UnknownSequenceError(f"{without_credentials(name)} is a URL; sequences are files or folders")
     place = Path(name).expanduser()
     if place.exists():
         return UnknownSequenceError(f"{name} is a file or folder, and no name of the catalogue")

@@ -385,8 +385,13 @@ class SequenceRun(CachedStages):
             if refresh or self.store.find(stage_key(call.task, call.inputs)) is None
         }
         if waiting:
-            together = Call(measure_views, {"renders": list(waiting.values()), **shared})
-            views = self._run_task(row, together)
+            every = {ref.digest: ref for ref in renders}
+            together, whole = (
+                Call(measure_views, {"renders": list(each.values()), **shared}) for each in (waiting, every)
+            )
+            # A run that was interrupted may have measured all of them already.
+            found = not refresh and self.store.find(stage_key(whole.task, whole.inputs)) is not None
+            views = self._run_task(row, whole if found else together)
             calls = [
                 Call(measure, {**call.inputs, "views": views if ref.digest in waiting else None})
                 for ref, call in zip(renders, calls, strict=True)

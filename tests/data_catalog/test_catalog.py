@@ -47,6 +47,10 @@ class TestNames:
         with pytest.raises(UnknownSequenceError, match=f"Did you mean {near}"):
             describe(wrong)
 
+    def test_a_url_is_refused_without_its_password(self) -> None:
+        with pytest.raises(UnknownSequenceError, match=r"^https://\*\*\*@host/video\.mp4 is a URL; "):
+            describe("https://user:never-to-be-seen@host/video.mp4")
+
     @pytest.mark.parametrize("name", ["exam.mp4", "./exam", "/nowhere/exam", "scan.dcm"])
     def test_a_path_that_is_none_is_said_to_be_none(self, name) -> None:
         with pytest.raises(UnknownSequenceError, match=r"^no such file or folder: /"):
