@@ -332,11 +332,11 @@ def _put_many(root: str) -> list[Ref]:
 class TestUrl:
     def test_folders_of_a_file_system_come_and_go(self, tmp_path: Path) -> None:
         store = Store(f"local://{tmp_path}/store", cache=tmp_path / "cache")
-        put(store)
+        ref = put(store)
         (damaged,) = (tmp_path / "store" / "toy-v1-aa").rglob("file.txt")
         damaged.write_text("jello")
         with pytest.raises(DamagedArtefactError) as caught:
-            store.open(store.find("toy-v1-aa"))  # type: ignore[arg-type]
+            store.open(ref)
         place = store.set_aside(caught.value)
         assert place is not None
         assert len(list(Path(place.removeprefix("local://")).rglob("file.txt"))) == 1

@@ -90,6 +90,19 @@ def test_what_the_wiring_itself_reads_is_made_anew(
     assert {stage for stage, _ in records(store)} == {"plan", "evaluate"}
 
 
+def test_figures_of_all_scenes_serve_metrics_that_an_interrupted_run_lacks(
+    finished: tuple[str, SequenceOutcome], store: Store
+) -> None:
+    """Nothing is measured again, nor stored under another key."""
+    _, whole = finished
+    before = sorted(store.keys())
+    store.rm(key_of(whole, "metrics_final"))
+    outcome = run(store)
+    assert outcome.status == "ok"
+    assert outcome.digests == whole.digests
+    assert sorted(store.keys()) == before
+
+
 def test_who_only_looks_moves_nothing(finished: tuple[str, SequenceOutcome], store: Store) -> None:
     _, whole = finished
     (Path(store.root) / "artefacts" / key_of(whole, "coarse") / "manifest.json").write_text("{")
