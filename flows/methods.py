@@ -181,6 +181,8 @@ PAPER_SHARED = frozenset(
         "explore.safety_share",
         "explore.visible_weight",
         # Of the score by error, which it does not use.
+        "explore.starts",
+        "explore.start_spacing",
         "explore.probe_views",
         "explore.probe_shift",
         "explore.probe_turn_deg",

@@ -23,7 +23,7 @@ __all__ = ["branch", "explore", "merge", "next_anchors", "start"]
 NEXT_ANCHORS = "next_anchors"
 
 
-@stage("explore-start", version=5)
+@stage("explore-start", version=6)
 def start(slot: Slot, scene: Ref, sequence: Ref, freespace: Ref, config: ExploreConfig) -> None:
     """Measure the scene and choose the anchors; writes `search/` and `state/`."""
     from extrags.exploration import prepare_search, start_exploration

@@ -83,7 +83,19 @@ class CoverageConfig(StageConfig):
 class ExploreConfig(StageConfig):
     """The search for virtual trajectories."""
 
-    trajectories: int = Field(20, ge=1, description="N_Tr: starts at most")
+    trajectories: int = Field(20, ge=1, description="N_Tr: trajectories at most")
+    starts: int = Field(
+        12,
+        ge=1,
+        description="score=error: training views that the search starts from, at least; never fewer than "
+        "trajectories. With score=pairs there are as many as trajectories, as in the paper",
+    )
+    start_spacing: float = Field(
+        2.5,
+        gt=0,
+        description="score=error: more training views are starts until each is within this distance of one, "
+        "in median rendered depths plus radians of turn",
+    )
     length: int = Field(16, ge=2, description="L: views per trajectory, the start included")
     directions: int = Field(32, ge=4, le=32, description="D: equal-area direction bins")
     step_share: float = Field(0.2, gt=0, description="length of a translation, in median rendered depths")

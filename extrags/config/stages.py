@@ -121,12 +121,17 @@ class IngestConfig(StageConfig):
 class AssessConfig(StageConfig):
     """Assessment of the coarse scene, and the plan of the later stages."""
 
-    probe_views: int = Field(24, ge=1, description="views in the fan round the training views")
+    probe_views: int = Field(
+        192,
+        ge=1,
+        description="views in the fan round the training views; with few of them what is found lacking, and "
+        "with it the plan, hangs on the seed",
+    )
     probe_offset: float = Field(0.35, gt=0, description="sideways offset of a probe, in median depths")
     probe_turn_deg: float = Field(35.0, ge=0, description="turn of a probe")
     hole_alpha: float = Field(HOLE_ALPHA, gt=0, lt=1, description="a pixel below this alpha is a hole")
     min_hole_share: float = Field(
-        0.05,
+        0.04,
         ge=0,
         le=1,
         description="explore, restore and judge only when holes and poorly seen pixels exceed this share; a "
@@ -136,7 +141,7 @@ class AssessConfig(StageConfig):
         2, ge=1, description="a Gaussian seen from fewer direction bins counts as poorly seen"
     )
     full_budget_share: float = Field(
-        0.25, gt=0, le=1, description="share of lacking pixels from which the whole budget is used"
+        0.2, gt=0, le=1, description="share of lacking pixels from which the whole budget is used"
     )
     force: bool = Field(False, description="run every stage whatever the measurements say")
     seed: int = Field(0, ge=0, description="seed of all random sampling")
@@ -398,7 +403,8 @@ class PipelineConfig(StageConfig):
         """Apply `{"coarse.iterations": 500}`-like settings.
 
         Raises:
-            ConfigError: for an unknown name (with the nearest known one) or a value out of range.
+            ConfigError: for an unknown name (with the nearest known one), a value out of range, or values
+                that do not go together.
         """
         known = settings_of(PipelineConfig)
         tree = self.model_dump()
@@ -416,6 +422,9 @@ class PipelineConfig(StageConfig):
             first = error.errors()[0]
             # A place ends with the member of a union or of a tuple that was tried.
             place = ".".join(str(part) for part in first["loc"])
-            wrong = next(name for name in known if f"{place}.".startswith(f"{name}."))
+            wrong = next((name for name in known if f"{place}.".startswith(f"{name}.")), None)
+            if wrong is None:
+                # Several settings that do not go together.
+                raise ConfigError(f"{place}: {first['ctx']['error']}") from error
             # `with_seed` does not validate: what is wrong may have been there before.
             raise known[wrong].refused(repr(overrides.get(wrong, first["input"]))) from error

@@ -19,7 +19,7 @@ from extrags.errors import ShapeError
 from extrags.events import MetricRecorded, Progress, emit
 from extrags.exploration.coverage import count_pairs
 from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
-from extrags.exploration.waves import Least, WaveState, start_views
+from extrags.exploration.waves import Least, WaveState, search_starts
 from extrags.freespace import FreeSpace, carve
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -204,7 +204,7 @@ def start_exploration(context: SearchContext) -> WaveState:
         context: from `prepare_search`.
     """
     config, measured = context.config, context.measured
-    anchors = start_views(measured.training, config.trajectories, measured.depth_unit_mm)
+    anchors = search_starts(measured.training, config, measured.depth_unit_mm)
     if config.score == "pairs":
         pairs = len(context.scene.gaussians) * config.directions
         total = max(1.0, float(np.ceil(config.min_gain_share * pairs)))
@@ -216,7 +216,7 @@ def start_exploration(context: SearchContext) -> WaveState:
         pairs=measured.pairs,
         known=measured.known,
         value=measured.value,
-        waiting=tuple(int(anchor) for anchor in anchors),
+        waiting=tuple(anchors),
         room=config.trajectories,
         least=least,
         wave=config.wave,

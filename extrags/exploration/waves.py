@@ -6,6 +6,7 @@ merge looks at all of them at once: the result does not depend on how many worke
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt32
 
 from extrags.cameras import Cameras, pose_distances
+from extrags.config import ExploreConfig
 from extrags.errors import ConfigError
 from extrags.exploration.coverage import coverage_gain
 from extrags.exploration.search import Branch
@@ -22,10 +24,12 @@ from extrags.exploration.seen import PairValue, Value, restored
 from extrags.store.storable import Storable
 from extrags.zarr_io import has_array, new_group, open_group, read_array, write_array
 
-__all__ = ["Least", "Merge", "WaveState", "merge_wave", "start_views"]
+__all__ = ["Least", "Merge", "WaveState", "merge_wave", "search_starts", "start_views"]
 
 
-def start_views(cameras: Cameras, count: int, depth_unit_mm: float) -> Int[np.ndarray, "t"]:
+def start_views(
+    cameras: Cameras, count: int, depth_unit_mm: float, spacing: float = math.inf
+) -> Int[np.ndarray, "t"]:
     """Training views spread evenly over space, by farthest point sampling.
 
     Their distance is `extrags.cameras.pose_distances` in depth units. The first is the view nearest to the
@@ -36,9 +40,10 @@ def start_views(cameras: Cameras, count: int, depth_unit_mm: float) -> Int[np.nd
         cameras: the training views.
         count: how many are wanted; all are returned when there are not so many.
         depth_unit_mm: median rendered depth.
+        spacing: further ones are returned until every view is within this distance of one.
 
     Returns:
-        Indices into `cameras`, at most `count`, no index twice.
+        Indices into `cameras`, no index twice.
 
     Raises:
         ConfigError: when `count` is below one.
@@ -54,11 +59,32 @@ def start_views(cameras: Cameras, count: int, depth_unit_mm: float) -> Int[np.nd
     middle = np.linalg.norm(cameras.centers - cameras.centers.mean(axis=0), axis=1)
     chosen = [int(np.argmin(middle))]
     nearest = distance_from(chosen[0])
-    while len(chosen) < min(count, len(cameras)):
+    while len(chosen) < len(cameras):
         nearest[chosen] = -1.0
+        if len(chosen) >= count and nearest.max() <= spacing:
+            break
         chosen.append(int(np.argmax(nearest)))
         nearest = np.minimum(nearest, distance_from(chosen[-1]))
     return np.array(chosen, dtype=np.int64)
+
+
+def search_starts(cameras: Cameras, config: ExploreConfig, depth_unit_mm: float) -> list[int]:
+    """Training views that the search may start from, spread evenly.
+
+    Args:
+        cameras: the training views.
+        config: number and spacing.
+        depth_unit_mm: median rendered depth.
+
+    Returns:
+        Indices into `cameras`, in the order of `start_views`.
+    """
+    if config.score == "pairs":
+        found = start_views(cameras, config.trajectories, depth_unit_mm)
+    else:
+        count = max(config.starts, config.trajectories)
+        found = start_views(cameras, count, depth_unit_mm, config.start_spacing)
+    return [int(view) for view in found]
 
 
 @dataclass(frozen=True)
@@ -192,10 +218,14 @@ class WaveState(Storable):
     def next_wave(self) -> tuple[int, ...]:
         """Anchors that grow together now; empty when the exploration is finished.
 
-        Always different ones: two branches from one anchor and one snapshot would be the same.
+        Always different ones: two branches from one anchor and one snapshot would be the same. Where there
+        are more starts than room, all of them grow in the first wave: which ones are worth the room cannot
+        be told before. Not with a wave of one, where trajectories are found one by one.
         """
         if self.room == 0:
             return ()
+        if self.waves == 0 and self.wave > 1 and len(self.waiting) > self.room:
+            return self.waiting
         return self.waiting[: self.wave]
 
     def merged(self, branches: Sequence[Branch]) -> WaveState:

@@ -23,7 +23,7 @@ from extrags.cameras import Cameras, rotation_about
 from extrags.config import ExploreConfig
 from extrags.events import Progress, emit
 from extrags.exploration.primitives import apply_primitives, orthonormalised, primitive_motions
-from extrags.exploration.waves import start_views
+from extrags.exploration.waves import search_starts
 from extrags.freespace import FREE, UNKNOWN, FreeSpace
 
 __all__ = [
@@ -111,8 +111,8 @@ class Moves:
         return self.config.step_share * self.unit_mm
 
     def starts(self, cameras: Cameras) -> list[int]:
-        """Training views to start from, in the order of the search."""
-        return [int(index) for index in start_views(cameras, self.config.trajectories, self.unit_mm)]
+        """Training views to start from, those of the search."""
+        return search_starts(cameras, self.config, self.unit_mm)
 
     def allowed(
         self, start: Float[np.ndarray, "4 4"], poses: Float[np.ndarray, "a 4 4"]

@@ -54,8 +54,8 @@ class TestAssess:
         for line in plan.decisions:
             assert line.run == (line.stage == "finetune")
             assert line.value == plan.measurements["lacking_share"]
-            assert line.threshold == 0.05
-            assert "no more than 5.00 %" in line.reason
+            assert line.threshold == 0.04
+            assert "no more than 4.00 %" in line.reason
             assert line.budget == ({"judge.enabled": False} if line.run else {})
         assert "on real views alone" in plan.decision("finetune").reason
         assert not plan.applied_to(config()).finetune.judge.enabled

@@ -49,6 +49,8 @@ TINY: dict[str, Any] = {
     "freespace.grid_size": 16,
     "freespace.render_width": 32,
     "explore.trajectories": 2,
+    "explore.starts": 2,
+    "explore.start_spacing": 100.0,
     "explore.length": 3,
     "explore.wave": 2,
     "explore.max_expansions": 3,

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from extrags.cameras import Cameras
+from extrags.cameras import Cameras, pose_distances
+from extrags.config import ExploreConfig
 from extrags.errors import ConfigError
 from extrags.exploration import Exploration, WaveState, explore, merge_wave, start_views
 from extrags.exploration.coverage import (
@@ -22,7 +23,7 @@ from extrags.exploration.coverage import (
 )
 from extrags.exploration.search import Branch, grow_branch, prepare_search
 from extrags.exploration.seen import PairValue, Seen
-from extrags.exploration.waves import Least
+from extrags.exploration.waves import Least, search_starts
 
 from .tube import SEEN, make_tube, small_config, small_freespace, small_tube
 
@@ -85,9 +86,37 @@ class TestStartViews:
         cameras = make_tube(n_gaussians=200, n_views=n_views).cameras
         assert sorted(start_views(cameras, 20, 30.0).tolist()) == list(range(n_views))
 
+    def test_further_ones_close_gaps(self):
+        cameras = make_tube(n_gaussians=200, n_views=40).cameras
+        chosen = start_views(cameras, 2, 30.0, spacing=0.3)
+        np.testing.assert_array_equal(chosen[:2], start_views(cameras, 2, 30.0))
+
+        def farthest(starts: np.ndarray) -> float:
+            distances = [pose_distances(cameras, cameras[int(one)], 30.0)[:, 0] for one in starts]
+            return float(np.min(distances, axis=0).max())
+
+        assert farthest(chosen) <= 0.3 < farthest(chosen[:-1])
+
     def test_no_start_is_refused(self):
         with pytest.raises(ConfigError, match="at least one start"):
             start_views(small_tube().cameras, 0, 30.0)
+
+
+class TestSearchStarts:
+    def test_fewer_trajectories_leave_the_starts(self):
+        cameras = make_tube(n_gaussians=200, n_views=40).cameras
+        many = search_starts(cameras, ExploreConfig(trajectories=12), 30.0)
+        assert search_starts(cameras, ExploreConfig(trajectories=2), 30.0) == many
+        assert len(search_starts(cameras, ExploreConfig(trajectories=15), 30.0)) == 15
+
+    def test_a_longer_recording_has_more(self):
+        cameras = make_tube(n_gaussians=200, n_views=40).cameras
+        config = ExploreConfig(trajectories=3, starts=3, start_spacing=1.0)
+        assert len(search_starts(cameras, config, 30.0)) < len(search_starts(cameras, config, 10.0))
+
+    def test_pairs_have_as_many_as_trajectories(self):
+        cameras = make_tube(n_gaussians=200, n_views=40).cameras
+        assert len(search_starts(cameras, ExploreConfig(trajectories=2, score="pairs"), 30.0)) == 2
 
 
 class TestMergeWave:
@@ -206,9 +235,16 @@ class TestWaveState:
 
     def test_ends_when_there_is_no_room(self):
         full = np.array([7, 0, 0, 0, 0, 0], np.uint32)
-        state = made_state(room=1).merged([made_branch(0, full), made_branch(1, full << 3)])
+        state = made_state(room=1, waves=1).merged([made_branch(0, full), made_branch(1, full << 3)])
         assert state.next_wave() == ()
         assert "there was no room left" in state.rejected[0]
+
+    def test_all_starts_grow_first_where_there_is_not_room_for_each(self):
+        assert made_state(room=3).next_wave() == (0, 1, 2, 3)
+        assert made_state(room=3, waves=1).next_wave() == (0, 1)
+        assert made_state(room=4).next_wave() == (0, 1)
+        # One by one means one by one.
+        assert made_state(room=3, wave=1).next_wave() == (0,)
 
     def test_branches_of_other_anchors_are_refused(self):
         with pytest.raises(ConfigError, match="the wave has the anchors"):
