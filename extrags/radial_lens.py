@@ -55,6 +55,7 @@ SERIES_SQUARE = 0.18
 
 _TABLE_SIZE = 2048
 _NEWTON_STEPS = 4
+_POWERS = (1, 3, 5, 7, 9)
 _FIT_ANGLES = 400
 _FIT_DIRECTIONS = 32
 _LEAST_ROLL_RAD = 1e-5
@@ -70,7 +71,7 @@ class RadialLens:
 
     Raises:
         SourceError: when a number is not finite, the field is empty or wider than `LARGEST_ANGLE_RAD`, or
-            the polynomial folds back inside it.
+            the polynomial folds back inside it or, beyond it, where points are still projected by it.
     """
 
     coefficients: tuple[float, float, float, float]
@@ -88,32 +89,73 @@ class RadialLens:
                 f"than 0 and at most {np.degrees(LARGEST_ANGLE_RAD):.0f}",
                 field="lens",
             )
-        angle = np.linspace(0, self.linear_from_rad, 512)
-        falling = np.flatnonzero(self._polynomial(angle)[1] <= 1e-3)
-        if falling.size:
+        fold = self.folding_angle(self.coefficients, self.max_angle_rad)
+        if fold is not None:
+            field_end = np.degrees(self.max_angle_rad)
+            where = (
+                f"inside its field of {field_end:.1f} degrees"
+                if fold <= self.max_angle_rad
+                else f"beyond its field of {field_end:.1f} degrees, but before the "
+                f"{np.degrees(self.linear_from_rad):.1f} degrees up to which points are projected by k1 to k4"
+            )
             raise SourceError(
-                f"the lens with k1 to k4 {self.coefficients} folds back {np.degrees(angle[falling[0]]):.1f} "
-                f"degrees from its axis, inside its field of {np.degrees(self.max_angle_rad):.1f} degrees",
+                f"the lens with k1 to k4 {self.coefficients} folds back {np.degrees(fold):.1f} degrees from "
+                f"its axis, {where}",
                 field="lens",
             )
 
     @property
     def linear_from_rad(self) -> float:
-        """Angle from which r grows linearly: the end of the field, or of the series if that is later."""
-        return max(self.max_angle_rad, float(np.arctan(np.sqrt(SERIES_SQUARE))) + 0.01)
+        """Angle from which r grows linearly: the end of the field, or of the series if that is later.
+
+        Of a narrow field it is the angle of culling, where that comes before the end of the series.
+        """
+        return self._linear_from(self.max_angle_rad)
 
     @property
     def projected_up_to_rad(self) -> float:
         """Angle from which points are culled."""
-        return min(self.max_angle_rad + MARGIN_RAD, LARGEST_PROJECTED_RAD)
+        return self._projected_up_to(self.max_angle_rad)
+
+    @classmethod
+    def folding_angle(
+        cls, coefficients: tuple[float, float, float, float], max_angle_rad: float
+    ) -> float | None:
+        """Angle in radians from which a polynomial does not rise any more where points are projected by it.
+
+        Args:
+            coefficients: k1 to k4.
+            max_angle_rad: half the field of view.
+
+        Returns:
+            None where it rises up to the end.
+        """
+        angle = np.linspace(0, cls._linear_from(max_angle_rad), 512)
+        falling = np.flatnonzero(cls._slope(coefficients, angle) <= 1e-3)
+        return float(angle[falling[0]]) if falling.size else None
+
+    @classmethod
+    def _linear_from(cls, max_angle_rad: float) -> float:
+        end_of_series = float(np.arctan(np.sqrt(SERIES_SQUARE))) + 0.01
+        return max(max_angle_rad, min(end_of_series, cls._projected_up_to(max_angle_rad)))
+
+    @staticmethod
+    def _projected_up_to(max_angle_rad: float) -> float:
+        return min(max_angle_rad + MARGIN_RAD, LARGEST_PROJECTED_RAD)
+
+    @staticmethod
+    def _slope(coefficients: tuple[float, float, float, float], angle: Any) -> Any:
+        """Derivative of r, by the polynomial alone."""
+        k1, k2, k3, k4 = coefficients
+        square = np.square(angle)
+        return 1 + square * (3 * k1 + square * (5 * k2 + square * (7 * k3 + square * 9 * k4)))
 
     def _polynomial(self, angle: Any) -> tuple[Any, Any]:
         """R and its derivative, by the polynomial alone."""
         k1, k2, k3, k4 = self.coefficients
         square = np.square(angle)
         radius = angle * (1 + square * (k1 + square * (k2 + square * (k3 + square * k4))))
-        slope = 1 + square * (3 * k1 + square * (5 * k2 + square * (7 * k3 + square * 9 * k4)))
-        return radius, slope
+        return radius, self._slope(self.coefficients, angle)
 
     def radius(self, angle: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
         """r(theta), in focal lengths."""
@@ -246,6 +288,10 @@ def fitted_lens(
 ) -> LensFit:
     """The radial lens nearest to a calibrated one, by linear least squares over the image.
 
+    A narrow field says little about the higher ones of k1 to k4, and points beyond it are projected by them:
+    where the polynomial folds back there, it is fitted anew without the last, then without the last two or
+    three.
+
     Args:
         project: rays (X / Z, Y / Z) to pixels, centres at +0.5; NaN where the lens has none.
         K: principal point, kept, and focal lengths, of which the ratio is kept.
@@ -254,7 +300,8 @@ def fitted_lens(
         max_angle_rad: largest angle that `project` holds for; the field ends at the corners if that is less.
 
     Raises:
-        SourceError: when no direction falls into the image, or the fit folds back.
+        SourceError: when no direction falls into the image, the fit folds back inside the field, or every
+            fit does beyond it.
     """
     end = min(max_angle_rad, LARGEST_ANGLE_RAD)
     angle = end * (np.arange(_FIT_ANGLES) + 1) / _FIT_ANGLES
@@ -275,18 +322,42 @@ def fitted_lens(
     # Tangential terms have no mean turn but for rounding, and for where the image ends.
     roll = roll if abs(roll) > _LEAST_ROLL_RAD else 0.0
     turn = turn + roll
-    powers = angle[:, None] ** np.array([1, 3, 5, 7, 9])
+    powers = angle[:, None] ** np.array(_POWERS)
     across, along = K[0, 0] * np.cos(turn), K[1, 1] * np.sin(turn)
     rows = np.concatenate(
         [(powers[:, None] * across[:, None])[inside], (powers[:, None] * along[:, None])[inside]]
     )
     sought = np.concatenate([(u - K[0, 2])[inside], (v - K[1, 2])[inside]])
-    found = np.linalg.lstsq(rows, sought, rcond=None)[0]
-    k1, k2, k3, k4 = (float(value) for value in found[1:] / found[0])
-    lens = RadialLens((k1, k2, k3, k4), end)
+    found, lens = _fitted_polynomial(rows, sought, end)
     fitted = K.astype(np.float64).copy()
     fitted[0, 0] *= found[0]
     fitted[1, 1] *= found[0]
     off = (rows @ found - sought).reshape(2, -1)
     distance = np.hypot(off[0], off[1])
     return LensFit(lens, fitted, float(distance.max()), float(np.sqrt(np.mean(distance**2))), roll)
+
+
+def _fitted_polynomial(
+    rows: Float[np.ndarray, "m 5"], sought: Float[np.ndarray, "m"], end: float
+) -> tuple[Float[np.ndarray, "5"], RadialLens]:
+    """The polynomial of most terms that does not fold back beyond the field, and its lens.
+
+    Args:
+        rows: what each coefficient, of the first power to the ninth, adds to each pixel coordinate.
+        sought: the pixel coordinates, from the principal point.
+        end: of the field, in radians.
+
+    Returns:
+        Coefficients of the powers, in pixels, and the lens.
+
+    Raises:
+        SourceError: when the polynomial folds back inside the field, or with any number of terms.
+    """
+    for terms in range(len(_POWERS), 1, -1):
+        found = np.zeros(len(_POWERS))
+        found[:terms] = np.linalg.lstsq(rows[:, :terms], sought, rcond=None)[0]
+        k1, k2, k3, k4 = (float(value) for value in found[1:] / found[0])
+        fold = RadialLens.folding_angle((k1, k2, k3, k4), end)
+        if fold is None or fold <= end:
+            break
+    return found, RadialLens((k1, k2, k3, k4), end)

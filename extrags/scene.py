@@ -124,8 +124,8 @@ class Scene(Storable):
             gaussians.scales.exp(),
             gaussians.opacities.sigmoid(),
             sh,
-            self._array(cameras.viewmats) if viewmats is None else viewmats,
-            self._array(cameras.K),
+            self.array(cameras.viewmats) if viewmats is None else viewmats,
+            self.array(cameras.K),
             cameras.width,
             cameras.height,
             lens=cameras.lens,
@@ -141,8 +141,11 @@ class Scene(Storable):
         zero, one = gain.new_zeros(()), gain.new_ones(())
         return CameraLight(gain[:, None].expand(-1, 3), one, zero, zero, zero, gain.new_zeros(3), zero, 1.0)
 
-    def _array(self, values: Float[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
-        return torch.from_numpy(values.astype(np.float32)).to(self.device)
+    def array(self, values: Float[np.ndarray, "*shape"]) -> Float[Tensor, "*shape"]:
+        """A copy of an array, such as poses, in the dtype and on the device of the Gaussians."""
+        means = self.gaussians.means
+        # Rounded on the processor: some devices know no float64.
+        return torch.from_numpy(values.astype(np.float64)).to(means.dtype).to(means.device)
 
     def detached(self) -> Scene:
         """A copy without gradient history."""

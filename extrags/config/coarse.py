@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from extrags.config.base import StageConfig
 
@@ -104,6 +104,17 @@ class DensifyConfig(StageConfig):
     scale_penalty: float = Field(
         0.01, ge=0, description="mcmc: weight of the mean scale, in extents, in the loss"
     )
+
+    @model_validator(mode="after")
+    def _a_reset_has_an_opacity(self) -> Self:
+        # A reset caps opacities at twice the threshold of pruning, as a logit.
+        resets = self.enabled and self.strategy == "default" and self.reset_every > 0
+        if resets and not 0 < self.prune_opacity < 0.5:
+            raise ValueError(
+                f"prune_opacity is {self.prune_opacity} and reset_every {self.reset_every}; expected a "
+                "prune_opacity above 0 and below 0.5 where opacities are reset, to twice that"
+            )
+        return self
 
 
 class PoseRefinementConfig(StageConfig):

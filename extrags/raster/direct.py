@@ -20,8 +20,8 @@ from extrags.errors import NonFiniteError, ShapeError
 from extrags.radial_lens import RadialLens
 from extrags.raster import native
 from extrags.raster.light import ROW_LENGTH
-from extrags.raster.loss import huber_depth_gradient
-from extrags.raster.rendering import Rendering, check_near, nonfinite_error
+from extrags.raster.loss import check_normalisation, huber_depth_gradient
+from extrags.raster.rendering import Rendering, check_near, check_size, nonfinite_error
 
 __all__ = ["DirectStep", "Target"]
 
@@ -41,7 +41,8 @@ class Target:
         depth_confidence: weight of the depth term per pixel, in [0, 1], [H, W]; None weights all equally.
 
     Raises:
-        ShapeError: when sizes do not fit together.
+        ShapeError: when sizes do not fit together, or that of the image is out of range.
+        ConfigError: when the normalisation is not positive.
         NonFiniteError: when the camera holds a NaN or an infinity.
     """
 
@@ -61,6 +62,8 @@ class Target:
         if rgb.ndim != 3 or rgb.shape[2] != 3:
             raise ShapeError(f"rgb has shape {tuple(rgb.shape)}, expected (H, W, 3)")
         self.height, self.width = int(rgb.shape[0]), int(rgb.shape[1])
+        check_size(self.width, self.height)
+        check_normalisation(normalisation)
         self.rgb = _contiguous_array(rgb)
         self.weight = None if weight is None else _contiguous_array(weight)
         self.ssim_weight = None if ssim_weight is None else _contiguous_array(ssim_weight)
@@ -78,13 +81,15 @@ class Target:
         self.viewmat = np.ascontiguousarray(viewmat, dtype=np.float32)
         self.K = np.ascontiguousarray(K, dtype=np.float32)
         self.lens = None if lens is None else lens.packed()
-        for name, matrix in (("viewmats", self.viewmat), ("Ks", self.K)):
+        for name, matrix, side in (("viewmats", self.viewmat, 4), ("Ks", self.K, 3)):
+            if matrix.shape != (side, side):
+                raise ShapeError(f"{name} has shape {matrix.shape}, expected {(side, side)}")
             if not np.isfinite(matrix).all():
                 raise nonfinite_error(name, torch.from_numpy(matrix)[None])
         if normalisation is None:
             pixels = self.height * self.width
             normalisation = pixels if self.weight is None else float(self.weight.sum(dtype=np.float64))
-        self.scale = 1 / (3 * normalisation) if normalisation != 0 else 1.0
+        self.scale = 1 / (3 * normalisation) if normalisation != 0 else 0.0
 
 
 def _contiguous_array(values: Tensor) -> np.ndarray:

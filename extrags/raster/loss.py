@@ -11,7 +11,7 @@ all weights then cancels. Any other Z, such as the number of valid pixels, keeps
 
 The SSIM map is that of Wang et al. 2004: 11 x 11 Gaussian window of sigma 1.5 px, zero padding,
 C1 = 0.01^2, C2 = 0.03^2 for a data range of one. It is computed on the unweighted images; the weights apply
-to the map only. If all weights are zero the loss is zero.
+to the map only. Where Z is the sum of weights and all of these are zero, the loss is zero.
 """
 
 from __future__ import annotations
@@ -107,7 +107,8 @@ def l1_ssim_loss_reference(
     ssim_weights = l1_weights if ssim_mask is None else ssim_mask.detach().reshape(-1, 1, height, width)
     l1 = (1 - dssim_weight) * l1_weights * (x - y).abs()
     dssim = dssim_weight * ssim_weights * (1 - _ssim_map(x, y)) / 2
-    return (l1 + dssim).sum() / (total if total != 0 else 1)
+    everything: Tensor = (l1 + dssim).sum()
+    return everything / total if total != 0 else everything * 0
 
 
 def inverse_depth_loss(
@@ -277,5 +278,14 @@ def _check(
                 f"{name} is {weights.dtype} {tuple(weights.shape)}, expected {image.dtype} "
                 f"{tuple(image.shape[:-1])}"
             )
-    if normalisation is not None and normalisation <= 0:
+    check_normalisation(normalisation)
+
+
+def check_normalisation(normalisation: float | None) -> None:
+    """Check what weighted sums are divided by; None is fine.
+
+    Raises:
+        ConfigError: when it is not positive.
+    """
+    if normalisation is not None and not normalisation > 0:
         raise ConfigError(f"normalisation is {normalisation}, expected a positive number of pixels")

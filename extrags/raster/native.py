@@ -385,7 +385,7 @@ class _L1Ssim(torch.autograd.Function):
         )
         if normalisation is None:
             normalisation = float(x[..., 0].numel()) if m is None else float(m.sum(dtype=torch.float64))
-        scale = 1 / (3 * normalisation) if normalisation != 0 else 1.0
+        scale = 1 / (3 * normalisation) if normalisation != 0 else 0.0
         gradient = torch.empty_like(x)
         loss = 0.0
         for index in range(len(x)):

@@ -20,6 +20,7 @@ from extrags.raster.rendering import (
     ALPHA_EPS,
     ALPHA_MAX,
     ALPHA_MIN,
+    COVARIANCE_MAX_PX2,
     DILATION_PX2,
     FIELD_OF_VIEW_MARGIN,
     TRANSMITTANCE_MIN,
@@ -192,6 +193,7 @@ def _project(inputs: RasterInputs, options: RasterOptions, camera: int) -> _Proj
     extent = torch.sqrt(reach[:, None] * torch.stack([xx, yy], -1).detach())
     u, v = means2d.detach().unbind(-1)
     inside = (determinant.detach() > 0) & torch.isfinite(determinant.detach())
+    inside &= (xx.detach() <= COVARIANCE_MAX_PX2) & (yy.detach() <= COVARIANCE_MAX_PX2)
     inside &= (u + extent[:, 0] > 0) & (u - extent[:, 0] < width)
     inside &= (v + extent[:, 1] > 0) & (v - extent[:, 1] < height)
     keep = torch.nonzero(inside)[:, 0]

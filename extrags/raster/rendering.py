@@ -18,6 +18,10 @@ __all__ = ["RasterInputs", "RasterOptions", "Rendering", "checked_inputs"]
 DILATION_PX2 = 0.3
 """Added to the diagonal of each projected covariance, in px^2: gsplat's `eps2d`, a low-pass filter."""
 
+COVARIANCE_MAX_PX2 = 1e12
+"""Gaussians with a larger variance along an image axis, in px^2, are culled: their inverse covariance has no
+digits left in float32."""
+
 ALPHA_MAX = 0.999
 """Upper limit of a Gaussian's alpha."""
 
@@ -130,8 +134,7 @@ def checked_inputs(
         raise ShapeError(f"means has shape {tuple(means.shape)}, expected (N, 3)")
     if not means.is_floating_point():
         raise ShapeError(f"means has dtype {means.dtype}, expected a floating-point dtype")
-    if not (1 <= width <= 32768 and 1 <= height <= 32768):
-        raise ShapeError(f"image size {width}x{height}, expected 1 to 32768 pixels a side")
+    check_size(width, height)
     check_near(near)
     n = means.shape[0]
     c = inputs.viewmats.shape[0] if inputs.viewmats.ndim == 3 else -1
@@ -167,6 +170,16 @@ def checked_inputs(
         if value.device != means.device:
             raise ShapeError(f"{name} is on {value.device}, means is on {means.device}")
     return inputs, degree
+
+
+def check_size(width: int, height: int) -> None:
+    """Check the size of an image.
+
+    Raises:
+        ShapeError: when it is out of range.
+    """
+    if not (1 <= width <= 32768 and 1 <= height <= 32768):
+        raise ShapeError(f"image size {width}x{height}, expected 1 to 32768 pixels a side")
 
 
 def check_near(near: float) -> None:

@@ -27,6 +27,7 @@ from extrags.raster.rendering import (
     ALPHA_EPS,
     ALPHA_MAX,
     ALPHA_MIN,
+    COVARIANCE_MAX_PX2,
     DILATION_PX2,
     FIELD_OF_VIEW_MARGIN,
     TRANSMITTANCE_MIN,
@@ -190,7 +191,8 @@ def _records(
         reach = 2 * torch.log(opacities / ALPHA_MIN).clamp_min(0)
         extent = torch.sqrt(reach[:, None] * torch.stack([xx, yy], -1))
         # Slightly larger, so that rounding never drops a pixel with alpha of at least 1/255.
-        extent = (extent * (1 + 1e-4) + 1e-3) * (ahead & (determinant > 0))[:, None]
+        kept = ahead & (determinant > 0) & (xx <= COVARIANCE_MAX_PX2) & (yy <= COVARIANCE_MAX_PX2)
+        extent = (extent * (1 + 1e-4) + 1e-3) * kept[:, None]
     return records, extent
 
 

@@ -11,9 +11,10 @@ _MORTON_BITS = 20
 
 
 def unit_quaternions(quats: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Rotations (w, x, y, z) of length one, float64."""
+    """Rotations (w, x, y, z) of length one, float64; one of length zero is rendered as none, and is none."""
     given = quats.astype(np.float64)
-    return np.asarray(given / np.maximum(np.linalg.norm(given, axis=1, keepdims=True), 1e-30))
+    length = np.linalg.norm(given, axis=1, keepdims=True)
+    return np.where(length > 0, given / np.maximum(length, 1e-300), [1.0, 0.0, 0.0, 0.0])
 
 
 def largest_component(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +32,15 @@ _HEADER_BYTES = 1 << 22
 def write_ply_scene(scene: Scene, path: Path) -> None:
     """Write the Gaussians as stored and, where there is one, the light into the header.
 
+    A rotation of length zero is rendered as none, and written as such: readers take it for damage.
+
     Args:
         scene: its colours are albedo where it has a light.
         path: file to write.
     """
+    gaussians = _with_rotations(scene.gaussians)
     if scene.light is None:
-        scene.gaussians.write_ply(path)
+        gaussians.write_ply(path)
         return
     values: dict[str, Any] = {
         name: value.tolist() for name, value in scene.light.detached().parameters().items()
@@ -48,9 +52,17 @@ def write_ply_scene(scene: Scene, path: Path) -> None:
     # In several lines: readers keep a line of the header in a buffer of about a thousand bytes.
     parts = (text[start : start + _LINE_BYTES] for start in range(0, len(text), _LINE_BYTES))
     lines = b"".join(_MARK + part + b"\n" for part in parts)
-    scene.gaussians.write_ply(path)
+    gaussians.write_ply(path)
     head, end, body = path.read_bytes().partition(b"element vertex")
     path.write_bytes(head + lines + end + body)
+
+
+def _with_rotations(gaussians: Gaussians) -> Gaussians:
+    null = gaussians.quats.norm(dim=1) == 0
+    if not bool(null.any()):
+        return gaussians
+    identity = gaussians.quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return replace(gaussians, quats=torch.where(null[:, None], identity, gaussians.quats))
 
 
 def read_ply_scene(path: Path) -> Scene:

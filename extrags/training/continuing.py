@@ -79,7 +79,9 @@ def continued_start(
 
     New frames begin at the mean exposure: that leaves those of the others, relative to the mean, as they are.
     New Gaussians are placed as those of any start (`starting_gaussians`), on pixels of new frames alone that
-    the earlier scene does not explain (`unexplained_pixels`), and as densely as there.
+    the earlier scene does not explain (`unexplained_pixels`), and as densely as there, but at most as many as
+    the new frames' even share of `densify.max_gaussians`. Where that is full, Gaussians of the earlier scene
+    that show least make room.
 
     Args:
         earlier: the scene and its frames.
@@ -102,8 +104,9 @@ def continued_start(
     where = unexplained_pixels(scene, sequence, new)
     # As densely as a start on all frames, whose points are spread over the valid pixels of all of them.
     share = float(where.sum()) / max(1, int(sequence.mask[chosen].sum()))
-    points = math.ceil(share * config.max_points)
     limit = config.densify.max_gaussians
+    # What the frames before explain is not given up for points of new ones.
+    points = min(math.ceil(share * config.max_points), math.floor(len(new) / len(chosen) * limit))
     kept = math.floor((1 - ROOM_SHARE * len(new) / len(chosen)) * limit)
     scene = Scene(
         scene.gaussians.subset(_strongest(scene, sequence, chosen, min(kept, limit - points))), light

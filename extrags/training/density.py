@@ -16,6 +16,7 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from extrags.config import DensifyConfig
+from extrags.errors import ConfigError
 from extrags.raster import Rendering, SelectiveAdam
 from extrags.raster.rotations import rotation_matrices
 
@@ -162,14 +163,20 @@ class DefaultStrategy(DensityStrategy):
         self._gradient, self._count, self._radius = statistics.unbind()
 
     def step(self, adam: SelectiveAdam, rendering: Rendering, iteration: int) -> None:
-        """See `DensityStrategy.step`."""
+        """See `DensityStrategy.step`.
+
+        Raises:
+            ConfigError: when no Gaussian would be left.
+        """
         if not self._window.open(iteration):
             return
         self.observe(rendering)
         done = iteration + 1
         every = self._config.reset_every
         if self._window.round_after(iteration) and (not every or done % every >= self._config.reset_pause):
-            self.decide(adam.parameters, done).apply(adam)
+            decision = self.decide(adam.parameters, done)
+            self._check_something_is_left(decision, done)
+            decision.apply(adam)
             self.reset_statistics(len(adam.steps))
         if every and done % every == 0:
             self.reset_opacities(adam)
@@ -244,6 +251,18 @@ class DefaultStrategy(DensityStrategy):
         adam.parameters["opacities"].clamp_(max=math.log(cap / (1 - cap)))
         adam.first_moments["opacities"].zero_()
         adam.second_moments["opacities"].zero_()
+
+    def _check_something_is_left(self, decision: DensityRound, done: int) -> None:
+        if bool(decision.keep.any()) or len(decision.new_gaussians["means"]):
+            return
+        config = self._config
+        sizes = f"densify.prune_scale_share {config.prune_scale_share}"
+        if done < self._refine_2d_until:
+            sizes += f" and densify.prune_scale2d {config.prune_scale2d}"
+        raise ConfigError(
+            f"pruning after {done} iterations removes all {len(decision.keep)} Gaussians: they are fainter "
+            f"than densify.prune_opacity {config.prune_opacity} or larger than {sizes} allow"
+        )
 
     def _growing(self, n: int) -> Bool[Tensor, "n"]:
         mean_gradient = self._gradient / self._count.clamp_min(1)

@@ -50,6 +50,9 @@ NEAREST_QUANTILE = 0.01
 CLEAR_OF_CAMERAS = 0.7
 """No new Gaussian is nearer to a camera than this share of the nearest surface: cameras fly in free space."""
 
+_ROUNDING = 1e-14
+"""Of a sum of shares, relative."""
+
 MIN_POINTS = 8
 """Fewer hole points have neither neighbours nor normals."""
 
@@ -190,7 +193,9 @@ def virtual_steps(config: FinetuneConfig, *, any_virtual: bool = True) -> Bool[n
     if not any_virtual:
         return np.zeros(config.iterations, dtype=bool)
     share = np.linspace(config.pseudo_share, config.pseudo_share_final, config.iterations)
-    return np.asarray(np.diff(np.floor(np.cumsum(share)), prepend=0) > 0)
+    # The sum of all shares so far. Rounding must not leave one that is a whole number just below it.
+    behind = np.arange(1, config.iterations + 1) * (share[0] + share) / 2
+    return np.asarray(np.diff(np.floor(behind * (1 + _ROUNDING)), prepend=0) > 0)
 
 
 def virtual_views(pseudo_views: PseudoViews, config: FinetuneConfig) -> list[View]:

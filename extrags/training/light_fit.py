@@ -150,7 +150,9 @@ class LightFit:
         row[:3] = 1 if frame is None else math.exp(float(exposures[frame]) - self._mean(exposures))
         common = row[3:-1]
         common[:] = self._common
-        np.exp(common, out=common, where=self._logarithms)
+        # Whoever uses the row says so where it is not finite.
+        with np.errstate(over="ignore"):
+            np.exp(common, out=common, where=self._logarithms)
         return row
 
     @staticmethod

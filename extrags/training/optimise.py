@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from extrags.errors import DivergedError
+from extrags.errors import DivergedError, NonFiniteError
 from extrags.events import Progress, emit
 from extrags.gaussians import Gaussians
+from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
 from extrags.threads import one_torch_thread
 from extrags.training.footprint import APPLIED_EVERY, SmallestFootprint
@@ -69,7 +70,8 @@ def optimise(
         footprint: lower bound on the size of Gaussians.
 
     Raises:
-        DivergedError: when loss or parameters stop being finite; names iteration and parameter group.
+        DivergedError: when loss, parameters or light stop being finite; names iteration and parameter group.
+        NonFiniteError: when the scene given is not finite.
     """
     step = make_step(scene, schedule)
     adam = step.adam
@@ -90,9 +92,15 @@ def optimise(
             adam.learning_rates = schedule.learning_rates(iteration)
             frame = view.frame if poses is not None and poses.active(iteration) else None
             viewmat = None if poses is None or frame is None else poses.viewmat(frame)
-            observation = step.differentiate(view, iteration, density, viewmat)
+            try:
+                observation = step.differentiate(view, iteration, density, viewmat)
+            except NonFiniteError as error:
+                if iteration == 0:
+                    raise
+                account = _account(schedule, iteration, adam.parameters, step.light)
+                raise DivergedError(f"{account}: {error}", last_good) from error
             if not math.isfinite(observation.loss):
-                raise DivergedError(_account(schedule, iteration, adam.parameters), last_good)
+                raise DivergedError(_account(schedule, iteration, adam.parameters, step.light), last_good)
             step.update(observation, iteration)
             density.step(adam, observation.rendering, iteration)
             last = iteration == schedule.iterations - 1
@@ -109,10 +117,11 @@ def optimise(
                 }
                 history.append(entry)
                 emit(Progress(schedule.stage, iteration + 1, schedule.iterations, entry))
-                if _finite(adam.parameters):
+                if not _nonfinite(adam.parameters, step.light):
                     last_good = Scene(Gaussians(**adam.parameters), step.light).detached()
-    if not _finite(adam.parameters):
-        raise DivergedError(_account(schedule, schedule.iterations, adam.parameters), last_good)
+    if _nonfinite(adam.parameters, step.light):
+        account = _account(schedule, schedule.iterations, adam.parameters, step.light)
+        raise DivergedError(account, last_good)
     found = Scene(Gaussians(**adam.parameters), step.light).detached()
     return TrainingResult(found, history, None if poses is None else poses.refined())
 
@@ -125,11 +134,21 @@ def _psnr(observation: Observation, view: View) -> float:
     return -10 * math.log10(max(float(error), 1e-12))
 
 
-def _finite(parameters: dict[str, Tensor]) -> bool:
-    return all(bool(torch.isfinite(value).all()) for value in parameters.values())
+@torch.no_grad()
+def _nonfinite(parameters: dict[str, Tensor], light: NearFieldLight | None) -> list[str]:
+    """Names of the groups that cannot be rendered."""
+    # A finite logarithm may be that of a number beyond float32.
+    groups = {name: value.exp() if name == "scales" else value for name, value in parameters.items()}
+    if light is not None:
+        # The logarithm of a strength of zero is not finite, and no error: what is rendered counts.
+        exposures = torch.cat([light.exposures(), light.exposure(None)[None]])
+        groups["light"] = light.camera_light(exposures).packed()
+    return [name for name, value in groups.items() if not bool(torch.isfinite(value).all())]
 
 
-def _account(schedule: Schedule, iteration: int, parameters: dict[str, Tensor]) -> str:
-    bad = [name for name, value in parameters.items() if not bool(torch.isfinite(value).all())]
+def _account(
+    schedule: Schedule, iteration: int, parameters: dict[str, Tensor], light: NearFieldLight | None
+) -> str:
+    bad = _nonfinite(parameters, light)
     where = f"parameter group {', '.join(bad)}" if bad else "all parameter groups still finite"
     return f"{schedule.stage}: not finite any more at iteration {iteration} ({where})"

@@ -108,7 +108,7 @@ class AutogradStep:
             exposure = scene.light.exposure(view.frame)[None]
         pose = None
         if viewmat is not None:
-            pose = torch.from_numpy(viewmat.astype(np.float32)).to(scene.device).requires_grad_()
+            pose = scene.array(viewmat).requires_grad_()
         rendering = scene.render(
             view.camera,
             exposure=exposure,
@@ -116,22 +116,23 @@ class AutogradStep:
             viewmats=None if pose is None else pose[None],
             absgrad=density.needs_absgrad,
         )
+        like = rendering.rgb
         loss = schedule.photometric_weight * l1_ssim_loss(
             rendering.rgb[0],
-            view.colours,
+            view.colours.to(like),
             dssim_weight=schedule.dssim_weight,
-            mask=view.weights,
-            ssim_mask=view.ssim_weight,
+            mask=view.weights.to(like),
+            ssim_mask=None if view.ssim_weight is None else view.ssim_weight.to(like),
             normalisation=view.normalisation,
         )
         if view.depth_mm is not None and schedule.depth_weight > 0:
             loss = loss + schedule.depth_weight_at(iteration) * depth_loss(
                 rendering.depth[0],
                 rendering.alpha[0],
-                view.depth_mm,
+                view.depth_mm.to(like),
                 scale=schedule.depth_scale,
                 huber_delta=schedule.depth_huber_delta,
-                confidence=view.depth_confidence,
+                confidence=None if view.depth_confidence is None else view.depth_confidence.to(like),
             )
         loss = loss * view.loss_weight
         if scene.light is not None and view.frame is not None:

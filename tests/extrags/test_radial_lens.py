@@ -127,3 +127,42 @@ def test_cameras_keep_their_lens() -> None:
     with pytest.raises(ShapeError, match="lenses"):
         Cameras.concatenated([cameras, flat])
     assert RadialLens.from_json(LENS.to_json()) == LENS
+
+
+@pytest.mark.parametrize("focal", [1600.0, 2000.0, 2600.0])
+def test_a_narrow_field_is_fitted_by_what_does_not_fold_beyond_it(focal: float) -> None:
+    rng = np.random.default_rng(0)
+    fewer = 0
+    for _ in range(12):
+        k1, k2, (p1, p2) = rng.uniform(-0.5, 0.1), rng.uniform(0, 0.4), rng.normal(0, 1.5e-3, 2)
+        found = Lens("OPENCV", (focal, focal, 325.0, 236.0, k1, k2, p1, p2), 640, 480).radial()
+        # Tangential terms, which no radial lens has, make nearly all of it.
+        assert found.rms_px < 0.3
+        angle = np.linspace(0, found.lens.projected_up_to_rad, 100)
+        assert (np.diff(found.lens.radius(angle)) > 0).all()
+        fewer += found.lens.coefficients[3] == 0
+    assert 0 < fewer < 12
+
+
+def test_a_fold_is_refused_where_points_are_projected_and_no_farther() -> None:
+    end = float(np.radians(10))
+    # 1 + 3 k1 x^2 vanishes at x.
+    with pytest.raises(SourceError, match=r"folds back 9\.0 degrees from its axis, inside its field of 10"):
+        RadialLens((-1 / (3 * np.radians(9) ** 2), 0.0, 0.0, 0.0), end)
+    with pytest.raises(SourceError, match=r"beyond its field of 10\.0 degrees, but before the 18\.6 degrees"):
+        RadialLens((-1 / (3 * np.radians(15) ** 2), 0.0, 0.0, 0.0), end)
+    lens = RadialLens((-1 / (3 * np.radians(20) ** 2), 0.0, 0.0, 0.0), end)
+    angle = np.linspace(0, np.radians(60), 50)
+    np.testing.assert_allclose(lens.angle(lens.radius(angle)), angle, atol=1e-12)
+
+
+def test_a_fold_inside_a_wide_field_is_not_fitted_away() -> None:
+    def folding(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        slope = np.hypot(x, y)
+        angle = np.arctan(slope)
+        gain = angle * (1 - angle**2 / 3) / np.maximum(slope, 1e-12)
+        return 100 * gain * x + 64, 100 * gain * y + 64
+
+    pinhole = np.array([[100.0, 0, 64], [0, 100.0, 64], [0, 0, 1]])
+    with pytest.raises(SourceError, match=r"folds back 57\.. degrees from its axis, inside its field"):
+        fitted_lens(folding, pinhole, 128, 128, LARGEST_ANGLE_RAD)

@@ -65,3 +65,16 @@ def test_the_near_plane_follows_the_unit_of_length() -> None:
     expected = lit.render(cameras)
     assert float(expected.alpha.mean()) > 0.1
     torch.testing.assert_close(found.rgb, expected.rgb, atol=1e-4, rtol=1e-4)
+
+
+def test_a_scene_in_float64_is_rendered_by_cameras_in_float64() -> None:
+    scene, cameras = _scene_and_cameras()
+    wide = Scene(Gaussians(**{name: value.double() for name, value in scene.gaussians.parameters().items()}))
+    # Less than float32 can tell apart.
+    moved = cameras.world_from_camera + 1e-9 * np.eye(4)[3] * np.eye(4)[:, :1]
+    nearby = replace(cameras, world_from_camera=moved)
+    with torch.no_grad():
+        single, double = scene.render(cameras).rgb, wide.render(cameras).rgb
+        assert double.dtype == torch.float64
+        torch.testing.assert_close(double.float(), single, rtol=1e-4, atol=1e-5)
+        assert not torch.equal(wide.render(nearby).rgb, double)

@@ -126,6 +126,7 @@ struct Frame {
 std::unique_ptr<Frame> render(const GaussianArrays& gaussians, const CameraSettings& camera,
                               const ImageArrays& images, int degree, bool check) {
   const Scene scene = gaussians.scene(degree);
+  expect(camera.width > 0 && camera.width <= 32768 && camera.height > 0 && camera.height <= 32768, "an image");
   images.check(static_cast<size_t>(camera.width) * static_cast<size_t>(camera.height), gaussians.count());
   auto frame = std::make_unique<Frame>();
   frame->degree = degree;
@@ -202,6 +203,7 @@ double l1_ssim(const In& image, const In& target, std::optional<In> mask, Out gr
                double scale, std::optional<In> ssim_mask) {
   expect(image.ndim() == 3 && image.shape(2) == 3, "image");
   const size_t height = image.shape(0), width = image.shape(1);
+  expect(height > 0 && width > 0, "image");
   expect(target.size() == image.size(), "target");
   expect(gradient.size() == image.size(), "gradient");
   expect(!mask || mask->size() == height * width, "mask");
@@ -242,6 +244,10 @@ void renew_stereo_memory() { stereo_memory = new StereoMemory; }
 using SourceTuple = std::tuple<In, In, In, In>;
 
 void march_rays(const In& reach, const Doubles& start, const Doubles& directions, Indices entered) {
+  expect(reach.ndim() == 3 && reach.shape(0) == reach.shape(1) && reach.shape(1) == reach.shape(2), "reach");
+  expect(start.size() == 3, "start");
+  expect(directions.ndim() == 2 && directions.shape(1) == 3, "directions");
+  expect(entered.shape(0) == directions.shape(0), "entered");
   nb::gil_scoped_release release_gil;
   march(reach.data(), static_cast<int64_t>(reach.shape(0)), start.data(), directions.data(),
         static_cast<int64_t>(directions.shape(0)), entered.data());

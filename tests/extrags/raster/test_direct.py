@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from extrags.errors import NonFiniteError, ShapeError
+from extrags.errors import ConfigError, NonFiniteError, ShapeError
 from extrags.raster import l1_ssim_loss, native, rasterize, set_num_threads
 from extrags.raster.direct import DirectStep, Target
 from extrags.raster.loss import huber_depth_gradient, inverse_depth_loss
@@ -288,3 +288,37 @@ def test_gradients_in_images_much_smaller_than_a_tile() -> None:
     for name, leaf in leaves.items():
         assert leaf.grad is not None
         assert relative_l2(step.gradients[name], leaf.grad) < 2e-5, name
+
+
+@pytest.mark.parametrize("shape", [(0, 0, 3), (4, 0, 3), (0, 4, 3), (1, 32769, 3)])
+def test_images_of_no_size_are_refused(shape: tuple[int, ...]) -> None:
+    with pytest.raises(ShapeError, match=f"image size {shape[1]}x{shape[0]}, expected 1 to 32768"):
+        Target(np.eye(4), np.eye(3), torch.zeros(shape))
+
+
+@pytest.mark.parametrize("normalisation", [0.0, -3.0, float("nan")])
+def test_a_normalisation_that_is_not_positive_is_refused(normalisation: float) -> None:
+    image = torch.zeros(5, 7, 3)
+    with pytest.raises(ConfigError, match="expected a positive number of pixels"):
+        Target(np.eye(4), np.eye(3), image, normalisation=normalisation)
+    with pytest.raises(ConfigError, match="expected a positive number of pixels"):
+        l1_ssim_loss(image, image, normalisation=normalisation)
+
+
+def test_cameras_of_other_shapes_are_refused(unchecked: None) -> None:
+    with pytest.raises(ShapeError, match=r"viewmats has shape \(3, 4\), expected \(4, 4\)"):
+        Target(np.eye(4)[:3], np.eye(3), torch.zeros(5, 7, 3))
+    with pytest.raises(ShapeError, match=r"Ks has shape \(4, 4\), expected \(3, 3\)"):
+        Target(np.eye(4), np.eye(4), torch.zeros(5, 7, 3))
+
+
+def test_no_weight_of_the_first_term_is_no_loss() -> None:
+    direct = DirectStep()
+    direct.bind(_parameters())
+    none, all_of_it = torch.zeros(43, 61), torch.ones(43, 61)
+    target = _target()
+    target = Target(
+        target.viewmat, target.K, torch.from_numpy(target.rgb), weight=none, ssim_weight=all_of_it
+    )
+    assert direct.run(target, sh_degree=1) == 0
+    assert all(bool((gradient == 0).all()) for gradient in direct.gradients.values())

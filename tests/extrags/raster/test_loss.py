@@ -140,9 +140,11 @@ def test_weights_only_choose_where_the_maps_count() -> None:
     assert float(l1_ssim_loss(image, target, mask=0.5 * half)) == pytest.approx(float(left), rel=1e-6)
 
 
-def test_empty_mask_is_no_loss() -> None:
+@pytest.mark.parametrize("function", [l1_ssim_loss, l1_ssim_loss_reference])
+@pytest.mark.parametrize("ssim_mask", [None, torch.ones(10, 12)])
+def test_empty_mask_is_no_loss(function, ssim_mask: torch.Tensor | None) -> None:
     image, target = _images(10, 12, 3)
-    value, gradient = _with_gradient(l1_ssim_loss, image, target, mask=torch.zeros(10, 12))
+    value, gradient = _with_gradient(function, image, target, mask=torch.zeros(10, 12), ssim_mask=ssim_mask)
     assert float(value) == 0
     assert float(gradient.abs().max()) == 0
 

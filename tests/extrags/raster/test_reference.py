@@ -1,11 +1,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from extrags.radial_lens import RadialLens
 from extrags.raster import rasterize
+from extrags.raster.torch_tiles import rasterize_tiles
 from tests.extrags.raster.scenes import RasterScene, tube, weighted_sum
 
 
@@ -84,6 +87,20 @@ def test_opaque_gaussian_stops_at_the_clip() -> None:
 def test_near_plane_culls() -> None:
     assert bool(_one(z=0.5).render("reference", near=0.49).visible.all())
     assert not bool(_one(z=0.5).render("reference", near=0.51).visible.any())
+
+
+@pytest.mark.parametrize(("sigma_px", "drawn"), [(0.99e6, True), (1.01e6, False)])
+@pytest.mark.parametrize("lens", [None, RadialLens((0.1, 0.0, 0.0, 0.0), 1.0)], ids=["pinhole", "lens"])
+def test_what_covers_too_many_pixels_is_culled(sigma_px: float, drawn: bool, lens: RadialLens | None) -> None:
+    scene = replace(_one(z=0.02), scales=torch.full((1, 3), sigma_px * 0.02 / 10, dtype=torch.float64))
+    for backend, dtype in (("reference", torch.float64), ("native", torch.float32)):
+        rendering = scene.to(dtype).render(backend, lens=lens)
+        assert bool(rendering.visible.all()) == drawn
+        assert bool((rendering.alpha > 0.5).all()) == drawn
+    if lens is None:
+        given = {name: getattr(scene, name) for name in ("means", "quats", "scales", "opacities")}
+        given |= {"sh": torch.zeros(1, 1, 3, dtype=torch.float64), "viewmats": scene.viewmats, "Ks": scene.Ks}
+        assert bool((rasterize_tiles(given, 11, 9).alpha > 0.5).all()) == drawn
 
 
 def test_gradcheck() -> None:

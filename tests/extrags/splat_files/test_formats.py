@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -101,6 +102,20 @@ def test_few_gaussians(
     assert float(distance.max()) < 0.05
     assert len(set(nearest.tolist())) == count
     assert torch.allclose(back.scales, few.scales[nearest], atol=0.05)
+
+
+@pytest.mark.parametrize(("write", "read", "name", "least_db"), FORMATS)
+def test_a_rotation_of_length_zero_is_none(
+    write: Writer,
+    read: Callable[[Path], Gaussians],
+    name: str,
+    least_db: float,
+    baked: Gaussians,
+    tmp_path: Path,
+) -> None:
+    one = baked.subset(torch.arange(1))
+    write(replace(one, quats=torch.zeros(1, 4)), tmp_path / name)
+    assert read(tmp_path / name).quats[0].abs().tolist() == pytest.approx([1, 0, 0, 0], abs=0.01)
 
 
 @pytest.mark.parametrize(("write", "read", "name", "least_db"), FORMATS)

@@ -14,7 +14,7 @@ from plyfile import PlyData
 from extrags.cameras import Cameras
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.scene import Scene
-from extrags.splat_files import read_ply_scene, write_ply_scene
+from extrags.splat_files import read_ply_scene, read_splat_file, write_ply_scene
 from tests.extrags.splat_files.conftest import psnr
 
 
@@ -142,6 +142,19 @@ class TestLight:
         (tmp_path / "a.ply").write_bytes(whole.replace(b"extrags_light {", b"extrags_light [", 1))
         with pytest.raises(SourceError, match="cannot be read"):
             read_ply_scene(tmp_path / "a.ply")
+
+    def test_a_rotation_of_length_zero_is_written_as_none(
+        self, lit: Scene, views: Cameras, tmp_path: Path
+    ) -> None:
+        quats = lit.gaussians.quats.clone()
+        quats[3] = 0
+        for light in (lit.light, None):
+            given = Scene(replace(lit.gaussians, quats=quats), light)
+            write_ply_scene(given, tmp_path / "a.ply")
+            back = read_splat_file(tmp_path / "a.ply")
+            assert back.gaussians.quats[3].tolist() == [1, 0, 0, 0]
+            assert torch.equal(back.gaussians.quats[4:], quats[4:])
+            assert psnr(back, given, views) > 100
 
     def test_no_file(self, tmp_path: Path) -> None:
         with pytest.raises(SourceNotFoundError):

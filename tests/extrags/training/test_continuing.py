@@ -148,6 +148,20 @@ class TestStart:
         others = gone[torch.randperm(len(gone), generator=torch.Generator().manual_seed(0))]
         assert lost(gone) < 0.3 * lost(others)
 
+    def test_points_of_new_frames_leave_the_others_their_share(
+        self, tube_sequence: EndoscopicSequence, old_frames: np.ndarray, first: Scene
+    ) -> None:
+        limit = 100
+        crowded = CONFIG.model_copy(
+            update={"max_points": 4000, "densify": DensifyConfig(max_gaussians=limit)}
+        )
+        train = tube_sequence.train
+        start = continued_start(EarlierScene(first, old_frames, 10), tube_sequence, train, crowded)
+        stayed = torch.isin(start.gaussians.means[:, 0], first.gaussians.means[:, 0])
+        assert int(stayed.sum()) >= limit * len(old_frames) // len(train)
+        assert not bool(stayed.all())
+        assert len(start.gaussians) <= limit
+
     def test_depth_that_differs_is_unexplained(
         self, tube_sequence: EndoscopicSequence, old_frames: np.ndarray, first: Scene
     ) -> None:

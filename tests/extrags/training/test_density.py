@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from extrags.config import DensifyConfig
+from extrags.config import DensifyConfig, PipelineConfig
+from extrags.errors import ConfigError
 from extrags.raster import Rendering, SelectiveAdam
 from extrags.training.density import DefaultStrategy, DensityStrategy, Window
 from extrags.training.relocation import MCMCStrategy
@@ -61,7 +62,29 @@ def small_ones(n: int) -> dict[str, Tensor]:
     return parameters
 
 
+class TestResets:
+    @pytest.mark.parametrize("threshold", [0.0, 0.5, 0.6])
+    def test_a_threshold_that_no_reset_can_double_is_refused(self, threshold: float) -> None:
+        with pytest.raises(ValueError, match=r"expected a prune_opacity above 0 and below 0\.5"):
+            DensifyConfig(reset_every=50, prune_opacity=threshold)
+        settings = {"coarse.densify.reset_every": 50, "coarse.densify.prune_opacity": threshold}
+        with pytest.raises(ConfigError, match=rf"^coarse\.densify: prune_opacity is {threshold} and"):
+            PipelineConfig().with_overrides(settings)
+
+    def test_where_nothing_is_reset_any_threshold_does(self) -> None:
+        for settings in ({}, {"reset_every": 50, "strategy": "mcmc"}, {"reset_every": 50, "enabled": False}):
+            assert DensifyConfig(prune_opacity=0.6, **settings).prune_opacity == 0.6  # type: ignore[arg-type]
+
+
 class TestDefaultStrategy:
+    def test_settings_that_leave_no_gaussian_are_named(self) -> None:
+        parameters = {name: value.requires_grad_() for name, value in tube_gaussians(10).parameters().items()}
+        adam = SelectiveAdam(parameters, dict.fromkeys(parameters, 0.0))
+        density = strategy(10, every=1, start_share=0.0, prune_opacity=0.95)
+        with pytest.raises(ConfigError, match=r"all 10 Gaussians.*prune_opacity 0\.95.*prune_scale_share 0"):
+            density.step(adam, strong(10, [2]), 0)
+        assert len(adam.steps) == 10
+
     def test_small_strong_gaussians_are_cloned(self) -> None:
         parameters = small_ones(10)
         density = strategy(10)

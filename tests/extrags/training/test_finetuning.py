@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from fractions import Fraction
+from itertools import accumulate
 
 import numpy as np
 import pytest
@@ -294,6 +297,16 @@ class TestSteps:
         rounding = 1e-9
         assert behind.min() >= -rounding
         assert behind.max() < 1 + rounding
+
+    @pytest.mark.parametrize(("iterations", "first", "last"), [(2000, 50, 0), (300, 30, 30), (100, 70, 10)])
+    def test_rounding_loses_no_virtual_view(self, iterations: int, first: int, last: int) -> None:
+        config = FinetuneConfig(
+            iterations=iterations, pseudo_share=first / 100, pseudo_share_final=last / 100
+        )
+        step = Fraction(last - first, 100 * (iterations - 1))
+        shares = [Fraction(first, 100) + i * step for i in range(iterations)]
+        expected = np.array([math.floor(total) for total in accumulate(shares)])
+        assert np.array_equal(np.cumsum(virtual_steps(config)), expected)
 
     def test_the_share_falls(self) -> None:
         config = FinetuneConfig(iterations=1000, pseudo_share=0.8, pseudo_share_final=0.1)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +10,17 @@ import torch
 from extrags.config import CoarseConfig, DensifyConfig, LightConfig
 from extrags.errors import CaptureError, DivergedError
 from extrags.events import Event, Progress, subscribed
+from extrags.illumination import NearFieldLight
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.training import TrainingResult, reconstruct
 from extrags.training.optimise import optimise
 from extrags.training.reconstruction import coarse_schedule
+from extrags.training.schedule import Schedule
+from extrags.training.step import AutogradStep, NativeStep, Observation, TrainingStep
 from extrags.training.views import View, real_views
+
+MakeStep = Callable[[Scene, Schedule], TrainingStep]
 
 QUIET = DensifyConfig(enabled=False)
 
@@ -106,6 +112,44 @@ class TestReconstruct:
         kept = caught.value.last_good
         assert isinstance(kept, Scene)
         assert all(bool(torch.isfinite(value).all()) for value in kept.gaussians.parameters().values())
+
+    @pytest.mark.parametrize("make_step", [NativeStep, AutogradStep])
+    @pytest.mark.parametrize("group", ["means", "scales", "light"])
+    @pytest.mark.parametrize("iterations", [3, 10])
+    def test_a_parameter_that_leaves_float32_diverges(
+        self, tube_sequence: EndoscopicSequence, iterations: int, group: str, make_step: MakeStep
+    ) -> None:
+        """Between two steps, or by the last one."""
+
+        class Leaving:
+            def __init__(self, scene: Scene, schedule: Schedule) -> None:
+                self._step = make_step(scene, schedule)
+                self.adam, self.differentiate = self._step.adam, self._step.differentiate
+
+            @property
+            def light(self) -> NearFieldLight | None:
+                return self._step.light
+
+            def update(self, observation: Observation, iteration: int) -> None:
+                self._step.update(observation, iteration)
+                if iteration == 2:
+                    with torch.no_grad():
+                        if group == "light":
+                            assert self.light is not None
+                            self.light.log_softening.fill_(100.0)
+                        else:
+                            self.adam.parameters[group][3, 1] = 100.0 if group == "scales" else float("nan")
+
+        start = reconstruct(tube_sequence, CoarseConfig(iterations=1, max_points=100)).scene
+        view = real_views(tube_sequence, tube_sequence.train)[0]
+        schedule = coarse_schedule(CoarseConfig(iterations=iterations), 20.0, 15.0, "coarse")
+        message = rf"coarse.*iteration 3 \(parameter group {group}\)"
+        with pytest.raises(DivergedError, match=message) as caught:
+            optimise(start, lambda _: view, schedule, make_step=Leaving)
+        kept = caught.value.last_good
+        assert isinstance(kept, Scene)
+        with torch.no_grad():
+            assert bool(kept.render(view.camera).rgb.isfinite().all())
 
 
 def test_a_unit_too_large_for_the_near_plane_is_refused_without_light(

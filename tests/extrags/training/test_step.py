@@ -170,6 +170,39 @@ class TestOneStep:
         assert losses[0] == losses[1]
 
 
+@pytest.mark.parametrize("lit", [True, False])
+def test_a_step_in_float64_is_that_in_float32(tube_sequence: EndoscopicSequence, lit: bool) -> None:
+    scene = _scene(lit=lit)
+    wide_gaussians, wide_light = (
+        None
+        if part is None
+        else replace(part, **{name: value.double() for name, value in part.parameters().items()})
+        for part in (scene.gaussians, scene.light)
+    )
+    assert isinstance(wide_gaussians, Gaussians)
+    wide = Scene(wide_gaussians, wide_light)
+    ssim_weight = torch.ones(tube_sequence.mask.shape[1:])
+    view = replace(
+        _weighted(real_views(tube_sequence, tube_sequence.train)[1]),
+        ssim_weight=ssim_weight,
+        depth_confidence=0.5 * ssim_weight,
+    )
+    schedule = _schedule()
+    density = density_strategy(schedule.densify, 20.0, 30, len(scene.gaussians), seed=0)
+    found = []
+    for start in (scene, wide):
+        step = AutogradStep(start, schedule)
+        observation = step.differentiate(view, 3, density, view.camera.viewmats[0])
+        assert observation.viewmat_gradient is not None
+        found.append((observation.loss, observation.viewmat_gradient, step.adam.parameters["means"].grad))
+    (loss, pose, means), (expected_loss, expected_pose, expected_means) = found
+    assert expected_means.dtype == torch.float64
+    assert loss == pytest.approx(expected_loss, rel=1e-5)
+    # A few pixels end at another Gaussian.
+    assert _relative(torch.from_numpy(pose), torch.from_numpy(expected_pose)) < 1e-2
+    assert _relative(means, expected_means) < 1e-2
+
+
 def _train(
     sequence: EndoscopicSequence, make_step: MakeStep, densify: DensifyConfig, iterations: int = 30
 ) -> tuple[Scene, list[dict[str, float]]]:
