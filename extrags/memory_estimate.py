@@ -9,6 +9,7 @@ docs/running_at_scale.md.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
@@ -66,6 +67,8 @@ FUSED_STACKS = (4, 4, 4, 4)
 PIXELS_MEASURED_AT_ONCE = 400_000
 SURFACE_WIDTH = 320
 SMALLEST_WIDTH = 32
+STEPS = {"enhance.max_width": 16, "enhance.max_views": 8, "ingest.width": 16}
+"""What settings are multiples of when they are named: an estimate is no finer."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +221,8 @@ def fitting_settings(
     """Settings that bring a run below a limit, those that cost least quality first.
 
     Tried are, one after the other and together with those before: virtual views of smaller size
-    (`enhance.max_width`), fewer of them (`enhance.max_views`), smaller frames (`ingest.width`).
+    (`enhance.max_width`), fewer of them (`enhance.max_views`), smaller frames (`ingest.width`). Once a run
+    fits, each of these is raised as far as it still does, in the opposite order.
 
     Args:
         config: settings of all stages.
@@ -242,6 +246,18 @@ def fitting_settings(
 
     if fits(changed):
         return changed
+
+    def raised(name: str, now: int) -> dict[str, int]:
+        """The changes with one of them as large as still fits; without it where nothing needs to change."""
+        others = {other: kept for other, kept in changed.items() if other != name}
+        if fits(others):
+            return others
+        step = STEPS[name]
+        larger = range((changed[name] // step + 1) * step, now, step)
+        # Memory grows with each of them.
+        fitting = bisect_left(larger, True, key=lambda value: not fits({**changed, name: value}))
+        return changed if fitting == 0 else {**changed, name: larger[fitting - 1]}
+
     ways: dict[str, tuple[int, list[int]]] = {
         "enhance.max_width": (config.enhance.working_width(size.width), [320, 240, 160]),
         "enhance.max_views": (config.enhance.max_views, [160, 96, 48]),
@@ -253,10 +269,9 @@ def fitting_settings(
                 continue
             changed[name] = value
             if fits(changed):
-                # What was tried before may not be needed any more.
-                for earlier in list(changed):
-                    fewer = {other: kept for other, kept in changed.items() if other != earlier}
-                    changed = fewer if fits(fewer) else changed
+                # Steps were large, and what was tried before may not be needed any more.
+                for earlier in reversed(list(changed)):
+                    changed = raised(earlier, ways[earlier][0])
                 if "ingest.width" in changed and config.ingest.height is not None:
                     # A height that was given belongs to the width that was given with it.
                     changed["ingest.height"] = round(size.height * changed["ingest.width"] / size.width)

@@ -30,6 +30,7 @@ __all__ = [
     "CostModel",
     "TaskCost",
     "Workload",
+    "beyond_the_fit",
     "fitted",
     "packaged_model",
     "probe_seconds",
@@ -96,13 +97,18 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
     "report": ("one", "frames*pixels"),
 }
 """Terms of the time of each task; others have a constant alone. Terms that records cannot tell apart (one
-number of iterations only) must not be there: the fit would give one of them the part of the other."""
+number of iterations only) must not be there: the fit would give one of them the part of the other. What was
+measured by itself, as the runs of the restoring network beyond the first, is in `run_costs.json` alone."""
 MEMORY_TERMS = ("one", "pixels", "held_pixels", "restored", "train*restored", "gaussians")
 """Terms of the memory of each task; those of `OF_FINAL_SCENE` depend on the Gaussians of the final scene."""
 EVALUATION_TERMS = ("pixels*stacks", "pixels*vgg")
 """Further terms of the memory of what evaluates."""
 HELD_PIXELS = MAPPED_BYTES / 3
 """Of all frames together, at most: the images of more are a mapped file, which the memory does not count."""
+RESTORING = frozenset({"enhance-train", "enhance", "finetune-judge", "evaluate-restore"})
+"""Tasks that prepare the restorer of `enhance.backend`, or run it."""
+FITTED_BACKEND = "embedded"
+"""The only one that there are records of."""
 OF_FINAL_SCENE = frozenset({"finetune", "evaluate-render", "evaluate-restore", "evaluate-views", "evaluate"})
 GAUSSIANS_WANTED = (51_000, 5000, 0.39)
 """So many, after so many iterations, and the power by which they grow with these: where densification ends
@@ -155,8 +161,11 @@ class Workload:
     def numbers(self) -> dict[str, float]:
         """By name in terms."""
         config = self.config
-        judge = config.finetune.judge
+        enhance, judge = config.enhance, config.finetune.judge
         coarse, final = self._gaussians()
+        samples = 1.0 if enhance.samples == "mean" else float(enhance.samples)
+        # The weights of the package take one.
+        steps = 1.0 if enhance.steps == "auto" else float(enhance.steps)
         return {
             "one": 1.0,
             "pixels": float(self.pixels),
@@ -171,15 +180,21 @@ class Workload:
             "coefficients": coarse * (config.coarse.sh_degree + 1) ** 2,
             "final_gaussians": final,
             "trajectories": float(config.explore.trajectories),
-            "fold_iterations": float(config.enhance.folds * config.enhance.fold_iterations),
-            "views": float(config.enhance.max_views if self.views is None else self.views),
+            # Leave-out pairs are for who trains or judges.
+            "fold_iterations": float(enhance.folds * enhance.fold_iterations)
+            * (enhance.judge or enhance.train_iterations > 0),
+            "judge_pairs": float(min(2 * self.train, enhance.judge_pairs)) * enhance.judge,
+            "views": float(enhance.max_views if self.views is None else self.views),
             "judge_iterations": judge.iterations_share * config.finetune.iterations,
             "judge_views": float(judge.views),
             "tuning": float(config.finetune.iterations),
             # LPIPS with this backbone takes longer than all other metrics together.
             "vgg": float("vgg" in config.evaluate.lpips_nets),
             "stacks": float(self.stacks),
-            "samples": 1.0 if config.enhance.samples == "mean" else float(config.enhance.samples),
+            "samples": samples,
+            # Of the restoring network: what was recorded is one run of it for each view.
+            "more_steps": steps - 1,
+            "more_evaluations": steps * samples - 1,
             # Of a network over a view: the frame once, each render as it is and aligned.
             "passes": 1.0 + 2.0 * self.stacks,
         }
@@ -189,8 +204,12 @@ class Workload:
         limit = self.config.coarse.densify.max_gaussians
         count, iterations, power = GAUSSIANS_WANTED
         wanted = count * (self.config.coarse.iterations / iterations) ** power
+        if not self.config.coarse.densify.enabled:
+            # As many as at the start, which no limit but this one bounds.
+            limit = wanted = self.config.coarse.max_points
         coarse = float(min(limit, wanted) if self.coarse_gaussians is None else self.coarse_gaussians)
-        tuned = min(self.config.finetune.growth * limit, FINAL_WANTED * max(wanted, coarse))
+        most = self.config.finetune.growth * self.config.coarse.densify.max_gaussians
+        tuned = max(coarse, min(most, FINAL_WANTED * max(wanted, coarse)))
         return coarse, float(tuned if self.final_gaussians is None else self.final_gaussians)
 
     def _restored_share(self) -> float:
@@ -248,31 +267,42 @@ class CostModel:
             None if memory is None else sum(factor * work.term(term) for term, factor in memory.items()),
         )
 
-    def pace(self, history: Sequence[tuple[Workload, TaskCost]]) -> dict[str, float]:
+    def pace(
+        self, history: Sequence[tuple[Workload, TaskCost]], config: PipelineConfig | None = None
+    ) -> dict[str, float]:
         """How much longer tasks take than on the reference machine, by their records.
 
         Args:
-            history: what was done on this machine and what it took, seconds of any one kind.
+            history: what was done on this machine and what it took, seconds of any one kind. Records with
+                settings beyond the fit count only for tasks that have the same ones.
+            config: settings of what is asked for; None: such as the model was fitted to.
 
         Returns:
             A factor for every task of the model: the median of its own records, drawn towards that of all
-            tasks (weighted by time) where they are few. Empty without any record.
+            tasks (weighted by time) where they are few. Of tasks with settings beyond the fit, that of
+            their own records; left out where there are none. Empty without any record that fits the model.
         """
+        beyond = {task: () if config is None else beyond_the_fit(task, config) for task in self.time}
         ratios: dict[str, list[float]] = {}
         taken = expected = 0.0
         for work, cost in history:
             if cost.task not in self.time or cost.seconds <= 0:
                 continue
-            usual = self.predict(cost.task, work).seconds
-            if usual > 0:
+            usual, own_beyond = self.predict(cost.task, work).seconds, beyond_the_fit(cost.task, work.config)
+            if usual > 0 and own_beyond == beyond[cost.task]:
                 ratios.setdefault(cost.task, []).append(math.log(cost.seconds / usual))
+            if usual > 0 and not own_beyond:
                 taken, expected = taken + cost.seconds, expected + usual
         if not expected:
             return {}
         whole = math.log(taken / expected)
-        found = {}
+        found: dict[str, float] = {}
         for task in self.time:
             own = ratios.get(task, [])
+            if beyond[task]:
+                # What all tasks say of the machine says nothing of work that the terms do not describe.
+                found |= {task: math.exp(median(own))} if own else {}
+                continue
             share = len(own) / (len(own) + PRIOR_RECORDS)
             found[task] = math.exp(share * median(own) + (1 - share) * whole if own else whole)
         return found
@@ -290,13 +320,41 @@ class CostModel:
 def stage_tasks(stage: str, config: PipelineConfig) -> tuple[str, ...]:
     """The tasks of a stage that are modelled and that these settings run."""
     left_out = set() if config.finetune.judge.enabled else {"finetune-judge"}
+    left_out |= {"evaluate-restore"} if config.evaluate.restored == "none" else set()
+    # It prepares nothing.
+    left_out |= {"enhance-train"} if config.enhance.backend == "classical" else set()
     return tuple(task for task in STAGE_TASKS[stage] if task not in left_out)
 
 
+def beyond_the_fit(task: str, config: PipelineConfig) -> tuple[str, ...]:
+    """Settings of a task that no record behind the packaged coefficients had, and no term stands for.
+
+    With the same ones, records of a store still tell what the task takes.
+
+    Returns:
+        Names and values, in words; empty where the coefficients hold.
+    """
+    enhance = config.enhance
+    found = []
+    if task in RESTORING and enhance.backend != FITTED_BACKEND:
+        found.append(f"enhance.backend={enhance.backend}")
+    # A restorer that was trained may have been found to be best with more steps.
+    elif task == "enhance-train" or (task in RESTORING and enhance.steps == "auto"):
+        found += [f"enhance.train_iterations={enhance.train_iterations}"] * (enhance.train_iterations > 0)
+    if task in ("finetune", "finetune-judge") and config.finetune.keep_scene:
+        found.append("finetune.keep_scene=true")
+    return tuple(found)
+
+
 def stage_seconds(model: CostModel, stage: str, work: Workload) -> float:
-    """Processor time of a stage on the reference machine, each task once; unknown tasks count nothing."""
+    """Processor time of a stage on the reference machine, each task once.
+
+    Unknown tasks, and those with settings `beyond_the_fit`, count nothing.
+    """
     return sum(
-        model.predict(task, work).seconds for task in stage_tasks(stage, work.config) if task in model.time
+        model.predict(task, work).seconds
+        for task in stage_tasks(stage, work.config)
+        if task in model.time and not beyond_the_fit(task, work.config)
     )
 
 
@@ -304,7 +362,8 @@ def fitted(history: Sequence[tuple[Workload, TaskCost]], probe_s: float) -> Cost
     """Fit the coefficients to records.
 
     Args:
-        history: what was done and what it took, all on one machine.
+        history: what was done and what it took, all on one machine. Records with settings `beyond_the_fit`
+            are left out.
         probe_s: what the probe took there.
 
     Raises:
@@ -312,7 +371,8 @@ def fitted(history: Sequence[tuple[Workload, TaskCost]], probe_s: float) -> Cost
     """
     by_task: dict[str, list[tuple[Workload, TaskCost]]] = {}
     for work, cost in history:
-        by_task.setdefault(cost.task, []).append((work, cost))
+        if not beyond_the_fit(cost.task, work.config):
+            by_task.setdefault(cost.task, []).append((work, cost))
     if not by_task:
         raise ConfigError("there is no record to fit costs to")
     time, memory = {}, {}

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from extrags.config import PipelineConfig
 from extrags.pipeline import STAGES, StageName
-from extrags.run_costs import Workload, packaged_model
+from extrags.run_costs import Workload, packaged_model, stage_tasks
 from flows.workloads import task_repeats, usual_work
 from tasks.progress import StageProgress, duration_text
 
@@ -17,6 +17,9 @@ OTHER_SECONDS: dict[str, float] = {"poses": 20.0, "depth": 30.0, "report": 4.0}
 with the pixels of all frames, for depth as far as it looks at them (`depth.max_width`)."""
 RESTORATION = {"enhance-keyframes": 0.1, "enhance-restore": 0.8, "enhance": 0.1}
 """Shares of its tasks in the time of the restoration, which is modelled as one."""
+
+MEASURED_SCENES = 2
+"""The coarse and the final scene."""
 
 LEARNED_SECONDS = 10.0
 """So much of what is expected must have run before anything is said of what is left."""
@@ -30,7 +33,8 @@ def expected_seconds(
     """How much processor time the tasks of each stage take on the reference machine, in the order they run.
 
     They count in proportion to each other: how fast this machine is with this sequence is learned from the
-    stages that have run.
+    stages that have run. Tasks whose settings no model knows (`extrags.run_costs.beyond_the_fit`) count as
+    with those it does know.
 
     Args:
         config: settings of all stages.
@@ -43,10 +47,15 @@ def expected_seconds(
         "depth": _pixels_of_depth(work) * work.train / (_pixels_of_depth(usual) * usual.train),
     }
     found: dict[StageName, dict[str, float]] = {}
+    restored = int(config.evaluate.restored != "none")
+    work = replace(work, stacks=MEASURED_SCENES + restored)
     for stage in STAGES:
-        repeats = task_repeats(stage, measured_scenes=2, restored=1)
+        repeats = task_repeats(stage, MEASURED_SCENES, restored)
+        run = stage_tasks(stage, config)
         tasks: dict[str, float] = {}
         for task, times in repeats.items():
+            if task not in run:
+                continue
             if task in model.time and stage not in OTHER_SECONDS:
                 seconds = times * model.predict(task, work).seconds
             else:

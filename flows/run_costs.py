@@ -14,6 +14,7 @@ from extrags.run_costs import (
     CostModel,
     TaskCost,
     Workload,
+    beyond_the_fit,
     packaged_model,
     probe_seconds,
     stage_tasks,
@@ -35,6 +36,8 @@ __all__ = [
 ]
 
 Record = tuple[Workload, TaskCost]
+OF_RESTORER = ("backend", "fold_iterations", "folds", "judge", "samples", "steps", "train_iterations")
+"""Settings that the restorer is prepared with, and that its runs depend on."""
 ENOUGH_SECONDS = 10.0
 """So much work on record tells more of a machine than a probe."""
 
@@ -64,7 +67,7 @@ class RunPrediction:
         stages: those that run.
         source: what tells how fast this machine is: `history` of the store, or a `probe`.
         records: so many records the history has.
-        unknown: stages that run and of whose cost nothing is known; not in any sum.
+        unknown: stages, and tasks of stages, that run and of whose cost nothing is known; not in any sum.
     """
 
     stages: list[StageCost]
@@ -108,7 +111,7 @@ class Pace:
     Args:
         source: `history` of a store, or a `probe`.
         records: so many records the history has.
-        processor: factors of processor time.
+        processor: factors of processor time; tasks of which nothing is known are not among them.
         elapsed: factors of elapsed time; empty where nothing is known of it.
     """
 
@@ -123,17 +126,19 @@ def pace_here(store: Store, fallback: PipelineConfig, model: CostModel) -> Pace:
 
     Args:
         store: with artefacts that were made on this machine.
-        fallback: settings that manifests do not hold.
+        fallback: settings of the run, and those that manifests do not hold.
         model: of the reference machine.
 
     Raises:
         StoreError: when the store cannot be read.
     """
     elapsed, processor = recorded_costs(store, fallback)
-    if sum(cost.seconds for _, cost in processor) >= ENOUGH_SECONDS:
-        return Pace("history", len(processor), model.pace(processor), model.pace(elapsed))
+    known = model.pace(processor, fallback)
+    if known and sum(cost.seconds for _, cost in processor) >= ENOUGH_SECONDS:
+        return Pace("history", len(processor), known, model.pace(elapsed, fallback))
     factor = probe_seconds() / model.probe_s
-    return Pace("probe", len(processor), dict.fromkeys(model.time, factor), {})
+    fitted = [task for task in model.time if not beyond_the_fit(task, fallback)]
+    return Pace("probe", len(processor), dict.fromkeys(fitted, factor), {})
 
 
 def predict_run(
@@ -147,6 +152,9 @@ def predict_run(
 ) -> RunPrediction:
     """What a run will cost on this machine, when nothing of it is in the store.
 
+    Of tasks with settings that the model does not know (`extrags.run_costs.beyond_the_fit`), records of the
+    store tell, where it has some with the same settings; else they are `unknown`.
+
     Args:
         store: its records tell how fast this machine is; without enough of them a probe does.
         work: size of the sequence and settings.
@@ -159,6 +167,10 @@ def predict_run(
         StoreError: when the store cannot be read.
     """
     model = model or packaged_model()
+    if "enhance" not in stages:
+        # Nothing is restored, with whatever backend.
+        unrestored = {"enhance.backend": "embedded", "enhance.train_iterations": 0}
+        work = replace(work, config=work.config.with_overrides(unrestored))
     pace = pace or pace_here(store, work.config, model)
     found: list[StageCost] = []
     unknown: list[str] = []
@@ -171,8 +183,12 @@ def predict_run(
             unknown.append(stage)
             continue
         repeats = task_repeats(stage, measured_scenes, restored)
-        run = [task for task in stage_tasks(stage, work.config) if task in repeats]
-        costs = [model.predict(task, work) for task in run if task in model.time]
+        run = [task for task in stage_tasks(stage, work.config) if task in repeats and task in model.time]
+        costs = [model.predict(task, work) for task in run if task in pace.processor]
+        if not costs:
+            unknown.append(stage)
+            continue
+        unknown += [task for task in run if task not in pace.processor]
         peaks = [cost.peak_mib for cost in costs if cost.peak_mib is not None]
         found.append(
             StageCost(
@@ -282,10 +298,14 @@ def _parts(manifest: Manifest, manifests: Mapping[str, Manifest]) -> list[Manife
 def _workload(
     manifest: Manifest, manifests: Mapping[str, Manifest], fallback: PipelineConfig
 ) -> Workload | None:
-    """The numbers of a record: of the frames it was made from, and of the settings behind it."""
+    """The numbers of a record: of the frames it was made from, and of the settings behind it.
+
+    None where what tells them, frames or restorer, is not in the store any more.
+    """
     line = [manifest, *_ancestors(manifest, manifests)]
     source = next((item for item in line if item.stage == "ingest"), None)
-    if source is None:
+    restores = "restorer" in manifest.input_keys or manifest.stage == "enhance"
+    if source is None or (restores and all(item.stage != "enhance-train" for item in line)):
         return None
     counts = source.counts
     size = [counts.get(name) for name in ("width", "height", "frames", "train", "test")]
@@ -332,6 +352,11 @@ def _config(line: list[Manifest], fallback: PipelineConfig) -> PipelineConfig:
             if isinstance(settings, dict) and group not in changed:
                 known = type(getattr(fallback, group)).model_fields
                 changed[group] = {name: value for name, value in settings.items() if name in known}
+    # Of the restorer, others hold no more than what they read themselves.
+    restorer = next((item.config.get("config") for item in line if item.stage == "enhance-train"), None)
+    settings = restorer if isinstance(restorer, dict) else {"backend": "embedded", "train_iterations": 0}
+    of_restorer = {name: settings[name] for name in OF_RESTORER if name in settings}
+    changed["enhance"] = {**changed.get("enhance", {}), **of_restorer}
     networks = next(
         (item.config.get("lpips_digests") for item in line if item.stage.startswith("evaluate")), None
     )

@@ -170,7 +170,8 @@ def benchmark_markdown(cases: Sequence[dict[str, Any]], baseline: str) -> str:
     )
     ceiling = by_dataset("ceiling_datasets", share_text)
     shares = (
-        f"## Share of the way from {baseline} to {CEILING}\n\nMean over sequences, smallest and largest.\n\n"
+        f"## Share of the way from {baseline} to {CEILING}\n\n"
+        "Of means over sequences, and its 95 % interval.\n\n"
         f"{ceiling}\n\n"
         if comparison["ceiling_datasets"]
         else ""
@@ -196,13 +197,13 @@ def difference_text(name: str, found: dict[str, Any] | None) -> str:
 
 
 def share_text(name: str, found: dict[str, Any] | None) -> str:
-    """A share in per cent, and its range over sequences if there are several."""
+    """A share in per cent, and its 95 % interval if there are several sequences."""
     if found is None:
         return figure(name, None)
     text = f"{100 * found['mean']:.0f} %"
-    if found["n"] == 1:
+    if found["low"] is None:
         return text
-    return f"{text} ({100 * found['smallest']:.0f} to {100 * found['largest']:.0f})"
+    return f"{text} ({100 * found['low']:.0f} to {100 * found['high']:.0f})"
 
 
 def spread_text(name: str, found: dict[str, Any] | None) -> str:

@@ -74,7 +74,7 @@ def assess(
     slot.counts["lacking_share"] = found["lacking_share"]
 
 
-@stage("plan", version=5)
+@stage("plan", version=6)
 def plan(slot: Slot, measured: Ref, config: PipelineConfig) -> None:
     """Derive the plan from the measurements and the budgets of the run; writes `plan.json`."""
     from extrags.scene_plan import decide

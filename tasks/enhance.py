@@ -118,7 +118,7 @@ def _only(config: EnhanceConfig, names: frozenset[str]) -> EnhanceConfig:
 
 
 # The model's digest is in the key: with another model in the same place, this is another restorer.
-@stage("enhance-train", version=20, ignore=("given",))
+@stage("enhance-train", version=21, ignore=("given",))
 def train(
     slot: Slot,
     scene: Ref,
@@ -164,7 +164,7 @@ def train(
     train_enhancer(shown, frames, config, coarse).save(slot.path / RESTORER)
 
 
-@stage("enhance-keyframes", version=7)
+@stage("enhance-keyframes", version=8)
 def keyframes(
     slot: Slot, scene: Ref, sequence: Ref, explore: Ref, restorer: Ref, config: EnhanceConfig
 ) -> None:
@@ -190,7 +190,7 @@ def keyframes(
 
 
 # The weights' digest is in the key; where their file lies is not.
-@stage("enhance-restore", version=11, ignore=("weights",))
+@stage("enhance-restore", version=12, ignore=("weights",))
 def restore(
     slot: Slot,
     scene: Ref,

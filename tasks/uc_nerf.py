@@ -22,7 +22,7 @@ def uc_nerf(slot: Slot, sequence: Ref, config: UcNerfConfig) -> None:
     slot.counts["parameters"] = sum(value.numel() for value in result.scene.network.parameters())
 
 
-@stage("uc-nerf-render", version=2)
+@stage("uc-nerf-render", version=3)
 def render_uc_nerf(slot: Slot, scene: Ref, sequence: Ref) -> None:
     """What `evaluate-render` does, for the baseline; writes `renders/` and, with true depth, `mesh/`."""
     from extrags.baselines.uc_nerf import rendering

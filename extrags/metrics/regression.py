@@ -27,9 +27,12 @@ __all__ = ["COST_NAMES", "LEVEL", "MATTERS", "compare_results"]
 LEVEL = 0.05
 """Chance of a false alarm in a whole comparison."""
 COST_NAMES = ("seconds", "processor_seconds", "peak_mib")
-MATTERS = {"cost": 0.05, "dB": 0.1, "other": 0.01}
-"""The smallest change that counts: share of a cost, decibels, and share of any other figure."""
-GROUP = ("method", "profile", "budget", "sequence", "setting", "width", "height")
+MATTERS = {"cost": 0.05, "dB": 0.1, "other": 0.01, "absolute": 0.01}
+"""The smallest change that counts: share of a cost, decibels, share of any other figure; of what was 0, which
+has no shares, the change itself."""
+UNITS = {"cost": "share", "dB": "dB", "other": "share", "absolute": "absolute"}
+SIZE = ("width", "height")
+GROUP = ("method", "profile", "budget", "sequence", "setting", *SIZE)
 MACHINE = ("processor", "cores", "threads", "isa")
 
 Verdict = Literal["worse", "better", "noise", "equal", "not judged"]
@@ -56,7 +59,7 @@ class _Row:
         return {
             **self.about,
             "quantity": self.quantity,
-            "unit": {"cost": "share", "dB": "dB", "other": "share"}[self.kind],
+            "unit": UNITS[self.kind],
             "paired": self.paired,
             "n": self.n,
             "before": self.before,
@@ -76,23 +79,24 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
 
     Returns:
         `{level, times_judged, rows, failed, missing, regressions}`. A row has what its runs share, the
-        quantity, means, the worsening (share of a cost or figure, or dB; positive is worse), its 95 %
-        interval and a verdict: `worse`, `better`, `noise`, `equal`, or `not judged` where a single pair says
-        nothing about noise. `failed` names groups of runs that fail now and did not; `missing` those that
-        are not in `after`, and figures that no run there has any more. Times and memory are judged on one
-        kind of machine only. `regressions` has the rows that are worse, and what fails or is missing, in
-        words.
+        quantity, means, the worsening (share of a cost or figure, or dB; `absolute`, in its own unit, of what
+        was 0; positive is worse), its 95 % interval and a verdict: `worse`, `better`, `noise`, `equal`, or
+        `not judged` where a single pair says nothing about noise. `failed` names groups of runs that fail
+        now and did not; `missing` those that are not in `after`, wholly or with a seed or repeat, and
+        figures that no run there has any more. Times and memory are judged on one kind of machine only.
+        `regressions` has the rows that are worse, and what fails or is missing, in words.
 
     Raises:
         ConfigError: for a document that is no such result, or two that have no group in common.
     """
-    sides = [_grouped(_cases(before, "the first result")), _grouped(_cases(after, "the second result"))]
+    found = [_cases(before, "the first result"), _cases(after, "the second result")]
+    sizes = [_sizes(cases) for cases in found]
+    sides = [_grouped(found[0], sizes), _grouped(found[1], sizes[::-1])]
     common = [group for group in sides[0] if group in sides[1]]
     if not common:
         raise ConfigError("the two results have no method, budget and sequence in common")
     same = all(
-        dict(before.get("machine") or {}).get(key) == dict(after.get("machine") or {}).get(key)
-        for key in MACHINE
+        (before.get("machine") or {}).get(key) == (after.get("machine") or {}).get(key) for key in MACHINE
     )
     rows: list[_Row] = []
     failed = []
@@ -102,6 +106,8 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
         if (error := _new_failure(was, now)) is not None:
             failed.append(f"{_label(group)} fails: {error}")
         rows += _rows(group, was, now, costs=same)
+        if gone := _gone(was, now):
+            missing.append(f"{_label(group)} was not run with {'; '.join(gone)}")
         missing += [f"{_label(group)} has no {name}" for name in _lost(was, now)]
     _judge(rows)
     worse = [_words(row) for row in rows if row.verdict == "worse"]
@@ -117,17 +123,68 @@ def compare_results(before: Mapping[str, Any], after: Mapping[str, Any]) -> dict
 
 def _cases(document: Mapping[str, Any], which: str) -> list[Mapping[str, Any]]:
     cases = document.get("cases")
-    needed = {"method", "profile", "sequence", "setting", "seed", "seconds", "metrics", "error"}
-    if not isinstance(cases, list) or not cases or not all(needed <= set(case) for case in cases):
-        raise ConfigError(f"{which} is no JSON of `bench pipeline` or `benchmark`: its `cases` lack fields")
+    known = [figure.name for figure in figures()]
+    if not isinstance(cases, list) or not cases or not all(_is_case(case, known) for case in cases):
+        raise ConfigError(
+            f"{which} is no JSON of `bench pipeline` or `benchmark`: its `cases` lack fields, or have others "
+            "in their place"
+        )
+    if not isinstance(document.get("machine") or {}, Mapping):
+        raise ConfigError(f"{which} is no JSON of `bench pipeline` or `benchmark`: `machine` is no object")
     return cases
 
 
-def _grouped(cases: Sequence[Mapping[str, Any]]) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+def _is_case(case: Any, known: Sequence[str]) -> bool:
+    """Whether it has all fields that are compared, and each of its kind."""
+    needed = {"method", "profile", "sequence", "setting", "seed", "seconds", "metrics", "error"}
+    if not isinstance(case, Mapping) or not needed <= set(case):
+        return False
+    names = [case.get(name) for name in (*GROUP, "error")]
+    numbers = [case.get(name) for name in ("seed", "repeat", *COST_NAMES)]
+    try:
+        for name in known:
+            figure_of(case["metrics"], name)
+    except (TypeError, ValueError):
+        return False
+    return (
+        all(isinstance(value, str | int | float | None) for value in names)
+        and all(isinstance(value, int | float | None) for value in numbers)
+        and isinstance(case["metrics"], Mapping | None)
+    )
+
+
+def _sizes(cases: Sequence[Mapping[str, Any]]) -> dict[tuple[Any, ...], set[tuple[Any, ...]]]:
+    """The sizes of images of all runs that have something in common but these."""
+    found: dict[tuple[Any, ...], set[tuple[Any, ...]]] = {}
+    for case in cases:
+        size = tuple(case.get(key) for key in SIZE)
+        if any(size):
+            found.setdefault(_but_size(case), set()).add(size)
+    return found
+
+
+def _but_size(case: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(case.get(key) for key in GROUP if key not in SIZE)
+
+
+def _grouped(
+    cases: Sequence[Mapping[str, Any]], sizes: Sequence[Mapping[tuple[Any, ...], set[tuple[Any, ...]]]]
+) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Runs by what they have in common.
+
+    Args:
+        cases: of one result.
+        sizes: from `_sizes`, of the same result and of the other one.
+    """
     found: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for case in cases:
         # Results of `benchmark` have no budgets or sizes.
-        found.setdefault(tuple(case.get(key) for key in GROUP), []).append(case)
+        group, size = _but_size(case), tuple(case.get(key) for key in SIZE)
+        if case["error"] and not any(size):
+            # It failed while its frames were read, before their size was known: that of other runs of it.
+            known = next((side[group] for side in sizes if len(side.get(group, ())) == 1), {size})
+            (size,) = known
+        found.setdefault((*group, *size), []).append(case)
     return found
 
 
@@ -139,6 +196,17 @@ def _new_failure(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, An
         if run["error"] and not before.get(_repetition(run), unstable):
             return str(run["error"])
     return None
+
+
+def _gone(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Seeds and repeats that are not there any more, in words; none where all of them are other ones."""
+    before, after = ({_repetition(run) for run in runs} for runs in (was, now))
+    if not before & after:
+        return []
+    repeated = any(repeat for _, repeat in before)
+    return [
+        f"seed {seed}{f', repeat {repeat}' if repeated else ''}" for seed, repeat in sorted(before - after)
+    ]
 
 
 def _lost(was: Sequence[Mapping[str, Any]], now: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -207,10 +275,12 @@ def _row(
     before, after = (np.asarray(sample, dtype=np.float64) for sample in samples)
     # Costs are multiplied by what slows a machine: they are compared as shares, by their logarithms.
     logarithms = kind == "cost" and before.min() > 0 and after.min() > 0
+    if kind != "dB" and before.mean() == 0:
+        kind = "absolute"
     if logarithms:
         x, y = np.log(before), np.log(after)
     else:
-        scale = 1.0 if kind == "dB" else max(abs(float(before.mean())), 1e-12)
+        scale = 1.0 if kind in ("dB", "absolute") else abs(float(before.mean()))
         x, y = before / scale, after / scale
     low = high = worse = better = None
     if paired:
@@ -278,14 +348,15 @@ def _judge(rows: Sequence[_Row]) -> None:
 
 
 def _words(row: _Row) -> str:
-    change = f"{row.worsening:.2f} dB" if row.kind == "dB" else f"{row.worsening:.1%}"
+    def amount(value: float) -> str:
+        return {"dB": f"{value:.2f} dB", "absolute": f"{value:.4g}"}.get(row.kind, f"{value:.1%}")
+
     interval = ""
     if row.low is not None and row.high is not None:
-        ends = (f"{end:.2f} dB" if row.kind == "dB" else f"{end:.1%}" for end in (row.low, row.high))
-        interval = f" [{' to '.join(ends)}]"
+        interval = f" [{amount(row.low)} to {amount(row.high)}]"
     return (
         f"{_label(tuple(row.about.values()))}: {row.quantity} {row.before:.4g} to {row.after:.4g}, worse by "
-        f"{change}{interval}, {row.n} {'pairs' if row.paired else 'runs a side'}"
+        f"{amount(row.worsening)}{interval}, {row.n} {'pairs' if row.paired else 'runs a side'}"
     )
 
 

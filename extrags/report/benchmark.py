@@ -194,8 +194,7 @@ def _difference_cell(figure: Mapping[str, Any], column: Figure) -> dict[str, str
 
 
 def _share_cell(figure: Mapping[str, Any], column: Figure) -> dict[str, str]:
-    smallest, largest = (percent(figure[end]) for end in ("smallest", "largest"))
-    note = "" if figure["n"] == 1 else f"{smallest} to {largest}"
+    note = "" if figure["low"] is None else f"{percent(figure['low'])} to {percent(figure['high'])}"
     return {**NO_CELL, "value": percent(figure["mean"]), "note": note}
 
 

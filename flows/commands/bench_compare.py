@@ -65,8 +65,8 @@ def _print(found: dict[str, Any], *, every: bool) -> None:
         counts[row["verdict"]] = counts.get(row["verdict"], 0) + 1
         if row["verdict"] in ("worse", "better") or every:
             name = f"{row['sequence']}@{row['setting']}" if row["setting"] else row["sequence"]
-            decibels = row["unit"] == "dB"
-            change = f"{row['worsening']:+.2f} dB" if decibels else f"{row['worsening']:+.1%}"
+            changes = {"dB": "{:+.2f} dB", "share": "{:+.1%}", "absolute": "{:+.4g}"}
+            change = changes[row["unit"]].format(row["worsening"])
             table.add_row(
                 escape(name),
                 escape(row["method"]),

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from extrags.config import PROFILES, profile_config
-from extrags.memory_estimate import COMPARED_WIDTH, FrameSize, estimate_memory, fitting_settings
+from extrags.memory_estimate import COMPARED_WIDTH, STEPS, FrameSize, estimate_memory, fitting_settings
 from extrags.training.frame_comparison import MAX_WIDTH_PX
 
 THUMBNAILS = FrameSize(60, 52, 225, 180)
@@ -111,11 +113,26 @@ class TestFittingSettings:
         assert peak(found) <= limit
         for name in found:
             assert peak({other: value for other, value in found.items() if other != name}) > limit
+            assert peak({**found, name: found[name] + STEPS[name]}) > limit
 
     def test_smaller_virtual_views_come_before_smaller_frames(self) -> None:
         config = profile_config("balanced").with_overrides({"enhance.max_width": None})
         found = fitting_settings(config, FULL, 0.9 * estimate_memory(config, FULL).peak_gb)
-        assert found == {"enhance.max_width": 320}
+        assert found is not None
+        assert list(found) == ["enhance.max_width"]
+        assert 320 <= found["enhance.max_width"] < FULL.width
+
+    def test_what_was_cut_first_is_raised_again_once_another_cut_is_enough(self) -> None:
+        """The ways are tried in large steps, the first of which may turn out to have been too large."""
+        config, size = profile_config("balanced"), FrameSize(100, 88, 1920, 1080)
+        for limit in (3.25, 3.75, 4.0, 4.25):
+            found = fitting_settings(config, size, limit)
+            assert found is not None
+            assert found["ingest.width"] > 900
+            smaller = replace(size, width=found["ingest.width"], height=found["ingest.width"] * 9 // 16)
+            for more in range(found.get("enhance.max_views", 240) + 8, 240, 8):
+                trial = config.with_overrides({**found, "enhance.max_views": more})
+                assert estimate_memory(trial, smaller).peak_gb > limit
 
     def test_none_where_the_process_alone_takes_more(self) -> None:
         assert fitting_settings(profile_config("quick"), THUMBNAILS, 0.1) is None

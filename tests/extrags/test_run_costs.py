@@ -10,7 +10,17 @@ import pytest
 
 from extrags.config import PipelineConfig, profile_config
 from extrags.errors import ConfigError
-from extrags.run_costs import STAGE_TASKS, CostModel, TaskCost, Workload, fitted, packaged_model
+from extrags.run_costs import (
+    STAGE_TASKS,
+    CostModel,
+    TaskCost,
+    Workload,
+    beyond_the_fit,
+    fitted,
+    packaged_model,
+    stage_seconds,
+    stage_tasks,
+)
 
 
 def work(
@@ -81,6 +91,14 @@ class TestFit:
         for item in LOADS:
             assert model.predict("coarse", item).seconds == pytest.approx(true_seconds(item), rel=0.1)
 
+    def test_other_backends_are_not_what_is_fitted(self) -> None:
+        records = [
+            (changed(backend="embedded"), TaskCost("enhance", 100.0, None)),
+            (changed(backend="classical"), TaskCost("enhance", 1.0, None)),
+        ]
+        model = fitted(records, 0.01)
+        assert model.predict("enhance", records[0][0]).seconds == pytest.approx(100, rel=1e-3)
+
     def test_without_records(self) -> None:
         with pytest.raises(ConfigError, match="no record"):
             fitted([], 0.01)
@@ -102,6 +120,13 @@ class TestGaussians:
                 assert found["gaussians"] == limit
                 assert found["final_gaussians"] == config.finetune.growth * limit
 
+    def test_without_densification_there_are_those_of_the_start(self) -> None:
+        config = profile_config("quick").with_overrides(
+            {"coarse.densify.enabled": False, "coarse.max_points": 5000, "coarse.densify.max_gaussians": 100}
+        )
+        found = Workload(20480, 48, 24, 24, config).numbers()
+        assert (found["gaussians"], found["final_gaussians"]) == (5000, 5000)
+
     def test_those_of_a_scene_that_is_there_count(self) -> None:
         item = replace(work(), coarse_gaussians=1234)
         assert item.numbers()["gaussians"] == 1234
@@ -119,6 +144,65 @@ def test_the_mean_of_a_restorer_is_one_sample() -> None:
     assert found["samples"] == 1
 
 
+def changed(**enhance: object) -> Workload:
+    settings = {f"enhance.{name}": value for name, value in enhance.items()}
+    return replace(work(), config=work().config.with_overrides(settings))
+
+
+class TestRestorer:
+    """Its settings, of which records know hardly any."""
+
+    def test_a_step_costs_a_run_of_the_network(self) -> None:
+        model = packaged_model()
+        for task, views in (("enhance", 96), ("evaluate-restore", 24), ("enhance-train", 48)):
+            one, four, sixteen = (
+                model.predict(task, changed(steps=steps)).seconds for steps in ("auto", 4, 16)
+            )
+            assert one == model.predict(task, changed(steps=1)).seconds
+            assert four - one == pytest.approx(views * 20480 * 3 * 1.9e-6)
+            assert sixteen - one == pytest.approx(5 * (four - one))
+
+    def test_so_does_a_sample(self) -> None:
+        model = packaged_model()
+        assert model.predict("enhance", changed(samples=4)) == model.predict("enhance", changed(steps=4))
+
+    def test_folds_are_for_who_trains_or_judges(self) -> None:
+        assert changed().numbers()["fold_iterations"] > 0
+        assert changed(judge=False).numbers()["fold_iterations"] == 0
+        assert changed(judge=False, train_iterations=10).numbers()["fold_iterations"] > 0
+
+    @pytest.mark.parametrize(
+        ("settings", "tasks"),
+        [
+            ({}, set()),
+            ({"enhance.steps": 4}, set()),
+            (
+                {"enhance.backend": "classical"},
+                {"enhance-train", "enhance", "finetune-judge", "evaluate-restore"},
+            ),
+            (
+                {"enhance.train_iterations": 9},
+                {"enhance-train", "enhance", "finetune-judge", "evaluate-restore"},
+            ),
+            ({"enhance.train_iterations": 9, "enhance.steps": 1}, {"enhance-train"}),
+            ({"finetune.keep_scene": True}, {"finetune", "finetune-judge"}),
+        ],
+    )
+    def test_what_no_record_tells_of(self, settings: dict[str, object], tasks: set[str]) -> None:
+        config = profile_config("quick").with_overrides(settings)
+        every = {task for found in STAGE_TASKS.values() for task in found}
+        assert {task for task in every if beyond_the_fit(task, config)} == tasks
+
+    def test_tasks_that_do_not_run_cost_nothing(self) -> None:
+        config = profile_config("quick")
+        assert "enhance-train" in stage_tasks("enhance", config)
+        assert stage_tasks("enhance", config.with_overrides({"enhance.backend": "classical"})) == ("enhance",)
+        without = config.with_overrides({"evaluate.restored": "none"})
+        assert "evaluate-restore" not in stage_tasks("evaluate", without)
+        # Nor is anything said of what nobody knows.
+        assert stage_seconds(packaged_model(), "enhance", changed(backend="classical")) == 0
+
+
 class TestPace:
     model = CostModel({"coarse": {"one": 10.0}, "ingest": {"one": 5.0}}, {}, 0.01)
 
@@ -134,6 +218,17 @@ class TestPace:
         pace = self.model.pace(records)
         assert pace["coarse"] == pytest.approx(1, rel=0.05)
         assert pace["ingest"] == pytest.approx(3, rel=0.05)
+
+    def test_records_of_another_backend_say_nothing(self) -> None:
+        model = CostModel({"coarse": {"one": 10.0}, "enhance": {"one": 10.0}}, {}, 0.01)
+        own, other = changed(backend="embedded"), changed(backend="classical")
+        records = [(own, TaskCost("coarse", 20.0, None)), (other, TaskCost("enhance", 1.0, None))]
+        # A large weight of the others would draw the pace of all tasks.
+        records += [(other, TaskCost("enhance", 1.0, None))] * 50
+        assert model.pace(records, own.config) == pytest.approx({"coarse": 2, "enhance": 2})
+        # But for that backend they are all that is known.
+        assert model.pace(records, other.config) == pytest.approx({"coarse": 2, "enhance": 0.1})
+        assert model.pace(records[:1], other.config) == pytest.approx({"coarse": 2})
 
     def test_no_records_no_pace(self) -> None:
         assert self.model.pace([]) == {}

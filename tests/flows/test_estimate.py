@@ -40,6 +40,19 @@ class TestEstimate:
             assert sum(large[stage].values()) > 1.5 * sum(small[stage].values())
         assert large["freespace"] == small["freespace"]
 
+    def test_tasks_that_do_not_run_are_not_waited_for(self) -> None:
+        def expected(stage: StageName, **settings: object) -> dict[str, float]:
+            changes = {name.replace("__", "."): value for name, value in settings.items()}
+            return expected_seconds(profile_config("quick").with_overrides(changes))[stage]
+
+        assert list(expected("finetune")) == ["finetune-judge", "finetune"]
+        assert list(expected("finetune", finetune__judge__enabled=False)) == ["finetune"]
+        restored, plain = expected("evaluate"), expected("evaluate", evaluate__restored="none")
+        assert "evaluate-restore" in restored
+        assert "evaluate-restore" not in plain
+        assert plain["evaluate-views"] < restored["evaluate-views"]
+        assert "enhance-train" not in expected("enhance", enhance__backend="classical")
+
     def test_depth_looks_at_frames_of_a_bounded_width(self) -> None:
         config = profile_config("balanced")
         depths = [

@@ -8,16 +8,18 @@ import pytest
 
 from extrags.config import PipelineConfig, profile_config
 from extrags.errors import ConfigError
-from extrags.run_costs import CostModel, Workload
+from extrags.run_costs import CostModel, Workload, packaged_model
 from extrags.store import Store
 from flows import run_costs
-from flows.run_costs import predict_run, recorded_costs
+from flows.run_costs import RunPrediction, predict_run, recorded_costs
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from flows.workloads import catalogue_work
 from tests.flows.tiny import SEQUENCE, TINY
 
 CONFIG: PipelineConfig = profile_config("quick").with_overrides(TINY)
+UNTRAINED = CONFIG.with_overrides({"enhance.train_iterations": 0})
+"""The restorer as it comes, of which the model knows."""
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +56,43 @@ def test_the_history_of_a_store_tells_the_pace(filled: Store, monkeypatch: pytes
     spent = sum(cost.seconds for _, cost in processor if cost.task in ("ingest", "coarse"))
     assert found.processor_seconds == pytest.approx(spent, rel=0.6)
     assert found.seconds is not None
+
+
+def test_what_a_backend_takes_is_unknown_without_records_of_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run_costs, "probe_seconds", lambda: 0.01)
+    stages = {"coarse", "enhance", "finetune", "evaluate"}
+
+    def predicted(stages: set[str] = stages, **settings: object) -> RunPrediction:
+        changes = {name.replace("__", "."): value for name, value in settings.items()}
+        config = UNTRAINED.with_overrides(changes)
+        return predict_run(Store(tmp_path), Workload(48 * 40, 24, 12, 12, config), stages)
+
+    assert predicted().unknown == []
+    classical = predicted(enhance__backend="classical")
+    assert classical.unknown == ["enhance", "finetune-judge", "evaluate-restore"]
+    assert [row.stage for row in classical.stages] == ["coarse", "finetune", "evaluate"]
+    assert predicted(enhance__train_iterations=9, enhance__steps=1).unknown == ["enhance-train"]
+    assert predicted(finetune__keep_scene=True).unknown == ["finetune"]
+    # Where nothing is restored, a backend is neither here nor there.
+    assert predicted(stages - {"enhance"}, enhance__backend="classical").unknown == []
+
+
+def test_the_restorer_of_a_record_is_the_one_it_was_made_with(filled: Store) -> None:
+    """What restores holds the settings it reads itself, which the restorer's are not among."""
+    config = CONFIG.with_overrides({"enhance.backend": "classical"})
+    outcome = run_sequence(SEQUENCE, config, filled.root, DirectRunner(filled.root), until="enhance")
+    assert outcome.status == "ok"
+    _, processor = recorded_costs(filled, UNTRAINED)
+    backends = {cost.task: work.config.enhance.backend for work, cost in processor}
+    assert backends["enhance"] == backends["enhance-train"] == "classical"
+    pace = packaged_model().pace(processor, UNTRAINED)
+    other = packaged_model().pace(processor, config)
+    assert pace["evaluate-restore"] == pytest.approx(pace["evaluate"])
+    assert pace["enhance"] == pytest.approx(pace["evaluate"])
+    assert other["enhance"] != pace["enhance"]
+    assert "evaluate-restore" not in other
 
 
 def test_without_history_a_probe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

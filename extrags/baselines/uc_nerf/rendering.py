@@ -18,11 +18,11 @@ __all__ = ["render", "surface"]
 def render(
     scene: UcNerf, sequence: EndoscopicSequence, frames: Int[np.ndarray, "v"] | None = None
 ) -> RenderedViews:
-    """Render frames of a sequence; the system knows no exposure.
+    """Render frames of a sequence, each from other frames than itself; the system knows no exposure.
 
     Args:
         scene: the trained baseline.
-        sequence: posed frames in its world; only the cameras are used.
+        sequence: posed frames, those it was trained on with the same split; only cameras are used.
         frames: indices of the frames; None takes the held-out ones.
 
     Returns:
@@ -35,9 +35,9 @@ def render(
         np.zeros(shape, np.float32),
         np.zeros(shape, np.float32),
     )
-    encoded = scene.encoded()
+    encoded, sources = scene.encoded(), _sources(sequence)
     for place, frame in enumerate(frames):
-        found = scene.render(sequence.cameras[int(frame)], encoded)
+        found = scene.render(sequence.cameras[int(frame)], encoded, leave_out=sources.get(int(frame)))
         assert found.rgb is not None
         rgb[place] = found.rgb.clamp(0, 1).reshape(*shape[1:], 3)
         alpha[place], depth[place] = found.alpha.reshape(shape[1:]), found.depth.reshape(shape[1:])
@@ -48,6 +48,8 @@ def render(
 def surface(scene: UcNerf, sequence: EndoscopicSequence) -> Mesh | None:
     """The surface by the rules of the protocol (`extrags.metrics.surface`); None when there is none.
 
+    The depth of a training frame is rendered as that of a held-out one is: from other frames.
+
     Args:
         scene: the trained baseline.
         sequence: provides the training and held-out cameras.
@@ -55,11 +57,16 @@ def surface(scene: UcNerf, sequence: EndoscopicSequence) -> Mesh | None:
     frames = np.unique(np.concatenate([sequence.train, sequence.test]))
     cameras = sequence.cameras[frames].at_most_width(PROTOCOL_FUSION.max_width)
     depth = np.zeros((len(cameras), cameras.height, cameras.width), np.float32)
-    encoded = scene.encoded()
-    for place in range(len(cameras)):
-        found = scene.render(cameras[place], encoded, color=False)
+    encoded, sources = scene.encoded(), _sources(sequence)
+    for place, frame in enumerate(frames):
+        found = scene.render(cameras[place], encoded, color=False, leave_out=sources.get(int(frame)))
         depth[place] = found.median_depth.where(found.alpha >= PROTOCOL_FUSION.min_alpha, 0.0).reshape(
             depth[place].shape
         )
         emit(Progress("surface", place + 1, len(cameras)))
     return surface_from_renders(cameras, depth)
+
+
+def _sources(sequence: EndoscopicSequence) -> dict[int, int]:
+    """Of each training frame, its place among the frames that the baseline keeps."""
+    return {int(frame): place for place, frame in enumerate(sequence.train)}

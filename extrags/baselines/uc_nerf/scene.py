@@ -67,7 +67,12 @@ class UcNerf(Storable):
             return self.network.stereo.encode(PosedImages.of(self.rgb, self.cameras, self.mask))
 
     def render(
-        self, camera: Cameras, encoded: EncodedViews | None = None, *, color: bool = True
+        self,
+        camera: Cameras,
+        encoded: EncodedViews | None = None,
+        *,
+        color: bool = True,
+        leave_out: int | None = None,
     ) -> RayColors:
         """Render one view; the result does not depend on the number of threads.
 
@@ -75,14 +80,16 @@ class UcNerf(Storable):
             camera: one camera.
             encoded: from `encoded`, so that several views share it; None computes it.
             color: False: depth and alpha alone.
+            leave_out: index of the training frame that is rendered: it is none of its own sources. None: of
+                no training frame.
 
         Returns:
             Values of the pixels, row by row.
         """
         encoded = self.encoded() if encoded is None else encoded
         with torch.no_grad(), one_torch_thread():
-            chosen = nearest_views(camera, self.cameras, self.scale)[: self.config.source_views]
-            views = encoded[chosen.tolist()]
+            nearest = nearest_views(camera, self.cameras, self.scale).tolist()
+            views = encoded[[place for place in nearest if place != leave_out][: self.config.source_views]]
             (K,), (viewmat,) = camera_tensors(camera)
             prior = self.network.stereo(views, K, viewmat, self.inverse_range, camera.width, camera.height)
             v, u = torch.meshgrid(

@@ -23,7 +23,7 @@ from extrags.baselines.uc_nerf.stereo import (
     plane_sweep,
 )
 from extrags.config import UcNerfConfig
-from extrags.errors import CaptureError, DivergedError
+from extrags.errors import CaptureError, ConfigError, DivergedError
 from extrags.events import Progress, emit
 from extrags.sequence import EndoscopicSequence
 from extrags.threads import one_torch_thread
@@ -103,12 +103,17 @@ def train(
     Raises:
         CaptureError: with fewer than three training frames; when neither depth nor points are known and all
             cameras stand in one place.
+        ConfigError: for frames through a lens: the baseline renders pinholes.
         DivergedError: when the loss does not stay finite.
 
     Source: Guo et al.: UC-NeRF: Uncertainty-aware Conditional Neural Radiance Fields from Endoscopic Sparse
     Views, IEEE Transactions on Medical Imaging 2024; docs/algorithms/uc_nerf.md lists what differs.
     """
     config = UcNerfConfig() if config is None else config
+    if sequence.lens is not None:
+        raise ConfigError(
+            f"{sequence.name}: its frames have a lens, and uc_nerf renders pinholes; take ingest.lens=pinhole"
+        )
     frames = np.asarray(sequence.train)
     if len(frames) < 3:
         raise CaptureError(

@@ -22,7 +22,7 @@ from extrags.restoration.uncertainty.calibration import Calibration
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training.leave_out import MIN_FRAMES
-from extrags.view_synthesis.gamut import Gamut
+from extrags.view_synthesis.gamut import Frame, Gamut
 from extrags.view_synthesis.gather import gather_references
 from extrags.view_synthesis.references import LightTransfer
 
@@ -132,6 +132,11 @@ def better_of_both(
 
 def _scene_gamut(sequence: EndoscopicSequence) -> Gamut:
     """Hues of the training frames' valid tissue."""
-    images = torch.from_numpy(sequence.rgb[sequence.train].astype(np.float32) / 255).permute(0, 3, 1, 2)
-    weight = torch.from_numpy(sequence.mask[sequence.train].astype(np.float32))[:, None]
-    return Gamut.of_images(images, weight)
+
+    def frame(index: int) -> Frame:
+        shown = sequence.train[index]
+        image = torch.from_numpy(sequence.rgb[shown].astype(np.float32) / 255).permute(2, 0, 1)
+        return image, torch.from_numpy(sequence.mask[shown].astype(np.float32))[None]
+
+    # One at a time: as floats, the frames of a long recording would not be in memory at once.
+    return Gamut.of_frames(frame, len(sequence.train))

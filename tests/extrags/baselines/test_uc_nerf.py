@@ -36,8 +36,9 @@ from extrags.baselines.uc_nerf.training import (
 )
 from extrags.cameras import transform_points, unproject_pixels
 from extrags.config import UcNerfConfig
-from extrags.errors import CaptureError
+from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, subscribed
+from extrags.radial_lens import RadialLens
 from tests.extrags.baselines.slanted_plane import HEIGHT, WIDTH, cameras, seen, slanted_plane
 
 TINY = UcNerfConfig(
@@ -371,6 +372,31 @@ class TestTraining:
         mesh = rendering.surface(trained, slanted_plane())
         assert mesh is not None
         assert len(mesh.triangles) > 100
+
+    def test_a_training_frame_is_no_source_of_its_own(
+        self, trained: UcNerf, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Its pixels change the views of other frames, and not its own colours and depth."""
+        sequence = slanted_plane()
+        frame, other = int(sequence.train[2]), int(sequence.train[3])
+        rgb = trained.rgb.copy()
+        rgb[2] = 255 - rgb[2]
+        scenes = (trained, replace(trained, rgb=rgb))
+        first, second = (rendering.render(scene, sequence, np.array([frame, other])) for scene in scenes)
+        np.testing.assert_array_equal(first.rgb[0], second.rgb[0])
+        assert np.abs(first.rgb[1] - second.rgb[1]).max() > 0
+
+        fused: list[np.ndarray] = []
+        monkeypatch.setattr(rendering, "surface_from_renders", lambda _, depth: fused.append(depth))
+        for scene in scenes:
+            rendering.surface(scene, sequence)
+        np.testing.assert_array_equal(fused[0][frame], fused[1][frame])
+        assert np.abs(fused[0][other] - fused[1][other]).max() > 0
+
+    def test_frames_through_a_lens_are_refused(self) -> None:
+        bent = replace(slanted_plane(), lens=RadialLens((-0.1, 0.0, 0.0, 0.0), 0.9))
+        with pytest.raises(ConfigError, match=r"uc_nerf renders pinholes.*ingest\.lens=pinhole"):
+            train(bent, TINY)
 
     def test_loading_gives_the_same_renders(self, trained: UcNerf, tmp_path: Path) -> None:
         trained.save(tmp_path / "uc_nerf")

@@ -152,10 +152,26 @@ class TestCeiling:
         assert shares == pytest.approx({"phantom/0": 0.5, "phantom/1": 0.7})
         (row,) = comparison["ceiling_datasets"]
         assert (row["method"], row["baseline"], row["figures"]["psnr"]["n"]) == ("coarse", "3dgs", 2)
-        assert row["figures"]["psnr"]["mean"] == pytest.approx(0.6)
+        # Gains of 3 and 7 of 6 and 10.
+        assert row["figures"]["psnr"]["mean"] == pytest.approx(10 / 16)
         assert (row["n_sequences"], row["n_seeds"]) == (2, 2)
         # Lower is better: the same share of the way down.
-        assert row["figures"]["lpips_alex"]["mean"] == pytest.approx(0.6)
+        assert row["figures"]["lpips_alex"]["mean"] == pytest.approx(10 / 16)
+
+    def test_a_sequence_with_hardly_any_way_to_go_decides_nothing(self) -> None:
+        runs = []
+        for number, best in enumerate((22.0, 22.0, 22.0, 20.002)):
+            for method, value in (("3dgs", 20.0), ("coarse", 21.0), ("oracle", best)):
+                runs.append(run(method, f"phantom/{number}", 0, value))
+        (row,) = compare_runs(runs, "3dgs")["ceiling_datasets"]
+        share = row["figures"]["psnr"]
+        assert share["mean"] == pytest.approx(4 / 6.002)
+        # In more than 2.5 % of all samples three of the four are the last one.
+        assert pytest.approx(share["low"]) == 0.5
+        assert share["high"] == pytest.approx(4 / 2.006)
+        assert (share["n"], share["deviation"]) == (4, None)
+        (first, *_) = compare_runs(runs, "3dgs")["ceiling_sequences"]
+        assert (first["figures"]["psnr"]["low"], first["figures"]["psnr"]["high"]) == (None, None)
 
     def test_without_an_oracle_there_is_none(self) -> None:
         comparison = compare_runs(both("phantom/0", 0, 20.0, 1.0), "3dgs")

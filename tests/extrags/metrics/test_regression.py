@@ -164,7 +164,87 @@ def test_groups_that_were_not_run_are_named() -> None:
     assert found["regressions"] == found["missing"]
 
 
-@pytest.mark.parametrize("wrong", [{}, {"cases": []}, {"cases": [{"method": "coarse"}]}])
+class TestRunsThatAreGone:
+    def test_seeds_are_named(self) -> None:
+        found = compare_results(result(seeds=range(3)), result(seeds=range(1), worse_db=5))
+        assert found["missing"] == ["coarse (quick) on phantom/0@sparse was not run with seed 1; seed 2"]
+        assert found["regressions"] == found["missing"]
+
+    def test_repeats_are_named(self) -> None:
+        once = result(seeds=range(1))
+        twice = {**once, "cases": [{**once["cases"][0], "repeat": repeat} for repeat in (0, 1)]}
+        assert compare_results(twice, once)["missing"] == [
+            "coarse (quick) on phantom/0@sparse was not run with seed 0, repeat 1"
+        ]
+        assert compare_results(once, twice)["missing"] == []
+
+    def test_other_seeds_are_not_fewer(self) -> None:
+        assert compare_results(result(), result(seeds=range(5, 10)))["missing"] == []
+
+
+class TestRunsThatFailedWhileReading:
+    """Of these no size is known."""
+
+    def sized(self, *, groups: int = 1, failing: int | None = None) -> dict[str, Any]:
+        found = result(groups=groups)
+        for case in found["cases"]:
+            failed = case["sequence"] == f"phantom/{failing}"
+            case.update(width=None if failed else 160, height=None if failed else 128)
+            case["error"] = "ingest: a file is broken" if failed else ""
+        return found
+
+    def test_they_are_the_runs_of_that_size(self) -> None:
+        found = compare_results(self.sized(groups=2), self.sized(groups=2, failing=0))
+        assert found["regressions"] == [
+            "coarse (quick) on phantom/0@sparse, 160x128 fails: ingest: a file is broken"
+        ]
+
+    def test_though_nothing_else_was_run(self) -> None:
+        assert len(compare_results(self.sized(), self.sized(failing=0))["failed"]) == 1
+
+    def test_what_works_now_is_not_gone(self) -> None:
+        found = compare_results(self.sized(groups=2, failing=0), self.sized(groups=2))
+        assert found["regressions"] == []
+
+    def test_one_seed_of_several(self) -> None:
+        after = self.sized()
+        after["cases"][1].update(width=None, height=None, error="ingest: a file is broken")
+        found = compare_results(self.sized(), after)
+        assert found["missing"] == []
+        assert len(found["failed"]) == 1
+
+
+@pytest.mark.parametrize(("now", "verdict"), [(1e-5, "noise"), (0.3, "better"), (0.0, "equal")])
+def test_a_figure_that_was_zero_has_no_shares(now: float, verdict: str) -> None:
+    sides = [result(), result()]
+    for side, value in zip(sides, (0.0, now), strict=True):
+        for case in side["cases"]:
+            case["metrics"] = {"surface": {"recall": value}}
+    (row,) = [row for row in compare_results(*sides)["rows"] if row["quantity"] == "surface.recall"]
+    assert (row["unit"], row["verdict"]) == ("absolute", verdict)
+    assert row["worsening"] == pytest.approx(-now)
+
+
+def _with(**changes: Any) -> dict[str, Any]:
+    return {"cases": [{**result()["cases"][0], **changes}]}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {},
+        {"cases": []},
+        {"cases": [1]},
+        {"cases": [{"method": "coarse"}]},
+        {**result(), "machine": "x"},
+        _with(sequence=["phantom/0"]),
+        _with(seed={}),
+        _with(seconds="long"),
+        _with(metrics=[20.0]),
+        _with(metrics={"psnr": "good"}),
+        _with(metrics={"psnr": [20.0]}),
+    ],
+)
 def test_other_documents_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match="second result is no JSON"):
         compare_results(result(), wrong)
