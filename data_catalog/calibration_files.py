@@ -1,10 +1,10 @@
 """Calibration files of endoscopes (OpenCV, Kalibr, Scaramuzza), for sources that state no intrinsics.
 
 * OpenCV: YAML, XML or JSON of `cv::FileStorage` with `camera_matrix` and `distortion_coefficients` (0, 4, 5,
-  8 or more numbers; with 4 and `fisheye_model: 1` the Kannala-Brandt fisheye), and `image_width` and
-  `image_height`, or `image_size` with both, without which the calibration holds for the images as they are.
-  Numbers are a matrix of OpenCV's, a plain list, or what ROS writes (`rows`, `cols`, `data`, and
-  `distortion_model`).
+  8 or more numbers; with 4 and `fisheye_model: 1`, or a `distortion_model` or `camera_model` that says so,
+  the Kannala-Brandt fisheye), and `image_width` and `image_height`, or `image_size` with both, without which
+  the calibration holds for the images as they are. Numbers are a matrix of OpenCV's, a plain list, or what
+  ROS writes (`rows`, `cols`, `data`).
 * Kalibr: the `camchain.yaml` with the camera `cam0`: pinhole with radtan, equidistant, fov or no distortion.
 * Scaramuzza: `calib_results.txt` of OCamCalib, a polynomial of fourth degree.
 
@@ -27,6 +27,7 @@ import numpy as np
 from data_catalog.c3vd.pinhole import PinholeResampling, own_pixels
 from data_catalog.c3vd.scaramuzza import ScaramuzzaCamera, camera_from_json
 from data_catalog.file_storage import read_file_storage
+from data_catalog.lens_entries import lens_kind, tells_distortion
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.sampling import LensSampling, Sampling
 from extrags.config import IngestConfig
@@ -35,7 +36,7 @@ from extrags.lens import Lens
 
 __all__ = ["CALIBRATION_VERSION", "read_calibration", "with_calibration_file"]
 
-CALIBRATION_VERSION = 3
+CALIBRATION_VERSION = 4
 """Raised by hand whenever the same file gives another camera."""
 
 _PROPORTION_TOLERANCE = 0.005
@@ -48,12 +49,10 @@ _OPENCV_NAMES = {
     "width": ("image_width", "image_Width", "imageWidth"),
     "height": ("image_height", "image_Height", "imageHeight"),
     "size": ("image_size", "imageSize", "image_Size", "img_size"),
-    "fisheye": ("fisheye_model",),
-    "model": ("distortion_model",),
 }
+_MODEL = "distortion_model"
 _OPENCV_COUNTS = (0, 4, 5, 8, 12, 14)
-_ROS_FISHEYES = ("equidistant", "fisheye")
-_ROS_MODELS = ("plumb_bob", "rational_polynomial", *_ROS_FISHEYES)
+_KALIBR_CAMERA = re.compile(r"""^[\s{"']*cam0["']?\s*:""", re.MULTILINE)
 _KALIBR_MODELS = {
     "none": ("PINHOLE", 0),
     "radtan": ("OPENCV", 4),
@@ -86,7 +85,7 @@ def read_calibration(file: Path, width: int, height: int) -> Lens | ScaramuzzaCa
         raise SourceError(f"cannot be read as text: {error}", file=file, field="calibration") from error
     if "#polynomial coefficients" in text:
         return _ocamcalib(text, file).scaled(width, height, file=file)
-    if "distortion_model" in text and "cam0" in text:
+    if "distortion_model" in text and _KALIBR_CAMERA.search(text) is not None:
         return _scaled(_kalibr(text, file), width, height, file)
     if any(name in text for name in _OPENCV_NAMES["K"][:3]):
         return _scaled(_opencv(text, width, height, file), width, height, file)
@@ -170,11 +169,11 @@ def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
     storage = read_file_storage(text, file, (*_OPENCV_NAMES["K"], *_OPENCV_NAMES["D"]))
     K, D = (_matrix(storage, name, file) for name in ("K", "D"))
     width, height = _size(storage, file) or (width, height)
-    fisheye = bool(_whole(storage, "fisheye")) or _ros_model(storage, file) in _ROS_FISHEYES
+    fisheye = _is_fisheye(storage, file)
     if K is None or K.size != 9:
         raise SourceError("expected a matrix of 3 x 3 numbers", file=file, field="camera_matrix")
     K = K.reshape(3, 3)
-    unread = [name for name in storage if _is_distortion(name, storage[name])]
+    unread = [name for name in storage if tells_distortion(name, storage[name])]
     if D is None and unread:
         raise SourceError(
             f"expected this name for the distortion; {unread[0]!r} is not known here",
@@ -194,6 +193,10 @@ def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
             field="distortion_coefficients",
         )
     terms = terms[:8]
+    if any(terms) and lens_kind(_MODEL, storage.get(_MODEL), file) == "pinhole":
+        raise SourceError(
+            f"found {storage[_MODEL]!r}, but distortion coefficients that are not 0", file=file, field=_MODEL
+        )
     if abs(K[0, 1]) > 1e-6 * abs(K[0, 0]):
         raise SourceError(f"a skew of {K[0, 1]:g}; expected 0", file=file, field="camera_matrix")
     if fisheye:
@@ -207,11 +210,22 @@ def _opencv(text: str, width: int, height: int, file: Path) -> _Described:
     return _Described(model, K, terms, width, height)
 
 
-def _is_distortion(name: str, value: Any) -> bool:
-    """Whether an entry tells of distortion, by its name; terms of their own that are zero tell of none."""
-    if re.fullmatch(r"[kp][1-6]", name):
-        return str(value).strip() not in ("0", "0.", "0.0")
-    return "dist" in name.lower() and name not in _OPENCV_NAMES["model"]
+def _is_fisheye(storage: Mapping[str, Any], file: Path) -> bool:
+    """Whether the entries that name a lens say that it is a fisheye; without any it is none.
+
+    Raises:
+        SourceError: a lens that is not known here, or entries that contradict each other.
+    """
+    told = {name: lens_kind(name, value, file) for name, value in storage.items()}
+    fisheye, others = (
+        [name for name, kind in told.items() if kind == wanted] for wanted in ("fisheye", "polynomial")
+    )
+    if fisheye and others:
+        name, other = fisheye[0], others[0]
+        raise SourceError(
+            f"found {storage[name]!r}, a fisheye, but {other} is {storage[other]!r}", file=file, field=name
+        )
+    return bool(fisheye)
 
 
 def _size(storage: Mapping[str, Any], file: Path) -> tuple[int, int] | None:
@@ -257,27 +271,6 @@ def _matrix(storage: Mapping[str, Any], key: str, file: Path) -> np.ndarray | No
         return numbers if shape is None else numbers.reshape(shape)
     except (KeyError, OverflowError, TypeError, ValueError) as error:
         raise SourceError(f"expected numbers: {error}", file=file, field=name) from error
-
-
-def _ros_model(storage: Mapping[str, Any], file: Path) -> str | None:
-    """What ROS calls the model of the distortion; None where the file does not say."""
-    model = _node(storage, "model")
-    if model is None:
-        return None
-    if model not in _ROS_MODELS:
-        raise SourceError(
-            f"found {model!r}; expected {', '.join(_ROS_MODELS)}", file=file, field="distortion_model"
-        )
-    return str(model)
-
-
-def _whole(storage: Mapping[str, Any], key: str) -> int:
-    """A whole number; 0 where it is not there."""
-    found = _node(storage, key)
-    try:
-        return 0 if found is None else int(float(found))
-    except (OverflowError, TypeError, ValueError):
-        return 0
 
 
 def _kalibr(text: str, file: Path) -> _Described:

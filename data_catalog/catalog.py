@@ -17,9 +17,8 @@ from data_catalog.checks import check_sequence
 from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
 from data_catalog.detail import DetailSize, source_detail
 from data_catalog.folders import FolderDataset
+from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
-from data_catalog.readers.dicom import DICOM_SUFFIXES
-from data_catalog.readers.video import VIDEO_SUFFIXES
 from data_catalog.specular import with_specular
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError

@@ -1,9 +1,9 @@
 """Checks that every sequence passes before anything else sees it.
 
 What is refused: non-finite or mirrored poses, intrinsics that are no pinhole, depth with NaN, infinity or
-negative values (0 is the one mark for "unknown"; a reader whose format has others turns them into 0), a
-frame without any valid depth or mask, a split that leaks, and camera axes or a depth scale that depth itself
-contradicts. What is readable but questionable is reported by `data_catalog.diagnostics`.
+negative values (0 is the one mark for "unknown"; files' NaN and infinity were turned into 0), depth that is
+known in no frame, a frame without any valid mask, a split that leaks, and camera axes or a depth scale that
+depth itself contradicts. What is readable but questionable is reported by `data_catalog.diagnostics`.
 """
 
 from __future__ import annotations
@@ -74,6 +74,8 @@ def check_sequence(sequence: EndoscopicSequence, *, file: object = None) -> None
             check_pose(sequence.world_from_camera[index], frame=name, file=file)
         if sequence.depth_mm is not None:
             check_depth(sequence.depth_mm[index], frame=name, file=file)
+    if sequence.depth_mm is not None and not any((depth > 0).any() for depth in sequence.depth_mm):
+        raise SourceError("no pixel of any frame has a depth", file=file, field="depth_mm")
     check_axes(sequence, file=file)
     check_depth_scale(sequence, file=file)
 
@@ -134,7 +136,7 @@ def check_intrinsics(
 
 
 def check_depth(depth_mm: Float[np.ndarray, "h w"], *, frame: object = None, file: object = None) -> None:
-    """Refuse a depth map with values that are no depth; 0 means unknown.
+    """Refuse a depth map with values that are no depth; 0 means unknown, and may stand throughout.
 
     Raises:
         SourceError: names the kind of value and how many there are.
@@ -154,8 +156,6 @@ def check_depth(depth_mm: Float[np.ndarray, "h w"], *, frame: object = None, fil
                 frame=frame,
                 field="depth_mm",
             )
-    if not (depth_mm > 0).any():
-        raise SourceError("no pixel has a depth", file=file, frame=frame, field="depth_mm")
 
 
 def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
@@ -170,7 +170,7 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
     """
     if sequence.world_from_camera is None or sequence.depth_mm is None:
         return
-    pairs = neighbouring_frames(sequence)
+    pairs = _comparable_pairs(sequence)
     if not pairs:
         return
     poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
@@ -208,8 +208,10 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
         SourceError: another factor, at least 1.5 times more or less, fits much better.
         PoseError: no motion at all fits much better, and no factor much better than that.
     """
-    pairs = neighbouring_frames(sequence)
-    if sequence.world_from_camera is None or sequence.depth_mm is None or not pairs:
+    if sequence.world_from_camera is None or sequence.depth_mm is None:
+        return
+    pairs = _comparable_pairs(sequence)
+    if not pairs:
         return
     poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
     as_given = _reprojection_error(sequence, poses, pairs)
@@ -272,6 +274,14 @@ def neighbouring_frames(sequence: EndoscopicSequence, at_most: int = _CHECKED_PA
         return neighbours
     chosen = np.round(np.linspace(0, len(neighbours) - 1, at_most)).astype(int)
     return [neighbours[int(k)] for k in chosen]
+
+
+def _comparable_pairs(sequence: EndoscopicSequence) -> list[tuple[int, int]]:
+    """Of `neighbouring_frames` those with depth in both: others tell nothing of axes and units."""
+    depth = sequence.depth_mm
+    if depth is None:
+        return []
+    return [pair for pair in neighbouring_frames(sequence) if all((depth[index] > 0).any() for index in pair)]
 
 
 def _reprojection_error(

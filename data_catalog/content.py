@@ -18,12 +18,21 @@ logger = logging.getLogger(__name__)
 
 _DARK = 14
 """A pixel whose brightest channel stays below this belongs to the frame round the picture."""
+_CORNER_SHARE = 0.04
+"""Of width and height, of the squares in the four corners that tell how dark a frame is that is not black."""
+_NEARLY_DARK, _LARGEST_DARK = 12, 40
+_CORNERS_ALIKE = 4
+"""So much may values in the corners differ, between corners, pixels and frames."""
+_ABOVE_SURROUND = 6
 _MARGIN_SHARE = 0.006
 """The picture's rim is blurred: so much of the image width is cut off all round."""
 _LARGEST_DENT = 0.05
 _CIRCLE_TRIALS = 400
 _CIRCLE_TOLERANCE_SHARE = 0.006
 _CIRCLE_INLIERS = 0.75
+_CIRCLE_KEEPS = 0.9
+"""Share of the lit region that lies in the circle round it. A dark round lumen at the image border has a
+round rim, too, with the picture outside."""
 _MIN_FRAMES = 4
 _MAX_FRAMES = 32
 _LARGEST_WIDTH = 640
@@ -58,15 +67,19 @@ class Circle:
         return np.asarray(np.hypot(x, y) <= self.radius_px - margin_px)
 
 
-def view_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
+def view_mask(rgb: UInt8[np.ndarray, "f h w 3"], dark_below: int = _DARK) -> Bool[np.ndarray, "h w"]:
     """False in the dark frame round an endoscope's picture, whatever its shape.
 
     A pixel is outside when it is dark in every frame and joined to the image border by such pixels: a dark
     lumen in the middle stays inside.
+
+    Args:
+        rgb: frames of one recording.
+        dark_below: a pixel is dark whose brightest channel is below this.
     """
     import cv2
 
-    dark = (rgb.max(axis=(0, 3)) < _DARK).astype(np.uint8)
+    dark = (rgb.max(axis=(0, 3)) < dark_below).astype(np.uint8)
     _, labels = cv2.connectedComponents(dark, connectivity=4)
     border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     outside = np.isin(labels, np.setdiff1d(border, 0)) & (dark > 0)
@@ -80,9 +93,10 @@ def content_circle(rgb: UInt8[np.ndarray, "f h w 3"]) -> Circle | None:
     by RANSAC (seeded) and least squares. Text and logos beside the picture are no part of that region.
 
     Returns:
-        None where the rim is no circle, or the picture fills the image.
+        None where the rim is no circle, the picture lies outside of it, or the picture fills the image.
     """
-    rim = _rim(_largest(view_mask(rgb)))
+    region = _largest(view_mask(rgb, _dark_below(rgb)))
+    rim = _rim(region)
     height, width = rgb.shape[1:3]
     if len(rim) < 0.25 * height:
         return None
@@ -104,7 +118,9 @@ def content_circle(rgb: UInt8[np.ndarray, "f h w 3"]) -> Circle | None:
     share = float((np.abs(np.hypot(*(rim - found[:2]).T) - found[2]) < tolerance).mean())
     if share < _CIRCLE_INLIERS:
         return None
-    return Circle(float(found[0]), float(found[1]), float(found[2]), share)
+    circle = Circle(float(found[0]), float(found[1]), float(found[2]), share)
+    kept = region & circle.mask(width, height)
+    return circle if kept.sum() >= _CIRCLE_KEEPS * region.sum() else None
 
 
 def overlay_mask(
@@ -181,7 +197,7 @@ def content_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
     circle = content_circle(small)
     margin = max(1.0, _MARGIN_SHARE * small.shape[2])
     inside = (
-        _picture(view_mask(small), margin)
+        _picture(view_mask(small, _dark_below(small)), margin)
         if circle is None
         else circle.mask(small.shape[2], small.shape[1], margin)
     )
@@ -190,6 +206,26 @@ def content_mask(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:
         return np.asarray(found)
     share = cv2.resize(found.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
     return np.asarray(share > 0.999)
+
+
+def _dark_below(rgb: UInt8[np.ndarray, "f h w 3"]) -> int:
+    """Below which value of the brightest channel a pixel may belong to the frame round the picture.
+
+    A frame that is not quite black, as of a video whose black level was left at 16, is told by the corners:
+    all four are of one value that stays from frame to frame, and the picture is brighter.
+    """
+    frames, height, width = rgb.shape[:3]
+    rows, columns = (max(4, round(_CORNER_SHARE * size)) for size in (height, width))
+    if frames < _MIN_FRAMES or 2 * rows > height or 2 * columns > width:
+        return _DARK
+    ends = [(slice(size), slice(-size, None)) for size in (rows, columns)]
+    corners = np.stack([rgb[:, down, right].max(axis=-1) for down in ends[0] for right in ends[1]])
+    low, high = int(corners.min()), int(corners.max())
+    dark_below = high + _ABOVE_SURROUND
+    if high - low > _CORNERS_ALIKE or not _NEARLY_DARK <= high <= _LARGEST_DARK:
+        return _DARK
+    middle = rgb[:, height // 4 : -(height // 4), width // 4 : -(width // 4)].max(axis=-1)
+    return dark_below if np.median(middle) > 2 * dark_below else _DARK
 
 
 def _picture(seen: Bool[np.ndarray, "h w"], margin_px: float) -> Bool[np.ndarray, "h w"]:

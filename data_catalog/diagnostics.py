@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable, Iterator
-from typing import Literal
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
-from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict
+from jaxtyping import Bool, Float
 
 from data_catalog.checks import axis_readings, reading_name
+from data_catalog.findings import Finding, warning
 from data_catalog.images import natural_key
 from data_catalog.matches import match_neighbours, pose_support
+from data_catalog.sampling import OFF_CENTRE_SHARE
 from extrags.cameras import Cameras, invert_poses, rotation_angle_deg
+from extrags.frame_quantiles import median_of_frames
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "diagnose"]
@@ -32,80 +33,64 @@ _POOR_SUPPORT = 0.4
 _EXPOSURE_JUMP = 0.5
 _EXPOSURE_DEVIATIONS = 8.0
 _MIN_BASELINE_SHARE = 0.02
-_OFF_CENTRE_SHARE = 0.2
 _JUMP = 8.0
 _CLIPPED_SHARE = 0.02
 _SATURATED_SHARE = 0.6
 _BLACK = 4.0
 
 
-class Finding(BaseModel):
-    """One thing that is wrong with a source, or looks so."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    kind: Literal["error", "warning"]
-    """An error stops a run; a warning makes its result worse or questionable."""
-    topic: str
-    """What it is about, in a word or two."""
-    sentence: str
-    """What was found, what was expected, what to do."""
-    file: str | None = None
-    frame: str | None = None
-    field: str | None = None
-
-    def __str__(self) -> str:
-        where = [
-            f"{label} {value}"
-            for label, value in (("file", self.file), ("frame", self.frame), ("field", self.field))
-            if value is not None
-        ]
-        return f"{', '.join(where)}: {self.sentence}" if where else self.sentence
-
-
-def diagnose(sequence: EndoscopicSequence, file: str) -> list[Finding]:
+def diagnose(sequence: EndoscopicSequence, file: str, *, thinned: bool = False) -> list[Finding]:
     """Everything questionable about a sequence.
+
+    Frames are looked at one after another: of long recordings they do not fit into memory together.
 
     Args:
         sequence: as a reader made it.
         file: the source, named in findings.
+        thinned: whether frames were left out on purpose, so that gaps in their numbering tell nothing.
     """
     found: list[Finding] = []
-    for check in _CHECKS:
+    for check in _CHECKS if thinned else (_missing, *_CHECKS):
         found += [finding.model_copy(update={"file": file}) for finding in check(sequence)]
     return found
 
 
-def _warning(topic: str, sentence: str, *, frame: str | None = None, field: str | None = None) -> Finding:
-    return Finding(kind="warning", topic=topic, sentence=sentence, frame=frame, field=field)
+def _late(names: list[str]) -> int | None:
+    """The first frame whose name comes before that of the one in front of it."""
+    keys = [natural_key(name) for name in names]
+    return next((k for k in range(1, len(keys)) if keys[k] < keys[k - 1]), None)
 
 
-def _names(sequence: EndoscopicSequence) -> Iterator[Finding]:
-    """Frames out of order, and single frames that are missing from a regular numbering."""
+def _order(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Frames out of order."""
     for members in _recordings(sequence):
         names = [sequence.frame_name(k) for k in members]
-        keys = [natural_key(name) for name in names]
-        late = next((k for k in range(1, len(keys)) if keys[k] < keys[k - 1]), None)
+        late = _late(names)
         if late is not None:
-            yield _warning(
+            yield warning(
                 "order of frames",
                 f"listed after {names[late - 1]}, though its name comes before; neighbours in the list are "
                 "taken for neighbours in time. List the frames in the order of recording",
                 frame=names[late],
                 field="frame names",
             )
+
+
+def _missing(sequence: EndoscopicSequence) -> Iterator[Finding]:
+    """Single frames that are missing from a regular numbering."""
+    for members in _recordings(sequence):
+        names = [sequence.frame_name(k) for k in members]
+        numbers = [_number(name) for name in names]
+        steps = [after - before for before, after in itertools.pairwise(numbers)]
+        if len(steps) < 6 or min(numbers) < 0 or _late(names) is not None:
             continue
-        numbers = np.array([_number(name) for name in names])
-        steps = np.diff(numbers)
-        if len(steps) < 6 or (numbers < 0).any():
-            continue
-        usual = int(np.median(steps))
-        gaps = np.flatnonzero(steps != usual)
-        if usual > 0 and 0 < gaps.size <= max(1, len(steps) // 20):
-            gap = int(gaps[0])
-            yield _warning(
+        usual = sorted(steps)[len(steps) // 2]
+        gaps = [k for k, step in enumerate(steps) if step != usual]
+        if usual > 0 and 0 < len(gaps) <= max(1, len(steps) // 20):
+            gap = gaps[0]
+            yield warning(
                 "missing frame",
-                f"the next frame is {names[gap + 1]}, {int(steps[gap])} on; all others are {usual} apart. "
+                f"the next frame is {names[gap + 1]}, {steps[gap]} on; all others are {usual} apart. "
                 "Frames are missing between the two",
                 frame=names[gap],
                 field="frame names",
@@ -118,7 +103,7 @@ def _images(sequence: EndoscopicSequence) -> Iterator[Finding]:
     for index in range(len(sequence)):
         digest = hashlib.blake2b(sequence.rgb[index].tobytes(), digest_size=16).digest()
         if digest in seen:
-            yield _warning(
+            yield warning(
                 "duplicate frame",
                 f"the same image as frame {sequence.frame_name(seen[digest])}, pixel by pixel; remove one",
                 frame=sequence.frame_name(index),
@@ -128,24 +113,28 @@ def _images(sequence: EndoscopicSequence) -> Iterator[Finding]:
         seen[digest] = index
     means = _brightness(sequence)
     for index in np.flatnonzero(means < _BLACK)[:1]:
-        yield _warning(
+        yield warning(
             "black frame",
             f"mean brightness {means[index]:.1f} of 255 inside the mask; {int((means < _BLACK).sum())} of "
             f"{len(means)} frames are like that. Leave them out",
             frame=sequence.frame_name(int(index)),
             field="rgb",
         )
-    red, _, blue = (float(sequence.rgb[..., channel][sequence.mask].mean()) for channel in range(3))
+    sums, saturated, inside = np.zeros(3), 0, max(1, sum(int(mask.sum()) for mask in sequence.mask))
+    for image, mask in zip(sequence.rgb, sequence.mask, strict=True):
+        sums += image[mask].sum(axis=0, dtype=np.float64)
+        saturated += int((saturated_mask(image) & mask).sum())
+    red, _, blue = (float(value) for value in sums / inside)
     if blue > 1.15 * red and blue > 20:
-        yield _warning(
+        yield warning(
             "colour channels",
             f"blue ({blue:.0f}) outweighs red ({red:.0f}) on average, which tissue never shows: the channels "
             "are probably swapped (BGR for RGB)",
             field="rgb",
         )
-    share = float(saturated_mask(sequence.rgb)[sequence.mask].mean())
+    share = saturated / inside
     if share > _SATURATED_SHARE:
-        yield _warning(
+        yield warning(
             "saturation",
             f"{share:.0%} of the pixels inside the mask are saturated in some channel; their colour is lost "
             "and does not train. Record darker",
@@ -165,7 +154,7 @@ def _exposure(sequence: EndoscopicSequence) -> Iterator[Finding]:
     jumps = [(k, step) for k, step in steps if abs(step) > limit]
     if jumps:
         frame, step = jumps[0]
-        yield _warning(
+        yield warning(
             "exposure jump",
             f"{np.exp(step):.2f} times as bright as the frame before ({len(jumps)} such jumps; neighbours "
             f"usually differ by {np.exp(np.median(np.abs(values))) - 1:.0%}). Fix exposure and gain when "
@@ -177,12 +166,10 @@ def _exposure(sequence: EndoscopicSequence) -> Iterator[Finding]:
 
 def _masks(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Masks that keep the dark frame and leave the picture out."""
-    inside, outside = sequence.mask, ~sequence.mask
-    share = float(outside.mean())
-    if share < 0.02:
+    kept = np.array([float(mask.mean()) for mask in sequence.mask])
+    if 1 - kept.mean() < 0.02:
         return
-    brightness = sequence.rgb.max(axis=-1)
-    lit_inside, lit_outside = (float((brightness[part] > 25).mean()) for part in (inside, outside))
+    lit_inside, lit_outside = _shares(sequence, (image.max(axis=-1) > 25 for image in sequence.rgb))
     if lit_inside < 0.3 and lit_outside > 0.6:
         yield Finding(
             kind="error",
@@ -193,8 +180,7 @@ def _masks(sequence: EndoscopicSequence) -> Iterator[Finding]:
         )
         return
     if sequence.depth_mm is not None:
-        known_inside = float((sequence.depth_mm[inside] > 0).mean())
-        known_outside = float((sequence.depth_mm[outside] > 0).mean())
+        known_inside, known_outside = _shares(sequence, (depth > 0 for depth in sequence.depth_mm))
         if known_inside < 0.2 and known_outside > 0.8:
             yield Finding(
                 kind="error",
@@ -204,10 +190,9 @@ def _masks(sequence: EndoscopicSequence) -> Iterator[Finding]:
                 field="mask",
             )
             return
-    kept = sequence.mask.mean(axis=(1, 2))
     if kept.min() < 0.05:
         index = int(kept.argmin())
-        yield _warning(
+        yield warning(
             "mask",
             f"the mask keeps {kept[index]:.1%} of the image",
             frame=sequence.frame_name(index),
@@ -230,8 +215,7 @@ def _intrinsics(sequence: EndoscopicSequence) -> Iterator[Finding]:
                 f"first two rows by {across:.2g}"
             )
         elif (
-            abs(cx - width / 2) > _OFF_CENTRE_SHARE * width
-            or abs(cy - height / 2) > _OFF_CENTRE_SHARE * height
+            abs(cx - width / 2) > OFF_CENTRE_SHARE * width or abs(cy - height / 2) > OFF_CENTRE_SHARE * height
         ):
             problem = (
                 f"the principal point ({cx:.1f}, {cy:.1f}) lies far from the centre of {width} x {height} "
@@ -248,7 +232,7 @@ def _intrinsics(sequence: EndoscopicSequence) -> Iterator[Finding]:
                 "endoscopes have 40 to 140 as a pinhole. Does fx belong to another image size?"
             )
         if problem:
-            yield _warning("intrinsics", problem, frame=sequence.frame_name(index), field="K")
+            yield warning("intrinsics", problem, frame=sequence.frame_name(index), field="K")
             return
 
 
@@ -281,7 +265,7 @@ def _poses(sequence: EndoscopicSequence) -> Iterator[Finding]:
     )
     distance = _scene_distance(sequence)
     if reach == 0 and turn < 1e-6:
-        yield _warning(
+        yield warning(
             "parallax",
             "all training frames have the same pose: the camera stands still, or the poses are placeholders. "
             "Nothing can be triangulated; depth alone carries the shape",
@@ -296,7 +280,7 @@ def _poses(sequence: EndoscopicSequence) -> Iterator[Finding]:
 
 def _parallax(reach: float, distance: float) -> Iterator[Finding]:
     if reach < _MIN_BASELINE_SHARE * distance:
-        yield _warning(
+        yield warning(
             "parallax",
             f"the training cameras reach over {reach:.3g}, {reach / distance:.1%} of the distance to the "
             f"scene ({distance:.3g}); expected at least {_MIN_BASELINE_SHARE:.0%}. Too little parallax to "
@@ -315,7 +299,7 @@ def _pose_steps(sequence: EndoscopicSequence, members: list[int]) -> Iterator[Fi
     for k in range(len(steps)):
         same = steps[k] == 0 and np.array_equal(rotations[k], rotations[k + 1])
         if same and usual > 0 and not np.array_equal(sequence.rgb[members[k]], sequence.rgb[members[k + 1]]):
-            yield _warning(
+            yield warning(
                 "repeated pose",
                 f"the same pose as frame {sequence.frame_name(members[k])}, but another image",
                 frame=sequence.frame_name(members[k + 1]),
@@ -327,7 +311,7 @@ def _pose_steps(sequence: EndoscopicSequence, members: list[int]) -> Iterator[Fi
     detour = steps[:-1] + steps[1:] - straight
     worst = int(detour.argmax())
     if usual > 0 and detour[worst] > _JUMP * max(usual, float(straight[worst])):
-        yield _warning(
+        yield warning(
             "pose jump",
             f"lies {steps[worst]:.3g} from the frame before and {steps[worst + 1]:.3g} from the one after, "
             f"which are {straight[worst]:.3g} apart (usual step {usual:.3g}); its pose is probably wrong",
@@ -391,7 +375,7 @@ def _epipolar(sequence: EndoscopicSequence) -> Iterator[Finding]:
             field="world_from_camera",
         )
     elif support.as_given < _POOR_SUPPORT:
-        yield _warning(
+        yield warning(
             "poses",
             f"the poses explain {support.as_given:.0%} of {support.matches} feature matches between "
             f"neighbouring frames, and no other reading of the axes does convincingly ({support.best:.0%} at "
@@ -407,29 +391,35 @@ def _depth(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Clip values that were not marked as unknown, and maps that hardly know anything."""
     if sequence.depth_mm is None:
         return
-    known = sequence.depth_mm > 0
-    largest = float(sequence.depth_mm.max())
-    share = float((sequence.depth_mm == largest).sum() / max(1, known.sum()))
+    depths = sequence.depth_mm
+    largest = max(depth.max() for depth in depths)
+    known = sum(int((depth > 0).sum()) for depth in depths)
+    share = sum(int((depth == largest).sum()) for depth in depths) / max(1, known)
     steps = np.unique(sequence.depth_mm[0])
     if share > _CLIPPED_SHARE and len(steps) > 32:
-        yield _warning(
+        yield warning(
             "depth clipped",
             f"{share:.1%} of the known depths are exactly {largest:.6g}, the largest value: a clip value "
             "that is not marked as unknown. Write 0 there",
             field="depth_mm",
         )
     elif len(steps) <= 32:
-        yield _warning(
+        yield warning(
             "depth resolution",
             f"the first frame has {len(steps)} different depths; expected a continuous map. Was it stored in "
             "8 bits or as a picture?",
             frame=sequence.frame_name(0),
             field="depth_mm",
         )
-    shares = (known & sequence.mask).sum(axis=(1, 2)) / np.maximum(1, sequence.mask.sum(axis=(1, 2)))
+    shares = np.array(
+        [
+            ((depth > 0) & mask).sum() / max(1, mask.sum())
+            for depth, mask in zip(depths, sequence.mask, strict=True)
+        ]
+    )
     if shares.min() < 0.1:
         index = int(shares.argmin())
-        yield _warning(
+        yield warning(
             "depth coverage",
             f"depth is known for {shares[index]:.1%} of the pixels inside the mask",
             frame=sequence.frame_name(index),
@@ -438,7 +428,7 @@ def _depth(sequence: EndoscopicSequence) -> Iterator[Finding]:
 
 
 _CHECKS: tuple[Callable[[EndoscopicSequence], Iterator[Finding]], ...] = (
-    _names,
+    _order,
     _images,
     _exposure,
     _masks,
@@ -464,22 +454,39 @@ def _neighbours(sequence: EndoscopicSequence) -> Iterator[tuple[int, int]]:
 
 def _number(name: str) -> int:
     """The last number of a name; -1 without any."""
-    numbers = [part for kind, part, _ in natural_key(name) if kind == 1]
-    return numbers[-1] if numbers else -1
+    numbers = [text for kind, _, text in natural_key(name) if kind == 1]
+    # Of zeros, no digit is left.
+    return int(numbers[-1] or 0) if numbers else -1
 
 
 def _brightness(sequence: EndoscopicSequence) -> Float[np.ndarray, "f"]:
     """Mean over the mask of the mean of the channels."""
-    grey = sequence.rgb.mean(axis=-1)
-    inside = np.maximum(1, sequence.mask.sum(axis=(1, 2)))
-    return np.asarray((grey * sequence.mask).sum(axis=(1, 2)) / inside)
+    frames = zip(sequence.rgb, sequence.mask, strict=True)
+    return np.array(
+        [image[mask].sum(dtype=np.float64) / (3 * max(1, int(mask.sum()))) for image, mask in frames]
+    )
+
+
+def _shares(sequence: EndoscopicSequence, frames: Iterable[Bool[np.ndarray, "h w"]]) -> tuple[float, float]:
+    """Share of the pixels that the mask keeps, and of those it leaves out, for which something holds.
+
+    Args:
+        sequence: whose mask it is.
+        frames: where it holds, one frame after another.
+    """
+    within, beyond = 0, 0
+    for holds, mask in zip(frames, sequence.mask, strict=True):
+        within += int((holds & mask).sum())
+        beyond += int((holds & ~mask).sum())
+    inside = sum(int(mask.sum()) for mask in sequence.mask)
+    return within / max(1, inside), beyond / max(1, sequence.mask.size - inside)
 
 
 def _scene_distance(sequence: EndoscopicSequence) -> float | None:
     """Median distance from cameras to what they see; None where neither depth nor points tell."""
     if sequence.depth_mm is not None:
-        known = sequence.depth_mm > 0
-        return float(np.median(sequence.depth_mm[known])) if known.any() else None
+        depths = sequence.depth_mm
+        return median_of_frames(lambda: (depth[depth > 0] for depth in depths))
     if sequence.points is None or not len(sequence.points):
         return None
     _, z = sequence.cameras.project(sequence.points)

@@ -14,6 +14,7 @@ from data_catalog.c3vd import reader as c3vd
 from data_catalog.calibration_files import with_calibration_file
 from data_catalog.dataset import Descriptor, Source
 from data_catalog.folder_reader import FolderReader, understood
+from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
 from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.posed_frames import assembled
 from data_catalog.readers import (
@@ -141,11 +142,11 @@ def _recognised(path: Path) -> FolderReader:
     if not path.is_dir():
         raise SourceError(
             "this is a file; expected a folder that holds a sequence, a video "
-            f"({', '.join(video.VIDEO_SUFFIXES)}) or a DICOM file ({', '.join(dicom.DICOM_SUFFIXES)})",
+            f"({', '.join(VIDEO_SUFFIXES)}) or a DICOM file ({', '.join(DICOM_SUFFIXES)})",
             file=path,
         )
-    for kind, suffixes in (("videos", video.VIDEO_SUFFIXES), ("DICOM files", dicom.DICOM_SUFFIXES)):
-        found = video.files_of_kind(path, suffixes)
+    for kind, suffixes in (("videos", VIDEO_SUFFIXES), ("DICOM files", DICOM_SUFFIXES)):
+        found = files_of_kind(path, suffixes)
         if len(found) > 1:
             raise SourceError(
                 f"{len(found)} {kind} in this folder: {_listed(found)}; give the path of the one to read",

@@ -11,7 +11,16 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-__all__ = ["Footage", "FootageFrame", "TimeSpan"]
+from data_catalog.images import natural_key
+
+__all__ = ["DICOM_SUFFIXES", "VIDEO_SUFFIXES", "Footage", "FootageFrame", "TimeSpan", "files_of_kind"]
+
+DICOM_SUFFIXES = (".dcm", ".dicom")
+VIDEO_SUFFIXES = (
+    *(".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".mxf", ".y4m"),
+    # Transport streams and discs of recorders, and what telephones and older programs write.
+    *(".ts", ".m2ts", ".mts", ".m2t", ".vob", ".m2v", ".3gp", ".3g2", ".asf", ".flv", ".ogv"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,3 +84,18 @@ class Footage(Protocol):
         Raises:
             SourceError: nothing can be decoded, or less than the header announces.
         """
+
+
+def files_of_kind(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Files with one of the suffixes directly in a folder, in natural order; hidden ones are none.
+
+    Args:
+        folder: that may hold them.
+        suffixes: of the kind, in small letters.
+    """
+    found = [
+        file
+        for file in folder.iterdir()
+        if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
+    ]
+    return sorted(found, key=lambda file: natural_key(file.name))

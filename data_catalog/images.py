@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,10 +22,12 @@ from extrags.sequence import EndoscopicSequence
 
 __all__ = [
     "COLOUR_SUFFIXES",
+    "UPRIGHT",
     "Resampling",
     "colour_files",
     "image_size",
     "natural_key",
+    "orientation",
     "read_colour",
     "read_depth",
     "read_mask",
@@ -34,6 +37,10 @@ __all__ = [
 
 BITS_PER_SAMPLE = 258
 """Tag of TIFF."""
+_ORIENTATION = 274
+"""Tag of EXIF."""
+UPRIGHT = 1
+"""Orientation of images whose pixels lie as they are shown."""
 _TIFF_SIGNATURES = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 COLOUR_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _MASK_THRESHOLD = 127
@@ -59,17 +66,27 @@ def colour_files(folder: Path) -> list[Path]:
     """Image files directly in a folder, in natural order.
 
     Hidden ones are none: macOS leaves `._NAME` with attributes beside each file on disks of others.
+
+    Raises:
+        SourceNotFoundError: one of them is a link to a file that is not there.
     """
-    found = [
+    named = [
         file
         for file in folder.iterdir()
-        if file.suffix.lower() in COLOUR_SUFFIXES and not file.name.startswith(".") and file.is_file()
+        if file.suffix.lower() in COLOUR_SUFFIXES and not file.name.startswith(".")
     ]
-    return sorted(found, key=lambda file: natural_key(file.name))
+    found = sorted(named, key=lambda file: natural_key(file.name))
+    for file in found:
+        if file.is_symlink() and not file.exists():
+            # Left out, it would be a frame that nobody misses.
+            raise SourceNotFoundError(f"a link to {file.readlink()}, which is not there", file=file)
+    return [file for file in found if file.is_file()]
 
 
 def read_colour(file: Path, *, frame: object = None) -> UInt8[np.ndarray, "h w 3"]:
     """Read an image as 8-bit RGB; of files with more bits the high ones, alpha is dropped.
+
+    Pixels are those of the file, whatever its EXIF orientation says (`orientation`).
 
     Raises:
         SourceNotFoundError: there is no such file.
@@ -106,6 +123,29 @@ def image_size(file: Path, *, frame: object = None) -> tuple[int, int]:
 
     with _image_errors(file, frame, "rgb"), Image.open(file) as image:
         return image.size
+
+
+def orientation(file: Path) -> int:
+    """How viewers turn an image that `read_colour` has read: EXIF's 1 to 8, `UPRIGHT` where nothing says so.
+
+    COLMAP and instant-ngp take pixels as they are stored, and so does `read_colour`; OpenCV turns them. Of a
+    TIFF, the orientation is part of its layout: Pillow has applied it, and nothing is left to turn.
+    """
+    from PIL import Image
+
+    if file.suffix.lower() not in COLOUR_SUFFIXES:
+        return UPRIGHT
+    try:
+        with warnings.catch_warnings(), _image_errors(file, None, "rgb"), Image.open(file) as image:
+            warnings.simplefilter("ignore")
+            # Pillow would decode a whole PNG to look for EXIF data behind the pixels.
+            if image.format == "TIFF" or (image.format == "PNG" and "exif" not in image.info):
+                return UPRIGHT
+            found = image.getexif().get(_ORIENTATION, UPRIGHT)
+    except SourceError:
+        # The pixels were read: what is damaged is what describes them, and that says nothing.
+        return UPRIGHT
+    return found if found in range(1, 9) else UPRIGHT
 
 
 def read_mask(file: Path, *, frame: object = None) -> Bool[np.ndarray, "h w"]:

@@ -13,15 +13,19 @@ from pydantic import BaseModel, ConfigDict
 
 from data_catalog.catalog import read, resolve
 from data_catalog.dataset import Source
-from data_catalog.diagnostics import Finding, diagnose
+from data_catalog.diagnostics import diagnose
+from data_catalog.findings import Finding, warning
 from data_catalog.folders import find_reader
+from data_catalog.readers import dicom, video
 from data_catalog.specular import specular_masks
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
+from extrags.frame_quantiles import quantile_of_frames
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
 
+_FOOTAGE = (video.READER.name, dicom.READER.name)
 _TILE_WIDTH = 240
 _MAX_TILES = 30
 
@@ -76,7 +80,10 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
         except ExtragsError as error:
             findings = [_as_finding(error)]
     if sequence is not None and source is not None:
-        findings = diagnose(sequence, source.path or source.name)
+        # Of footage the reader itself chooses frames.
+        thinned = source.format in _FOOTAGE or (config is not None and config.max_frames is not None)
+        findings = diagnose(sequence, source.path or source.name, thinned=thinned)
+        findings += [item.model_copy(update={"file": source.path or source.name}) for item in heard.findings]
     return Inspection(
         name=source.name if source is not None else str(name_or_path),
         format=source.format if source is not None else None,
@@ -94,6 +101,9 @@ def facts(sequence: EndoscopicSequence) -> dict[str, Any]:
     """
     K = sequence.K
     inside = max(1, int(sequence.mask.sum()))
+    # Frame by frame: what is made of all of them at once would be as large as they are.
+    frames = zip(sequence.rgb, sequence.mask, strict=True)
+    saturated = sum(int((saturated_mask(image) & mask).sum()) for image, mask in frames)
     specular = specular_masks(sequence.rgb, sequence.mask) if sequence.specular is None else sequence.specular
     result: dict[str, Any] = {
         "frames": len(sequence),
@@ -115,21 +125,24 @@ def facts(sequence: EndoscopicSequence) -> dict[str, Any]:
         "points": 0 if sequence.points is None else len(sequence.points),
         "masked_share": float(1 - sequence.mask.mean()),
         "specular_share": float(specular.sum() / inside),
-        "saturated_share": float((saturated_mask(sequence.rgb) & sequence.mask).sum() / inside),
+        "saturated_share": saturated / inside,
     }
     if sequence.world_from_camera is not None:
         centers = sequence.cameras.centers
         result["path_length"] = float(np.linalg.norm(np.diff(centers, axis=0), axis=1).sum())
         result["reach"] = float(np.linalg.norm(np.ptp(centers, axis=0)))
     if sequence.depth_mm is not None:
-        known = sequence.depth_mm > 0
-        low, middle, high = np.percentile(sequence.depth_mm[known], [1, 50, 99]) if known.any() else (0, 0, 0)
-        result["depth_known_share"] = float((known & sequence.mask).sum() / inside)
-        result["depth"] = {"p1": float(low), "median": float(middle), "p99": float(high)}
+        depths = sequence.depth_mm
+        known = zip(depths, sequence.mask, strict=True)
+        result["depth_known_share"] = sum(int(((depth > 0) & mask).sum()) for depth, mask in known) / inside
+        result["depth"] = {
+            name: quantile_of_frames(lambda: (depth[depth > 0] for depth in depths), share) or 0.0
+            for name, share in (("p1", 0.01), ("median", 0.5), ("p99", 0.99))
+        }
     if sequence.observed is not None and len(sequence.test):
-        shown = sequence.mask[sequence.test]
-        seen = sequence.observed[sequence.test] & shown
-        result["observed_share"] = float(seen.sum() / max(1, int(shown.sum())))
+        shown = sum(int(sequence.mask[index].sum()) for index in sequence.test)
+        seen = sum(int((sequence.observed[index] & sequence.mask[index]).sum()) for index in sequence.test)
+        result["observed_share"] = seen / max(1, shown)
     return result
 
 
@@ -148,8 +161,9 @@ def contact_sheet(sequence: EndoscopicSequence) -> UInt8[np.ndarray, "h w 3"]:
         else sequence.specular[chosen]
     )
     farthest = 1.0
-    if sequence.depth_mm is not None and (sequence.depth_mm > 0).any():
-        farthest = float(np.percentile(sequence.depth_mm[sequence.depth_mm > 0], 99))
+    if sequence.depth_mm is not None:
+        depths = sequence.depth_mm
+        farthest = quantile_of_frames(lambda: (depth[depth > 0] for depth in depths), 0.99) or farthest
     height = round(_TILE_WIDTH * sequence.height / sequence.width)
     tiles = []
     for index, shine in zip(chosen.tolist(), specular, strict=True):
@@ -198,9 +212,15 @@ class _HeardWarnings(logging.Handler):
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
         self.messages: list[str] = []
+        self.findings: list[Finding] = []
+        """Of warnings that have a topic: what a sequence does not show any more."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.messages.append(record.getMessage())
+        topic = getattr(record, "topic", None)
+        if topic is None:
+            self.messages.append(record.getMessage())
+        else:
+            self.findings.append(warning(topic, record.getMessage(), field="K"))
 
     def __enter__(self) -> _HeardWarnings:
         logging.getLogger("data_catalog").addHandler(self)

@@ -136,8 +136,8 @@ def _supporting(
         relative = invert_poses(poses[match.second][None])[0] @ poses[match.first]
         rotation, shift = relative[:3, :3], relative[:3, 3]
         K_first, K_second = sequence.K[match.first], sequence.K[match.second]
-        here = unproject_pixels(match.first_px, K_first)
-        there = unproject_pixels(match.second_px, K_second)
+        here = unproject_pixels(match.first_px, K_first, sequence.lens)
+        there = unproject_pixels(match.second_px, K_second, sequence.lens)
         length = float(np.linalg.norm(shift))
         if length < 1e-12:
             continue

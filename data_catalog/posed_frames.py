@@ -17,7 +17,15 @@ from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.checks import check_depth, check_intrinsics, check_pose
 from data_catalog.guessed_intrinsics import fitted_to_picture
-from data_catalog.images import COLOUR_SUFFIXES, read_colour, read_depth, read_mask, spread
+from data_catalog.images import (
+    COLOUR_SUFFIXES,
+    UPRIGHT,
+    orientation,
+    read_colour,
+    read_depth,
+    read_mask,
+    spread,
+)
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from data_catalog.splits import every_nth
 from data_catalog.visibility import observed_by_depth
@@ -36,6 +44,8 @@ __all__ = ["MaskFinder", "PosedFrame", "SourceFrames", "assembled"]
 logger = logging.getLogger(__name__)
 
 _EXACT_POSE = 1e-14
+_BRIGHTEST_OF_12_BITS = 16
+"""Of 255: values of 12 bits in files of 16 stay below."""
 
 
 @dataclass(frozen=True)
@@ -152,7 +162,8 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         name: of the sequence.
 
     Raises:
-        SourceError: a file is wrong or of another size than its camera; names file, frame and field.
+        SourceError: a file is wrong or of another size than its camera, or all pictures are black; names
+            file, frame and field.
         PoseError: a pose that is no rigid motion.
         ConfigError: a size that the source cannot give.
     """
@@ -167,6 +178,8 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
     for index, frame in enumerate(kept, start=source.looked_at + 1):
         pixels.read(frame)
         emit(Progress("ingest", index, source.looked_at + len(kept)))
+    pixels.tell(kept)
+    _tell_about_orientation(kept)
     K = np.stack([pixels.samplings[frame.lens].K for frame in kept])
     rgb, mask = pixels.colours.array, pixels.masks(kept)
     if source.intrinsics == "guessed":
@@ -212,6 +225,8 @@ class _Pixels:
         self.samplings: dict[CameraModel, Sampling] = {}
         self.colours = FrameStack(count)
         self.depths = FrameStack(count)
+        self.brightest = 0
+        self.unfinite: dict[Path, int] = {}
         # Many frames share one file: it is read again only when another one, or another lens, comes.
         self._last_mask: tuple[Path | None, CameraModel, Bool[np.ndarray, "h w"]] | None = None
         self._masks: list[Bool[np.ndarray, "h w"] | None] = []
@@ -224,17 +239,51 @@ class _Pixels:
         sampling = self._sampling(frame)
         sampled = sampling.colour(image, file=frame.file, frame=frame.label)
         sampled = self.colours.append(sampled)
+        self.brightest = max(self.brightest, int(sampled.max()))
         if frame.mask_file is None and source.masks is not None:
             source.masks.see(frame, image, sampled)
             self._masks.append(None)
         else:
             self._masks.append(self._mask(frame, sampling))
         if frame.depth_file is not None:
-            depth = source.read_depth(frame.depth_file, frame.label)
+            depth = self._known(source.read_depth(frame.depth_file, frame.label), frame.depth_file)
             # Before shrinking, so that row, column and count are those of the file.
             check_depth(depth, frame=frame.label, file=frame.depth_file)
             _check_size(depth, frame, frame.depth_file, "depth", None)
             self.depths.append(sampling.depth(depth, file=frame.depth_file, frame=frame.label))
+
+    def tell(self, frames: Sequence[PosedFrame]) -> None:
+        """Say what reading found out about the frames as a whole.
+
+        Raises:
+            SourceError: when nothing is brighter than what 12 bits reach in files of 16.
+        """
+        if self.brightest < _BRIGHTEST_OF_12_BITS:
+            raise SourceError(
+                f"nothing in any frame is brighter than {self.brightest} of 255; expected pictures that use "
+                "the whole range. Grey of 12 bits in files of 16 looks like that: multiply it by 16, so that "
+                "4095 becomes 65520",
+                file=frames[0].file,
+                frame=frames[0].label,
+                field="rgb",
+            )
+        if self.unfinite:
+            logger.warning(
+                "%s: %d depth values in %d of %d frames, this one first, are NaN or infinite, and taken as "
+                "unknown",
+                next(iter(self.unfinite)),
+                sum(self.unfinite.values()),
+                len(self.unfinite),
+                len(frames),
+            )
+
+    def _known(self, depth: Float[np.ndarray, "h w"], file: Path) -> Float[np.ndarray, "h w"]:
+        """Depth with 0 where it is not finite, which is counted."""
+        finite = np.isfinite(depth)
+        if finite.all():
+            return depth
+        self.unfinite[file] = int((~finite).sum())
+        return np.where(finite, depth, np.float32(0))
 
     def lens(self, frames: Sequence[PosedFrame], file: Path) -> RadialLens | None:
         """The lens of all frames that were read; None for pinholes.
@@ -287,6 +336,18 @@ class _Pixels:
                 _check_size(mask, frame, file, "mask", None)
             self._last_mask = (file, lens, sampling.mask(mask, file=file, frame=frame.label))
         return self._last_mask[2]
+
+
+def _tell_about_orientation(frames: Sequence[PosedFrame]) -> None:
+    turned = [frame for frame in frames if orientation(frame.file) != UPRIGHT]
+    if turned:
+        logger.warning(
+            "%s: %d of %d images, this one first, are turned by viewers (EXIF orientation), and read as they "
+            "are stored, as by COLMAP; masks, depth, intrinsics and poses have to belong to stored pixels",
+            turned[0].file,
+            len(turned),
+            len(frames),
+        )
 
 
 def _check_for_all_or_none(source: SourceFrames, field: str, values: Sequence[object]) -> None:

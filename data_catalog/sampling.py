@@ -22,6 +22,10 @@ __all__ = ["CameraModel", "LensSampling", "Sampling", "keeps_central_resolution"
 
 logger = logging.getLogger(__name__)
 
+MUCH_LEFT_OUT = 0.2
+"""Share of a lens's image that its pinhole may leave out without a warning."""
+OFF_CENTRE_SHARE = 0.2
+"""Of width and height: farther from the image's centre no principal point is expected."""
 LARGEST_FIT_ERROR_PX = 1.0
 """A radial model that is farther from the calibrated lens, in pixels of the sequence, is refused: root mean
 square over the image."""
@@ -139,7 +143,7 @@ class LensSampling:
             box: left, top, width and height to keep, in pixels; None keeps all.
 
         Raises:
-            ConfigError: a size that the source cannot give.
+            ConfigError: a size that the source cannot give, or that its several lenses cannot share.
         """
         undistortion = None
         width, height = lens.width, lens.height
@@ -151,6 +155,8 @@ class LensSampling:
                 lens, config.field_of_view_deg, size=_enlarged_size(lens, config, first)
             )
             height, width = undistortion.valid.shape
+        elif isinstance(first, LensSampling):
+            first.check_shared_with(lens, config)
         resampling = (
             first.resampling
             if isinstance(first, LensSampling)
@@ -158,6 +164,8 @@ class LensSampling:
         )
         if undistortion is None:
             return cls(None, resampling, resampling.intrinsics(lens.K))
+        if first is None and config.field_of_view_deg is None:
+            _tell_what_is_left_out(lens, undistortion)
         return cls(undistortion, resampling, resampling.intrinsics(undistortion.K))
 
     @classmethod
@@ -204,6 +212,24 @@ class LensSampling:
                 "frames of several lenses cannot keep their pixels; take ingest.lens=pinhole", field="lens"
             )
         return cls(None, resampling, resampling.intrinsics(found.K), found.lens, found.roll_rad)
+
+    def check_shared_with(self, pinhole: Lens, config: IngestConfig) -> None:
+        """Refuse frames of a pinhole beside those of a lens whose pinhole was enlarged: these share no size.
+
+        Raises:
+            ConfigError: names both sizes, and the settings.
+        """
+        sizes = self.resampling
+        wider = self.undistortion is not None and config.field_of_view_deg is not None
+        enlarged = wider and keeps_central_resolution(config)
+        if not enlarged or (pinhole.width, pinhole.height) == (sizes.source_width, sizes.source_height):
+            return
+        raise ConfigError(
+            f"frames of a pinhole keep their {pinhole.width} x {pinhole.height} pixels, and those of a "
+            f"distorted lens, which come first, become {sizes.source_width} x {sizes.source_height} by "
+            "ingest.size=central and ingest.field_of_view_deg; give ingest.width or ingest.downscale, or "
+            "leave the field of view out"
+        )
 
     @cached_property
     def source_share(self) -> Float[np.ndarray, "h2 w2"]:
@@ -265,6 +291,31 @@ class LensSampling:
         """
         straight = depth if self.undistortion is None else self.undistortion.depth(depth)
         return self.resampling.depth(straight, file=file, frame=frame)
+
+
+def _tell_what_is_left_out(lens: Lens, plan: Undistortion) -> None:
+    """Warn where the pinhole of a lens shows much less than the lens; `data check` makes a finding of it."""
+    left_out = 1 - float((source_areas(plan.u, plan.v) * plan.valid).sum()) / (lens.width * lens.height)
+    if left_out <= MUCH_LEFT_OUT:
+        return
+    off_centre = np.abs(lens.K[:2, 2] / (lens.width, lens.height) - 0.5).max()
+    reason = (
+        "that is far from the centre: was the image cropped, or does the lens belong to another size?"
+        if off_centre > OFF_CENTRE_SHARE
+        else "the lens is wider than this; a larger ingest.field_of_view_deg shows more of it, and "
+        "ingest.lens=native all"
+    )
+    logger.warning(
+        "the pinhole leaves out %.0f %% of the source's image of %d x %d pixels, whose principal point is "
+        "(%.1f, %.1f): %s",
+        100 * left_out,
+        lens.width,
+        lens.height,
+        lens.K[0, 2],
+        lens.K[1, 2],
+        reason,
+        extra={"topic": "lens"},
+    )
 
 
 def source_areas(u: Float[np.ndarray, "h w"], v: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -8,10 +8,10 @@ frames that come after are compared with the last one before.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
+
+from extrags.dense_flow import DenseFlow
 
 __all__ = ["ShotFinder", "followed_share"]
 
@@ -33,9 +33,7 @@ class ShotFinder:
     """Numbers the shots of a recording, frame by frame. It keeps two small frames and no more."""
 
     def __init__(self) -> None:
-        import cv2
-
-        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._flow = DenseFlow()
         self._before: UInt8[np.ndarray, "h w"] | None = None
         self._anchor: UInt8[np.ndarray, "h w"] | None = None
         self._cut_at = 0
@@ -85,7 +83,7 @@ class ShotFinder:
 def followed_share(
     before: UInt8[np.ndarray, "h w"],
     after: UInt8[np.ndarray, "h w"],
-    flow: Any = None,
+    flow: DenseFlow | None = None,
 ) -> float:
     """Share of the lit pixels that can be followed from one frame into the next.
 
@@ -96,13 +94,12 @@ def followed_share(
     """
     import cv2
 
-    flow = flow or cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow = flow or DenseFlow()
     lit = after > _LIT
     if not lit.any():
         # Into the dark and out of it nothing can be followed.
         return 1.0 if not (before > _LIT).any() else 0.0
-    back: Float[np.ndarray, "h w 2"] = flow.calc(after, before, None)
-    forth: Float[np.ndarray, "h w 2"] = flow.calc(before, after, None)
+    back, forth = flow.between(after, before), flow.between(before, after)
     x, y = np.meshgrid(
         np.arange(after.shape[1], dtype=np.float32), np.arange(after.shape[0], dtype=np.float32)
     )

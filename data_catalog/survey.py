@@ -12,8 +12,7 @@ Which shot is the longest is counted in seconds, by the timestamps of the frames
 the frame rate varies, the two differ.
 
 Source: sharpness as the mean absolute Laplacian over the mean brightness, after Pertuz et al., "Analysis of
-focus measure operators for shape-from-focus", Pattern Recognition 2013; flow: Kroeger et al., "Fast optical
-flow using dense inverse search", ECCV 2016 (OpenCV's DIS).
+focus measure operators for shape-from-focus", Pattern Recognition 2013; flow: `extrags.dense_flow`.
 """
 
 from __future__ import annotations
@@ -29,6 +28,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from data_catalog.footage import FootageFrame, TimeSpan
 from data_catalog.interlacing import is_combed, is_interlaced
 from data_catalog.shots import ShotFinder
+from extrags.dense_flow import DenseFlow
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
 
@@ -137,9 +137,7 @@ def survey(
     Raises:
         SourceError: there is no frame, or frames of different sizes.
     """
-    import cv2
-
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+    flow = DenseFlow()
     shots = ShotFinder()
     numbers: list[int] = []
     times_s: list[float] = []
@@ -165,7 +163,7 @@ def survey(
         if not shots.see(grey) or reference is None:
             # Nothing can be measured across a cut: the path goes on from here.
             reference, behind = grey, path[-1] if path else 0.0
-        moved = _moved(flow.calc(reference, grey, None), reference, grey)
+        moved = _moved(flow.between(reference, grey), reference, grey)
         path.append(max(behind + moved, path[-1] if path else 0.0))
         if moved >= _PLAIN_MOVE:
             reference, behind = grey, path[-1]

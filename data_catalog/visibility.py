@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import Cameras, pixel_rays
+from extrags.events import Progress, emit
 from extrags.frame_stacks import empty_stack
 from extrags.sequence import Split
 
@@ -25,7 +26,7 @@ def observed_from_depth(
 
     A point of a held-out frame is observed when it falls into a training image and lies no farther than
     that image's depth (the farthest of the four pixels round it, so that rounding at slanted walls does
-    not hide it).
+    not hide it). After each held-out frame it emits progress: there are as many tests as pairs of frames.
 
     Args:
         cameras: all frames.
@@ -39,7 +40,7 @@ def observed_from_depth(
         True where observed, [F, H, W]; false in training frames and where depth is unknown.
     """
     observed = empty_stack(depth_mm.shape, bool)
-    for index in test:
+    for done, index in enumerate(test, start=1):
         known = depth_mm[index] > 0
         rays = pixel_rays(cameras[int(index)])[0][known]
         points = cameras.centers[index] + rays * depth_mm[index][known][:, None].astype(np.float64)
@@ -53,6 +54,7 @@ def observed_from_depth(
             depth = depth_mm[other]
             seen[left] = _in_front(points[left], cameras[int(other)], depth, tolerance_share, tolerance_mm)
         observed[index][known] = seen
+        emit(Progress("ingest", done, len(test)))
     return observed
 
 

@@ -287,7 +287,7 @@ class Undistortion:
         inside &= (u >= 0.5) & (u <= width - 0.5) & (v >= 0.5) & (v <= height - 0.5)
         return cls(pinhole, u, v, inside)
 
-    def image(self, image: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "h w *c"]:
+    def image(self, image: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "h2 w2 *c"]:
         """Values of any number of channels, float32, bilinear; zero where nothing was seen."""
         import cv2
 
@@ -297,7 +297,7 @@ class Undistortion:
         moved[~self.valid] = 0
         return np.asarray(moved)
 
-    def colour(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
+    def colour(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
         """Colours, bilinear; black where nothing was seen."""
         import cv2
 
@@ -305,7 +305,7 @@ class Undistortion:
         moved[~self.valid] = 0
         return np.asarray(moved)
 
-    def mask(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+    def mask(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h2 w2"]:
         """True where all source pixels that a sample touches are true, and the lens saw it."""
         import cv2
 
@@ -314,7 +314,7 @@ class Undistortion:
         )
         return np.asarray((moved > 0.999) & self.valid)
 
-    def depth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    def depth(self, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h2 w2"]:
         """z-depth, never mixed across a fold; 0 where unknown."""
         return np.where(self.valid, sample_depth(depth, self.u, self.v), 0).astype(np.float32)
 

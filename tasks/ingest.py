@@ -7,7 +7,8 @@ from typing import Any
 
 from data_catalog import Source
 from extrags.config import IngestConfig
-from extrags.store import Ref, Slot
+from extrags.errors import SourceError
+from extrags.store import Ref, Slot, digest_of
 from tasks.stage import stage
 
 __all__ = ["ingest", "training_frames"]
@@ -32,15 +33,23 @@ def ingest(
         fingerprint: of its content, and of the calibration file's.
         config: settings without `calibration`, whose path is not part of the key.
         calibration: path of the calibration file; None without.
+
+    Raises:
+        SourceError: what reading raises, or files that are others than when the fingerprint was taken: the
+            artefact would stand under the key of other content.
     """
     from data_catalog import read
-    from data_catalog.catalog import measured_detail
+    from data_catalog.catalog import measured_detail, source_fingerprint
     from data_catalog.detail import detail_size
     from extrags.sequence import saturated_mask
 
     config = config.model_copy(update={"calibration": calibration})
     asked = measured_detail(source, config)
     sequence = read(source, config if asked is None else asked.applied_to(config))
+    # By content, as for the key: of files that are decoded, that is a small part of the time.
+    if digest_of(source_fingerprint(source, config)) != digest_of(fingerprint):
+        problem = "the files changed while they were read; run again"
+        raise SourceError(problem, file=source.path or source.name)
     slot.save(sequence)
     detail = asked or detail_size(sequence, config.detail_psnr_db)
     log.info("%s: frames hold %s", sequence.name, detail)

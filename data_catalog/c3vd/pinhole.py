@@ -36,6 +36,8 @@ USUAL_WIDTH = 225
 """Of thumbnails (`ingest.size`): the whole divisor that comes nearest to this."""
 
 _LARGEST_SUPERSAMPLE = 16
+_REACH_PX = 2
+"""A bicubic sample takes colours from pixels so far from the one that it lies in."""
 
 
 @dataclass(frozen=True)
@@ -179,15 +181,20 @@ class PinholeResampling:
     def mask(
         self, mask: Bool[np.ndarray, "h w"], *, file: object = None, frame: object = None
     ) -> Bool[np.ndarray, "h2 w2"]:
-        """True where all of the footprint is true and inside the source image.
+        """True where the footprint, and all that its interpolation reaches, is true and in the source image.
 
         Raises:
             SourceError: the mask is not of the camera's size.
         """
+        import cv2
+
         self._check_size(mask, "mask", file, frame)
+        kernel = np.ones((2 * _REACH_PX + 1, 2 * _REACH_PX + 1), np.uint8)
+        # The image border takes nothing away: colours repeat it.
+        clear = cv2.erode(mask.astype(np.uint8), kernel) > 0
         column = np.clip(np.rint(self.samples[..., 0]).astype(int), 0, self.camera.width - 1)
         row = np.clip(np.rint(self.samples[..., 1]).astype(int), 0, self.camera.height - 1)
-        return np.asarray(self.inside & _all_of_block(mask[row, column], self.supersample))
+        return np.asarray(self.inside & _all_of_block(clear[row, column], self.supersample))
 
     def _check_size(self, array: np.ndarray, field: str, file: object, frame: object) -> None:
         if array.shape[:2] != (self.camera.height, self.camera.width):

@@ -41,8 +41,8 @@ __all__ = ["READER", "open_recording", "pair_files", "pair_frames"]
 logger = logging.getLogger(__name__)
 
 EVALUATES, TRAINS = 0, 1
-# Interpolation at the edge of a dark frame reaches this far into it.
 _FRAME_MARGIN_PX = 2
+"""Of a dark frame, beside it: its edge is blurred."""
 
 
 @dataclass(frozen=True)
@@ -265,9 +265,12 @@ class _DarkFrameMask:
         """The mask of a frame's recording."""
         import cv2
 
-        inside = view_mask(self._brightest[frame.recording][None]).astype(np.uint8)
-        size = 2 * _FRAME_MARGIN_PX + 1
-        return sampling.mask(np.asarray(cv2.erode(inside, np.ones((size, size), np.uint8))) > 0)
+        inside = view_mask(self._brightest[frame.recording][None])
+        if not isinstance(sampling, PinholeResampling):
+            # A pinhole's grid keeps as far from the frame by itself: interpolation reaches into it.
+            size = 2 * _FRAME_MARGIN_PX + 1
+            inside = np.asarray(cv2.erode(inside.astype(np.uint8), np.ones((size, size), np.uint8)) > 0)
+        return sampling.mask(inside)
 
 
 def _observed_on(

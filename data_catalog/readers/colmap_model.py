@@ -222,7 +222,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="colmap",
-    version=5,
+    version=6,
     summary="a COLMAP model in sparse/0/ with images/, described in data_catalog/readers/colmap_model.py",
     recognises=_recognises,
     files=_files,
@@ -364,7 +364,8 @@ def _is_metric(folder: Path) -> bool:
     file = folder / LENGTH_UNIT_FILE
     if not file.is_file():
         return False
-    unit = file.read_text(encoding="utf-8", errors="replace").strip()
+    # Editors on Windows put a mark at the beginning.
+    unit = file.read_text(encoding="utf-8-sig", errors="replace").strip()
     if unit not in ("mm", "arbitrary"):
         raise SourceError(
             f"{unit!r} is no length unit known here; expected mm or arbitrary", file=file, field="length_unit"
@@ -375,7 +376,7 @@ def _is_metric(folder: Path) -> bool:
 def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train", "test"]]:
     known = {image.name for image in images}
     file = folder / "test_list.txt"
-    training, held_out = _listed(folder / "train_list.txt"), _listed(file)
+    training, held_out = _listed(folder / "train_list.txt", known), _listed(file, known)
     unknown = sorted((held_out or set()) - known, key=natural_key)
     if unknown:
         raise SourceError(
@@ -389,14 +390,20 @@ def _splits(folder: Path, images: list[ColmapImage]) -> dict[str, Literal["train
     return listed_split(known, training & known if training else None, held_out, file=file)
 
 
-def _listed(file: Path) -> set[str] | None:
-    """Names in a list, one to a line; None where there is no such file."""
+def _listed(file: Path, known: set[str]) -> set[str] | None:
+    """Names in a list, one to a line; None where there is no such file.
+
+    Args:
+        file: with or without the mark that editors on Windows put at the beginning.
+        known: names in the model. Blanks about a name are left out, unless it has them there.
+    """
     if not file.is_file():
         return None
     try:
-        return {line.removesuffix("\r") for line in file.read_text(encoding="utf-8").split("\n")} - {"", "\r"}
+        lines = file.read_text(encoding="utf-8-sig").split("\n")
     except UnicodeDecodeError as error:
         raise SourceError(f"not a text file: {error}", file=file, field="split") from error
+    return {line if line in known else line.strip() for line in lines} - {""}
 
 
 def _tell_about_unposed(root: Path, posed: set[str]) -> None:

@@ -1,9 +1,9 @@
 """Reader of a DICOM multi-frame file: read like a video; poses come later.
 
 A file with one of `DICOM_SUFFIXES`, a file without suffix that begins as DICOM files do, or a folder that
-holds one such file and no images. Needs pydicom, which the extra `dicom` brings. Beside the file, both
-optional: `intrinsics.json` and `mask.png`, as in `data_catalog.readers.frames_folder`. How frames are chosen
-and what is masked: `data_catalog.readers.footage_frames`.
+holds one such file and hardly any images, as with videos. Needs pydicom, which the extra `dicom` brings.
+Beside the file, both optional: `intrinsics.json` and `mask.png`, as in `data_catalog.readers.frames_folder`.
+How frames are chosen and what is masked: `data_catalog.readers.footage_frames`.
 
 Read are uncompressed and JPEG-compressed pixels (whatever pydicom decodes with Pillow), and the streams of
 MPEG-2, MPEG-4 and HEVC that video endoscopes store, which go to the reader of videos. Colours: RGB, YBR_FULL,
@@ -33,18 +33,17 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from data_catalog.folder_reader import FolderReader
-from data_catalog.footage import Footage, FootageFrame, TimeSpan
+from data_catalog.footage import DICOM_SUFFIXES, Footage, FootageFrame, TimeSpan
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames
-from data_catalog.readers.video import VideoFile, only_file, with_files_beside
+from data_catalog.readers.video import VideoFile, only_file, tell_about_stills, with_files_beside
 from extrags.config import IngestConfig
 from extrags.errors import ExtragsError, MissingDependencyError, SourceError, SourceNotFoundError
 
-__all__ = ["DICOM_SUFFIXES", "READER", "DicomFile", "open_dicom"]
+__all__ = ["READER", "DicomFile", "open_dicom"]
 
 logger = logging.getLogger(__name__)
 
-DICOM_SUFFIXES = (".dcm", ".dicom")
 _MAGIC_AT, _MAGIC = 128, b"DICM"
 _LOOKED_AT = (
     "Rows",
@@ -242,12 +241,13 @@ def _frames(place: Path, config: IngestConfig) -> SourceFrames:
     file = _dicom_file(place)
     if file is None:
         raise SourceNotFoundError("no DICOM file here", file=place)
+    tell_about_stills(place, file)
     return footage_frames(open_dicom(file), config)
 
 
 READER = FolderReader(
     name="dicom",
-    version=4,
+    version=5,
     summary="a DICOM multi-frame file (dcm), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

@@ -8,6 +8,9 @@
         depth/*.png             optional: z-depth in the unit of the poses, 8 or 16 bit; 0 = unknown
         masks/*.png             optional, also gt_masks/; of either polarity
 
+Other files in these folders, such as `depth/*.npy`, are not read, which a warning says where there are no
+images beside them.
+
 The matrix is LLFF's: columns are the camera's down, right and backward axes, its centre, and (height, width,
 focal length). They become OpenCV's (right, down, forward) on reading; the principal point is the image's
 centre. Lengths are those of the stereo reconstruction, millimetres in the published clips. EndoNeRF's own
@@ -70,6 +73,22 @@ def _part(folder: Path, names: tuple[str, ...]) -> list[Path]:
     return [] if found is None else colour_files(found)
 
 
+def _not_read(folder: Path) -> list[str]:
+    """Folders of masks or depth in which there are files, and none of them an image, as sentences."""
+    said = []
+    for field, names in (("masks", _MASK_FOLDERS), ("depth", _DEPTH_FOLDERS)):
+        place = next((folder / name for name in names if (folder / name).is_dir()), None)
+        if place is None or colour_files(place):
+            continue
+        others = sorted(file.name for file in place.iterdir() if file.is_file() and file.name[0] != ".")
+        if others:
+            said.append(
+                f"{place.name}/ holds no images, and what it holds is not read ({len(others)} files, the "
+                f"first is {others[0]}); expected {field} as one image for each frame"
+            )
+    return said
+
+
 def _recognises(folder: Path) -> bool:
     return (folder / POSES_FILE).is_file() and bool(_part(folder, _IMAGE_FOLDERS))
 
@@ -92,6 +111,8 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         )
     masks = _matching(_part(folder, _MASK_FOLDERS), images, "mask")
     depths = _matching(_part(folder, _DEPTH_FOLDERS), images, "depth")
+    for sentence in _not_read(folder):
+        logger.warning("%s: %s", folder, sentence)
     white_is_tissue = True
     if masks:
         polarity = mask_polarity(folder)

@@ -1,20 +1,23 @@
 """Reader of plain frames: a folder of images and nothing else; the poses stage finds the rest.
 
 Images lie in the folder itself, or in `images/` or `rgb/` below it, and are taken in natural order (9 before
-10). Optional beside them: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or
-`field_of_view_deg` (horizontal), in pixels of the files with centres at +0.5, of a pinhole; and `mask.png`
-(white is tissue). Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the
-log: the sequence's intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A
-calibration file (`ingest.calibration`) may stand in for both. Without a mask, the dark frame round the
-picture is found from all frames: dark everywhere, always, and joined to the image border; so are a round
-picture and burnt-in text (`data_catalog.content`).
+10). Where several of these hold images, those of the one with at least twice as many as any other are taken,
+and the others named in a warning; without such a one the source is refused. Woven (interlaced) images are
+read as they are, with a warning.
+
+Optional beside them: `intrinsics.json` with `K` (3 x 3), or `fx`, `fy`, `cx`, `cy`, or `field_of_view_deg`
+(horizontal), in pixels of the files with centres at +0.5, of a pinhole; and `mask.png` (white is tissue).
+Without intrinsics a horizontal field of view of 90 degrees is assumed, and said so in the log: the sequence's
+intrinsics are `guessed`, and the poses stage estimates them, lens distortion included. A calibration file
+(`ingest.calibration`) may stand in for both. Without a mask, the dark frame round the picture is found from
+all frames: dark everywhere, always, and joined to the image border; so are a round picture and burnt-in text
+(`data_catalog.content`).
 """
 
 from __future__ import annotations
 
 import json
 import logging
-import re
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +27,38 @@ from jaxtyping import Bool, Float, UInt8
 from data_catalog.checks import check_intrinsics
 from data_catalog.content import content_mask, looked_at
 from data_catalog.folder_reader import FolderReader
+from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
 from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
-from data_catalog.images import colour_files, image_size
+from data_catalog.images import colour_files, image_size, read_colour, spread
+from data_catalog.interlacing import is_combed, is_interlaced
+from data_catalog.lens_entries import lens_kind, tells_distortion
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.sampling import Sampling
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from extrags.lens import Lens
 
-__all__ = ["INTRINSICS_FILE", "MASK_FILE", "READER", "is_mask", "mask_beside", "read_intrinsics"]
+__all__ = [
+    "FEWEST_FRAMES",
+    "INTRINSICS_FILE",
+    "MASK_FILE",
+    "READER",
+    "is_mask",
+    "listed_files",
+    "mask_beside",
+    "places_with_frames",
+    "read_intrinsics",
+]
 
 logger = logging.getLogger(__name__)
 
 INTRINSICS_FILE = "intrinsics.json"
 MASK_FILE = "mask.png"
-_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+FEWEST_FRAMES = 4
+"""Fewer stills beside a video are pictures about it: poses could not be estimated from them."""
+_CLEARLY_MORE = 2
+_LOOKED_AT_FOR_COMBS = 12
+_NAMED_FILES = 3
 _SIZES = (("width", "height"), ("w", "h"))
 
 
@@ -61,17 +81,87 @@ def mask_beside(folder: Path, images: Path | None = None) -> Path | None:
     return found if found.is_file() else None
 
 
+def places_with_frames(folder: Path) -> dict[Path, list[Path]]:
+    """The frames in a folder itself, in `images/` and in `rgb/`, where there are any; the most first.
+
+    Raises:
+        SourceNotFoundError: a link to an image that is not there.
+    """
+    places = [place for place in (folder, folder / "images", folder / "rgb") if place.is_dir()]
+    found = {place: [file for file in colour_files(place) if not is_mask(file)] for place in places}
+    return {place: found[place] for place in sorted(found, key=lambda at: -len(found[at])) if found[place]}
+
+
+def listed_files(files: list[Path]) -> str:
+    """The names of some files, the first ones where there are many."""
+    more = f" and {len(files) - _NAMED_FILES} more" if len(files) > _NAMED_FILES else ""
+    return ", ".join(file.name for file in files[:_NAMED_FILES]) + more
+
+
 def _images(folder: Path) -> list[Path]:
-    for place in (folder, folder / "images", folder / "rgb"):
-        if place.is_dir():
-            found = [file for file in colour_files(place) if not is_mask(file)]
-            if found:
-                return found
-    return []
+    """The frames to read; none where there are none.
+
+    Raises:
+        SourceError: several places hold about as many.
+    """
+    found = places_with_frames(folder)
+    if not found:
+        return []
+    files, *others = found.values()
+    if others and len(files) < _CLEARLY_MORE * len(others[0]):
+        told = " and ".join(f"{len(there)} images {_said(at, folder)}" for at, there in found.items())
+        raise SourceError(
+            f"{told}; give the path of the folder to read, or move away what is not to be read", file=folder
+        )
+    return files
+
+
+def _said(place: Path, folder: Path) -> str:
+    return "in the folder itself" if place == folder else f"in {place.name}/"
 
 
 def _recognises(folder: Path) -> bool:
-    return bool(_images(folder))
+    if not folder.is_dir():
+        return False
+    most = max((len(files) for files in places_with_frames(folder).values()), default=0)
+    # A few pictures beside several videos are not what is meant.
+    return most >= FEWEST_FRAMES or (most > 0 and not _footage(folder))
+
+
+def _footage(folder: Path) -> list[Path]:
+    return files_of_kind(folder, (*VIDEO_SUFFIXES, *DICOM_SUFFIXES))
+
+
+def _tell_what_is_passed_over(folder: Path, files: list[Path]) -> None:
+    """Warn of images elsewhere in a folder, and of videos."""
+    for place, others in places_with_frames(folder).items():
+        if place != files[0].parent:
+            logger.warning(
+                "%s: images %s are not read (%s), only the %d %s",
+                folder,
+                _said(place, folder),
+                listed_files(others),
+                len(files),
+                _said(files[0].parent, folder),
+            )
+    if footage := _footage(folder):
+        logger.warning(
+            "%s: %d images are read, and not %s; give its path to read that instead",
+            folder,
+            len(files),
+            listed_files(footage),
+        )
+
+
+def _tell_whether_woven(folder: Path, files: list[Path]) -> None:
+    """Warn of images that show two moments each."""
+    looked_at = [files[k] for k in spread(len(files), _LOOKED_AT_FOR_COMBS)]
+    if is_interlaced([is_combed(read_colour(file, frame=file.name)) for file in looked_at]):
+        logger.warning(
+            "%s: interlaced: each image shows two moments, woven line by line, and is read as it is; "
+            "give the video they were taken from, of which single moments are read, or deinterlace them",
+            folder,
+        )
 
 
 def _files(folder: Path) -> list[Path]:
@@ -83,6 +173,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     files = _images(folder)
     if not files:
         raise SourceNotFoundError("no image in this folder", file=folder)
+    _tell_what_is_passed_over(folder, files)
     width, height = image_size(files[0], frame=files[0].name)
     K = read_intrinsics(folder, width, height, guess_is_used=config.calibration is None)
     lens = Lens.pinhole(K, width, height)
@@ -91,6 +182,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         for place in (folder / "mask", folder / "masks"):
             if place.is_dir():
                 logger.warning("%s is not read; of plain frames, one mask.png holds for all", place)
+    _tell_whether_woven(folder, files)
     return SourceFrames(
         frames=[PosedFrame(file.name, file, lens, mask_file=mask_file) for file in files],
         pose_file=folder,
@@ -122,7 +214,7 @@ class _ContentMask:
 
 READER = FolderReader(
     name="frames",
-    version=6,
+    version=7,
     summary="plain images in the folder, in images/ or in rgb/, optionally with intrinsics.json and mask.png",
     recognises=_recognises,
     files=_files,
@@ -196,9 +288,7 @@ def _check_described(content: dict[str, Any], width: int, height: int, file: Pat
         SourceError: names the entry.
     """
     for name, value in content.items():
-        is_model = name in ("camera_model", "model") and str(value).upper() not in _PINHOLES
-        is_term = "dist" in name.lower() or re.fullmatch(r"[kp][1-6]", name) is not None
-        if is_model or (is_term and np.any(np.asarray(value) != 0)):
+        if tells_distortion(name, value) or _names_other_lens(name, value, file):
             raise SourceError(
                 f"{json.dumps(value)}; expected a pinhole here. A lens with distortion is told by a "
                 "calibration file (ingest.calibration)",
@@ -213,3 +303,13 @@ def _check_described(content: dict[str, Any], width: int, height: int, file: Pat
                 file=file,
                 field=names[0],
             )
+
+
+def _names_other_lens(name: str, value: Any, file: Path) -> bool:
+    """Whether an entry names a lens that is no pinhole, or one that is not known."""
+    try:
+        kind = lens_kind(name, value, file)
+    except SourceError:
+        return True
+    # A model of distortion is a pinhole's where its terms are zero, and these are looked at by themselves.
+    return kind == "fisheye" or (kind == "polynomial" and name in ("camera_model", "model"))

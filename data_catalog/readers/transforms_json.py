@@ -5,7 +5,9 @@ nothing else), `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`, `cx`, `cy`,
 `p2`, `camera_model` or `is_fisheye`, each for all frames or in a frame of its own; `file_path` (its suffix
 may be missing; frames without a file are left out, with a warning), `mask_path` (white is tissue),
 `depth_file_path`; `train_filenames`, `test_filenames` and `val_filenames` (frames in none of them are left
-out); `ply_file_path`. Images of distorted cameras are resampled to a pinhole.
+out); `ply_file_path` (points that are not finite are left out, with a warning). A `null` is as good as no
+value. Images of distorted cameras are resampled to a pinhole; a term of distortion that the camera's model
+has not is refused, unless it is 0.
 
 Depth is z-depth; a value times `depth_unit_scale_factor` is in the unit of the poses. Where the file does not
 say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). 0 is unknown.
@@ -20,6 +22,7 @@ Source: https://docs.nerf.studio/quickstart/data_conventions.html.
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,20 +42,34 @@ from extrags.sequence import EndoscopicSequence
 
 __all__ = ["READER", "TRANSFORMS_FILE", "write_transforms"]
 
+logger = logging.getLogger(__name__)
+
 TRANSFORMS_FILE = "transforms.json"
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 _NERFSTUDIO_DEPTH_SCALE = 1e-3
 _MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "arbitrary": 1.0}
 _FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
+_DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def _recognises(folder: Path) -> bool:
     return (folder / TRANSFORMS_FILE).is_file()
 
 
+def _load(file: Path) -> dict[str, Any]:
+    """What the file holds, without keys whose value is null."""
+    content = load_frame_list(file, "file_path")
+    frames = [_stated(entry) for entry in content["frames"]]
+    return {**_stated(content), "frames": frames}
+
+
+def _stated(entry: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in entry.items() if value is not None}
+
+
 def _files(folder: Path) -> list[Path]:
     file = folder / TRANSFORMS_FILE
-    content = load_frame_list(file, "file_path")
+    content = _load(file)
     found = {file}
     for entry in content["frames"]:
         for key in _FILE_KEYS:
@@ -66,7 +83,7 @@ def _files(folder: Path) -> list[Path]:
 
 def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     file = folder / TRANSFORMS_FILE
-    content = load_frame_list(file, "file_path")
+    content = _load(file)
     unit = content.get("length_unit", "arbitrary")
     if not isinstance(unit, str) or unit not in _MM_PER_UNIT:
         raise SourceError(
@@ -120,7 +137,7 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
 
 READER = FolderReader(
     name="transforms",
-    version=5,
+    version=6,
     summary=f"{TRANSFORMS_FILE} of nerfstudio or instant-ngp, described in "
     "data_catalog/readers/transforms_json.py",
     recognises=_recognises,
@@ -255,9 +272,10 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
         "fy": fy,
         "cx": number("cx", width / 2),
         "cy": number("cy", height / 2),
-        **{key: number(key, 0.0) for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")},
+        **{key: number(key, 0.0) for key in _DISTORTION},
     }
-    model = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"))
+    stated = str(values.get("camera_model", "OPENCV_FISHEYE" if values.get("is_fisheye") else "OPENCV"))
+    model = stated
     if model in ("PINHOLE", "SIMPLE_PINHOLE") or (
         model == "OPENCV" and not any(named[key] for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     ):
@@ -266,13 +284,14 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
         model = "OPENCV"
     elif model == "OPENCV":
         # nerfstudio's OPENCV has k1 to k4 as a polynomial; COLMAP's has two, the full one puts k4 below.
-        if named["k4"]:
-            raise SourceError(
-                "k4 with camera_model OPENCV is not understood; expected OPENCV_FISHEYE or k4 = 0",
-                file=file,
-                frame=frame,
-                field="k4",
-            )
+        for key in ("k4", "k5", "k6"):
+            if named[key]:
+                raise SourceError(
+                    f"{key} with camera_model OPENCV is not understood; expected OPENCV_FISHEYE or {key} = 0",
+                    file=file,
+                    frame=frame,
+                    field=key,
+                )
         model = "FULL_OPENCV"
     names = LENS_PARAMETERS.get(model)
     if names is None or not set(names) <= set(named):
@@ -283,6 +302,15 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
             frame=frame,
             field="camera_model",
         )
+    for key in _DISTORTION:
+        if named[key] and key not in names:
+            raise SourceError(
+                f"{key} = {named[key]:g} with camera_model {stated}, which has no such term; expected the "
+                f"model that the camera was calibrated with, or {key} = 0",
+                file=file,
+                frame=frame,
+                field=key,
+            )
     try:
         return Lens(model, tuple(float(named[key]) for key in names), width, height)
     except SourceError as error:
@@ -337,13 +365,21 @@ def _points(
         located = np.stack([np.asarray(vertices[axis], dtype=np.float64) for axis in "xyz"], axis=1)
     except (OSError, TypeError, ValueError) as error:
         raise SourceError(f"no PLY with vertices: {error}", file=place, field="ply_file_path") from error
+    finite = np.isfinite(located).all(axis=1)
+    if not finite.all():
+        logger.warning(
+            "%s: %d of %d points are not finite and left out", place, int((~finite).sum()), len(located)
+        )
+    if not finite.any():
+        return None, None
     names = set(vertices.dtype.names or ())
     if not {"red", "green", "blue"} <= names:
-        return located, None
+        return located[finite], None
     coloured = [vertices[name] for name in ("red", "green", "blue")]
     if any(values.dtype.kind not in "fiu" for values in coloured):
         raise SourceError("colours are not numbers", file=place, field="ply_file_path")
-    return located, np.nan_to_num(np.stack(coloured, axis=1)).clip(0, 255).astype(np.uint8)
+    shades = np.nan_to_num(np.stack(coloured, axis=1)[finite]).clip(0, 255).astype(np.uint8)
+    return located[finite], shades
 
 
 def _write_points(

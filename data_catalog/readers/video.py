@@ -1,6 +1,7 @@
 """Reader of a video file: picks frames by motion and sharpness, masks what is not tissue; poses come later.
 
-A file with one of `VIDEO_SUFFIXES`, or a folder that holds one such file and no images. Beside the file, both
+A file with one of `VIDEO_SUFFIXES`, or a folder that holds one such file and fewer than four images, which a
+warning names (with more images in `images/` or `rgb/` it is refused). Beside the file, both
 optional: `intrinsics.json` and `mask.png`, as in `data_catalog.readers.frames_folder`; without the first a
 field of view of 90 degrees is assumed and said so until the poses stage estimates it, without the second the
 picture's outline and burnt-in text are found. How frames are chosen: `data_catalog.readers.footage_frames`.
@@ -24,23 +25,25 @@ import numpy as np
 from jaxtyping import UInt8
 
 from data_catalog.folder_reader import FolderReader
-from data_catalog.footage import FootageFrame, TimeSpan
-from data_catalog.images import colour_files, natural_key
+from data_catalog.footage import VIDEO_SUFFIXES, FootageFrame, TimeSpan, files_of_kind
+from data_catalog.images import colour_files
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames
-from data_catalog.readers.frames_folder import INTRINSICS_FILE, MASK_FILE, is_mask
+from data_catalog.readers.frames_folder import (
+    FEWEST_FRAMES,
+    INTRINSICS_FILE,
+    MASK_FILE,
+    is_mask,
+    listed_files,
+    places_with_frames,
+)
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 
-__all__ = ["READER", "VIDEO_SUFFIXES", "VideoFile", "files_of_kind", "only_file", "with_files_beside"]
+__all__ = ["READER", "VideoFile", "only_file", "tell_about_stills", "with_files_beside"]
 
 logger = logging.getLogger(__name__)
 
-VIDEO_SUFFIXES = (
-    *(".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".wmv", ".mxf", ".y4m"),
-    # Transport streams and discs of recorders, and what telephones and older programs write.
-    *(".ts", ".m2ts", ".mts", ".m2t", ".vob", ".m2v", ".3gp", ".3g2", ".asf", ".flv", ".ogv"),
-)
 _MIN_DECODED = 0.9
 _USUAL_FRAMES_PER_S = 25.0
 _COUNTS_WHAT_IS_HIDDEN = "mp4"
@@ -155,7 +158,7 @@ class VideoFile:
 
 
 def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
-    """The file that a path means: itself, or the only one of its kind in a folder without images; else None.
+    """The file that a path means: itself, or the only one of its kind in a folder without frames; else None.
 
     Args:
         place: a file or a folder.
@@ -166,23 +169,31 @@ def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
     if not place.is_dir():
         return None
     found = files_of_kind(place, suffixes)
-    images = [file for file in colour_files(place) if not is_mask(file)]
-    return found[0] if len(found) == 1 and not images else None
+    stills = [file for file in colour_files(place) if not is_mask(file)]
+    return found[0] if len(found) == 1 and len(stills) < FEWEST_FRAMES else None
 
 
-def files_of_kind(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    """Files with one of the suffixes directly in a folder, in natural order; hidden ones are none.
+def tell_about_stills(place: Path, file: Path) -> None:
+    """Warn of the few pictures that lie beside a footage and are not read.
 
     Args:
-        folder: that may hold them.
-        suffixes: of the kind, in small letters.
+        place: the folder that was given, or the footage itself, beside which nothing is looked for.
+        file: the footage in it.
+
+    Raises:
+        SourceError: there are so many in a folder below that these may be the frames that are meant.
     """
-    found = [
-        file
-        for file in folder.iterdir()
-        if file.suffix.lower() in suffixes and not file.name.startswith(".") and file.is_file()
-    ]
-    return sorted(found, key=lambda file: natural_key(file.name))
+    if place == file:
+        return
+    for folder, stills in places_with_frames(place).items():
+        if len(stills) >= FEWEST_FRAMES:
+            raise SourceError(
+                f"{file.name}, and {len(stills)} images in {folder.name}/; give the path of the one to read",
+                file=place,
+            )
+        logger.warning(
+            "%s: %s is read, and not the pictures beside it: %s", place, file.name, listed_files(stills)
+        )
 
 
 def with_files_beside(file: Path) -> list[Path]:
@@ -204,12 +215,13 @@ def _frames(place: Path, config: IngestConfig) -> SourceFrames:
     file = only_file(place, VIDEO_SUFFIXES)
     if file is None:
         raise SourceNotFoundError("no video here", file=place)
+    tell_about_stills(place, file)
     return footage_frames(VideoFile(file), config)
 
 
 READER = FolderReader(
     name="video",
-    version=5,
+    version=6,
     summary="a video file (mp4, avi, mov, mkv, ...), optionally with intrinsics.json and mask.png beside it",
     recognises=_recognises,
     files=_files,

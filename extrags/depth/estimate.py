@@ -150,7 +150,8 @@ def estimate_depth(
         stage: named in progress events.
 
     Raises:
-        CaptureError: with a single frame, or when all cameras stand in one place.
+        CaptureError: with a single frame, when all cameras stand in one place, or when all sparse points lie
+            behind the cameras.
         ConfigError: when a CUDA device is asked for and there is none.
         WeightsError: when the weights of a network cannot be read.
         MissingDependencyError: when a monocular network is asked for without the package it needs.
@@ -336,7 +337,15 @@ def _ranges(
         if inside.sum() >= MIN_POINTS:
             found[frame] = np.quantile(z[frame][inside], (0.02, 0.5, 0.98))
     together = np.concatenate(everything)
-    overall = np.quantile(together if len(together) else z[z > 0], (0.02, 0.5, 0.98))
+    if not len(together):
+        together = z[z > 0]
+    if not len(together):
+        raise CaptureError(
+            f"{sequence.name}: all {len(points)} sparse points lie behind all {count} cameras; expected "
+            "points in the world of the poses, in front of the cameras that saw them. Mend them, or take "
+            "them out of the source: then points are triangulated"
+        )
+    overall = np.quantile(together, (0.02, 0.5, 0.98))
     # A frame with few points may see what none of them lies on: it searches the whole scene's range.
     found = np.where(np.isnan(found), overall, found)
     low = np.minimum(found[:, 0], 0.5 * (found[:, 0] + overall[0]))

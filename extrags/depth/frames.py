@@ -21,6 +21,9 @@ ANGLE_SPREAD = 0.9
 MAX_TURN_DEG = 60.0
 """Frames whose optical axes differ by more share too little."""
 
+AT_ONCE = 64
+"""Candidates that are compared with a frame together."""
+
 
 @dataclass(frozen=True)
 class PosedFrames:
@@ -119,23 +122,16 @@ def select_sources(
         rays = pixels @ np.linalg.inv(K[frame]).T
         shells = np.concatenate([rays * typical_depth[frame] * share for share in (0.6, 1.0, 1.7)])
         points = shells @ world_from_camera[frame, :3, :3].T + centers[frame]
+        baseline = np.linalg.norm(centers - centers[frame], axis=1)
+        turn = np.degrees(np.arccos(np.clip(axes @ axes[frame], -1, 1)))
+        candidate = (baseline > 1e-9 * typical_depth[frame]) & (turn <= MAX_TURN_DEG)
+        candidate[frame] = False
         scores = np.zeros(frames)
-        for other in range(frames):
-            baseline = float(np.linalg.norm(centers[other] - centers[frame]))
-            turn = np.degrees(np.arccos(np.clip(axes[frame] @ axes[other], -1, 1)))
-            if other == frame or baseline <= 1e-9 * typical_depth[frame] or turn > MAX_TURN_DEG:
-                continue
-            local = points @ from_world[other, :3, :3].T + from_world[other, :3, 3]
-            z = np.maximum(local[:, 2], 1e-9)
-            u = K[other, 0, 0] * local[:, 0] / z + K[other, 0, 2]
-            v = K[other, 1, 1] * local[:, 1] / z + K[other, 1, 2]
-            seen = (local[:, 2] > 1e-6) & (u > 0) & (u < width) & (v > 0) & (v < height)
-            to_first, to_second = points - centers[frame], points - centers[other]
-            cosine = np.einsum("ni,ni->n", to_first, to_second)
-            cosine /= np.linalg.norm(to_first, axis=1) * np.linalg.norm(to_second, axis=1) + 1e-12
-            angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-            worth = np.exp(-0.5 * (np.log(np.maximum(angle, 1e-6) / BEST_ANGLE_DEG) / ANGLE_SPREAD) ** 2)
-            scores[other] = float((worth * seen).mean())
+        candidates = np.flatnonzero(candidate)
+        # Not all at once: of many frames, what lies between would not fit into the processor's caches.
+        for some in np.array_split(candidates, -(-len(candidates) // AT_ONCE)) if len(candidates) else ():
+            of_some = points, centers[frame], centers[some], from_world[some], K[some]
+            scores[some] = _shared_views(*of_some, width, height)
         for slot in range(chosen.shape[1]):
             best = int(np.argmax(scores))
             if scores[best] < 1e-3:
@@ -147,3 +143,36 @@ def select_sources(
             scores *= 1 - 0.6 * np.exp(-0.5 * (near / 0.5) ** 2)
             scores[best] = 0
     return chosen
+
+
+def _shared_views(
+    points: Float[np.ndarray, "n 3"],
+    center: Float[np.ndarray, "3"],
+    centers: Float[np.ndarray, "k 3"],
+    from_world: Float[np.ndarray, "k 4 4"],
+    K: Float[np.ndarray, "k 3 3"],
+    width: int,
+    height: int,
+) -> Float[np.ndarray, "k"]:
+    """How well candidates match a frame: the mean worth of angles, which is 0 where they do not see a point.
+
+    Args:
+        points: in world coordinates.
+        center: of the frame.
+        centers: of the candidates.
+        from_world: camera-from-world poses of the candidates.
+        K: intrinsics of the candidates in pixels.
+        width: of all images in pixels.
+        height: of all images in pixels.
+    """
+    local = points @ from_world[:, :3, :3].transpose(0, 2, 1) + from_world[:, None, :3, 3]
+    z = np.maximum(local[..., 2], 1e-9)
+    u = K[:, None, 0, 0] * local[..., 0] / z + K[:, None, 0, 2]
+    v = K[:, None, 1, 1] * local[..., 1] / z + K[:, None, 1, 2]
+    seen = (local[..., 2] > 1e-6) & (u > 0) & (u < width) & (v > 0) & (v < height)
+    to_first, to_second = points - center, points - centers[:, None]
+    cosine = np.einsum("ni,kni->kn", to_first, to_second)
+    cosine /= np.linalg.norm(to_first, axis=1) * np.linalg.norm(to_second, axis=2) + 1e-12
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    worth = np.exp(-0.5 * (np.log(np.maximum(angle, 1e-6) / BEST_ANGLE_DEG) / ANGLE_SPREAD) ** 2)
+    return np.asarray((worth * seen).mean(axis=1))

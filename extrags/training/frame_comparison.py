@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from extrags.dense_flow import DenseFlow
 from extrags.errors import CaptureError
 from extrags.sequence import EndoscopicSequence, saturated_mask
 
@@ -107,7 +108,7 @@ class ComparedFrames:
             np.arange(small.height) + 0.5, np.arange(small.width) + 0.5, indexing="ij"
         )
         self._pixels = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
-        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._flow = DenseFlow()
         self._detail = [_detail(image) for image in self.grey]
         self._contrast = [_equal_contrast(image) for image in self.grey]
 
@@ -170,7 +171,7 @@ class ComparedFrames:
         offset = float((warped - own)[known].mean())
         # What the source does not show has no displacement.
         filled = np.where(known, warped - offset, own).astype(np.float32)
-        flow = self._flow.calc(self._contrast[frame], _equal_contrast(filled), None)
+        flow = self._flow.between(self._contrast[frame], _equal_contrast(filled))
         return PairComparison(
             _structure(self._detail[frame], compared), _structure(_detail(warped), compared), flow, compared
         )

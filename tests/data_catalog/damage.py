@@ -90,8 +90,8 @@ def depth(
     return do
 
 
-def with_nan(values: np.ndarray) -> np.ndarray:
-    values[7, 3:6] = np.nan
+def with_negative(values: np.ndarray) -> np.ndarray:
+    values[7, 3:6] = -1
     return values
 
 

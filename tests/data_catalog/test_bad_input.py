@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from data_catalog.catalog import read
 from data_catalog.checks import check_axes, check_sequence
@@ -79,23 +80,64 @@ class TestFolder:
         with pytest.raises(PoseError, match=r"frame rgb/0002\.png.*no world_from_camera"):
             read(posed_folder)
 
-    @pytest.mark.parametrize(("value", "kind"), [(np.nan, "NaN"), (np.inf, "infinite"), (-2.0, "negative")])
-    def test_bad_depth_values(self, posed_folder, value, kind) -> None:
+    def test_negative_depth(self, posed_folder) -> None:
         file = posed_folder / "depth" / "0005.npy"
         depth = np.load(file)
-        depth[7, 3:6] = value
+        depth[7, 3:6] = -2.0
         np.save(file, depth)
         with pytest.raises(
-            SourceError, match=f"3 of 1920 depth values are {kind}, the first at row 7, column 3"
+            SourceError, match="3 of 1920 depth values are negative, the first at row 7, column 3"
         ) as caught:
             read(posed_folder)
         assert caught.value.frame == "rgb/0005.png"
         assert str(caught.value.file).endswith("0005.npy")
 
-    def test_depth_that_is_nowhere_known(self, posed_folder) -> None:
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+    def test_depth_that_is_not_finite_is_unknown(self, posed_folder, caplog, value) -> None:
+        whole = read(posed_folder)
+        for name in ("0005.npy", "0007.npy"):
+            file = posed_folder / "depth" / name
+            depth = np.load(file)
+            depth[7, 3:6] = value
+            np.save(file, depth)
+        found = read(posed_folder).depth_mm
+        expected = whole.depth_mm.copy()
+        expected[[5, 7], 7, 3:6] = 0
+        np.testing.assert_array_equal(found, expected)
+        told = f"0005.npy: 6 depth values in 2 of {len(whole)} frames, this one first, are NaN or infinite"
+        assert told in caplog.text
+
+    def test_a_frame_without_any_depth(self, posed_folder) -> None:
         file = posed_folder / "depth" / "0005.npy"
         np.save(file, np.zeros_like(np.load(file)))
-        with pytest.raises(SourceError, match="no pixel has a depth"):
+        depth = read(posed_folder).depth_mm
+        assert not depth[5].any()
+        assert all(image.any() for index, image in enumerate(depth) if index != 5)
+
+    def test_axes_are_told_beside_a_frame_without_depth(self, posed_folder, edit_poses) -> None:
+        """Pairs with such a frame tell nothing, and must not count as contradictions to all readings."""
+        file = posed_folder / "depth" / "0005.npy"
+        np.save(file, np.zeros_like(np.load(file)))
+
+        def inverted(content) -> None:
+            for entry in content["frames"]:
+                entry["world_from_camera"] = np.linalg.inv(entry["world_from_camera"]).tolist()
+
+        edit_poses(inverted)
+        with pytest.raises(PoseError, match="world-to-camera"):
+            read(posed_folder)
+
+    def test_depth_that_is_nowhere_known(self, posed_folder) -> None:
+        for file in (posed_folder / "depth").iterdir():
+            np.save(file, np.zeros_like(np.load(file)))
+        with pytest.raises(SourceError, match="field depth_mm: no pixel of any frame has a depth"):
+            read(posed_folder)
+
+    def test_pictures_of_12_bits_in_16(self, posed_folder) -> None:
+        for file in sorted((posed_folder / "rgb").iterdir()):
+            grey = np.asarray(Image.open(file).convert("L")).astype(np.uint16)
+            Image.fromarray(grey * 16).save(file)
+        with pytest.raises(SourceError, match=r"field rgb: .* brighter than 1\d of 255; .* Grey of 12 bits"):
             read(posed_folder)
 
     def test_opengl_axes(self, posed_folder, edit_poses) -> None:

@@ -136,6 +136,16 @@ class TestOpenCV:
             ("distortion_coefficients:", "expected numbers"),
             ("distortion_coefficients: {rows: 2, cols: 2, data: [0.1]}", "expected numbers"),
             ("distortion_model: division\ndistortion_coefficients: [0.1, 0, 0, 0]", "found 'division'"),
+            ("camera_model: omni\ndistortion_coefficients: [0.1, 0, 0, 0]", "camera_model: found 'omni'"),
+            ("fisheye_model: maybe\ndistortion_coefficients: [0.1, 0, 0, 0]", "fisheye_model: found 'maybe'"),
+            (
+                "distortion_model: none\ndistortion_coefficients: [0.1, 0, 0, 0]",
+                "found 'none', but dist",
+            ),
+            (
+                "fisheye: false\ndistortion_model: equidistant\ndistortion_coefficients: [0.1, 0, 0, 0]",
+                "found 'equidistant', a fisheye, but fisheye is False",
+            ),
         ],
     )
     def test_distortion_that_cannot_be_read_is_refused(self, tmp_path, entry, problem) -> None:
@@ -149,6 +159,41 @@ class TestOpenCV:
         lens = read_calibration(opencv_file(tmp_path / "a.yml", terms, fisheye=True), WIDTH, HEIGHT)
         expected = cv2.fisheye.projectPoints(RAYS[:, None], np.zeros(3), np.zeros(3), K, np.array(terms))[0]
         np.testing.assert_allclose(projected(lens, RAYS), expected[:, 0], atol=1e-9)
+
+    @pytest.mark.parametrize(
+        "told",
+        [
+            {"fisheye_model": "true"},
+            {"fisheye_model": 1.0},
+            {"fisheye": True},
+            {"camera_model": "fisheye"},
+            {"model": "OPENCV_FISHEYE"},
+            {"camera_model": "pinhole", "distortion_model": "Kannala-Brandt"},
+        ],
+    )
+    def test_a_fisheye_by_other_names(self, tmp_path, told) -> None:
+        """Its terms would be taken for radial and tangential ones, pixels beside the right place."""
+        content = {"camera_matrix": K.tolist(), "distortion_coefficients": [0.03, -0.01, 0.004, -0.001]}
+        (tmp_path / "a.json").write_text(json.dumps({**content, "fisheye_model": 1}))
+        (tmp_path / "b.json").write_text(json.dumps({**content, **told}))
+        expected = read_calibration(tmp_path / "a.json", WIDTH, HEIGHT)
+        assert expected.model == "OPENCV_FISHEYE"
+        assert read_calibration(tmp_path / "b.json", WIDTH, HEIGHT) == expected
+
+    def test_what_is_not_about_the_lens_is_passed_over(self, tmp_path) -> None:
+        (tmp_path / "a.yml").write_text(
+            f"camera_matrix: {K.tolist()}\ndistance_to_board: 5\nworking_distance_mm: 20\n"
+            "model: Olympus GIF-H190\ndistortion_model: plumb_bob\nlens_distortion: [0, 0.0]\n"
+        )
+        assert read_calibration(tmp_path / "a.yml", WIDTH, HEIGHT).is_pinhole
+
+    def test_ros_calls_a_camera_cam0(self, tmp_path) -> None:
+        """Which is Kalibr's name for the first one."""
+        (tmp_path / "a.yaml").write_text(
+            f"camera_name: cam0\ncamera_matrix: {{rows: 3, cols: 3, data: {K.ravel().tolist()}}}\n"
+            "distortion_model: plumb_bob\ndistortion_coefficients: [0.1, 0, 0, 0, 0]\n"
+        )
+        assert read_calibration(tmp_path / "a.yaml", WIDTH, HEIGHT).model == "FULL_OPENCV"
 
     def test_no_distortion_is_a_pinhole(self, tmp_path) -> None:
         lens = read_calibration(opencv_file(tmp_path / "a.yml", [0.0] * 5), WIDTH, HEIGHT)

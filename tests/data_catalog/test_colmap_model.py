@@ -294,6 +294,30 @@ class TestMasks:
         assert "mask is not read; masks are looked for in masks/" in caplog.text
 
 
+class TestTextFiles:
+    @pytest.mark.parametrize(("mark", "blank"), [("\ufeff", ""), ("", " "), ("\ufeff", "\t\r")])
+    def test_marks_and_blanks_of_editors(self, clip, tmp_path, mark, blank) -> None:
+        write_colmap(clip, tmp_path / "scene")
+        expected = read(tmp_path / "scene")
+        assert expected.metric
+        for name in ("train_list.txt", "test_list.txt", "length_unit.txt"):
+            file = tmp_path / "scene" / name
+            file.write_text(mark + file.read_text().replace("\n", f"{blank}\n"), encoding="utf-8")
+        found = read(tmp_path / "scene")
+        assert found.metric
+        np.testing.assert_array_equal(found.train, expected.train)
+        np.testing.assert_array_equal(found.test, expected.test)
+
+    def test_a_blank_may_belong_to_a_name(self, clip, tmp_path) -> None:
+        write_colmap(clip, tmp_path / "scene")
+        rename_images(tmp_path / "scene", lambda name: f"{name} ")
+        images = tmp_path / "scene" / "images"
+        for file in list(images.iterdir()):
+            file.rename(file.with_name(f"{file.name} "))
+        (tmp_path / "scene" / "test_list.txt").write_text("0003.png \n")
+        assert read(tmp_path / "scene").test.tolist() == [3]
+
+
 class TestNames:
     @pytest.mark.parametrize("place", ["images", "rgb"])
     def test_absolute_names_are_those_below_the_folder(self, workspace, place) -> None:

@@ -62,6 +62,39 @@ class TestCircle:
         assert found is not None
         assert abs(found.radius_px - 84) < 2
 
+    @pytest.mark.parametrize("middle", [(310, 90), (160, 172), (12, 10)], ids=["right", "below", "corner"])
+    def test_a_round_lumen_at_the_border_is_no_picture(self, middle) -> None:
+        """Its rim is a circle, too: the mask would keep the lumen and leave the tissue out."""
+        scene = moving_scene(6)
+        lumen = rim(*middle, 60).mask(320, 180)
+        scene[:, lumen] = 5
+        assert content_circle(scene) is None
+        kept = content_mask(scene)
+        assert kept[~lumen].mean() > 0.97
+
+    @pytest.mark.parametrize("level", [16, 30])
+    def test_a_surround_that_is_not_quite_black(self, level) -> None:
+        """As of a video whose black level was left at 16."""
+        circle = rim(160, 90, 84)
+        scene = moving_scene(6)
+        noise = np.random.default_rng(2).integers(level - 1, level + 2, scene.shape)
+        scene = np.where(circle.mask(320, 180)[None, ..., None], scene, noise).astype(np.uint8)
+        found = content_circle(scene)
+        assert found is not None
+        assert abs(found.radius_px - 84) < 1.5
+        mask = content_mask(scene)
+        assert not mask[~circle.mask(320, 180)].any()
+        assert mask[circle.mask(320, 180, 4.0)].all()
+
+    def test_dark_corners_of_a_full_picture_are_no_surround(self) -> None:
+        """They differ from each other, and from frame to frame."""
+        scene = moving_scene(6)
+        scene[:, :12, :20] = scene[:, :12, :20] // 8
+        scene[:, -12:, -20:] = scene[:, -12:, -20:] // 8
+        scene[:, :12, -20:] = scene[:, :12, -20:] // 9
+        scene[:, -12:, :20] = scene[:, -12:, :20] // 9
+        assert content_mask(scene).mean() > 0.97
+
     @pytest.mark.parametrize("shape", ["full", "rectangle"])
     def test_no_circle_where_there_is_none(self, shape) -> None:
         scene = moving_scene(6)

@@ -41,7 +41,7 @@ from tests.data_catalog.damage import (
     same_image,
     telling_nothing,
     unknown_camera_model,
-    with_nan,
+    with_negative,
     without_flip,
     words,
 )
@@ -173,10 +173,10 @@ DAMAGES = {
         None,
         "world_from_camera",
     ),
-    "depth with NaN": Damage(
+    "depth below zero": Damage(
         "extrags",
-        depth(with_nan, (5,)),
-        "3 of 7392 depth values are NaN, the first at row 7, column 3",
+        depth(with_negative, (5,)),
+        "3 of 7392 depth values are negative, the first at row 7, column 3",
         "rgb/0005.png",
         "depth_mm",
         "0005.npy",
@@ -196,7 +196,10 @@ DAMAGES = {
         "depth_mm",
     ),
     "depth nowhere known": Damage(
-        "extrags", depth(lambda values: values * 0, (5,)), "no pixel has a depth", "rgb/0005.png", "depth_mm"
+        "extrags", depth(lambda values: values * 0), "no pixel of any frame has a depth", None, "depth_mm"
+    ),
+    "depth not known in a frame": Damage(
+        "extrags", depth(lambda values: values * 0, (5,)), r"depth is known for 0\.0%", "0005", "depth_mm"
     ),
     "depth of another size": Damage(
         "extrags",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -31,6 +32,19 @@ def test_depth_carried_from_frame_to_frame(clip, tmp_path) -> None:
     rounded = replace(clip, depth_mm=np.round(clip.depth_mm))
     assert carried_error_mm(read(tmp_path)) == pytest.approx(carried_error_mm(rounded), abs=1e-4)
     assert carried_error_mm(read(tmp_path)) < 0.5
+
+
+@pytest.mark.parametrize("part", ["depth", "masks"])
+def test_arrays_in_place_of_images_are_told_of(clip, tmp_path, caplog, part) -> None:
+    write_endonerf(clip, tmp_path)
+    shutil.rmtree(tmp_path / "depth")
+    (tmp_path / part).mkdir()
+    for index in range(len(clip)):
+        np.save(tmp_path / part / f"{index:04d}.npy", np.ones(clip.mask.shape[1:]))
+    assert read(tmp_path).depth_mm is None
+    told = f"{part}/ holds no images, and what it holds is not read (10 files, the first is 0000.npy)"
+    assert caplog.text.count(told) == 1
+    assert any(told in note for note in inspect(tmp_path).notes)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from data_catalog.images import read_colour, read_depth, read_mask
+from data_catalog.images import UPRIGHT, orientation, read_colour, read_depth, read_mask
 from extrags.errors import SourceError
 
 GREY = np.random.default_rng(0).integers(0, 2**16, (20, 30), dtype=np.uint16)
@@ -44,6 +44,38 @@ def test_alpha_is_dropped(tmp_path: Path) -> None:
     colours = np.random.default_rng(1).integers(0, 256, (20, 30, 4), dtype=np.uint8)
     found = read_colour(written(tmp_path / "a.png", colours))
     np.testing.assert_array_equal(found, colours[..., 2::-1])
+
+
+class TestOrientation:
+    @pytest.mark.parametrize("name", ["a.jpg", "a.png"])
+    def test_pixels_are_as_they_are_stored(self, tmp_path: Path, name: str) -> None:
+        file = self.tagged(tmp_path / name)
+        assert orientation(file) == 6
+        assert read_colour(file).shape == (20, 30, 3)
+
+    def test_a_tiff_is_upright_once_it_is_read(self, tmp_path: Path) -> None:
+        file = self.tagged(tmp_path / "a.tif")
+        assert orientation(file) == UPRIGHT
+        assert read_colour(file).shape == (30, 20, 3)
+
+    @pytest.mark.parametrize("tag", [1, 0, 9, None])
+    def test_upright(self, tmp_path: Path, tag: int | None) -> None:
+        assert orientation(self.tagged(tmp_path / "a.jpg", tag)) == UPRIGHT
+
+    def test_damaged_exif_says_nothing(self, tmp_path: Path) -> None:
+        file = self.tagged(tmp_path / "a.jpg")
+        file.write_bytes(file.read_bytes().replace(b"Exif\0\0MM\0*", b"Exif\0\0MM\0?"))
+        assert orientation(file) == UPRIGHT
+        (tmp_path / "a.mp4").write_bytes(b"no image")
+        assert orientation(tmp_path / "a.mp4") == UPRIGHT
+
+    @staticmethod
+    def tagged(file: Path, tag: int | None = 6) -> Path:
+        exif = Image.Exif()
+        if tag is not None:
+            exif[274] = tag
+        Image.fromarray((GREY >> 8).astype(np.uint8)).convert("RGB").save(file, exif=exif)
+        return file
 
 
 def test_floating_point_has_no_white(tmp_path: Path) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from data_catalog.matches import match_neighbours, pose_support
 from extrags.cameras import invert_poses
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, UnknownSequenceError
+from extrags.sequence import EndoscopicSequence, Split
 
 
 class TestRightSources:
@@ -53,6 +57,89 @@ class TestRightSources:
         found = inspect(shared_data / "sinus_hopkins" / "images", IngestConfig(downscale=8, max_frames=6))
         assert any("assuming a horizontal field of view of 90 degrees" in note for note in found.notes)
         assert found.format == "frames"
+
+
+class TestNumbering:
+    @staticmethod
+    def named(sequence: EndoscopicSequence, numbers: list[int], pattern: str) -> EndoscopicSequence:
+        shown = np.arange(len(numbers)) % len(sequence)
+        return EndoscopicSequence(
+            name="numbered",
+            rgb=sequence.rgb[shown],
+            K=sequence.K[shown],
+            mask=sequence.mask[shown],
+            split=Split("first", np.arange(1, len(numbers)), np.arange(1)),
+            frame_names=tuple(pattern.format(number) for number in numbers),
+        )
+
+    @pytest.mark.parametrize("pattern", ["{:04d}", "frame_{}", "frame_{:06d}", "0_{:020d}"])
+    @pytest.mark.parametrize(
+        ("left_out", "missing"), [((), ()), ((12,), (11,)), ((12, 13), (11,)), (tuple(range(1, 31, 2)), ())]
+    )
+    def test_a_gap_is_found(self, clip, pattern, left_out, missing) -> None:
+        """What was compared was how many digits the numbers have."""
+        numbers = [number for number in range(31) if number not in left_out]
+        findings = diagnose(self.named(clip, numbers, pattern), "source")
+        found = [finding.frame for finding in findings if finding.topic == "missing frame"]
+        assert found == [pattern.format(number) for number in missing]
+        if missing:
+            (told,) = (finding for finding in findings if finding.topic == "missing frame")
+            assert f"{len(left_out) + 1} on; all others are 1 apart" in told.sentence
+
+    def test_frames_that_were_left_out_on_purpose_are_not_missing(self, clip, tmp_path) -> None:
+        sequence = self.named(clip, [*range(12), *range(13, 31)], "{:04d}")
+        assert not [f for f in diagnose(sequence, "source", thinned=True) if f.topic == "missing frame"]
+        for number in range(21):
+            Image.fromarray(clip.rgb[number % len(clip)]).save(tmp_path / f"{number:04d}.png")
+        thinned = inspect(tmp_path, IngestConfig(max_frames=20)).findings
+        assert not [finding for finding in thinned if finding.topic == "missing frame"]
+
+
+class TestLens:
+    @staticmethod
+    def written(clip: EndoscopicSequence, folder: Path, **lens: float) -> Path:
+        (folder / "images").mkdir()
+        frames = []
+        for index in range(6):
+            Image.fromarray(clip.rgb[index]).save(folder / "images" / f"{index:04d}.png")
+            pose = clip.world_from_camera[index] @ np.diag([1.0, -1, -1, 1])
+            frames.append({"file_path": f"images/{index:04d}.png", "transform_matrix": pose.tolist()})
+        sizes = {"w": clip.width, "h": clip.height, "fl_x": 80, "fl_y": 80, "camera_model": "OPENCV"}
+        (folder / "transforms.json").write_text(json.dumps({**sizes, **lens, "frames": frames}))
+        return folder
+
+    def test_a_lens_of_which_little_is_used_is_told(self, clip, tmp_path) -> None:
+        """The pinhole's own principal point is always in the middle, and shows nothing."""
+        found = inspect(self.written(clip, tmp_path, cx=24, cy=20, k1=-0.05))
+        (told,) = (finding for finding in found.findings if finding.topic == "lens")
+        assert "principal point is (24.0, 20.0): that is far from the centre" in told.sentence
+        assert told.file == str(tmp_path)
+
+    def test_most_of_it_is_enough(self, clip, tmp_path) -> None:
+        found = inspect(self.written(clip, tmp_path, cx=48, cy=38.5, k1=-0.05))
+        assert not [finding for finding in found.findings if finding.topic == "lens"]
+
+
+def test_memory_does_not_grow_with_the_frames(clip) -> None:
+    """What is made of all frames at once would be as large as they are."""
+    peaks = []
+    for count in (10, 60):
+        shown = np.arange(count) % len(clip)
+        many = EndoscopicSequence(
+            name="many",
+            rgb=clip.rgb[shown],
+            K=clip.K[shown],
+            mask=clip.mask[shown],
+            split=Split("first", np.arange(1, count), np.arange(1)),
+            depth_mm=clip.depth_mm[shown],
+            specular=np.zeros((count, clip.height, clip.width), bool),
+        )
+        tracemalloc.start()
+        diagnose(many, "source")
+        facts(many)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] - peaks[0] < 5 * clip.rgb[0].nbytes
 
 
 class TestPoseSupport:

@@ -10,10 +10,17 @@ import pytest
 
 from data_catalog.c3vd.scaramuzza import CALIBRATIONS
 from data_catalog.catalog import read
+from data_catalog.matches import FrameMatches, pose_support
 from data_catalog.readers.colmap_files import read_model, write_model
 from data_catalog.readers.colmap_model import write_colmap
 from data_catalog.readers.transforms_json import write_transforms
-from extrags.cameras import pixel_rays, project_points, rotation_about, rotation_angle_deg
+from extrags.cameras import (
+    pixel_rays,
+    project_points,
+    rotation_about,
+    rotation_angle_deg,
+    unproject_pixels,
+)
 from extrags.config import IngestConfig, PipelineConfig
 from extrags.errors import ConfigError, SourceError
 from extrags.lens import Lens
@@ -53,6 +60,27 @@ def test_a_fisheye_keeps_its_pixels(fisheye: dict[str, EndoscopicSequence]) -> N
     found = native.depth_mm[4][row, column]  # type: ignore[index]
     assert inside.mean() > 0.8
     assert np.median(np.abs(found / z[inside] - 1)) < 0.02
+
+
+def test_poses_are_judged_through_the_lens(clip: EndoscopicSequence) -> None:
+    """Right poses would be said to be wrong: far from the axis a pinhole's rays are others."""
+    lens = RadialLens((-0.2, 0.04, 0.008, -0.003), float(np.radians(85)))
+    fisheye = replace(clip, lens=lens, depth_mm=None, observed=None)
+    generator = np.random.default_rng(0)
+    matches = []
+    for first in range(4):
+        # Points before both cameras, seen through the lens.
+        seen = generator.uniform((0, 0), (clip.width, clip.height), (400, 2))
+        rays = unproject_pixels(seen, clip.K[first], lens)
+        points = fisheye.cameras[first].centers[0] + (rays * generator.uniform(20, 60, (400, 1))) @ (
+            fisheye.cameras.world_from_camera[first, :3, :3].T
+        )
+        (there,), (z,) = fisheye.cameras[first + 1].project(points)
+        kept = (z > 1) & fisheye.cameras.contains(there)
+        matches.append(FrameMatches(first, first + 1, seen[kept], there[kept]))
+    support = pose_support(fisheye, matches)
+    assert support.as_given > 0.99
+    assert pose_support(replace(fisheye, lens=None), matches).as_given < 0.9
 
 
 def test_as_a_pinhole_it_is_what_ingest_makes(fisheye: dict[str, EndoscopicSequence]) -> None:

@@ -181,6 +181,10 @@ class TestFrames:
             ({"fx": 70, "fy": 71, "cx": 41, "cy": 29, "k1": -0.3}, r"k1: -0\.3; expected a pinhole"),
             ({"field_of_view_deg": 80, "dist_coeffs": [0, 0.1]}, r"dist_coeffs: .*ingest\.calibration"),
             ({"field_of_view_deg": 80, "camera_model": "OPENCV"}, 'camera_model: "OPENCV"; expected a pinh'),
+            ({"field_of_view_deg": 80, "distortion_model": "equidistant"}, "distortion_model: .*a pinhole"),
+            ({"field_of_view_deg": 80, "model": "fisheye 8"}, 'model: "fisheye 8"; expected a pinhole'),
+            ({"field_of_view_deg": 80, "fisheye": True}, "fisheye: true; expected a pinhole"),
+            ({"field_of_view_deg": 80, "D": [0.1, 0, 0, 0]}, "field D: .*expected a pinhole"),
             ({"field_of_view_deg": 80, "w": 160, "h": 120}, "for images of 160 x 120 pixels; found 80 x 60"),
         ],
     )
@@ -197,6 +201,21 @@ class TestFrames:
     def test_a_pinhole_may_be_told_at_length(self, frames) -> None:
         told = {"fx": 70, "fy": 71, "cx": 41, "cy": 29, "k1": 0, "p2": 0.0, "model": "PINHOLE"}
         (frames / "intrinsics.json").write_text(json.dumps({**told, "width": 80, "height": 60}))
+        np.testing.assert_allclose(read(frames).K[0], [[70, 0, 41], [0, 71, 29], [0, 0, 1]])
+
+    @pytest.mark.parametrize(
+        "told",
+        [
+            {"working_distance_mm": 20, "distance_to_board": 5.5},
+            {"distortion_model": "none"},
+            {"distortion_model": "plumb_bob", "D": [0, 0, 0, 0, 0]},
+            {"dist_coeffs": None, "distortion": "none", "lens_distortion": {"k1": 0, "k2": 0.0}},
+            {"model": "Olympus GIF-H190", "undistorted": True},
+        ],
+    )
+    def test_what_tells_of_no_distortion_is_let_pass(self, frames, told) -> None:
+        content = {"fx": 70, "fy": 71, "cx": 41, "cy": 29, **told}
+        (frames / "intrinsics.json").write_text(json.dumps(content))
         np.testing.assert_allclose(read(frames).K[0], [[70, 0, 41], [0, 71, 29], [0, 0, 1]])
 
     def test_frame_of_another_size(self, frames) -> None:

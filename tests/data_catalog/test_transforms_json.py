@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
+from plyfile import PlyData, PlyElement
 
 from data_catalog.catalog import read, resolve
 from data_catalog.readers.colmap_model import write_colmap
 from data_catalog.readers.transforms_json import write_transforms
 from extrags.config import IngestConfig
-from extrags.errors import SourceNotFoundError
+from extrags.errors import SourceError, SourceNotFoundError
 from extrags.sequence import Split
 from tests.data_catalog.layouts import carried_error_mm, same_frames
 
@@ -151,6 +152,71 @@ class TestReading:
         assert wide.K[0, 0, 0] == pytest.approx(48 / np.tan(np.radians(70)))
         assert wide.mask[0, 38, 48]
         assert not wide.mask[0, 0, 0]
+
+    @pytest.mark.parametrize(
+        ("model", "terms", "refused"),
+        [
+            ("PINHOLE", {"k1": -0.3}, "k1"),
+            ("SIMPLE_PINHOLE", {"p2": 0.01}, "p2"),
+            ("OPENCV", {"k1": 0.1, "k5": 0.2}, "k5"),
+            ("OPENCV", {"k6": 0.2}, "k6"),
+            ("OPENCV", {"k3": 0.1, "k6": 0.2}, "k6"),
+            ("SIMPLE_RADIAL", {"k1": 0.1, "k3": 0.1}, "k3"),
+            ("OPENCV_FISHEYE", {"k1": 0.1, "p1": 0.01}, "p1"),
+        ],
+    )
+    def test_a_term_that_the_model_has_not_is_refused(self, folder, edit, model, terms, refused) -> None:
+        edit(lambda content: content.update(camera_model=model, **terms))
+        said = rf"frame images/0000\.png, field {refused}: {refused} .*camera_model {model}"
+        with pytest.raises(SourceError, match=said):
+            read(folder)
+        edit(lambda content: content.update(dict.fromkeys(terms, 0.0)))
+        assert len(read(folder)) == 10
+
+    def test_null_is_no_value(self, clip, folder, edit) -> None:
+        def nothing(content) -> None:
+            content.update(dict.fromkeys(("camera_model", "k1", "ply_file_path", "depth_unit_scale_factor")))
+            content["val_filenames"] = None
+            for entry in content["frames"]:
+                entry.update(mask_path=None, depth_file_path=None, p1=None)
+
+        before = read(folder)
+        edit(nothing)
+        found = read(folder)
+        same_frames(found, replace(before, depth_mm=None), atol=ROUNDING)
+        assert found.depth_mm is None
+        assert found.points is None
+
+    @pytest.mark.parametrize("coloured", [True, False])
+    def test_points_that_are_not_finite_are_left_out(self, folder, edit, caplog, coloured) -> None:
+        kinds = [*((axis, "f4") for axis in "xyz"), *((c, "u1") for c in ("red", "green", "blue"))]
+        rows = np.zeros(20, dtype=kinds if coloured else kinds[:3])
+        rows["x"] = np.arange(20)
+        if coloured:
+            rows["red"] = np.arange(20)
+        rows["y"][::10], rows["z"][5] = np.nan, np.inf
+        PlyData([PlyElement.describe(rows, "vertex")]).write(str(folder / "points.ply"))
+        edit(lambda content: content.update(ply_file_path="points.ply"))
+        back = read(folder)
+        kept = [index for index in range(20) if index not in (0, 5, 10)]
+        assert back.points[:, 0].tolist() == kept
+        assert (back.points_rgb is not None) == coloured
+        if coloured:
+            assert back.points_rgb[:, 0].tolist() == kept
+        assert "points.ply: 3 of 20 points are not finite and left out" in caplog.text
+        rows["x"] = np.nan
+        PlyData([PlyElement.describe(rows, "vertex")]).write(str(folder / "points.ply"))
+        assert read(folder).points is None
+
+    def test_pixels_are_taken_as_they_are_stored_and_said(self, folder, edit, caplog) -> None:
+        exif = Image.Exif()
+        exif[274] = 6
+        before = read(folder)
+        assert "EXIF" not in caplog.text
+        for file in sorted((folder / "images").iterdir())[3:5]:
+            Image.open(file).save(file, exif=exif)
+        np.testing.assert_array_equal(read(folder).rgb, before.rgb)
+        assert "0003.png: 2 of 10 images, this one first, are turned by viewers" in caplog.text
 
     def test_paths_without_suffix(self, folder, edit) -> None:
         def strip(content) -> None:

@@ -47,6 +47,14 @@ def test_it_is_near_the_truth(withheld: EndoscopicSequence, estimate: DepthEstim
     assert f"{estimate.report['n_points']} points" in estimate.summary
 
 
+def test_points_behind_all_cameras_are_refused(withheld: EndoscopicSequence) -> None:
+    training = withheld.training_part().at_most_width(16)
+    behind = training.cameras.centers[0] - 1e4 * training.cameras.world_from_camera[0, :3, 2]
+    moved = replace(training, points=behind + np.random.default_rng(0).normal(size=(20, 3)), points_rgb=None)
+    with pytest.raises(CaptureError, match=r"all 20 sparse points lie behind all \d+ cameras"):
+        estimate_depth(moved, DepthConfig(**SETTINGS))
+
+
 def test_it_knows_where_it_is_wrong(withheld: EndoscopicSequence, estimate: DepthEstimate) -> None:
     error = relative_error(withheld, estimate)
     known = (true_training_depth(withheld) > 0) & withheld.mask[withheld.train]

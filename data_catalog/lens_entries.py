@@ -1,0 +1,114 @@
+"""What entries of files that describe a camera tell of its lens, by their names and values.
+
+Files of many programs are read, and hold much besides: distances, names of products, dates. An entry counts
+only where its name says that it is about the lens.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from extrags.errors import SourceError
+
+__all__ = ["LensKind", "lens_kind", "tells_distortion"]
+
+LensKind = Literal["pinhole", "polynomial", "fisheye"]
+"""`pinhole`: undistorted, or nothing is said of distortion; `polynomial`: OpenCV's radial and tangential
+terms, a pinhole where all are zero; `fisheye`: Kannala and Brandt's, no pinhole whatever its terms."""
+
+_DISTORTION = re.compile(r"(?<!un)distort|dist_?coef|^(lens_?)?dist$", re.IGNORECASE)
+_TERM = re.compile(r"[kp][1-6]")
+_MODEL_NAMES = ("distortion_model", "camera_model", "model")
+_SWITCHES = ("fisheye_model", "fisheye", "is_fisheye")
+_KINDS: dict[str, LensKind] = {
+    **dict.fromkeys(("", "none", "no", "pinhole", "simple_pinhole", "perspective", "undistorted"), "pinhole"),
+    **dict.fromkeys(
+        ("plumb_bob", "rational_polynomial", "radtan", "radial_tangential", "brown", "brown_conrady"),
+        "polynomial",
+    ),
+    **dict.fromkeys(("opencv", "full_opencv", "simple_radial", "radial", "polynomial"), "polynomial"),
+    **dict.fromkeys(
+        ("fisheye", "opencv_fisheye", "equidistant", "kannala_brandt", "kannala_brandt4", "kb4"), "fisheye"
+    ),
+}
+_WORDS_OF_LENSES = re.compile(
+    r"fish|omni|catadioptric|radial|division|sphere|spherical|equidist|equirect|equisolid|stereographic|"
+    r"scaramuzza|ocam|kannala|unified|pinhole|distort|^(fov|mei|eucm|ds)$"
+)
+_YES, _NO = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
+
+
+def _is_named_distortion(name: str) -> bool:
+    """Whether an entry holds distortion, by its name: `dist_coeffs`, `lens_distortion`, `D`, `k1`.
+
+    Names of models and distances do not.
+    """
+    if name in _MODEL_NAMES:
+        return False
+    return name == "D" or _TERM.fullmatch(name) is not None or _DISTORTION.search(name) is not None
+
+
+def tells_distortion(name: str, value: Any) -> bool:
+    """Whether an entry tells of distortion; terms that are zero, none at all and the word `none` do not."""
+    return _is_named_distortion(name) and _is_more_than_nothing(value)
+
+
+def lens_kind(name: str, value: Any, file: Path) -> LensKind | None:
+    """The kind of lens that an entry names; None where it is about something else.
+
+    `model` may be what an endoscope's maker calls it, and counts only where it names a lens.
+
+    Raises:
+        SourceError: a lens that is not known here, or no answer to whether it is a fisheye.
+    """
+    if value is None:
+        return None
+    if name in _SWITCHES:
+        return "fisheye" if _answer(name, value, file) else "polynomial"
+    if name not in _MODEL_NAMES:
+        return None
+    spelled = re.sub(r"[\s-]+", "_", str(value).strip().lower())
+    found = _KINDS.get(spelled)
+    if found is None and (name != "model" or _WORDS_OF_LENSES.search(spelled) is not None):
+        known = ", ".join(kind for kind in _KINDS if kind)
+        raise SourceError(f"found {value!r}; expected a lens model: {known}", file=file, field=name)
+    return found
+
+
+def _answer(name: str, value: Any, file: Path) -> bool:
+    """Whether a switch is on.
+
+    Raises:
+        SourceError: neither yes nor no.
+    """
+    spelled = str(value).strip().lower()
+    # Programs write whole numbers as 1.0 or `1.`, too.
+    spelled = re.sub(r"\.0*$", "", spelled)
+    if spelled in _YES:
+        return True
+    if spelled in _NO:
+        return False
+    raise SourceError(f"found {value!r}; expected 1 or 0, true or false", file=file, field=name)
+
+
+def _is_more_than_nothing(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        # A matrix of OpenCV's or of ROS says how large it is, too.
+        return _is_more_than_nothing(value.get("data", list(value.values())))
+    if isinstance(value, list | tuple | np.ndarray):
+        return any(_is_more_than_nothing(item) for item in value)
+    if value is None or isinstance(value, str):
+        return any(not _is_nothing(part) for part in (value or "").lower().split())
+    return bool(value != 0)
+
+
+def _is_nothing(word: str) -> bool:
+    try:
+        return float(word) == 0
+    except ValueError:
+        return word in ("none", "null", "false", "no")

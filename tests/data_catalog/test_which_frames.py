@@ -1,0 +1,112 @@
+"""Which of the images and videos in a folder are read, and what is said of the others."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from data_catalog.catalog import read, resolve
+from data_catalog.images import colour_files
+from data_catalog.inspection import inspect
+from extrags.errors import SourceError, SourceNotFoundError
+from tests.data_catalog.footage_fixture import interlaced, write_video
+from tests.data_catalog.test_content import moving_scene
+
+
+def write_frames(folder: Path, count: int, *, first: int = 0) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, image in enumerate(moving_scene(count, 48, 42), start=first):
+        Image.fromarray(image).save(folder / f"{number:04d}.png")
+
+
+class TestSeveralFolders:
+    @pytest.mark.parametrize("below", ["images", "rgb"])
+    def test_one_picture_beside_the_frames(self, tmp_path, below, caplog) -> None:
+        """As the contact sheet that `data show` writes."""
+        write_frames(tmp_path / below, 8)
+        Image.new("RGB", (720, 640), (90, 40, 30)).save(tmp_path / "contact_sheet.png")
+        assert read(tmp_path).rgb.shape == (8, 42, 48, 3)
+        assert (
+            f"images in the folder itself are not read (contact_sheet.png), only the 8 in {below}/"
+            in caplog.text
+        )
+
+    def test_a_few_below_the_frames(self, tmp_path, caplog) -> None:
+        write_frames(tmp_path, 8)
+        write_frames(tmp_path / "images", 2, first=40)
+        assert read(tmp_path).frame_names[0] == "0000"
+        assert "images in images/ are not read (0040.png, 0041.png), only the 8 in the folder" in caplog.text
+
+    def test_about_as_many_are_refused(self, tmp_path) -> None:
+        write_frames(tmp_path / "images", 8)
+        write_frames(tmp_path / "rgb", 5)
+        with pytest.raises(SourceError, match=r"8 images in images/ and 5 images in rgb/; give the path"):
+            read(tmp_path)
+        assert len(read(tmp_path / "rgb")) == 5
+
+    def test_of_one_folder_nothing_is_said(self, tmp_path, caplog) -> None:
+        write_frames(tmp_path / "images", 4)
+        read(tmp_path)
+        assert "not read" not in caplog.text
+
+
+class TestVideos:
+    @pytest.fixture
+    def exam(self, tmp_path: Path) -> Path:
+        return write_video(tmp_path / "exam.avi", moving_scene(30, 64, 48, speed=2))
+
+    def test_a_poster_beside_a_video(self, exam, caplog) -> None:
+        write_frames(exam.parent, 1)
+        assert resolve(exam.parent).format == "video"
+        assert len(read(exam.parent)) > 4
+        assert "exam.avi is read, and not the pictures beside it: 0000.png" in caplog.text
+
+    def test_frames_below_a_video_are_refused(self, exam) -> None:
+        """The video was read, and nothing said of the frames."""
+        write_frames(exam.parent / "images", 8)
+        with pytest.raises(
+            SourceError, match=r"exam\.avi, and 8 images in images/; give the path of the one"
+        ):
+            read(exam.parent)
+        assert len(read(exam.parent / "images")) == 8
+        assert resolve(exam).format == "video"
+
+    def test_frames_beside_a_video_are_read_and_it_is_named(self, exam, caplog) -> None:
+        write_frames(exam.parent, 8)
+        assert len(read(exam.parent)) == 8
+        assert "8 images are read, and not exam.avi; give its path" in caplog.text
+
+    def test_a_poster_beside_several_videos(self, exam) -> None:
+        exam.with_name("other.avi").write_bytes(exam.read_bytes())
+        write_frames(exam.parent, 1)
+        with pytest.raises(SourceError, match=r"2 videos in this folder: exam\.avi and other\.avi"):
+            resolve(exam.parent)
+
+
+def test_woven_frames_are_told(tmp_path) -> None:
+    for number, image in enumerate(interlaced(moving_scene(8, 320, 240, speed=8))):
+        Image.fromarray(image).save(tmp_path / f"{number}.png")
+    assert any("interlaced: each image shows two moments" in note for note in inspect(tmp_path).notes)
+
+
+def test_frames_of_one_moment_are_not(tmp_path) -> None:
+    for number, image in enumerate(moving_scene(6, 320, 240, speed=8)):
+        Image.fromarray(image).save(tmp_path / f"{number}.png")
+    assert not any("interlaced" in note for note in inspect(tmp_path).notes)
+
+
+def test_a_link_to_nothing_is_refused(tmp_path) -> None:
+    """It was left out, and the frames round it taken for neighbours."""
+    write_frames(tmp_path, 6)
+    (tmp_path / "0003.png").unlink()
+    (tmp_path / "0003.png").symlink_to(tmp_path / "gone.png")
+    with pytest.raises(SourceNotFoundError, match=r"0003\.png: a link to .*gone\.png, which is not there"):
+        read(tmp_path)
+    (tmp_path / "elsewhere.dat").write_bytes((tmp_path / "0002.png").read_bytes())
+    (tmp_path / "0003.png").unlink()
+    (tmp_path / "0003.png").symlink_to(tmp_path / "elsewhere.dat")
+    assert len(colour_files(tmp_path)) == 6
+    assert np.array_equal(read(tmp_path).rgb[2], read(tmp_path).rgb[3])
