@@ -72,7 +72,7 @@ TIME_TERMS: dict[str, tuple[str, ...]] = {
     "assess": ("one", "gaussians"),
     "surface": ("one", "train*pixels", "gaussians"),
     "freespace": ("one", "gaussians"),
-    "explore": ("trajectories", "trajectories*gaussians"),
+    "explore": ("branches", "branches*gaussians"),
     "enhance-train": (
         "one",
         "train*pixels",
@@ -179,7 +179,7 @@ class Workload:
             "gaussians": coarse,
             "coefficients": coarse * (config.coarse.sh_degree + 1) ** 2,
             "final_gaussians": final,
-            "trajectories": float(config.explore.trajectories),
+            "branches": float(self._branches()),
             # Leave-out pairs are for who trains or judges.
             "fold_iterations": float(enhance.folds * enhance.fold_iterations)
             * (enhance.judge or enhance.train_iterations > 0),
@@ -211,6 +211,13 @@ class Workload:
         most = self.config.finetune.growth * self.config.coarse.densify.max_gaussians
         tuned = max(coarse, min(most, FINAL_WANTED * max(wanted, coarse)))
         return coarse, float(tuned if self.final_gaussians is None else self.final_gaussians)
+
+    def _branches(self) -> int:
+        """Of the exploration, at least, where it uses its budget: with fewer trajectories all starts grow."""
+        explore = self.config.explore
+        if explore.score == "pairs" or explore.wave == 1:
+            return explore.trajectories
+        return max(explore.starts, explore.trajectories)
 
     def _restored_share(self) -> float:
         if self.width is None:

@@ -63,17 +63,17 @@ class Gamut:
         """
         lit = sum(len(_lit_pixels(*frame(index))) for index in range(count))
         step = max(1, math.ceil(lit / MAX_SAMPLES))
-        parts = [torch.zeros(0, 3)]
+        parts: list[Float[Tensor, "p 3"]] = []
         passed = 0
         for index in range(count):
             found = _lit_pixels(*frame(index))
             # The pixels of all frames are counted through, so that each frame has its share.
             parts.append(found[-passed % step :: step])
             passed += len(found)
-        pixels = torch.cat(parts)
-        if len(pixels) == 0:
+        if lit == 0:
             return cls(0.0, 1e6, 0.0, 1e6)
-        ends = torch.tensor([TAIL, 1 - TAIL])
+        pixels = torch.cat(parts)
+        ends = pixels.new_tensor([TAIL, 1 - TAIL])
         red = pixels[:, 0].clamp_min(1e-3)
         green = torch.quantile(pixels[:, 1] / red, ends)
         blue = torch.quantile(pixels[:, 2] / red, ends)

@@ -127,6 +127,18 @@ class TestGaussians:
         found = Workload(20480, 48, 24, 24, config).numbers()
         assert (found["gaussians"], found["final_gaussians"]) == (5000, 5000)
 
+    def test_fewer_trajectories_leave_the_starts_of_the_search(self) -> None:
+        def branches(**settings: object) -> float:
+            config = profile_config("quick").with_overrides(
+                {f"explore.{name}": value for name, value in settings.items()}
+            )
+            return replace(work(), config=config).numbers()["branches"]
+
+        assert branches(trajectories=3) == branches(trajectories=12) == 12
+        assert branches(trajectories=20) == 20
+        assert branches(trajectories=3, starts=1) == 3
+        assert branches(trajectories=3, wave=1) == branches(trajectories=3, score="pairs") == 3
+
     def test_those_of_a_scene_that_is_there_count(self) -> None:
         item = replace(work(), coarse_gaussians=1234)
         assert item.numbers()["gaussians"] == 1234
