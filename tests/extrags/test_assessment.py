@@ -138,6 +138,36 @@ class TestAssess:
         whole = assess(tube.scene, tube.sequence, small).measurements
         assert found["lacking_share"] == pytest.approx(whole["lacking_share"], abs=0.02)
 
+    def test_a_pixel_that_is_partly_outside_the_mask_saw_nothing(self):
+        tube = small_tube()
+        small = config().with_overrides({"explore.render_width": tube.sequence.width // 2})
+
+        def found(columns: int) -> dict[str, float]:
+            mask = np.zeros_like(tube.sequence.mask)
+            mask[:, :, :columns] = True
+            return assess(tube.scene, replace(tube.sequence, mask=mask), small).measurements
+
+        # A column more is half a pixel of the small views, and two more are a whole one.
+        assert found(25) == found(24) != found(26)
+
+    def test_surface_seen_from_as_many_directions_as_are_asked_for_is_seen_well(self):
+        tube = small_tube()
+        one = replace(tube.sequence, split=replace(tube.sequence.split, train=np.array([3])))
+        # What a single view sees it sees from one direction.
+        enough, more = (
+            assess(tube.scene, one, config(min_directions=count)).measurements for count in (1, 2)
+        )
+        assert enough["poor_share"] < 0.5
+        assert more["lacking_share"] == 1
+
+    def test_a_faint_pixel_is_poorly_seen_by_what_it_is_made_of(self):
+        tube = small_tube()
+        # No Gaussian is seen from so many directions: what is no hole is poorly seen.
+        settings = config(min_directions=33, hole_alpha=0.02)
+        found = assess(with_gap(tube), tube.sequence, settings).measurements
+        assert found["hole_share"] > 0.05
+        assert found["poor_share"] == pytest.approx(1 - found["hole_share"])
+
     def test_masks_that_leave_nothing_out_change_nothing(self):
         whole = replace(small_tube().sequence, mask=np.ones_like(small_tube().sequence.mask))
         assert assess(small_tube().scene, whole, config()) == tube_plan()
@@ -149,6 +179,17 @@ class TestAssess:
             plan = assess(tube.scene, tube.sequence, config(full_budget_share=full))
             share = lacking / full if expected < 1 else 1.0
             assert plan.decision("explore").budget["trajectories"] == int(np.ceil(share * 20))
+
+    def test_a_part_of_a_trajectory_is_a_whole_one(self):
+        settings = config(full_budget_share=0.5)
+        plan = decide({"lacking_share": 0.255}, settings)
+        assert plan.decision("explore").budget == {"trajectories": 11}
+
+    def test_the_start_of_a_trajectory_is_no_virtual_view(self):
+        settings = config(full_budget_share=0.5).with_overrides({"explore.length": 5})
+        plan = decide({"lacking_share": 0.05}, settings)
+        assert plan.decision("explore").budget == {"trajectories": 2}
+        assert plan.decision("enhance").budget == {"max_views": 8}
 
     def test_no_more_trajectories_than_views_that_are_restored(self):
         # With more, restoration would have to leave some without a view, after all of them were searched.
@@ -253,6 +294,15 @@ class TestProbeViews:
         ]
         # Each is turned by 35 degrees from its own training view.
         assert np.allclose(np.abs(np.stack(turned) - 35.0).min(axis=1), 0, atol=1e-6)
+
+    def test_turn_in_turns_towards_the_shift_and_away_from_it(self):
+        tube = make_tube(n_gaussians=800, n_views=1, width=32, height=24)
+        probes = probe_views(tube.scene, tube.cameras, 26.0, AssessConfig(probe_views=6))
+        start = tube.cameras.world_from_camera[0]
+        shifts = (probes.centers - start[:3, 3]) @ start[:3, :3]
+        axes = probes.world_from_camera[:, :3, 2] @ start[:3, :3]
+        assert (np.linalg.norm(shifts, axis=1) > 1).all()
+        np.testing.assert_array_equal(np.sign((shifts * axes).sum(axis=1)), [1, -1] * 3)
 
     def test_do_not_enter_the_tissue(self):
         # A camera 3 mm from the wall: shifts towards it are cut short.

@@ -89,6 +89,16 @@ class TestPixelConfidence:
         mapped = pixel_confidence(rendered, restored, bounded)
         np.testing.assert_allclose(1 - np.exp(-confidence / 0.25), mapped, rtol=1e-5, atol=1e-6)
 
+    def test_every_view_is_compared_with_its_own_restored_image(self) -> None:
+        """Views are compared a few at a time."""
+        rendered, restored = (np.concatenate([images, images[:, ::-1]] * 2) for images in self._images())
+        restored[5] = rendered[5]
+        measure = PerceptualDifference(None)
+        together = pixel_confidence(rendered, restored, measure)
+        for view in range(len(rendered)):
+            alone = pixel_confidence(rendered[view : view + 1], restored[view : view + 1], measure)
+            np.testing.assert_allclose(together[view], alone[0], atol=1e-6)
+
     def test_raw_lpips_without_weights_is_refused(self) -> None:
         with pytest.raises(WeightsError, match=r"pixel_confidence=raw is LPIPS itself: no weights"):
             PerceptualDifference(None, "no weights", raw=True)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,36 @@ class TestNearFieldLight:
         points = torch.tensor([[4.0, -3.0, 20.0], [0.0, 10.0, 60.0]])
         distance = points.norm(dim=-1)
         torch.testing.assert_close(start.falloff(distance, points[:, 2] / distance), start.gain(points))
+
+    def test_walls_that_slant_and_rays_off_the_axis_are_darker_by_their_powers(self) -> None:
+        near = torch.tensor([25.0, 25.0, 25.0])
+        slanting = replace(light(), cosine=torch.tensor(0.8))
+        facing = torch.tensor([1.0, -0.5, 0.2])
+        expected = ((facing.square() + 0.04) / 1.04) ** 0.4
+        torch.testing.assert_close(slanting.falloff(near, None, facing), expected)
+        spread = replace(light(), spread=torch.tensor(2.0))
+        cosine = torch.tensor([1.0, 0.8, 0.05])
+        torch.testing.assert_close(spread.falloff(near, cosine), cosine.clamp_min(0.1) ** 2)
+
+    def test_exposures_follow_frames_in_whatever_order_they_were_trained(self) -> None:
+        train = np.array([6, 0, 2])
+        own = light().exposures().log()
+        gains = light().interpolated_exposures(np.array([1, 4]), train).log()
+        torch.testing.assert_close(gains, torch.stack([(own[1] + own[2]) / 2, (own[2] + own[0]) / 2]))
+
+    def test_exposures_of_another_recording_do_not_count(self) -> None:
+        train, recording = np.array([0, 2, 4]), np.array([0, 0, 0, 1, 1, 1])
+        own = light().exposures()
+        gains = light().interpolated_exposures(np.array([1, 3, 5]), train, recording)
+        between = (own[0].log() + own[1].log()) / 2
+        torch.testing.assert_close(gains, torch.stack([between.exp(), own[2], own[2]]))
+
+    def test_a_highlight_brighter_than_the_picture_leaves_no_albedo(self) -> None:
+        start = NearFieldLight.initial(1, 25.0)
+        points, normals = torch.tensor([[0.0, 0.0, 20.0]]), torch.tensor([[0.0, 0.0, -1.0]])
+        seen = start.apply_response(0.5 * start.specular_gain(points, normals)[:, None].expand(1, 3))
+        assert seen.min() > 1e-4
+        assert start.albedo(seen, points, normals).abs().max() == 0
 
     def test_exposure_of_held_out_frames(self) -> None:
         """Interpolated inside a recording that was trained on, the mean elsewhere."""

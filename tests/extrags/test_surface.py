@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from plyfile import PlyData
 
 from extrags.cameras import Cameras, look_at, pixel_rays
 from extrags.config import SurfaceConfig
 from extrags.errors import CaptureError, ShapeError
+from extrags.scene import Scene
 from extrags.surface import Mesh, fuse_depth, fuse_surface, rendered_depth
 from extrags.zarr_io import new_group, open_group, read_array, write_array
 
@@ -32,6 +34,19 @@ def sphere_views(n: int = 8, width: int = 72) -> tuple[Cameras, np.ndarray]:
 def normals_and_centres(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     corners = mesh.vertices[mesh.triangles].astype(np.float64)
     return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), corners.mean(axis=1)
+
+
+def test_depth_of_faint_pixels_is_not_fused() -> None:
+    tube = small_tube()
+    gaussians = tube.scene.gaussians
+    faint = Scene(replace(gaussians, opacities=gaussians.opacities - 3.5), tube.scene.light)
+    with torch.no_grad():
+        alpha = faint.render(tube.cameras).alpha.numpy()
+    config = SurfaceConfig(min_alpha=float(np.median(alpha)))
+    _, depth = rendered_depth(faint, tube.cameras, config)
+    assert depth.shape == alpha.shape
+    assert not depth[alpha < config.min_alpha - 1e-3].any()
+    assert (depth[alpha > config.min_alpha + 1e-3] > 0).mean() > 0.9
 
 
 class TestFuseDepth:

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import cloudpickle
 import pytest
+from prefect import Task
 
 from extrags.errors import ConfigError, DamagedArtefactError, DivergedError
 from extrags.store import Ref, Slot, Store
+from tasks.enhance import restore
+from tasks.finetune import judge
 from tasks.progress import StageProgress, observed
 from tasks.stage import ArtefactRecords, StageKey, at, stage, stage_key, stage_versions
 from tests.tasks.toy import ToyConfig, double, source, total
@@ -106,6 +109,24 @@ class TestKey:
     def test_settings_and_inputs_count(self) -> None:
         assert self.key(config=ToyConfig(scale=2.0)) != self.key()
         assert stage_key(double, {"number": Ref(uri="u", digest="e")}) != self.key()
+
+    def test_another_device_counts_and_the_processor_is_as_none(self) -> None:
+        key = StageKey(name="a", version=1)
+        none, cpu, cuda = (
+            key.compute_key(None, {"x": 1} | device, None)
+            for device in ({}, {"device": "cpu"}, {"device": "cuda"})
+        )
+        assert none == cpu != cuda
+
+    @pytest.mark.parametrize("task", [restore, judge])
+    def test_weights_of_confidences_count_by_their_content(self, task: Task[..., Ref]) -> None:
+        key = task.cache_policy
+        assert isinstance(key, StageKey)
+        one, other, elsewhere = (
+            key.compute_key(None, {"weights_digest": digest, "weights": place}, None)
+            for digest, place in (("one", "here"), ("other", "here"), ("one", "there"))
+        )
+        assert one == elsewhere != other
 
     def test_two_stages_never_share_a_key(self) -> None:
         assert StageKey(name="a", version=1).compute_key(None, {"x": 1}, None) != StageKey(

@@ -8,7 +8,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from extrags.depth.completion import INPUT_CHANNELS, STEREO, CompletionNetwork, completion_loss
+from extrags.depth.completion import (
+    INPUT_CHANNELS,
+    SHADING,
+    STEREO,
+    CompletionNetwork,
+    completion_inputs,
+    completion_loss,
+)
 from extrags.depth.pretraining import cavities, photographs
 from extrags.depth.pretraining import examples as practice
 from extrags.depth.pretraining.cavities import KINDS, Cavities, Kind
@@ -25,8 +32,9 @@ from extrags.depth.pretraining.training import (
     train_completion,
     unmatched,
 )
-from extrags.depth.stereo import StereoSettings
+from extrags.depth.stereo import StereoSettings, multi_view_stereo
 from extrags.depth.weights import load_completion
+from tests.extrags.depth.planes import tilted_plane
 
 
 def test_an_untrained_network_believes_stereo() -> None:
@@ -46,6 +54,26 @@ def test_loss_of_a_constant_error() -> None:
     assert float(terms["error"]) == pytest.approx(0.2 * torch.e - 1, rel=1e-5)
     hidden = completion_loss(truth + 0.2, truth, truth, torch.zeros_like(mask))
     assert float(hidden["depth"]) == 0
+
+
+def test_what_is_unknown_has_no_slope() -> None:
+    truth, mask = torch.zeros(1, 8, 8), torch.ones(1, 8, 8)
+    mask[..., 4:] = 0
+    terms = completion_loss(truth + 0.2, truth, truth, mask)
+    assert float(terms["depth"]) == pytest.approx(0.2)
+    assert float(terms["slope"]) == pytest.approx(0, abs=1e-6)
+
+
+def test_brightness_that_could_not_be_fitted_predicts_nothing() -> None:
+    frames, _ = tilted_plane()
+    sources = torch.tensor([[1, 2], [0, 2], [1, 3], [2, 4], [3, 2]])
+    near, far = torch.full((5,), 0.8), torch.full((5,), 5.0)
+    stereo = multi_view_stereo(frames, sources, near, far, StereoSettings(hypotheses=16, radius_px=2))
+    prior = torch.full_like(stereo.prior, 2.0)
+    for scatter, known in ((0.1, True), (torch.inf, False)):
+        fitted = replace(stereo, prior=prior, prior_scatter=torch.full_like(stereo.prior_scatter, scatter))
+        found = completion_inputs(frames, fitted).channels[:, SHADING]
+        assert bool((found != 0).any()) == known
 
 
 def test_expected_error_does_not_move_the_depth() -> None:

@@ -11,11 +11,17 @@ import pytest
 import torch
 
 from extrags.config import DepthConfig
+from extrags.depth import estimate as depth_estimate
+from extrags.depth.completion import CompletionNetwork
 from extrags.depth.estimate import DepthEstimate, estimate_depth, posed_frames
+from extrags.depth.frames import PosedFrames
+from extrags.depth.shading import ShadingFit
+from extrags.depth.stereo import StereoDepth, StereoSettings, multi_view_stereo
 from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, subscribed
 from extrags.sequence import EndoscopicSequence, Split
 from extrags.stress.inputs import plane_views
+from tests.extrags.depth.planes import tilted_plane
 from tests.extrags.depth.withheld import true_training_depth, with_points, withheld_phantom
 
 SETTINGS = {"hypotheses": 48, "sources": 4}
@@ -189,9 +195,9 @@ def test_a_frame_that_nothing_matches_is_told_to_be_a_guess(withheld: Endoscopic
     assert found.report == estimate_depth(part.with_poses(poses), DepthConfig(**SETTINGS)).report
 
 
-def test_far_from_the_origin_of_the_world() -> None:
+def _plane_sequence() -> EndoscopicSequence:
     cameras, depth, _, _ = plane_views(3, 16, 12)
-    sequence = EndoscopicSequence(
+    return EndoscopicSequence(
         name="made/plane",
         rgb=np.zeros((*depth.shape, 3), np.uint8),
         K=cameras.K,
@@ -199,10 +205,97 @@ def test_far_from_the_origin_of_the_world() -> None:
         split=Split("made", np.arange(3), np.arange(0)),
         world_from_camera=cameras.world_from_camera,
     )
-    poses = cameras.world_from_camera.copy()
+
+
+def test_far_from_the_origin_of_the_world() -> None:
+    sequence = _plane_sequence()
+    poses = sequence.cameras.world_from_camera.copy()
     poses[:, :3, 3] += 1e5
     here, there = (posed_frames(given) for given in (sequence, replace(sequence, world_from_camera=poses)))
     steps = [
         given.world_from_camera[1:, :3, 3] - given.world_from_camera[:1, :3, 3] for given in (here, there)
     ]
     torch.testing.assert_close(steps[1], steps[0], atol=1e-5, rtol=1e-5)
+
+
+def test_a_frame_that_sees_far_points_alone_is_searched_nearer_too() -> None:
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 0, 3] = 1000.0
+    sequence = EndoscopicSequence(
+        name="made/apart",
+        rgb=np.zeros((2, 12, 16, 3), np.uint8),
+        K=np.tile(np.array([[16.0, 0, 8], [0, 16.0, 6], [0, 0, 1]]), (2, 1, 1)),
+        mask=np.ones((2, 12, 16), dtype=bool),
+        split=Split("made", np.arange(2), np.arange(0)),
+        world_from_camera=poses,
+    )
+    points = np.repeat([[0.0, 0.0, 10.0], [1000.0, 0.0, 50.0]], 20, axis=0)
+    near, typical, far = depth_estimate._ranges(sequence, points, DepthConfig(range_margin=2.0))
+    np.testing.assert_allclose(near, [5.0, 15.0])
+    np.testing.assert_allclose(typical, [10.0, 50.0])
+    # At least as far as what is typical of all.
+    np.testing.assert_allclose(far, [60.0, 100.0])
+
+
+@pytest.fixture(scope="module")
+def plane_stereo() -> tuple[PosedFrames, StereoDepth]:
+    frames, depth = tilted_plane()
+    sources = torch.tensor([[1, 2], [0, 2], [1, 3], [2, 4], [3, 2]])
+    near, far = torch.full((5,), 0.8), torch.full((5,), 5.0)
+    settings = StereoSettings(hypotheses=16, radius_px=2)
+    return frames, multi_view_stereo(frames, sources, near, far, settings, monocular=1 / depth)
+
+
+def test_stereo_and_a_monocular_network_count_by_the_squares_of_their_errors(
+    plane_stereo: tuple[PosedFrames, StereoDepth],
+) -> None:
+    _, stereo = plane_stereo
+    unsure = replace(
+        stereo,
+        agrees=torch.zeros_like(stereo.agrees),
+        prior=stereo.fused + 0.3,
+        prior_scatter=torch.full_like(stereo.prior_scatter, 0.1),
+    )
+    log_depth, error = depth_estimate._with_fallback(unsure)
+    # Errors of a half and of a tenth: 4 to 100.
+    torch.testing.assert_close(log_depth - stereo.fused, torch.full_like(log_depth, 0.3 * 100 / 104))
+    torch.testing.assert_close(error, torch.full_like(error, 104**-0.5))
+
+
+def test_stereo_that_others_look_through_is_not_mixed_in(
+    plane_stereo: tuple[PosedFrames, StereoDepth], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames, stereo = plane_stereo
+    ones = torch.ones_like(stereo.agrees)
+    violates = torch.zeros_like(ones)
+    violates[..., :20] = 1
+    found = replace(stereo, agrees=ones, seen=ones, violates=violates)
+    expected = stereo.fused - 0.1
+    error = torch.full_like(expected, 0.2)
+    sources = torch.tensor([[1, 2], [0, 2], [1, 3], [2, 4], [3, 2]])
+    monkeypatch.setattr(depth_estimate, "_run_network", lambda *_: (expected, error))
+    monkeypatch.setattr(depth_estimate, "_sources", lambda *_: sources)
+    monkeypatch.setattr(depth_estimate, "sweep_around", lambda *_, **__: found)
+    mixed, left, _ = depth_estimate._completed(
+        CompletionNetwork(),
+        frames,
+        _plane_sequence(),
+        stereo,
+        DepthConfig(),
+        StereoSettings(),
+        depth_estimate._Told("depth", 6),
+    )
+    torch.testing.assert_close(mixed[..., :20], expected[..., :20])
+    assert (mixed - expected)[..., 20:].min() > 0.05
+    assert left[..., :20].min() > 1.5 * left[..., 20:].max()
+
+
+def test_only_what_nothing_matches_has_an_error_of_its_scale(
+    plane_stereo: tuple[PosedFrames, StereoDepth],
+) -> None:
+    _, stereo = plane_stereo
+    fit = ShadingFit(0.5, torch.tensor([0.0, 9.0, 0.1, 0.2, 0.3]), 0.1, 0.2, 1000)
+    found = depth_estimate._scale_error(replace(stereo, n_sources=torch.tensor([2, 0, 2, 1, 2]), fits=[fit]))
+    # As far as the intercepts of the others differ.
+    spread = float(np.std([0.0, 0.1, 0.2, 0.3], ddof=1))
+    torch.testing.assert_close(found, torch.tensor([0.0, spread, 0.0, 0.0, 0.0]))

@@ -13,6 +13,7 @@ import torch
 from extrags.depth import matching, native
 from extrags.depth.consistency import agreement
 from extrags.depth.frames import PosedFrames, select_sources
+from extrags.depth.shading import fit_shading
 from extrags.depth.stereo import StereoSettings, multi_view_stereo, sweep_around
 from extrags.errors import ShapeError
 from extrags.raster import native as raster_native
@@ -224,6 +225,60 @@ def test_agreement_of_true_depths_and_of_wrong_ones() -> None:
     found = agreement(frames, wrong, torch.tensor([3]), sources[:1])
     assert found.violates[found.seen > 0].mean() > 0.99
     assert found.agrees[found.seen > 0].mean() < 0.01
+
+
+def test_depth_is_fused_with_that_of_all_that_agree() -> None:
+    frames, depth = inside_sphere()
+    farther = depth.clone()
+    farther[3] *= 1.03
+    found = agreement(frames, farther, torch.tensor([3]), torch.tensor([[1, 2]]))
+    both = (found.seen * found.agrees)[0] == 1
+    assert both.float().mean() > 0.3
+    # A third of the error is left where two others agree.
+    assert float((found.fused[0] - depth[3].log())[both].exp().mean()) == pytest.approx(1.01, abs=2e-3)
+
+
+def test_a_wide_range_is_searched_from_end_to_end() -> None:
+    frames, depth = tilted_plane()
+    sources = torch.tensor([[1, 2], [0, 2], [1, 3], [2, 4], [3, 2]])
+    near, far = torch.full((5,), 1.0), torch.full((5,), 100.0)
+    found = multi_view_stereo(frames, sources, near, far, StereoSettings(hypotheses=64, radius_px=2))
+    assert (found.log_depth - depth.log()).abs()[:, 4:-4, 4:-4].median() < 0.05
+
+
+def test_a_frame_that_nothing_matches_has_the_depth_that_is_predicted() -> None:
+    frames, depth = tilted_plane()
+    sources = torch.tensor([[1, 2], [0, 2], [1, 3], [2, 1], [-1, -1]])
+    near, far = torch.full((5,), 0.8), torch.full((5,), 5.0)
+    settings = StereoSettings(hypotheses=24, radius_px=2, shading=False)
+    known, blind = (
+        multi_view_stereo(frames, sources, near, far, settings, monocular=monocular).log_depth[4]
+        for monocular in (1 / depth, None)
+    )
+    # Without any prediction it is the middle of the range.
+    torch.testing.assert_close(blind, torch.full_like(blind, 2.0).log())
+    both = torch.stack([known.flatten(), depth[4].log().flatten()])
+    assert float(torch.corrcoef(both)[0, 1]) > 0.95
+    assert (known - depth[4].log()).abs().median() < 0.2
+
+
+def test_brightness_is_not_fitted_where_it_is_saturated(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames, _ = tilted_plane()
+    frames.rgb[:, 0, 10:20, 20:30] = 1.0
+    asked: list[torch.Tensor] = []
+
+    def fitted(
+        brightness: torch.Tensor, log_depth: torch.Tensor, sure: torch.Tensor, recording: torch.Tensor
+    ):
+        asked.append(sure)
+        return fit_shading(brightness, log_depth, sure, recording)
+
+    monkeypatch.setattr("extrags.depth.stereo.fit_shading", fitted)
+    sources = torch.tensor([[1, 2], [0, 2], [1, 3], [2, 4], [3, 2]])
+    near, far = torch.full((5,), 0.8), torch.full((5,), 5.0)
+    multi_view_stereo(frames, sources, near, far, StereoSettings(hypotheses=24, radius_px=2))
+    assert asked[0].float().mean() > 0.2
+    assert not asked[0][:, 10:20, 20:30].any()
 
 
 def test_sources_lie_on_both_sides_and_share_the_view() -> None:

@@ -15,11 +15,11 @@ from extrags.exploration.expected_error import Sizes, measure_sizes, probe_camer
 from extrags.exploration.measurements import Destinations, SceneMeasurements, frontier_of, measure_scene
 from extrags.exploration.search import Branch, SearchContext, grow_branch, prepare_search
 from extrags.exploration.seen import ErrorValue, PairValue, Seen, Value, union
-from extrags.freespace import FREE, FreeSpace, carve
+from extrags.freespace import FREE, OCCUPIED, FreeSpace, carve
 from extrags.scene import Scene
 from extrags.surface import fuse_surface
 
-from .tube import Tube, make_ball, make_tube, small_config, small_freespace, small_tube
+from .tube import Tube, make_ball, make_tube, small_config, small_freespace, small_tube, square_camera
 
 ROWS = 12
 START = 5
@@ -131,6 +131,17 @@ class TestProbes:
         )
         assert turned.max() > 120
         assert np.linalg.norm(centers - cameras.centers[which], axis=1).max() > 0.5 * ready.depth_unit_mm
+
+    def test_none_passes_through_a_wall(self):
+        # Two rooms beside each other, and a camera in the left one.
+        occupancy = np.full((16, 16, 16), FREE, np.uint8)
+        occupancy[8] = OCCUPIED
+        space = FreeSpace(occupancy, np.full(3, -8.0), np.eye(3), 1.0, np.ones((16, 16, 16), np.float32))
+        pose = np.eye(4)
+        pose[0, 3] = -2.5
+        probes = probe_cameras(square_camera(pose), space, 6.0, 0.1, error_config(probe_shift=1.0))
+        assert probes.centers[:, 0].max() < 0
+        assert np.linalg.norm(probes.centers - pose[:3, 3], axis=1).max() > 3
 
     def test_another_seed_gives_others(self):
         first, second = context().measured, context(seed=1).measured

@@ -9,6 +9,8 @@ import pytest
 
 from extrags.cameras import rotation_angle_deg
 from extrags.errors import CaptureError, ShapeError
+from extrags.events import Event, Progress, subscribed
+from extrags.exploration import search
 from extrags.exploration.coverage import coverage_gain, rendered_pairs, training_coverage
 from extrags.exploration.darkness import luminance
 from extrags.exploration.primitives import PRIMITIVES, apply_primitives, primitive_motions
@@ -177,6 +179,24 @@ class TestGrowBranch:
         start = found.pairs & 0
         start |= rendered_pairs(ready.scene, ready.scoring_cameras(np.eye(4)[None]), **SEEN)[1][0]
         assert found.values[0] == max(int(coverage_gain(start, pairs[0])) for pairs in alone)
+
+    @pytest.mark.parametrize("sign", [1, -1])
+    def test_the_queue_gives_its_best_and_the_most_valuable_path_is_kept(self, sign, monkeypatch):
+        # Each of the four turns is a dead end, so that they are all tried, the best score first.
+        ready, _ = disc_context(hole_weight=1.0)
+        rows = len(ready.scene.gaussians) + len(ready.frontier)
+        # What is known of the holes already makes the turns worth different amounts.
+        seen = np.random.default_rng(4).integers(0, 2**32, rows, dtype=np.uint32)
+        monkeypatch.setattr(search, "score", lambda candidates, _: sign * candidates.value)
+        events: list[Event] = []
+        with subscribed(events.append):
+            found = grow_branch(ready, np.eye(4), seen)
+        tried = [event.values["value"] for event in events if isinstance(event, Progress)]
+        worths = sorted({*tried})
+        assert len(tried) == len(worths) == 4
+        assert tried == worths[::-sign]
+        at_start = ready.value.gain(seen, ready.seen(*ready.observe(np.eye(4)[None])))
+        assert at_start + sum(found.values) == pytest.approx(worths[-1])
 
     def test_a_spent_budget_keeps_the_best_path(self):
         found = branch(length=16, max_expansions=3)

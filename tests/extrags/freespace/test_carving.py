@@ -11,6 +11,7 @@ from extrags.cameras import Cameras, rotation_about
 from extrags.config import FreespaceConfig
 from extrags.errors import CaptureError, ShapeError
 from extrags.freespace import FREE, OCCUPIED, UNKNOWN, FreeSpace, carve, voxel_visibility
+from extrags.freespace.carving import _nearest_error, carving_views
 from extrags.gaussians import Gaussians
 from extrags.scene import Scene
 from extrags.surface import Mesh
@@ -227,6 +228,30 @@ class TestCarve:
         assert space.lookup(np.array([0.0, 0, 6.0])) == OCCUPIED
         assert space.lookup(np.array([0.0, 0, 11.0])) == UNKNOWN
         assert space.lookup(np.array([8.0, 0, 11.0])) == FREE
+
+    @pytest.mark.parametrize(("wall_voxels", "layers"), [(1.5, 1), (3.0, 3)])
+    def test_the_wall_is_as_thick_as_is_asked_for(self, wall_voxels, layers):
+        scene, wall = scene_of_points(sheet(16.0, half=20.0, n=80)), sheet_mesh(16.0, 20.0)
+        config = FreespaceConfig(grid_size=32, wall_voxels=wall_voxels, passage_share=0.0, margin_share=0.2)
+        space = carve(scene, wall, square_camera(), config)
+        at_wall = space.from_grid(np.floor(space.to_grid(np.array([0.3, 0.3, 16.0]))) + 0.5)
+        behind = at_wall + np.outer(np.arange(6) * space.voxel_mm, [0, 0, 1])
+        expected = np.where(np.arange(6) <= layers, OCCUPIED, UNKNOWN)
+        np.testing.assert_array_equal(space.lookup(behind), expected)
+
+    def test_the_views_that_carve_are_far_from_each_other(self):
+        tube = small_tube()
+        # Most of the recording lingers in one place.
+        cameras = tube.cameras[[0] * 6 + [4, 7]]
+        chosen = carving_views(tube.scene, cameras, FreespaceConfig(max_views=3))
+        found = np.unique(chosen.centers, axis=0)
+        np.testing.assert_array_equal(found, np.unique(tube.cameras.centers[[0, 4, 7]], axis=0))
+
+    def test_the_largest_error_of_a_voxel_counts(self):
+        vertices = np.array([[0.2, 0.5, 0.5], [0.6, 0.5, 0.5], [0.7, 0.5, 0.5], [3.5, 3.5, 3.5]])
+        found = _nearest_error(vertices, np.array([0.1, 0.4, 0.2, 0.3]), 4)
+        assert found[0, 0, 0] == found[1, 0, 0] == 0.4
+        assert found[3, 3, 3] == found[3, 3, 2] == 0.3
 
     def test_one_training_view_is_enough(self):
         tube = small_tube()

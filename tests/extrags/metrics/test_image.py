@@ -109,6 +109,13 @@ def test_ssim_is_bounded_and_symmetric(seed: int, height: int, width: int, dark:
     assert bool((forth >= -1).all())
 
 
+def test_ssim_of_a_negative_is_negative() -> None:
+    image = torch.rand(1, 32, 32, 3, generator=torch.Generator().manual_seed(6))
+    found = ssim(image, 1 - image)
+    assert found is not None
+    assert -1 <= found < -0.8
+
+
 def test_ssim_gradient() -> None:
     # Once inside inference mode first: tensors cached there must still serve autograd.
     with torch.inference_mode():

@@ -62,6 +62,18 @@ def test_umeyama_never_mirrors() -> None:
     assert np.linalg.det(found.rotation) == pytest.approx(1)
 
 
+def test_umeyama_has_the_best_scale_of_what_is_mirrored() -> None:
+    source = np.random.default_rng(8).normal(size=(30, 3))
+    target = 2 * source * [1, 1, -0.4]
+    found = umeyama(source, target)
+
+    def squares(scale: float) -> float:
+        moved = scale * source @ found.rotation.T
+        return float(np.square((target - target.mean(0)) - (moved - moved.mean(0))).sum())
+
+    assert squares(found.scale) < min(squares(0.99 * found.scale), squares(1.01 * found.scale))
+
+
 def test_points_on_a_line_still_fit() -> None:
     source = np.linspace(0, 1, 8)[:, None] * np.array([1.0, 2.0, 3.0])
     wanted = random_similarity(3, 2.0)

@@ -12,7 +12,7 @@ from extrags.config import PosesConfig
 from extrags.errors import CaptureError
 from extrags.events import Event, Progress, subscribed
 from extrags.poses import RgbdAlignment, align_by_depth, errors_against_given
-from extrags.poses.alignment import Posed, agreement, align, pair_equations
+from extrags.poses.alignment import TUKEY, Posed, _solved, _tukey, agreement, align, pair_equations
 from extrags.poses.depth_views import depth_view
 from extrags.poses.landmarks import Landmarks, landmarks, match_landmarks, relative_pose
 from extrags.sequence import EndoscopicSequence, Split
@@ -209,3 +209,17 @@ class TestLandmarks:
         assert len(none.points) == 0
         assert len(match_landmarks(none, none)) == 0
         assert relative_pose(none, landmarks(sequence, 0), seed=0) == (None, 0)
+
+
+def test_residuals_far_beyond_the_usual_do_not_count() -> None:
+    ratios = np.array([0.0, 0.5 * TUKEY, -0.5 * TUKEY, TUKEY, 3 * TUKEY])
+    np.testing.assert_allclose(_tukey(ratios), [1, 0.75**2, 0.75**2, 0, 0])
+
+
+def test_what_is_nearly_undetermined_is_solved_alike_in_any_unit() -> None:
+    rows = np.random.default_rng(0).normal(size=(20, 6))
+    rows[:, 5] *= 1e-3
+    normal, right = rows.T @ rows, rows.T @ np.random.default_rng(1).normal(size=20)
+    length = np.repeat([1.0, 1000.0], 3)
+    found = _solved(normal / np.outer(length, length), right / length, 2000.0)
+    np.testing.assert_allclose(found, length * _solved(normal, right, 2.0), rtol=1e-6)

@@ -60,6 +60,27 @@ def test_a_third_of_outliers_and_unknown_depth() -> None:
     assert found.mm_per_unit == pytest.approx(MM_PER_UNIT, rel=1e-4)
 
 
+@pytest.mark.parametrize("unit", [1.0, 250.0])
+def test_the_spread_is_a_share_whatever_the_unit(unit: float) -> None:
+    given = observations(60)
+    signs = np.random.default_rng(2).choice([0.9, 1.0, 1.1], given["depth_mm"].shape, p=[0.4, 0.2, 0.4])
+    given["depth_mm"] = (unit * signs * given["depth_mm"]).astype(np.float32)
+    found = depth_scale(**given)
+    assert found is not None
+    assert found.mm_per_unit == pytest.approx(unit * MM_PER_UNIT, rel=1e-4)
+    assert found.relative_spread == pytest.approx(0.1, rel=1e-3)
+
+
+def test_depth_outside_the_mask_does_not_count() -> None:
+    given = observations(60)
+    given["mask"][:, :, 40:] = False
+    given["depth_mm"][:, :, 40:] *= 5
+    found = depth_scale(**given)
+    assert found is not None
+    assert found.relative_spread < 1e-6
+    assert found.n_observations < len(given["observed_frame"])
+
+
 def test_masked_and_missing_depth_give_no_scale() -> None:
     given = observations(60)
     assert depth_scale(**given | {"mask": np.zeros_like(given["mask"])}) is None

@@ -35,6 +35,12 @@ class TestDomain:
         scores = [domain.score(scene) for scene in world(np.random.default_rng(3), shift=1.0)]
         assert min(scores) > 1
 
+    def test_the_distance_is_a_mean_over_directions(self) -> None:
+        domain = Domain(np.ones(3), np.eye(3)[:2], np.array([1.0, 2.0]), 1.0)
+        patches = np.array([[4.0, 9.0, 7.0], [1.0, 1.0, 1.0], [2.0, 3.0, 0.0]])
+        assert domain.score(patches) == pytest.approx(1.0)
+        assert domain.score(patches[:1]) == pytest.approx(np.sqrt((3**2 + 4**2) / 2))
+
     def test_it_goes_through_json(self, domain: Domain) -> None:
         loaded = Domain.from_dict(json.loads(json.dumps(domain.as_dict())))
         (scene,) = world(np.random.default_rng(4), scenes=1)

@@ -79,6 +79,24 @@ class TestChoice:
         missing[..., 10:16] = 1
         assert sorted(choose_keyframes(cameras, depth, missing, 3)) == [0, 2]
 
+    def test_the_nearer_of_two_views_of_one_hole_serves_both(self) -> None:
+        cameras = flat_views([0.0, 0.0])
+        cameras.world_from_camera[1, 2, 3] = -10.0
+        depth = torch.full((2, 1, 16, 40), 10.0)
+        depth[1] = 20.0
+        missing = torch.zeros(2, 1, 16, 40)
+        missing[0, ..., 4:12, 12:28] = 1
+        missing[1, ..., 6:10, 16:24] = 1
+        assert choose_keyframes(cameras, depth, missing, 1) == [0]
+
+    def test_what_stands_before_a_hole_does_not_show_it(self) -> None:
+        cameras = flat_views([0.0, 0.0])
+        depth = torch.full((2, 1, 16, 40), 10.0)
+        depth[1] = 30.0
+        missing = torch.zeros(2, 1, 16, 40)
+        missing[..., 10:16] = 1
+        assert sorted(choose_keyframes(cameras, depth, missing, 2)) == [0, 1]
+
     def test_nothing_missing_needs_none(self) -> None:
         cameras = flat_views([0.0, 1.0])
         depth = torch.full((2, 1, 16, 40), 10.0)
@@ -107,6 +125,23 @@ class TestKeyframes:
         assert found.unknown.max() > 200
         again = restore_keyframes(tube.scene, tube.sequence, TRAJECTORIES, ClassicalEnhancer(), SETTINGS)
         assert np.array_equal(again.rgb, found.rgb)
+
+    def test_each_has_the_exposure_of_its_view(self, tube: Tube) -> None:
+        clips = [cameras[1:] for cameras in TRAJECTORIES]
+        gains = 0.5 + torch.arange(9).reshape(3, 3) / 10
+        found = make_keyframes(
+            tube.scene, tube.references, clips, ClassicalEnhancer(), SETTINGS, exposure=list(gains)
+        )
+        assert found.view[:, 1].any()
+        np.testing.assert_array_equal(found.exposure, gains.numpy()[found.view[:, 0], found.view[:, 1]])
+
+    def test_others_are_shown_them_at_their_exposures(self, tube: Tube) -> None:
+        clips = [cameras[1:] for cameras in TRAJECTORIES]
+        found = make_keyframes(tube.scene, tube.references, clips, ClassicalEnhancer(), SETTINGS)
+        gains = np.linspace(0.5, 0.8, len(found), dtype=np.float32)
+        invented = replace(found, exposure=gains).invented(tube.references.transfer)
+        assert invented is not None
+        np.testing.assert_array_equal(invented.views.exposure, gains)
 
     def test_a_later_one_follows_the_earlier(self, tube: Tube) -> None:
         # The same view in two clips: alone, each paints it with a colour of its own.

@@ -154,6 +154,32 @@ class TestRestoredRenders:
         assert change[-1].mean() < -1e-4
         assert (np.abs(change).max(axis=-1) < 1e-6).mean() > 0.05
 
+    def test_holes_of_the_final_scene_are_invented_whatever_was_judged(
+        self, tube: Tube, renders: RenderedViews, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        half = renders.rgb.shape[2] // 2
+        solid = replace(renders, alpha=np.ones_like(renders.alpha))
+        solid.alpha[..., :half] = 0
+        training = tube.sequence.training_part()
+
+        def invented(shares: RestoredShares) -> torch.Tensor:
+            asked: list[torch.Tensor] = []
+            monkeypatch.setattr(
+                restored_renders_module,
+                "agreed_views",
+                lambda rgb, _, unconfirmed, *__: [rgb, asked.append(unconfirmed)][0],
+            )
+            restored_renders(
+                tube.scene, solid, tube.sequence, training, Unnamed(), CONFIG, finish="smooth", shares=shares
+            )
+            return torch.cat(asked)
+
+        usual, none = invented(RestoredShares()), invented(RestoredShares(0.0, 0.0))
+        assert usual[..., :half].any()
+        assert usual[..., half:].any()
+        torch.testing.assert_close(none[..., :half], usual[..., :half])
+        assert none[..., half:].abs().max() < 1e-6
+
     def test_geometry_stays_that_of_the_scene(self, tube: Tube, renders: RenderedViews) -> None:
         mixed = restored(tube, renders, ClassicalEnhancer())
         np.testing.assert_array_equal(mixed.depth_mm, renders.depth_mm)
@@ -231,6 +257,35 @@ class TestRestoredShares:
         assert found is not None
         assert found.known == (0.4 if certainty else RESTORED_SHARE)
         assert found.invented == pytest.approx(expected)
+
+    def test_what_lies_outside_the_masks_does_not_decide(self, tube: Tube, renders: RenderedViews) -> None:
+        test = tube.sequence.test
+        mask, other = tube.sequence.mask.copy(), tube.sequence.rgb.copy()
+        mask[..., 40:] = False
+        other[test, :, 40:] = 255 - other[test, :, 40:]
+        truth = tube.sequence.rgb[test].astype(np.float32) / 255
+        rendered = (truth - 0.02).astype(np.float32)
+        found = [
+            restored_shares(
+                [(tube.scene, replace(renders, rgb=rendered), replace(tube.sequence, mask=mask, rgb=rgb))],
+                Shifted(rendered.clip(0, 1), 0.1),
+                CONFIG,
+            )
+            for rgb in (tube.sequence.rgb, other)
+        ]
+        assert found[0] is not None
+        assert found[0].known < RESTORED_SHARE
+        assert found[0] == found[1]
+
+    def test_smaller_errors_have_less_in_common_with_those_of_restored_views(self) -> None:
+        """A quarter of the squared error is half the error, and so half its product with another."""
+        errors = restored_renders_module._Errors
+        trial = errors(pixels=1e4, rendered=4.0, restored=10.0, product=1.5)
+        scene = errors(pixels=1e4, rendered=1.0, restored=10.0, product=0.75)
+        share, certainty = trial.share("known", 0.25)
+        assert (share, certainty) == pytest.approx(scene.share("known", 1.0))
+        assert share == pytest.approx(0.25 / 9.5)
+        assert certainty == 1
 
     def test_blending_and_filling_needs_none(self, tube: Tube, renders: RenderedViews) -> None:
         assert restored_shares([(tube.scene, renders, tube.sequence)], ClassicalEnhancer(), CONFIG) is None

@@ -66,6 +66,25 @@ class TestTiles:
         assert float(texture.tiles.std()) == pytest.approx(expected, rel=0.1)
         assert float(texture.tiles.abs().max()) <= 2 * MOST_DETAIL
 
+    def test_the_edge_of_what_is_seen_is_no_detail(self) -> None:
+        texture = SurfaceTexture.of_references(plane_references(facing_plane((0, 0)), contrast=0.0))
+        assert texture is not None
+        assert float(texture.tiles.abs().max()) < 1e-4
+
+    def test_what_is_not_trusted_does_not_set_their_scale(self) -> None:
+        references = plane_references(facing_plane((0, 0), (7, 3)))
+        references.packed[1, 3] = 0
+        references.packed[1, 4] *= 2
+        texture = SurfaceTexture.of_references(references)
+        assert texture is not None
+        assert texture.texel_mm == pytest.approx(PIXEL_MM, rel=1e-3)
+
+    def test_they_show_one_surface(self) -> None:
+        references = plane_references(facing_plane((0, 0)))
+        for left in range(0, WIDTH, 24):
+            references.packed[..., left : left + 4] *= torch.tensor([1, 1, 1, 1, 2, 1])[None, :, None, None]
+        assert SurfaceTexture.of_references(references) is None
+
     def test_there_is_none_where_no_depth_is_known(self) -> None:
         assert SurfaceTexture.of_references(plane_references(facing_plane((0, 0)), known=False)) is None
 
@@ -87,6 +106,22 @@ class TestDetail:
         # Pixels lie on texels here: nothing is averaged.
         assert float(laid.std() / noise.tiles.std()) == pytest.approx(1, abs=0.03)
         assert abs(float(laid.mean())) < 0.02
+
+    @pytest.mark.parametrize("axis", range(3))
+    def test_a_wall_shows_it_along_both_of_its_directions(self, noise: SurfaceTexture, axis: int) -> None:
+        normals = torch.eye(3)[[axis] * 200]
+        for along in range(3):
+            points = torch.eye(3)[[along] * 200] * torch.arange(200.0)[:, None] * PIXEL_MM
+            varies = float(noise._at(points, normals, torch.ones(200)).std(dim=0).min()) > 0.03
+            assert varies == (along != axis)
+
+    def test_between_two_planes_it_keeps_its_variance(self, noise: SurfaceTexture) -> None:
+        points = 400 * torch.rand(20000, 3, generator=torch.Generator().manual_seed(1))
+        along, between = (
+            noise._at(points, torch.tensor(normal).expand(20000, 3), torch.ones(20000)).std()
+            for normal in ((1.0, 0.0, 0.0), (0.5**0.5, 0.5**0.5, 0.0))
+        )
+        assert float(between / along) == pytest.approx(1, abs=0.05)
 
     def test_another_seed_lays_other_tiles(self, noise: SurfaceTexture) -> None:
         other = SurfaceTexture(noise.tiles, noise.texel_mm, seed=1)

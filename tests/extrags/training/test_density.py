@@ -148,6 +148,17 @@ class TestDefaultStrategy:
         assert [i for i in range(10) if not decision.keep[i]] == [8, 9]
         assert len(decision.new_gaussians["means"]) == 4
 
+    def test_what_grows_takes_the_room_of_what_is_large_in_the_image(self) -> None:
+        parameters = small_ones(10)
+        density = strategy(10, refine_scale2d_stop_share=1.0, prune_scale2d=10.0, cap=12)
+        gradient = torch.zeros(1, 10, 2)
+        gradient[0, 1, 0] = 1.0
+        density.observe(seen(gradient, radius_px=torch.arange(10.0)[None]))
+        decision = density.decide(parameters, 100)
+        # One is cloned, which leaves room for the split of one.
+        assert [i for i in range(10) if not decision.keep[i]] == [9]
+        assert int(decision.keep.sum()) + len(decision.new_gaussians["means"]) == 12
+
     def test_mean_gradient_counts_visible_views_only(self) -> None:
         parameters = small_ones(3)
         visible = torch.tensor([[True, True, False]])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from extrags.cameras import Cameras
@@ -21,12 +22,15 @@ def cameras_at(*z_mm: float) -> Cameras:
     return Cameras(K, poses, 64, 48)
 
 
-def test_the_bound_is_a_share_of_a_pixel_of_the_nearest_view_that_sees_the_position() -> None:
-    footprint = SmallestFootprint(cameras_at(0.0, 30.0), 0.5)
+@pytest.mark.parametrize("heights_mm", [(0.0, 30.0), (30.0, 0.0)])
+def test_the_bound_is_a_share_of_a_pixel_of_the_nearest_view_that_sees_the_position(
+    heights_mm: tuple[float, float],
+) -> None:
+    footprint = SmallestFootprint(cameras_at(*heights_mm), 0.5)
     means = np.array(
         [
-            [0.0, 0.0, 40.0],  # 40 mm before the first camera, 10 mm before the second
-            [0.0, 0.0, 20.0],  # before the first alone
+            [0.0, 0.0, 40.0],  # 40 mm before one camera, 10 mm before the other
+            [0.0, 0.0, 20.0],  # before one alone
             [0.0, 0.0, -5.0],  # behind both
             [50.0, 0.0, 40.0],  # beside both images
         ]

@@ -18,6 +18,7 @@ from extrags.training.frame_weights import (
     LEAST_SHARPNESS,
     LEAST_WEIGHT,
     FrameWeights,
+    _sharpness,
     frame_weights,
     weighted_views,
 )
@@ -100,6 +101,26 @@ class TestBlur:
             for length in (5, 7, 9)
         ]
         assert weights[0] > weights[1] > weights[2] >= LEAST_WEIGHT
+
+    def test_a_frame_counts_by_the_square_of_its_sharpness(
+        self, plane: EndoscopicSequence, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        sharpness = np.ones(len(plane.train))
+        sharpness[:5] = [1.2, LEAST_SHARPNESS, LEAST_SHARPNESS / 2, 0.01, np.nan]
+        monkeypatch.setattr("extrags.training.frame_weights._sharpness", lambda *_: sharpness)
+        np.testing.assert_allclose(judged(plane).weights[:5], [1, 1, 0.25, LEAST_WEIGHT, 1])
+
+    def test_what_resampling_softens_is_no_blur(self) -> None:
+        """Frames as sharp as each other, each of which is softer where it is warped into another."""
+        sharp, soft = np.eye(2), 0.5 * np.eye(2)
+        pairs = {
+            (frame, source): (sharp, soft) for frame in range(3) for source in range(3) if frame != source
+        }
+        np.testing.assert_allclose(_sharpness(pairs, 3), 1)
+        # One frame of half their gradient.
+        for other in (1, 2):
+            pairs[0, other], pairs[other, 0] = (0.25 * sharp, soft), (sharp, 0.25 * soft)
+        np.testing.assert_allclose(_sharpness(pairs, 3)[0], 0.5, rtol=1e-4)
 
     def test_in_a_minority_of_several_frames(self, plane: EndoscopicSequence) -> None:
         sequence = changed(plane, 2, blurred_along_rows(plane.rgb[2], 7))

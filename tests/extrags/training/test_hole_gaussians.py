@@ -295,6 +295,22 @@ class TestHoleGaussians:
             distance = np.linalg.norm(new.means.double().numpy() - alone.cameras.centers[0], axis=1)
             assert distance.min() >= 21 * (1 - 1e-5)
 
+    def test_virtual_cameras_are_kept_clear_too(
+        self, sequence: EndoscopicSequence, pseudo: PseudoViews, holes: np.ndarray
+    ) -> None:
+        depth = np.full((len(sequence.rgb), *holes.shape[1:]), 30.0, dtype=np.float32)
+        # The real cameras stand far away, and look away.
+        poses = pseudo.cameras.world_from_camera[:1].repeat(len(depth), axis=0)
+        poses[:, :3, 3] -= 500 * poses[:, :3, 2]
+        poses[:, :3, :3] = poses[:, :3, :3] @ np.diag([-1.0, 1.0, -1.0])
+        mask = np.ones_like(sequence.mask)
+        far = replace(sequence, depth_mm=depth, mask=mask, world_from_camera=poses)
+        holes[1:] = False
+        for z, some in ((5.0, False), (25.0, True)):
+            views = wall_views(pseudo, np.full(holes.shape, z), holes)
+            found = hole_gaussians(wall_scene(None), far, views, self.ROOM)
+            assert (found is not None) == some
+
     def test_nothing_to_fill(self, sequence: EndoscopicSequence, pseudo: PseudoViews) -> None:
         none = wall_views(pseudo, np.full((3, HEIGHT, WIDTH), 20.0), np.zeros((3, HEIGHT, WIDTH), dtype=bool))
         assert hole_gaussians(wall_scene(None), sequence, none, self.ROOM) is None

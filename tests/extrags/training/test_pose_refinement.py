@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from extrags.cameras import rotation_about
 from extrags.config import CoarseConfig, DensifyConfig, PoseRefinementConfig
 from extrags.errors import ShapeError
 from extrags.metrics.pose import absolute_trajectory_error
@@ -93,6 +94,24 @@ def test_gradient_of_turn_and_shift_against_differences(
     assert np.corrcoef(analytic, numeric)[0, 1] > 0.98
 
 
+def test_gradient_of_a_large_turn_is_exact() -> None:
+    """Of a loss that is linear in the view matrix."""
+    poses = refinement()
+    weights = np.random.default_rng(0).normal(size=(4, 4))
+    weights[3] = 0
+    start = np.array([0.8, -0.5, 0.3, 0.01, 0.02, -0.015])
+    poses.corrections[1] = start
+    analytic = poses.gradient(1, weights)
+    numeric = np.zeros(6)
+    for axis in range(6):
+        sides = []
+        for sign in (1, -1):
+            poses.corrections[1] = start + sign * 1e-5 * np.eye(6)[axis]
+            sides.append(float((weights * poses.viewmat(1)).sum()))
+        numeric[axis] = (sides[0] - sides[1]) / 2e-5
+    np.testing.assert_allclose(analytic, numeric, rtol=1e-6, atol=1e-6)
+
+
 def test_both_steps_give_the_same_gradient(step_and_view: tuple[Scene, View]) -> None:
     scene, view = step_and_view
     schedule = coarse_schedule(CONFIG, 20.0, DEPTH_MM, "coarse")
@@ -147,6 +166,21 @@ def test_the_prior_draws_back() -> None:
     for iteration in range(60):
         poses.step(iteration % 6, np.zeros((4, 4)), iteration)
     assert poses.refined().mean_shift < 0.8 * before
+
+
+def test_the_first_step_has_the_first_rate_and_the_last_the_last() -> None:
+    """Whenever poses begin to move: Adam's first step is as long as its rate."""
+    for start_share, iteration, expected in (
+        (0.4, 40, 4e-3),
+        (0.4, 70, 2e-3),
+        (0.0, 50, 2e-3),
+        (0.0, 100, 1e-3),
+    ):
+        config = PoseRefinementConfig(
+            prior=0.0, start_share=start_share, learning_rate=4e-3, learning_rate_final=1e-3
+        )
+        poses = PoseRefinement(tube_cameras(), config, DEPTH_MM, 100)
+        assert poses._rate(iteration) == pytest.approx(expected)
 
 
 @pytest.fixture(scope="module")
@@ -251,3 +285,17 @@ def test_held_out_frames_go_along(exact: EndoscopicSequence) -> None:
     np.testing.assert_allclose(bent.world_from_camera[:, :3, :3], poses[:, :3, :3], atol=1e-12)
     with pytest.raises(ShapeError, match="3 refined poses for 6 training frames"):
         with_refined_poses(exact, refined[:3])
+
+
+def test_held_out_frames_go_along_with_what_looks_as_they_do(exact: EndoscopicSequence) -> None:
+    """All stand in one place; one training frame looks where the held-out ones do, and it alone has moved."""
+    assert exact.world_from_camera is not None
+    poses = np.repeat(exact.world_from_camera[:1], len(exact), axis=0)
+    poses[exact.train[1:], :3, :3] = poses[0, :3, :3] @ rotation_about(np.array([0.0, 1.0, 0.0]), np.pi / 2)
+    still = replace(exact, world_from_camera=poses)
+    refined = poses[exact.train].copy()
+    refined[0, :3, 3] += [0.0, 0.4, 0.0]
+    found = with_refined_poses(still, refined).world_from_camera
+    assert found is not None
+    moved = (found - poses)[exact.test, :3, 3]
+    np.testing.assert_allclose(moved, np.broadcast_to([0.0, 0.4, 0.0], moved.shape), atol=1e-3)

@@ -76,6 +76,20 @@ class TestStartingGaussians:
         # What is unsure far from anything sure is all there is.
         assert len(radius) > 0.8 * len(before)
 
+    def test_unsure_depth_starts_where_nothing_beside_it_is_sure(
+        self, tube_sequence: EndoscopicSequence
+    ) -> None:
+        depth, train = tube_sequence.depth_mm, tube_sequence.train
+        assert depth is not None
+        error = np.full_like(depth, 0.01)
+        middle = tube_sequence.width // 2
+        error[:, :, :middle] = 0.9
+        found = starting._starting_depth(replace(tube_sequence, depth_error=error), train)
+        near = starting.BESIDE_RELIABLE_PX
+        assert (found[:, :, middle - near : middle] == 0).mean() > 0.9
+        np.testing.assert_array_equal(found[:, :, : middle - near], depth[train][:, :, : middle - near])
+        np.testing.assert_array_equal(found[:, :, middle:], depth[train][:, :, middle:])
+
     def test_cameras_alone_give_random_points(
         self, tube_sequence: EndoscopicSequence, caplog: pytest.LogCaptureFixture
     ) -> None:

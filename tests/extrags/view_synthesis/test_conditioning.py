@@ -68,6 +68,33 @@ class TestObservation:
             assert not seen[outside].any()
         assert torch.equal(half.of_scene(tube.scene).seen, half.seen)
 
+    def test_depth_is_known_inside_the_mask_and_taken_from_the_scene_where_the_frame_has_none(
+        self, tube: Tube
+    ) -> None:
+        assert tube.sequence.depth_mm is not None
+        frames = tube.sequence.train[:2]
+        mask, depth_mm = tube.sequence.mask.copy(), tube.sequence.depth_mm.copy()
+        mask[..., WIDTH // 2 :] = False
+        depth_mm[:, : HEIGHT // 2] = 0
+        partly = replace(tube.sequence, mask=mask, depth_mm=depth_mm)
+        found = gather_references(tube.scene, partly, frames, exposure=torch.ones(2)).packed
+        assert not found[:, 4:, :, WIDTH // 2 :].any()
+        assert found[:, 5, HEIGHT // 2 :, : WIDTH // 2].all()
+        rendered = tube.scene.render(tube.sequence.cameras[frames])
+        solid = rendered.alpha[:, : HEIGHT // 2, : WIDTH // 2] > 0.9
+        assert solid.float().mean() > 0.5
+        assert torch.equal(found[:, 5, : HEIGHT // 2, : WIDTH // 2] > 0, solid)
+
+    def test_saturated_pixels_are_hardly_trusted(self, tube: Tube) -> None:
+        frames = tube.sequence.train[:1]
+        rgb = tube.sequence.rgb.copy()
+        rgb[frames[0], 20:24, 30:34] = 255
+        bright = gather_references(
+            tube.scene, replace(tube.sequence, rgb=rgb), frames, exposure=torch.ones(1)
+        ).packed[0, 3]
+        assert bright[20:24, 30:34].max() <= 0.1
+        assert bright[10:18, 20:28].min() == 1
+
     def test_exposures_must_belong_to_the_frames(self, tube: Tube) -> None:
         with pytest.raises(ShapeError, match="exposures"):
             gather_references(tube.scene, tube.sequence, np.array([0, 1]))

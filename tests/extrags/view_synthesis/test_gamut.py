@@ -36,13 +36,22 @@ class TestOfImages:
         assert Gamut.of_images(frames, weight) == expected
 
     def test_pixels_are_counted_through_all_frames(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        """Of two pixels in a frame, every third of all is looked at: the first, then the second of another."""
+        """Every third of all is looked at: the first of one frame, the second of the next."""
         monkeypatch.setattr(gamut, "MAX_SAMPLES", 2)
         frames = torch.full((3, 3, 1, 2), 0.5)
         frames[0, 1, 0, 0], frames[1, 1, 0, 1] = 0.2, 0.3
         found = Gamut.of_images(frames, torch.ones(3, 1, 1, 2))
         assert found.green_low == pytest.approx(0.4, abs=0.01)
         assert found.green_high == pytest.approx(0.6, abs=0.01)
+
+    def test_small_frames_are_left_out_as_pixels_of_large_ones_are(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(gamut, "MAX_SAMPLES", 10)
+        frames = torch.full((40, 3, 1, 1), 0.8)
+        frames[:, 1] = torch.linspace(0.2, 0.6, 40)[:, None, None]
+        weight = torch.ones(40, 1, 1, 1)
+        assert Gamut.of_images(frames, weight) == Gamut.of_images(frames[::4], weight[::4])
 
     def test_frames_are_made_one_at_a_time(self) -> None:
         frames = torch.rand(3, 3, 8, 11, generator=torch.Generator().manual_seed(0))

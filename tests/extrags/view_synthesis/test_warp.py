@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from extrags.cameras import Cameras, pixel_rays, pose_distances
-from extrags.view_synthesis.references import LightTransfer
+from extrags.view_synthesis.references import LightTransfer, ReferenceViews
 from extrags.view_synthesis.warp import covisibility, depth_normals, fit_falloff_exponent, warp_references
 from tests.extrags.lit_tube import cast_tube, exact_references, tube_cameras, tube_light
 
@@ -160,3 +161,79 @@ def test_far_from_the_origin_of_the_world() -> None:
     here = warp_references(references, cameras, depth, count=4)
     there = warp_references(far, moved(cameras), depth, count=4)
     torch.testing.assert_close(there.blend, here.blend, atol=1e-4, rtol=1e-4)
+
+
+def _same_place(
+    colors: list[tuple[float, float, float]], trust: list[float]
+) -> tuple[ReferenceViews, Tensor]:
+    """References that stand in one place and show nothing but one colour each, and the depth from there."""
+    cameras = tube_cameras(4)[[3] * len(colors)]
+    references = exact_references(cameras, None)
+    references.packed[:, :3] = torch.tensor(colors)[:, :, None, None]
+    references.packed[:, 3] = torch.tensor(trust)[:, None, None]
+    return references, 1 / references.packed[:1, 4:5]
+
+
+def test_what_is_trusted_less_counts_by_the_square() -> None:
+    references, depth = _same_place([(0.4, 0.4, 0.4), (0.42, 0.42, 0.42)], [1.0, 0.5])
+    blend = warp_references(references, references.cameras[[0]], depth, count=2).blend
+    # A fifth of the difference, less what the brighter one is taken for a highlight.
+    torch.testing.assert_close(blend, torch.full_like(blend, 0.404), atol=5e-4, rtol=0)
+
+
+def test_a_highlight_is_not_blended() -> None:
+    dark, bright = (0.4, 0.4, 0.4), (0.9, 0.9, 0.9)
+    references, depth = _same_place([dark, bright, dark, dark], [1.0] * 4)
+    blend = warp_references(references, references.cameras[[0]], depth, count=4).blend
+    torch.testing.assert_close(blend, torch.full_like(blend, 0.4), atol=1e-3, rtol=0)
+
+
+def test_what_is_too_bright_keeps_its_hue() -> None:
+    references, depth = _same_place([(0.5, 0.25, 0.125)], [1.0])
+    references.exposure.fill_(0.25)
+    blend = warp_references(references, references.cameras[[0]], depth, count=1).blend
+    expected = torch.tensor([1.0, 0.5, 0.25])[None, :, None, None]
+    torch.testing.assert_close(blend, expected.expand_as(blend))
+
+
+def test_the_ratio_is_that_of_the_references_to_the_views_distance() -> None:
+    references, depth = _same_place([(0.4, 0.4, 0.4)], [1.0])
+    poses = references.cameras.world_from_camera.copy()
+    poses[:, :3, 3] += 3 * poses[:, :3, 2]
+    nearer = replace(references.cameras, world_from_camera=poses)
+    warped = warp_references(references, nearer, depth - 3, count=1)
+    seen = warped.blend_weight > 0.5
+    assert seen.any()
+    assert warped.log_ratio[seen].min() > 0.01
+
+
+def _fading_references(exponent: float) -> ReferenceViews:
+    references = exact_references(tube_cameras(10), None)
+    distance = cast_tube(references.cameras, None)[1] * np.linalg.norm(
+        pixel_rays(references.cameras), axis=-1
+    )
+    fall = torch.from_numpy(((distance / 20) ** -exponent).astype(np.float32))
+    references.packed[:, :3] *= fall[:, None]
+    return references
+
+
+def test_the_exponent_is_found_whatever_the_exposures() -> None:
+    references = _fading_references(0.8)
+    references.packed[:, :3] *= torch.linspace(1, 0.5, 10)[:, None, None, None]
+    assert abs(fit_falloff_exponent(references) - 0.8) < 0.12
+
+
+def test_the_exponent_is_found_in_spite_of_what_shows_another_brightness() -> None:
+    references = _fading_references(0.8)
+    # Something darkens the lower third of every second view.
+    references.packed[::2, :3, 32:] *= 0.5
+    assert abs(fit_falloff_exponent(references) - 0.8) < 0.12
+
+
+def test_chosen_references_keep_what_is_theirs() -> None:
+    references = replace(exact_references(tube_cameras(4), None), exposure=torch.arange(1.0, 5.0))
+    chosen = references.subset(np.array([3, 1]))
+    assert chosen.exposure.tolist() == [4, 2]
+    assert chosen.frames.tolist() == [3, 1]
+    assert torch.equal(chosen.packed, references.packed[[3, 1]])
+    np.testing.assert_array_equal(chosen.cameras.centers, references.cameras.centers[[3, 1]])
