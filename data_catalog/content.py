@@ -7,7 +7,7 @@ burnt-in overlay keeps its edges while the scene moves.
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -30,9 +30,11 @@ _LARGEST_DENT = 0.05
 _CIRCLE_TRIALS = 400
 _CIRCLE_TOLERANCE_SHARE = 0.006
 _CIRCLE_INLIERS = 0.75
-_CIRCLE_KEEPS = 0.9
-"""Share of the lit region that lies in the circle round it. A dark round lumen at the image border has a
-round rim, too, with the picture outside."""
+_NEAR_TOLERANCES = 3
+_CIRCLE_LIT = 0.5
+"""Share of the circle, as far as it lies in the image, that is lit. A dark round lumen at the image border
+has a round rim, too, with the picture outside. How much is lit outside of the circle tells nothing: panels of
+the processor may touch the picture."""
 _MIN_FRAMES = 4
 _MAX_FRAMES = 32
 _LARGEST_WIDTH = 640
@@ -52,7 +54,7 @@ class Circle:
         center_x: may lie outside the image.
         center_y: may lie outside the image.
         radius_px: of the rim itself, before any margin.
-        inliers: share of rim points that lie on it.
+        inliers: share of rim points that lie on it, of all or of those near it.
     """
 
     center_x: float
@@ -93,7 +95,7 @@ def content_circle(rgb: UInt8[np.ndarray, "f h w 3"]) -> Circle | None:
     by RANSAC (seeded) and least squares. Text and logos beside the picture are no part of that region.
 
     Returns:
-        None where the rim is no circle, the picture lies outside of it, or the picture fills the image.
+        None where the rim is no circle, most of what it surrounds is dark, or the picture fills the image.
     """
     region = _largest(view_mask(rgb, _dark_below(rgb)))
     rim = _rim(region)
@@ -115,12 +117,18 @@ def content_circle(rgb: UInt8[np.ndarray, "f h w 3"]) -> Circle | None:
     found = _fitted(rim[best])
     if found is None:
         return None
-    share = float((np.abs(np.hypot(*(rim - found[:2]).T) - found[2]) < tolerance).mean())
-    if share < _CIRCLE_INLIERS:
+    circle = Circle(float(found[0]), float(found[1]), float(found[2]), 0.0)
+    # Of a panel that touches the picture only the part that hides the rim counts, not the panel's outline.
+    near = _rim(region & circle.mask(width, height, -_NEAR_TOLERANCES * tolerance))
+    share = max(
+        float((np.abs(np.hypot(*(points - found[:2]).T) - found[2]) < tolerance).mean())
+        for points in (rim, near)
+        if len(points)
+    )
+    disc = circle.mask(width, height)
+    if share < _CIRCLE_INLIERS or (region & disc).sum() < _CIRCLE_LIT * disc.sum():
         return None
-    circle = Circle(float(found[0]), float(found[1]), float(found[2]), share)
-    kept = region & circle.mask(width, height)
-    return circle if kept.sum() >= _CIRCLE_KEEPS * region.sum() else None
+    return replace(circle, inliers=share)
 
 
 def overlay_mask(

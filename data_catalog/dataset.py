@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -15,6 +17,13 @@ from extrags.sequence import EndoscopicSequence
 __all__ = ["Dataset", "Descriptor", "Source", "file_digests"]
 
 _BLOCK_BYTES = 1 << 20
+_SETTLED_NS = 60_000_000_000
+"""A file that changed since then may change again without another time of change: clocks of file systems are
+coarse, and what is written through mapped memory is stamped late."""
+_MOST_REMEMBERED = 1 << 17
+
+_remembered: dict[tuple[int, ...], str] = {}
+"""Digests by what the operating system tells of a file."""
 
 
 class Descriptor(BaseModel):
@@ -123,14 +132,32 @@ class Dataset(Protocol):
 def file_digests(listed: Iterable[tuple[str, Path]]) -> list[list[Any]]:
     """Name, size in bytes and BLAKE2b digest of each file, as JSON gives them back.
 
+    Files that this process has digested, and that the operating system says are unchanged since, are not read
+    again: same inode, size, and times of the last change of content and of inode. Programs can set the first
+    of these times back, not the second.
+
     Args:
         listed: files, each with a name that does not depend on where it lies.
     """
-    found = []
-    for name, file in listed:
-        digest = hashlib.blake2b(digest_size=16)
-        with file.open("rb") as stream:
+    return [[name, *_size_and_digest(file)] for name, file in listed]
+
+
+def _size_and_digest(file: Path) -> tuple[int, str]:
+    with file.open("rb") as stream:
+        # Of the open file, and before its content: a change while it is read leads to other times. Network
+        # file systems ask their server when a file is opened, not at every `stat`.
+        state = os.fstat(stream.fileno())
+        now_ns = time.time_ns()
+        known_by = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+        found = _remembered.get(known_by)
+        if found is None:
+            digest = hashlib.blake2b(digest_size=16)
             while block := stream.read(_BLOCK_BYTES):
                 digest.update(block)
-        found.append([name, file.stat().st_size, digest.hexdigest()])
-    return found
+            found = digest.hexdigest()
+            # File systems without times give 0.
+            if 0 < state.st_ctime_ns < now_ns - _SETTLED_NS:
+                if len(_remembered) >= _MOST_REMEMBERED:
+                    _remembered.clear()
+                _remembered[known_by] = found
+    return state.st_size, found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import struct
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +24,10 @@ __all__ = [
     "COLOUR_SUFFIXES",
     "UPRIGHT",
     "Resampling",
+    "bits_per_value",
+    "check_links",
     "colour_files",
+    "image_entries",
     "image_size",
     "natural_key",
     "orientation",
@@ -63,24 +66,44 @@ def natural_key(name: str) -> tuple[tuple[int, int, str], ...]:
 
 
 def colour_files(folder: Path) -> list[Path]:
-    """Image files directly in a folder, in natural order.
-
-    Hidden ones are none: macOS leaves `._NAME` with attributes beside each file on disks of others.
+    """Image files directly in a folder that is read, in natural order.
 
     Raises:
         SourceNotFoundError: one of them is a link to a file that is not there.
     """
+    found = image_entries(folder)
+    check_links(found)
+    return found
+
+
+def image_entries(folder: Path) -> list[Path]:
+    """What is called like an image directly in a folder, links to nothing among them, in natural order.
+
+    Hidden ones are none: macOS leaves `._NAME` with attributes beside each file on disks of others.
+    """
     named = [
         file
         for file in folder.iterdir()
-        if file.suffix.lower() in COLOUR_SUFFIXES and not file.name.startswith(".")
+        if file.suffix.lower() in COLOUR_SUFFIXES
+        and not file.name.startswith(".")
+        and (file.is_file() or _leads_nowhere(file))
     ]
-    found = sorted(named, key=lambda file: natural_key(file.name))
-    for file in found:
-        if file.is_symlink() and not file.exists():
-            # Left out, it would be a frame that nobody misses.
+    return sorted(named, key=lambda file: natural_key(file.name))
+
+
+def check_links(files: Iterable[Path]) -> None:
+    """Refuse links to nothing: left out, each would be a frame that nobody misses.
+
+    Raises:
+        SourceNotFoundError: one of the files is a link to a file that is not there.
+    """
+    for file in files:
+        if _leads_nowhere(file):
             raise SourceNotFoundError(f"a link to {file.readlink()}, which is not there", file=file)
-    return [file for file in found if file.is_file()]
+
+
+def _leads_nowhere(file: Path) -> bool:
+    return file.is_symlink() and not file.exists()
 
 
 def read_colour(file: Path, *, frame: object = None) -> UInt8[np.ndarray, "h w 3"]:
@@ -123,6 +146,25 @@ def image_size(file: Path, *, frame: object = None) -> tuple[int, int]:
 
     with _image_errors(file, frame, "rgb"), Image.open(file) as image:
         return image.size
+
+
+def bits_per_value(file: Path) -> int:
+    """Bits of each colour or grey value in an image file; 8 for what is no image.
+
+    Raises:
+        SourceNotFoundError: there is no such file.
+        SourceError: the file is damaged.
+    """
+    from PIL import Image
+
+    if file.suffix.lower() not in COLOUR_SUFFIXES:
+        return 8
+    with _image_errors(file, None, "rgb"), Image.open(file) as image:
+        told = getattr(image, "tag_v2", {}).get(BITS_PER_SAMPLE)
+        if told is not None:
+            return int(told[0])
+        # Of colours of 16 bits only the description of what is stored tells: their mode is that of 8.
+        return 16 if ";16" in f"{image.mode} {image.tile}" else 8
 
 
 def orientation(file: Path) -> int:

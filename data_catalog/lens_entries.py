@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -28,19 +28,23 @@ _SWITCHES = ("fisheye_model", "fisheye", "is_fisheye")
 _KINDS: dict[str, LensKind] = {
     **dict.fromkeys(("", "none", "no", "pinhole", "simple_pinhole", "perspective", "undistorted"), "pinhole"),
     **dict.fromkeys(
-        ("plumb_bob", "rational_polynomial", "radtan", "radial_tangential", "brown", "brown_conrady"),
+        ("plumb_bob", "rational", "rational_polynomial", "radtan", "radial_tangential"),
         "polynomial",
     ),
+    **dict.fromkeys(("brown", "brown_conrady"), "polynomial"),
     **dict.fromkeys(("opencv", "full_opencv", "simple_radial", "radial", "polynomial"), "polynomial"),
     **dict.fromkeys(
-        ("fisheye", "opencv_fisheye", "equidistant", "kannala_brandt", "kannala_brandt4", "kb4"), "fisheye"
+        ("fisheye", "opencv_fisheye", "equidistant", "equi", "kannala_brandt", "kannala_brandt4", "kb4"),
+        "fisheye",
     ),
 }
 _WORDS_OF_LENSES = re.compile(
     r"fish|omni|catadioptric|radial|division|sphere|spherical|equidist|equirect|equisolid|stereographic|"
-    r"scaramuzza|ocam|kannala|unified|pinhole|distort|^(fov|mei|eucm|ds)$"
+    r"scaramuzza|ocam|kannala|unified|pinhole|distort|opencv|prism|^(fov|atan|mei|ucm|eucm|ds|kb\d*)$"
 )
+_EXAMPLES = "pinhole, plumb_bob, rational_polynomial, opencv, fisheye or equidistant"
 _YES, _NO = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
+_EMPTY = ("", "none", "null")
 
 
 def _is_named_distortion(name: str) -> bool:
@@ -61,7 +65,8 @@ def tells_distortion(name: str, value: Any) -> bool:
 def lens_kind(name: str, value: Any, file: Path) -> LensKind | None:
     """The kind of lens that an entry names; None where it is about something else.
 
-    `model` may be what an endoscope's maker calls it, and counts only where it names a lens.
+    `camera_model` and `model` may be what an endoscope's maker calls it, and count only where they name a
+    lens. A mapping is looked through, and a lens of more terms counts before one of fewer.
 
     Raises:
         SourceError: a lens that is not known here, or no answer to whether it is a fisheye.
@@ -69,19 +74,38 @@ def lens_kind(name: str, value: Any, file: Path) -> LensKind | None:
     if value is None:
         return None
     if name in _SWITCHES:
-        return "fisheye" if _answer(name, value, file) else "polynomial"
+        answer = _answer(name, value, file)
+        return None if answer is None else "fisheye" if answer else "polynomial"
     if name not in _MODEL_NAMES:
         return None
-    spelled = re.sub(r"[\s-]+", "_", str(value).strip().lower())
-    found = _KINDS.get(spelled)
-    if found is None and (name != "model" or _WORDS_OF_LENSES.search(spelled) is not None):
-        known = ", ".join(kind for kind in _KINDS if kind)
-        raise SourceError(f"found {value!r}; expected a lens model: {known}", file=file, field=name)
+    free_text = name != "distortion_model"
+    if free_text and isinstance(value, Mapping):
+        return _kind_in_mapping(name, value, file)
+    spelled = re.sub(r"[\s+/-]+", "_", str(value).strip().lower())
+    # Projection and distortion in one, as Kalibr calls its models: pinhole-radtan.
+    found = _KINDS.get(spelled, _KINDS.get(spelled.removeprefix("pinhole_")))
+    if found is None and (not free_text or _WORDS_OF_LENSES.search(spelled) is not None):
+        problem = f"found {value!r}; expected a lens model that is known here, such as {_EXAMPLES}"
+        raise SourceError(problem, file=file, field=name)
     return found
 
 
-def _answer(name: str, value: Any, file: Path) -> bool:
-    """Whether a switch is on.
+def _kind_in_mapping(name: str, entries: Mapping[str, Any], file: Path) -> LensKind | None:
+    """The kind of lens that any entry of a mapping names.
+
+    Raises:
+        SourceError: a lens that is not known here, or distortion, which is not looked for there.
+    """
+    for entry, value in entries.items():
+        if tells_distortion(str(entry), value):
+            problem = f"{entry!r} is distortion; expected it beside this entry"
+            raise SourceError(problem, file=file, field=name)
+    kinds = {lens_kind(name, value, file) for value in entries.values()}
+    return next((kind for kind in get_args(LensKind)[::-1] if kind in kinds), None)
+
+
+def _answer(name: str, value: Any, file: Path) -> bool | None:
+    """Whether a switch is on; None where it is left empty.
 
     Raises:
         SourceError: neither yes nor no.
@@ -89,6 +113,8 @@ def _answer(name: str, value: Any, file: Path) -> bool:
     spelled = str(value).strip().lower()
     # Programs write whole numbers as 1.0 or `1.`, too.
     spelled = re.sub(r"\.0*$", "", spelled)
+    if spelled in _EMPTY:
+        return None
     if spelled in _YES:
         return True
     if spelled in _NO:

@@ -20,12 +20,14 @@ from data_catalog.guessed_intrinsics import fitted_to_picture
 from data_catalog.images import (
     COLOUR_SUFFIXES,
     UPRIGHT,
+    bits_per_value,
     orientation,
     read_colour,
     read_depth,
     read_mask,
     spread,
 )
+from data_catalog.lens_use import LensUse
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from data_catalog.splits import every_nth
 from data_catalog.visibility import observed_by_depth
@@ -46,6 +48,7 @@ logger = logging.getLogger(__name__)
 _EXACT_POSE = 1e-14
 _BRIGHTEST_OF_12_BITS = 16
 """Of 255: values of 12 bits in files of 16 stay below."""
+_BITS_OF_LARGE_VALUES = 16
 
 
 @dataclass(frozen=True)
@@ -227,6 +230,8 @@ class _Pixels:
         self.depths = FrameStack(count)
         self.brightest = 0
         self.unfinite: dict[Path, int] = {}
+        # A field of view that was asked for is meant to leave out what is beyond it.
+        self._use = LensUse(count) if config.field_of_view_deg is None else None
         # Many frames share one file: it is read again only when another one, or another lens, comes.
         self._last_mask: tuple[Path | None, CameraModel, Bool[np.ndarray, "h w"]] | None = None
         self._masks: list[Bool[np.ndarray, "h w"] | None] = []
@@ -237,6 +242,8 @@ class _Pixels:
         image = source.read_colour(frame)
         _check_size(image, frame, frame.file, "rgb", source.intrinsics_file)
         sampling = self._sampling(frame)
+        if self._use is not None:
+            self._use.see(len(self.colours), frame.lens, sampling, image)
         sampled = sampling.colour(image, file=frame.file, frame=frame.label)
         sampled = self.colours.append(sampled)
         self.brightest = max(self.brightest, int(sampled.max()))
@@ -259,10 +266,14 @@ class _Pixels:
             SourceError: when nothing is brighter than what 12 bits reach in files of 16.
         """
         if self.brightest < _BRIGHTEST_OF_12_BITS:
+            likely = (
+                "expected pictures that use the whole range. Grey of 12 bits in files of 16 looks like that: "
+                "multiply it by 16, so that 4095 becomes 65520"
+                if bits_per_value(frames[0].file) == _BITS_OF_LARGE_VALUES
+                else "all frames are black"
+            )
             raise SourceError(
-                f"nothing in any frame is brighter than {self.brightest} of 255; expected pictures that use "
-                "the whole range. Grey of 12 bits in files of 16 looks like that: multiply it by 16, so that "
-                "4095 becomes 65520",
+                f"no pixel of any frame is brighter than {self.brightest} of 255: {likely}",
                 file=frames[0].file,
                 frame=frames[0].label,
                 field="rgb",
@@ -276,6 +287,8 @@ class _Pixels:
                 len(self.unfinite),
                 len(frames),
             )
+        if self._use is not None:
+            self._use.tell()
 
     def _known(self, depth: Float[np.ndarray, "h w"], file: Path) -> Float[np.ndarray, "h w"]:
         """Depth with 0 where it is not finite, which is counted."""
@@ -334,6 +347,8 @@ class _Pixels:
             if file is not None:
                 mask = read_mask(file, frame=frame.label) == self.source.white_is_tissue
                 _check_size(mask, frame, file, "mask", None)
+                if self._use is not None:
+                    self._use.see_mask(len(self.colours) - 1, lens, mask)
             self._last_mask = (file, lens, sampling.mask(mask, file=file, frame=frame.label))
         return self._last_mask[2]
 

@@ -22,8 +22,6 @@ __all__ = ["CameraModel", "LensSampling", "Sampling", "keeps_central_resolution"
 
 logger = logging.getLogger(__name__)
 
-MUCH_LEFT_OUT = 0.2
-"""Share of a lens's image that its pinhole may leave out without a warning."""
 OFF_CENTRE_SHARE = 0.2
 """Of width and height: farther from the image's centre no principal point is expected."""
 LARGEST_FIT_ERROR_PX = 1.0
@@ -164,8 +162,6 @@ class LensSampling:
         )
         if undistortion is None:
             return cls(None, resampling, resampling.intrinsics(lens.K))
-        if first is None and config.field_of_view_deg is None:
-            _tell_what_is_left_out(lens, undistortion)
         return cls(undistortion, resampling, resampling.intrinsics(undistortion.K))
 
     @classmethod
@@ -291,31 +287,6 @@ class LensSampling:
         """
         straight = depth if self.undistortion is None else self.undistortion.depth(depth)
         return self.resampling.depth(straight, file=file, frame=frame)
-
-
-def _tell_what_is_left_out(lens: Lens, plan: Undistortion) -> None:
-    """Warn where the pinhole of a lens shows much less than the lens; `data check` makes a finding of it."""
-    left_out = 1 - float((source_areas(plan.u, plan.v) * plan.valid).sum()) / (lens.width * lens.height)
-    if left_out <= MUCH_LEFT_OUT:
-        return
-    off_centre = np.abs(lens.K[:2, 2] / (lens.width, lens.height) - 0.5).max()
-    reason = (
-        "that is far from the centre: was the image cropped, or does the lens belong to another size?"
-        if off_centre > OFF_CENTRE_SHARE
-        else "the lens is wider than this; a larger ingest.field_of_view_deg shows more of it, and "
-        "ingest.lens=native all"
-    )
-    logger.warning(
-        "the pinhole leaves out %.0f %% of the source's image of %d x %d pixels, whose principal point is "
-        "(%.1f, %.1f): %s",
-        100 * left_out,
-        lens.width,
-        lens.height,
-        lens.K[0, 2],
-        lens.K[1, 2],
-        reason,
-        extra={"topic": "lens"},
-    )
 
 
 def source_areas(u: Float[np.ndarray, "h w"], v: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

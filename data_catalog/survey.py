@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from data_catalog.footage import FootageFrame, TimeSpan
+from data_catalog.footage import FootageFrame
 from data_catalog.interlacing import is_combed, is_interlaced
 from data_catalog.shots import ShotFinder
 from extrags.dense_flow import DenseFlow
@@ -123,16 +123,13 @@ class Survey:
         )
 
 
-def survey(
-    frames: Iterable[FootageFrame], *, file: Path, announced: int = 0, span: TimeSpan | None = None
-) -> Survey:
+def survey(frames: Iterable[FootageFrame], *, file: Path, announced: int = 0) -> Survey:
     """Look at all frames at a small size and measure motion, sharpness, cuts and combs.
 
     Args:
         frames: one after another; none is kept.
         file: named in errors.
         announced: about how many there are, for progress; 0 where unknown.
-        span: named in errors where it is not the whole.
 
     Raises:
         SourceError: there is no frame, or frames of different sizes.
@@ -169,10 +166,6 @@ def survey(
             reference, behind = grey, path[-1]
         if index % _PROGRESS_EVERY == 0 and announced > 0:
             emit(Progress("ingest", min(index, announced), 2 * announced))
-    if not numbers and span is not None and span != TimeSpan():
-        raise SourceError(
-            f"no frame from {span.start_s:g} to {span.end_s:g} s (ingest.start_s, ingest.end_s)", file=file
-        )
     if not numbers:
         raise SourceError("not a single frame can be decoded; is it a video, and whole?", file=file)
     usable = np.array(sharpness)

@@ -38,7 +38,13 @@ from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames
 from data_catalog.readers.video import VideoFile, only_file, tell_about_stills, with_files_beside
 from extrags.config import IngestConfig
-from extrags.errors import ExtragsError, MissingDependencyError, SourceError, SourceNotFoundError
+from extrags.errors import (
+    ExtragsError,
+    MissingDependencyError,
+    SourceError,
+    SourceNotFoundError,
+    installed_with,
+)
 
 __all__ = ["READER", "DicomFile", "open_dicom"]
 
@@ -197,8 +203,7 @@ def open_dicom(file: Path) -> Footage:
     """
     if find_spec("pydicom") is None:
         raise MissingDependencyError(
-            f"{file.name}: DICOM files need pydicom: not installed. "
-            "Install with: pip install 'extrags[dicom]'"
+            f"{file.name}: DICOM files need pydicom: not installed. Install with: {installed_with('dicom')}"
         )
     from pydicom import dcmread
     from pydicom.uid import HEVCM10P51, HEVCMP51, MPEGTransferSyntaxes

@@ -33,6 +33,8 @@ logger = logging.getLogger(__name__)
 
 MAX_FRAMES = 200
 """So many are chosen at most, unless `ingest.max_frames` says otherwise."""
+_SURELY_THERE = 0.9
+"""A file with a smaller share of the frames that its header announces is not read."""
 _SAMPLE_WIDTH = 640
 _MAX_SAMPLES = 32
 _NAMED_SHOTS = 5
@@ -56,7 +58,7 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
     if config.end_s is not None and config.end_s <= config.start_s:
         raise ConfigError(f"ingest.end_s = {config.end_s:g} is not after ingest.start_s = {config.start_s:g}")
     span = TimeSpan(config.start_s, np.inf if config.end_s is None else config.end_s)
-    found = survey(footage.frames(span), file=file, announced=footage.announced, span=span)
+    found = survey(_frames_of(footage, span), file=file, announced=footage.announced)
     shot = found.longest_shot()
     _report(found, shot, footage)
     here = slice(shot.first, shot.last + 1)
@@ -94,6 +96,32 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
         intrinsics="given" if (file.parent / INTRINSICS_FILE).is_file() else "guessed",
         looked_at=len(found),
     )
+
+
+def _frames_of(footage: Footage, span: TimeSpan) -> Iterator[FootageFrame]:
+    """The frames of a part.
+
+    Raises:
+        SourceError: there are none.
+    """
+    is_empty = True
+    for frame in footage.frames(span):
+        is_empty = False
+        yield frame
+    if is_empty and span != TimeSpan():
+        until = "s on" if span.end_s == np.inf else f"to {span.end_s:g} s"
+        raise SourceError(
+            f"no frame from {span.start_s:g} {until} (ingest.start_s, ingest.end_s){_end_in_words(footage)}",
+            file=footage.file,
+        )
+
+
+def _end_in_words(footage: Footage) -> str:
+    """When the last frame is shown; empty where the frames that the header announces are not there."""
+    # Headers are off by a few frames. Those before are decoded, but not turned into pictures.
+    numbers = range(int(_SURELY_THERE * footage.announced), 2 * footage.announced)
+    last_s = max((frame.time_s for frame in footage.frames(TimeSpan(), numbers)), default=None)
+    return "" if last_s is None else f"; the last frame is at {last_s:.4g} s"
 
 
 def _report(found: Survey, shot: Shot, footage: Footage) -> None:

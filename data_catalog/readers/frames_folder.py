@@ -29,7 +29,7 @@ from data_catalog.content import content_mask, looked_at
 from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
 from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
-from data_catalog.images import colour_files, image_size, read_colour, spread
+from data_catalog.images import check_links, image_entries, image_size, read_colour, spread
 from data_catalog.interlacing import is_combed, is_interlaced
 from data_catalog.lens_entries import lens_kind, tells_distortion
 from data_catalog.posed_frames import PosedFrame, SourceFrames
@@ -73,9 +73,13 @@ def mask_beside(folder: Path, images: Path | None = None) -> Path | None:
     Args:
         folder: that should hold it.
         images: folder of the images; None for the same.
+
+    Raises:
+        SourceNotFoundError: the mask is a link to a file that is not there.
     """
     found = folder / MASK_FILE
-    for file in (file for place in {folder, images or folder} for file in colour_files(place)):
+    check_links([found])
+    for file in (file for place in {folder, images or folder} for file in image_entries(place)):
         if is_mask(file) and file != found:
             logger.warning("%s is not read; the mask of all frames is %s", file, found)
     return found if found.is_file() else None
@@ -84,11 +88,10 @@ def mask_beside(folder: Path, images: Path | None = None) -> Path | None:
 def places_with_frames(folder: Path) -> dict[Path, list[Path]]:
     """The frames in a folder itself, in `images/` and in `rgb/`, where there are any; the most first.
 
-    Raises:
-        SourceNotFoundError: a link to an image that is not there.
+    Links to nothing are among them: which place is meant does not depend on whether its files are there.
     """
     places = [place for place in (folder, folder / "images", folder / "rgb") if place.is_dir()]
-    found = {place: [file for file in colour_files(place) if not is_mask(file)] for place in places}
+    found = {place: [file for file in image_entries(place) if not is_mask(file)] for place in places}
     return {place: found[place] for place in sorted(found, key=lambda at: -len(found[at])) if found[place]}
 
 
@@ -103,6 +106,7 @@ def _images(folder: Path) -> list[Path]:
 
     Raises:
         SourceError: several places hold about as many.
+        SourceNotFoundError: one of the frames is a link to a file that is not there.
     """
     found = places_with_frames(folder)
     if not found:
@@ -113,6 +117,7 @@ def _images(folder: Path) -> list[Path]:
         raise SourceError(
             f"{told}; give the path of the folder to read, or move away what is not to be read", file=folder
         )
+    check_links(files)
     return files
 
 
@@ -153,17 +158,6 @@ def _tell_what_is_passed_over(folder: Path, files: list[Path]) -> None:
         )
 
 
-def _tell_whether_woven(folder: Path, files: list[Path]) -> None:
-    """Warn of images that show two moments each."""
-    looked_at = [files[k] for k in spread(len(files), _LOOKED_AT_FOR_COMBS)]
-    if is_interlaced([is_combed(read_colour(file, frame=file.name)) for file in looked_at]):
-        logger.warning(
-            "%s: interlaced: each image shows two moments, woven line by line, and is read as it is; "
-            "give the video they were taken from, of which single moments are read, or deinterlace them",
-            folder,
-        )
-
-
 def _files(folder: Path) -> list[Path]:
     extra = [folder / INTRINSICS_FILE, folder / MASK_FILE]
     return sorted([*_images(folder), *(file for file in extra if file.is_file())])
@@ -182,14 +176,42 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
         for place in (folder / "mask", folder / "masks"):
             if place.is_dir():
                 logger.warning("%s is not read; of plain frames, one mask.png holds for all", place)
-    _tell_whether_woven(folder, files)
     return SourceFrames(
         frames=[PosedFrame(file.name, file, lens, mask_file=mask_file) for file in files],
         pose_file=folder,
         metric=False,
+        read_colour=_Images(folder, [files[k] for k in spread(len(files), config.max_frames)]).image,
         masks=_ContentMask(),
         intrinsics="given" if (folder / INTRINSICS_FILE).is_file() else "guessed",
     )
+
+
+class _Images:
+    """Reads the frames that are kept, and warns with the last one where they show two moments each.
+
+    Args:
+        folder: named in the warning.
+        files: that will be read, in order.
+    """
+
+    def __init__(self, folder: Path, files: list[Path]) -> None:
+        self._folder = folder
+        self._last = files[-1]
+        self._looked_at = {files[k] for k in spread(len(files), _LOOKED_AT_FOR_COMBS)}
+        self._combed: list[bool] = []
+
+    def image(self, frame: PosedFrame) -> UInt8[np.ndarray, "h w 3"]:
+        """The image of the next frame, as it lies on disk."""
+        image = read_colour(frame.file, frame=frame.label)
+        if frame.file in self._looked_at:
+            self._combed.append(is_combed(image))
+        if frame.file == self._last and is_interlaced(self._combed):
+            logger.warning(
+                "%s: interlaced: each image shows two moments, woven line by line, and is read as it is; "
+                "give the video they were taken from, of which single moments are read, or deinterlace them",
+                self._folder,
+            )
+        return image
 
 
 class _ContentMask:

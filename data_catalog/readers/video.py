@@ -26,7 +26,7 @@ from jaxtyping import UInt8
 
 from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import VIDEO_SUFFIXES, FootageFrame, TimeSpan, files_of_kind
-from data_catalog.images import colour_files
+from data_catalog.images import image_entries
 from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers.footage_frames import footage_frames
 from data_catalog.readers.frames_folder import (
@@ -169,7 +169,7 @@ def only_file(place: Path, suffixes: tuple[str, ...]) -> Path | None:
     if not place.is_dir():
         return None
     found = files_of_kind(place, suffixes)
-    stills = [file for file in colour_files(place) if not is_mask(file)]
+    stills = [file for file in image_entries(place) if not is_mask(file)]
     return found[0] if len(found) == 1 and len(stills) < FEWEST_FRAMES else None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -137,7 +138,21 @@ class TestFolder:
         for file in sorted((posed_folder / "rgb").iterdir()):
             grey = np.asarray(Image.open(file).convert("L")).astype(np.uint16)
             Image.fromarray(grey * 16).save(file)
-        with pytest.raises(SourceError, match=r"field rgb: .* brighter than 1\d of 255; .* Grey of 12 bits"):
+        with pytest.raises(SourceError, match=r"field rgb: .* brighter than 1\d of 255: .* Grey of 12 bits"):
+            read(posed_folder)
+
+    def test_colours_of_12_bits_in_16(self, posed_folder) -> None:
+        """Pillow calls them colours of 8 bits."""
+        for file in sorted((posed_folder / "rgb").iterdir()):
+            assert cv2.imwrite(str(file), cv2.imread(str(file)).astype(np.uint16) * 16)
+        with pytest.raises(SourceError, match=r"brighter than 1\d of 255: .* Grey of 12 bits"):
+            read(posed_folder)
+
+    def test_black_pictures_of_8_bits(self, posed_folder) -> None:
+        """Nothing is said of 12 bits, which these files cannot hold."""
+        for file in sorted((posed_folder / "rgb").iterdir()):
+            Image.fromarray(np.array(Image.open(file).convert("RGB")) // 20).save(file)
+        with pytest.raises(SourceError, match=r"brighter than 1\d of 255: all frames are black$"):
             read(posed_folder)
 
     def test_opengl_axes(self, posed_folder, edit_poses) -> None:

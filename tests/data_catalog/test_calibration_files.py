@@ -137,6 +137,9 @@ class TestOpenCV:
             ("distortion_coefficients: {rows: 2, cols: 2, data: [0.1]}", "expected numbers"),
             ("distortion_model: division\ndistortion_coefficients: [0.1, 0, 0, 0]", "found 'division'"),
             ("camera_model: omni\ndistortion_coefficients: [0.1, 0, 0, 0]", "camera_model: found 'omni'"),
+            ("camera_model: {type: omni}\ndistortion_coefficients: [0.1, 0, 0, 0]", "found 'omni'"),
+            ("camera_model: {type: pinhole, k1: 0.1}", "'k1' is distortion"),
+            ("distortion_model: standard\ndistortion_coefficients: [0.1, 0, 0, 0]", "such as pinhole"),
             ("fisheye_model: maybe\ndistortion_coefficients: [0.1, 0, 0, 0]", "fisheye_model: found 'maybe'"),
             (
                 "distortion_model: none\ndistortion_coefficients: [0.1, 0, 0, 0]",
@@ -179,6 +182,27 @@ class TestOpenCV:
         expected = read_calibration(tmp_path / "a.json", WIDTH, HEIGHT)
         assert expected.model == "OPENCV_FISHEYE"
         assert read_calibration(tmp_path / "b.json", WIDTH, HEIGHT) == expected
+
+    @pytest.mark.parametrize(
+        "told",
+        [
+            *({"camera_model": name} for name in ("Olympus CF-H190", 3, "standard", [], {"type": "pinhole"})),
+            *({"camera_model": name} for name in ("rational", "Pinhole + Brown", "pinhole-radtan")),
+            *({"fisheye_model": nothing} for nothing in ("", "none", None)),
+        ],
+        ids=str,
+    )
+    def test_free_text_does_not_stand_in_the_way(self, tmp_path, told) -> None:
+        """Makers and calibration programs write what they like; the coefficients are those of OpenCV."""
+        content = {"camera_matrix": K.tolist(), "distortion_coefficients": [-0.2, 0.05, 0, 0, 0]}
+        (tmp_path / "a.json").write_text(json.dumps(content | told))
+        assert read_calibration(tmp_path / "a.json", WIDTH, HEIGHT).model == "FULL_OPENCV"
+
+    def test_a_fisheye_within_an_entry(self, tmp_path) -> None:
+        content = {"camera_matrix": K.tolist(), "distortion_coefficients": [0.03, -0.01, 0, 0]}
+        for name in ({"projection": "pinhole", "type": "equidistant"}, "pinhole-equi"):
+            (tmp_path / "a.json").write_text(json.dumps({**content, "camera_model": name}))
+            assert read_calibration(tmp_path / "a.json", WIDTH, HEIGHT).model == "OPENCV_FISHEYE"
 
     def test_what_is_not_about_the_lens_is_passed_over(self, tmp_path) -> None:
         (tmp_path / "a.yml").write_text(

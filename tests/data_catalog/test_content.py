@@ -72,6 +72,25 @@ class TestCircle:
         kept = content_mask(scene)
         assert kept[~lumen].mean() > 0.97
 
+    @pytest.mark.parametrize(
+        ("middle_x", "columns"), [(160, 60), (160, 75), (210, 120)], ids=["narrow", "to the border", "wide"]
+    )
+    def test_a_lit_panel_that_touches_the_picture_stays_outside(self, middle_x, columns) -> None:
+        """The processor's menu: more than a tenth of all that is lit is no part of the round picture."""
+        circle = rim(middle_x, 90, 80)
+        scene = in_a_circle(moving_scene(6), circle)
+        panel = np.zeros((180, 320), bool)
+        panel[70:112, middle_x - 75 - columns : middle_x - 75] = True
+        panel &= ~circle.mask(320, 180)
+        assert panel.sum() > 0.1 * circle.mask(320, 180).sum()
+        scene[:, panel] = 90
+        found = content_circle(scene)
+        assert found is not None
+        assert abs(found.radius_px - 80) < 1.5
+        mask = content_mask(scene)
+        assert not mask[~circle.mask(320, 180)].any()
+        assert mask[circle.mask(320, 180, 4.0)].all()
+
     @pytest.mark.parametrize("level", [16, 30])
     def test_a_surround_that_is_not_quite_black(self, level) -> None:
         """As of a video whose black level was left at 16."""
@@ -94,6 +113,36 @@ class TestCircle:
         scene[:, :12, -20:] = scene[:, :12, -20:] // 9
         scene[:, -12:, :20] = scene[:, -12:, :20] // 9
         assert content_mask(scene).mean() > 0.97
+
+    def test_corners_of_a_full_picture_that_are_all_dim_are_no_surround(self) -> None:
+        """They are bright enough to be told from black, and of many values."""
+        scene = moving_scene(6)
+        for rows in (slice(40), slice(-40, None)):
+            for columns in (slice(60), slice(-60, None)):
+                scene[:, rows, columns] = 14 + scene[:, rows, columns] // 10
+        corners = scene[:, :12, :20].max(axis=-1)
+        assert corners.min() > 14
+        assert 18 < corners.max() < 40
+        mask = content_mask(scene)
+        # The steady edges round the dim corners are taken for burnt-in signs.
+        assert mask[:30, :50].all()
+        assert mask[:30, -50:].all()
+        assert mask[-30:, :50].all()
+        assert mask[-30:, -50:].all()
+
+    def test_a_dim_picture_is_no_surround(self) -> None:
+        """Its corners are of one value; the rest is hardly brighter."""
+        scene = moving_scene(6) // 8 + 16
+        scene[:, :60] = 16
+        scene[:, -20:] = 16
+        assert content_mask(scene).all()
+
+    def test_few_frames_do_not_tell_a_surround_that_is_not_black(self) -> None:
+        """What is of one value in three frames may be tissue that the scope did not move across."""
+        scene = moving_scene(4)
+        scene[:, :20] = scene[:, -20:] = 20
+        assert content_mask(scene[:3]).all()
+        assert not content_mask(scene)[:20].any()
 
     @pytest.mark.parametrize("shape", ["full", "rectangle"])
     def test_no_circle_where_there_is_none(self, shape) -> None:

@@ -115,6 +115,26 @@ class TestLens:
         assert "principal point is (24.0, 20.0): that is far from the centre" in told.sentence
         assert told.file == str(tmp_path)
 
+    @pytest.mark.parametrize("masked", [False, True])
+    def test_corners_that_show_nothing_are_no_loss(self, clip, tmp_path, masked) -> None:
+        """Of an endoscope's round picture nothing is left out, and 30 % of the image is."""
+        rows, columns = np.mgrid[: clip.height, : clip.width] + 0.5
+        round_picture = np.hypot(columns - clip.width / 2, rows - clip.height / 2) < 0.36 * clip.width
+        lens = {"cx": clip.width / 2, "cy": clip.height / 2, "k1": -0.6, "k2": 0.2}
+        folder = self.written(clip, tmp_path, **lens)
+        assert [finding for finding in inspect(folder).findings if finding.topic == "lens"]
+        if masked:
+            content = json.loads((folder / "transforms.json").read_text())
+            for frame in content["frames"]:
+                frame["mask_path"] = "mask.png"
+            (folder / "transforms.json").write_text(json.dumps(content))
+            Image.fromarray(255 * round_picture.astype(np.uint8)).save(folder / "mask.png")
+        else:
+            for index in range(6):
+                seen = clip.rgb[index] * round_picture[..., None]
+                Image.fromarray(seen).save(folder / "images" / f"{index:04d}.png")
+        assert not [finding for finding in inspect(folder).findings if finding.topic == "lens"]
+
     def test_most_of_it_is_enough(self, clip, tmp_path) -> None:
         found = inspect(self.written(clip, tmp_path, cx=48, cy=38.5, k1=-0.05))
         assert not [finding for finding in found.findings if finding.topic == "lens"]

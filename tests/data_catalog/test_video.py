@@ -356,6 +356,8 @@ class TestKindsOfFiles:
         assert max(numbers) < 30
         with pytest.raises(SourceError, match=r"no frame from 60 to 70 s \(ingest.start_s, ingest.end_s\)"):
             read(file, IngestConfig(start_s=60, end_s=70))
+        with pytest.raises(SourceError, match=r"no frame from 100 s on .*; the last frame is at 1\.96 s"):
+            read(file, IngestConfig(start_s=100))
         with pytest.raises(ConfigError, match=r"ingest\.end_s = 2 is not after ingest\.start_s = 3"):
             read(file, IngestConfig(start_s=3, end_s=2))
 

@@ -9,8 +9,10 @@ import pytest
 from PIL import Image
 
 from data_catalog.catalog import read, resolve
-from data_catalog.images import colour_files
+from data_catalog.images import colour_files, read_colour
 from data_catalog.inspection import inspect
+from data_catalog.readers import frames_folder
+from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
 from tests.data_catalog.footage_fixture import interlaced, write_video
 from tests.data_catalog.test_content import moving_scene
@@ -79,6 +81,19 @@ class TestVideos:
         assert len(read(exam.parent)) == 8
         assert "8 images are read, and not exam.avi; give its path" in caplog.text
 
+    @pytest.mark.parametrize(("count", "expected"), [(3, "video"), (4, "frames")])
+    def test_how_many_pictures_beside_a_video_are_frames(self, exam, count, expected) -> None:
+        write_frames(exam.parent, count)
+        assert resolve(exam.parent).format == expected
+
+    @pytest.mark.parametrize("below", ["", "images"])
+    def test_a_link_to_nothing_beside_a_video_is_named(self, exam, below, caplog) -> None:
+        """It is not read, and so its target is not missed."""
+        (exam.parent / below).mkdir(exist_ok=True)
+        (exam.parent / below / "poster.png").symlink_to(exam.parent / "gone.png")
+        assert len(read(exam.parent)) > 4
+        assert "exam.avi is read, and not the pictures beside it: poster.png" in caplog.text
+
     def test_a_poster_beside_several_videos(self, exam) -> None:
         exam.with_name("other.avi").write_bytes(exam.read_bytes())
         write_frames(exam.parent, 1)
@@ -96,6 +111,57 @@ def test_frames_of_one_moment_are_not(tmp_path) -> None:
     for number, image in enumerate(moving_scene(6, 320, 240, speed=8)):
         Image.fromarray(image).save(tmp_path / f"{number}.png")
     assert not any("interlaced" in note for note in inspect(tmp_path).notes)
+
+
+def test_woven_frames_are_told_where_a_mask_is_given(tmp_path, caplog) -> None:
+    for number, image in enumerate(interlaced(moving_scene(8, 320, 240, speed=8))):
+        Image.fromarray(image).save(tmp_path / f"{number}.png")
+    Image.new("L", (320, 240), 255).save(tmp_path / "mask.png")
+    read(tmp_path)
+    assert caplog.text.count("interlaced: each image shows two moments") == 1
+
+
+def test_woven_frames_are_looked_for_among_those_that_are_kept(tmp_path, caplog) -> None:
+    scene = moving_scene(2, 320, 240, speed=8)
+    for number in range(30):
+        kept_and_woven = number in (4, 12, 17, 25)
+        Image.fromarray(interlaced(scene)[0] if kept_and_woven else scene[0]).save(tmp_path / f"{number}.png")
+    read(tmp_path, IngestConfig(max_frames=8))
+    assert "interlaced: each image shows two moments" in caplog.text
+
+
+def test_each_frame_that_is_kept_is_decoded_once_and_no_other(tmp_path, monkeypatch) -> None:
+    """Damage of a frame that is left out stopped the reading."""
+    write_frames(tmp_path, 16)
+    for number in range(1, 15):
+        if number not in (5, 10):
+            (tmp_path / f"{number:04d}.png").write_bytes(b"damaged")
+    decoded = []
+
+    def noted(file: Path, *, frame: object = None) -> np.ndarray:
+        decoded.append(file.name)
+        return read_colour(file, frame=frame)
+
+    monkeypatch.setattr(frames_folder, "read_colour", noted)
+    assert read(tmp_path, IngestConfig(max_frames=4)).frame_names == ("0000", "0005", "0010", "0015")
+    assert decoded == ["0000.png", "0005.png", "0010.png", "0015.png"]
+
+
+@pytest.mark.parametrize(("read_from", "elsewhere"), [("", "images"), ("images", ""), ("images", "rgb")])
+def test_a_link_to_nothing_that_is_not_read_is_named(tmp_path, read_from, elsewhere, caplog) -> None:
+    write_frames(tmp_path / read_from, 6)
+    (tmp_path / elsewhere).mkdir(exist_ok=True)
+    (tmp_path / elsewhere / "sheet.png").symlink_to(tmp_path / "gone.png")
+    assert len(read(tmp_path)) == 6
+    assert "are not read (sheet.png), only the 6" in caplog.text
+
+
+def test_a_mask_that_is_a_link_to_nothing_is_refused(tmp_path) -> None:
+    """Without it all pixels would be taken for tissue."""
+    write_frames(tmp_path / "images", 6)
+    (tmp_path / "mask.png").symlink_to(tmp_path / "gone.png")
+    with pytest.raises(SourceNotFoundError, match=r"mask\.png: a link to .*gone\.png, which is not there"):
+        read(tmp_path)
 
 
 def test_a_link_to_nothing_is_refused(tmp_path) -> None:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +68,38 @@ def test_files_that_change_while_they_are_read(
     with pytest.raises(SourceError, match="the files changed"):
         ingested(store, source, fingerprint)
     assert Store(str(store)).ls() == []
+
+
+def test_only_files_that_changed_are_read_again(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the time of change that programs cannot set."""
+    source, read = resolve(folder), []
+    blake2b = hashlib.blake2b
+
+    def counted(*given: object, **named: object) -> object:
+        read.append(1)
+        return blake2b(*given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(hashlib, "blake2b", counted)
+    before = source_fingerprint(source, CONFIG)
+    read.clear()
+    assert source_fingerprint(source, CONFIG) == before
+    # They are as new as changes that leave no trace.
+    assert len(read) == len(before["files"])
+    later_ns = time.time_ns() + 3_600_000_000_000
+    monkeypatch.setattr(time, "time_ns", lambda: later_ns)
+    source_fingerprint(source, CONFIG)
+    read.clear()
+    assert source_fingerprint(source, CONFIG) == before
+    assert not read
+
+    poses, times = folder / "poses.json", (folder / "poses.json").stat()
+    poses.write_text(poses.read_text().replace("[[30, 0, 16]", "[[31, 0, 16]"))
+    os.utime(poses, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert poses.stat().st_size == times.st_size
+    with pytest.raises(SourceError, match="the files changed"):
+        ingested(tmp_path / "store", source, before)
 
 
 @pytest.mark.parametrize("name", ["folder", "phantom"])
