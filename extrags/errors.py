@@ -28,7 +28,17 @@ __all__ = [
     "UnknownSequenceError",
     "WeightsError",
     "did_you_mean",
+    "installed_with",
 ]
+
+
+def installed_with(extra: str) -> str:
+    """How an optional part is installed, to be appended to a message; no package index has extrags.
+
+    Args:
+        extra: as `pyproject.toml` names it.
+    """
+    return f"pip install -e '.[{extra}]' in a checkout of extrags"
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:

@@ -379,6 +379,12 @@ def decide(trials: Sequence[Trial], max_loss_db: float, left: Int[np.ndarray, "m
         outcome = "virtual views are kept"
         if amount < 1:
             outcome = f"virtual views weigh {amount:g} of finetune.pseudo_weight"
+        # They may be kept with less gain than real views alone: the rule has to stand beside the numbers.
+        outcome += (
+            ": with them these frames, which lie near the path, lose no more than "
+            f"{max_loss_db:g} dB against the coarse scene and, but for the standard error of that "
+            "difference, against real views alone"
+        )
     elif control.holds(max_loss_db):
         amount = 0.0
         outcome = "fine-tuning is on real views alone"

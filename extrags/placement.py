@@ -16,7 +16,7 @@ from typing import Literal
 from extrags.config import PipelineConfig
 from extrags.config.backends import BACKENDS
 from extrags.devices import chosen_device
-from extrags.errors import ConfigError, MissingDependencyError
+from extrags.errors import ConfigError, MissingDependencyError, installed_with
 
 __all__ = ["Placement", "check_device", "placements", "run_device"]
 
@@ -86,7 +86,7 @@ def check_device(config: PipelineConfig) -> None:
     chosen_device("cuda", "device")
     if find_spec("gsplat") is None:
         raise MissingDependencyError(
-            "device=cuda needs gsplat: pip install extrags[cuda]; or take device=cpu"
+            f"device=cuda needs gsplat: {installed_with('cuda')}; or take device=cpu"
         )
     if config.ingest.lens == "native":
         raise ConfigError(f"device=cuda: {NATIVE_LENS}; take ingest.lens=pinhole, or device=cpu")

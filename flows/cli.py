@@ -8,6 +8,7 @@ A verb is a module of `flows.commands` with `add_arguments`, which gives the par
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -108,7 +109,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _run(arguments)
     except BrokenPipeError:
         # `extrags cache ls | head`: nothing is wrong.
-        sys.stderr.close()
         return OK
     except Exception as error:
         if "--debug" in arguments:
@@ -120,6 +120,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for line in describe_error(error):
             print(f"extrags: {without_credentials(line)}", file=sys.stderr)
         return USAGE if isinstance(error, ConfigError | UnknownSequenceError) else FAILED
+    finally:
+        _write_out()
+
+
+def _write_out() -> None:
+    """Write what the streams still hold; it goes nowhere where the reader has gone.
+
+    Left to Python's own end, it would be written then, and fail with a message and an exit code of its own.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except BrokenPipeError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+        except (OSError, ValueError):
+            # A full disk, or a closed stream: Python reports that in its own way.
+            pass
 
 
 def _run(arguments: Sequence[str]) -> int:

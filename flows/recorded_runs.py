@@ -138,7 +138,9 @@ def chosen_runs(
         more = f", and {unfinished} that did not come to a page" if unfinished else ""
         raise ConfigError(
             f"{', '.join(names)}: {len(runs)} finished run{'s' * (len(runs) != 1)} on record in "
-            f"{store.root}{more}; a comparison takes two"
+            f"{store.root}{more}; a comparison takes two. Of runs that differ in settings alone the last one "
+            "is on record; to compare them, run once with each value in a matrix (extrags run ... --matrix "
+            "coarse.iterations=150,300), or name the pages of two runs"
         )
     return runs
 

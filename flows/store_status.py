@@ -2,32 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from data_catalog.catalog import resolve
+from data_catalog.names import comparable_name
 from data_catalog.patterns import is_named
-from extrags.errors import ExtragsError
+from extrags.errors import ExtragsError, UnknownSequenceError
 from extrags.metrics.comparison import figure_of
 from extrags.pipeline import STAGES
-from extrags.store import Store, in_work
+from extrags.store import Manifest, Store, in_work
+from extrags.store.manifest import stage_of
+from extrags.store.runs import Run, active_runs, runs_of
 from flows.outcome_records import OutcomeRecord, outcome_records, setting_text
 from flows.selection import chosen_sequences
 
 __all__ = ["StageStatus", "StatusRow", "StoreStatus", "store_status"]
 
-State = Literal["done", "skipped", "failed", "missing", "running"]
+State = Literal["done", "skipped", "failed", "missing", "running", "stopped"]
 
 TASKS = {
     "training-frames": "coarse",
     "depth-frames": "coarse",
     "refined-frames": "coarse",
     "continued-coarse": "coarse",
+    "import-scene": "coarse",
     "plan": "assess",
     "uc-nerf": "coarse",
     "uc-nerf-render": "evaluate",
 }
 """Stages of the tasks that do not begin with the name of theirs."""
+
+SCENES = frozenset({"continued-coarse", "import-scene", "uc-nerf"})
+"""Tasks that make what the stage `coarse` otherwise makes."""
+FRAMES = frozenset({"training-frames", "depth-frames", "refined-frames"})
+"""Tasks that several stages have run: they do not tell how far a run has come."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +64,9 @@ class StatusRow:
     Args:
         sequence: its name.
         variant: method, profile, seed and what a matrix changed, in words.
-        state: `failed` where the last run did, `running` where one of its artefacts is being made now,
-            `done` where all of its stages are there, else `missing`.
+        state: `failed` where the last run did, `running` where one of its artefacts is being made now or its
+            first run is going on, `done` where all of its stages are there, `stopped` where its only runs
+            were interrupted, else `missing`.
         reason: why it failed.
         ended: when its last run came to an end, UTC; empty where none is on record.
         psnr: of the final scene, in dB.
@@ -92,8 +103,8 @@ class StoreStatus:
         rows: by sequence.
         artefacts: how many there are, of these rows and of all others.
         bytes: of the artefacts of these rows, each counted once.
-        unrecorded: artefacts that no row has: of runs with other settings, of benchmarks, of versions that
-            left no record.
+        unrecorded: artefacts that neither a run on record nor one that is going on has: of runs with other
+            settings, of benchmarks, of versions that left no record.
     """
 
     store: str
@@ -138,7 +149,9 @@ class StoreStatus:
 
 
 def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
-    """Look a store over: one listing of its keys and one small record per sequence, no artefact is read.
+    """Look a store over: one listing of its keys and one small record per run, no artefact is read.
+
+    Of a run that has not come to an end, also the manifests of what it has made.
 
     Args:
         store: of which.
@@ -146,7 +159,8 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
             never run. All that is in the store by default.
 
     Raises:
-        UnknownSequenceError: for a pattern that matches nothing, in the store or the catalogue.
+        UnknownSequenceError: for a pattern that matches nothing, in the store or the catalogue, and for a
+            name that is in neither and no path.
         StoreError: when the store cannot be read.
     """
     records = list(outcome_records(store).values())
@@ -155,10 +169,14 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
     running: dict[str, set[str]] = {}
     for item in in_work(store):
         running.setdefault(item["label"], set()).add(_stage_of(item["stage"]))
-    names = _names(patterns, records, running)
+    going_on = active_runs(store)
+    for run in going_on:
+        running.setdefault(run.sequence, set())
+    unfinished = _unfinished(store, going_on, {str(record["sequence"]) for record in records})
+    names = _names(patterns, [*(str(record["sequence"]) for record in records), *running, *unfinished])
     rows: list[StatusRow] = []
     bytes_of: dict[str, int] = {}
-    recorded: set[str] = set()
+    recorded: set[str] = {key for run in (*going_on, *unfinished.values()) for key in run.keys}
     for record in records:
         made = {key: size for row in record["stages"] for key, size in row["artefacts"].items()}
         recorded |= set(made)
@@ -166,7 +184,11 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
             bytes_of |= {key: size for key, size in made.items() if key in there}
             rows.append(_row(record, there, running.get(record["sequence"], set())))
     shown = {row.sequence for row in rows}
-    rows += [_unrecorded(name, running.get(name, set())) for name in names if name not in shown]
+    for name in names:
+        if name not in shown:
+            manifests = _manifests(store, unfinished[name].keys & there) if name in unfinished else []
+            bytes_of |= {manifest.key: manifest.bytes for manifest in manifests}
+            rows.append(_unrecorded(name, unfinished.get(name), running.get(name), manifests))
     order = {name: place for place, name in enumerate(names)}
     rows.sort(key=lambda row: (order[row.sequence], row.variant))
     counts: dict[State, int] = {}
@@ -176,23 +198,65 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
     return StoreStatus(store.root, rows, len(keys), sum(bytes_of.values()), unrecorded, counts)
 
 
-def _names(
-    patterns: Sequence[str], records: Sequence[OutcomeRecord], running: Mapping[str, Any]
-) -> list[str]:
-    known = list(dict.fromkeys([*sorted(str(record["sequence"]) for record in records), *sorted(running)]))
+def _unfinished(store: Store, going_on: Sequence[Run], ended: set[str]) -> dict[str, Run]:
+    """Of sequences of which no run came to an end: the run that is going on, or was interrupted last.
+
+    Runs that are going on together count as one.
+    """
+    found: dict[str, Run] = {}
+    for run in runs_of(store):
+        if run.sequence not in ended:
+            found[run.sequence] = run
+    found = {name: run for name, run in found.items() if run.interrupted}
+    for name in {run.sequence for run in going_on} - ended:
+        keys = frozenset(key for run in going_on if run.sequence == name for key in run.keys)
+        found[name] = Run("", name, "", keys)
+    return found
+
+
+def _manifests(store: Store, keys: Iterable[str]) -> list[Manifest]:
+    found = []
+    for key in sorted(keys):
+        try:
+            ref = store.find(key)
+            if ref is not None:
+                found.append(store.manifest(ref))
+        except ExtragsError:
+            continue  # Damaged, or removed just now: not there for this look.
+    return found
+
+
+def _names(patterns: Sequence[str], on_record: Iterable[str]) -> list[str]:
+    known = sorted(set(on_record))
     if not patterns:
         return known
     names: dict[str, None] = {}
     for pattern in patterns:
         # A sequence may be in the store although its data are not on this machine.
-        found = [name for name in known if is_named(name, pattern)]
+        same = comparable_name(pattern)
+        found = [name for name in known if is_named(name, pattern) or comparable_name(name) == same]
         try:
-            found += [item.name for item in chosen_sequences([pattern])]
+            chosen = [item.name for item in chosen_sequences([pattern])]
+            for name in chosen:
+                if comparable_name(name) not in {comparable_name(other) for other in found}:
+                    _check_known(name)
+                    found.append(name)
         except ExtragsError:
             if not found:
                 raise
         names |= dict.fromkeys(found)
     return list(names)
+
+
+def _check_known(name: str) -> None:
+    """Raises `UnknownSequenceError` for what is neither in the catalogue nor a path."""
+    try:
+        resolve(name)
+    except UnknownSequenceError:
+        raise
+    except ExtragsError:
+        # Its data are elsewhere or wrong: that concerns who runs it.
+        return
 
 
 def _row(record: OutcomeRecord, there: set[str], running: set[str]) -> StatusRow:
@@ -233,12 +297,40 @@ def _stage(row: Mapping[str, Any], there: set[str], running: set[str]) -> StageS
     return StageStatus(state, row["made_seconds"] if left else 0.0, sum(left), row["reason"])
 
 
-def _unrecorded(name: str, running: set[str]) -> StatusRow:
-    """A sequence of which no run has come to an end."""
-    stages: dict[str, StageStatus] = {
-        stage: StageStatus("running" if stage in running else "missing") for stage in STAGES
-    }
-    return StatusRow(name, "", "running" if running else "missing", "", "", None, stages)
+def _unrecorded(
+    name: str, run: Run | None, running: set[str] | None, manifests: Sequence[Manifest]
+) -> StatusRow:
+    """A sequence of which no run has come to an end.
+
+    Args:
+        name: its name.
+        run: that is going on or was interrupted; None where there was none.
+        running: its stages that are being made now; None where no run is going on.
+        manifests: of what the run has made or found.
+    """
+    made: dict[str, list[Manifest]] = {}
+    for manifest in manifests:
+        made.setdefault(_stage_of(manifest.stage), []).append(manifest)
+    now = running or set()
+    keys = () if run is None else run.keys
+    come_to = {_stage_of(task) for task in map(stage_of, keys) if task not in FRAMES} | now
+    reached = max((STAGES.index(stage) for stage in STAGES if stage in come_to), default=0)
+    stages: dict[str, StageStatus] = {}
+    for place, stage in enumerate(STAGES):
+        own = made.get(stage, [])
+        whole = any(item.stage == stage or item.stage in SCENES for item in own)
+        state: State = "missing"
+        if stage in now:
+            state = "running"
+        elif whole or (own and place < reached):
+            state = "done"
+        elif place < reached and stage not in come_to:
+            state = "skipped"  # Stages run in this order.
+        stages[stage] = StageStatus(state, sum(item.seconds for item in own), sum(item.bytes for item in own))
+    if running is not None:
+        return StatusRow(name, "", "running", "", "", None, stages)
+    ended = "" if run is None else run.ended
+    return StatusRow(name, "", "missing" if run is None else "stopped", "", ended, None, stages)
 
 
 def _variant(record: OutcomeRecord) -> str:

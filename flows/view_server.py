@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from extrags.cameras import Cameras
-from extrags.errors import ConfigError, ExtragsError, MissingDependencyError, StoreError
+from extrags.errors import ConfigError, ExtragsError, MissingDependencyError, StoreError, installed_with
 from extrags.export import write_camera_path
 from extrags.view import Picture, SceneRenderer, ViewSession, overview, pinhole, typical_depth
 
@@ -44,7 +44,7 @@ def check_installed() -> Any:
         import viser
     except ImportError as error:
         raise MissingDependencyError(
-            "extrags view needs the package viser: pip install extrags[view]"
+            f"extrags view needs the package viser: {installed_with('view')}"
         ) from error
     return viser
 

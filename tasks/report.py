@@ -13,11 +13,13 @@ from tasks.coarse import HISTORY
 from tasks.evaluate import METRICS_FILE
 from tasks.stage import stage
 
-__all__ = ["PAGE", "REPORT_PARTS", "dataset_report", "report"]
+__all__ = ["PAGE", "REPORT_PARTS", "ROWS", "dataset_report", "report"]
 
 PAGE = "report.html"
 CONTENT = "content.json"
 """Beside a page: the digest of what it shows, apart from times and machine of the run."""
+ROWS = "stages.json"
+"""Beside a page: the times of the stages that it tells of."""
 
 S = TypeVar("S", bound=Storable)
 
@@ -54,7 +56,7 @@ def report(
     profile: str,
     rows: list[dict[str, Any]],
 ) -> None:
-    """Build the page; writes `report.html` and `content.json`.
+    """Build the page; writes `report.html`, `content.json` and `stages.json`.
 
     Args:
         slot: the artefact to write.
@@ -116,6 +118,9 @@ def report(
     )
     page, content = build_pages(inputs, config.report)
     _save_page(slot, page, content)
+    # A page that is built again tells of the same run.
+    slot.save_json(ROWS, rows)
+    slot.run_files.add(ROWS)
     slot.counts["kib"] = round(len(page.encode()) / 1024)
 
 

@@ -18,12 +18,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from extrags.errors import MissingDependencyError, WeightsError
+from extrags.errors import MissingDependencyError, WeightsError, installed_with
 from extrags.model_files import fingerprint, missing_weights
 
 __all__ = ["MonocularNetwork", "Preparation", "find_monocular", "load_monocular", "monocular_digest"]
 
-INSTALL = "pip install extrags[monocular]"
+INSTALL = installed_with("monocular")
 CONFIG, PREPROCESSOR, WEIGHTS = "config.json", "preprocessor_config.json", "model.safetensors"
 
 ARCHITECTURES = ("DepthAnythingForDepthEstimation", "DPTForDepthEstimation")

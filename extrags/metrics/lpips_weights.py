@@ -21,7 +21,7 @@ from torch import Tensor
 from extrags.array_files import load_npz, load_state_dict
 from extrags.config import LpipsNet
 from extrags.data_directories import weights_roots
-from extrags.errors import ConfigError, WeightsError
+from extrags.errors import ConfigError, WeightsError, installed_with
 from extrags.metrics.lpips_networks import LAYERS, array_names
 
 __all__ = [
@@ -93,7 +93,7 @@ def find_weights(explicit: str | None = None, net: LpipsNet = "alex") -> tuple[P
         return (heads, backbone)
     searched = " and no ".join(str(folder / filename) for folder in folders)
     parts = [
-        *([] if heads is not None else ["no package with the heads (pip install 'extrags[lpips]')"]),
+        *([] if heads is not None else [f"no package with the heads ({installed_with('lpips')})"]),
         *([] if backbone.is_file() else [f"no {backbone} (extrags weights lpips --download)"]),
     ]
     raise WeightsError(

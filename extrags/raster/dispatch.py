@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from extrags.errors import ConfigError, MissingDependencyError
+from extrags.errors import ConfigError, MissingDependencyError, installed_with
 from extrags.radial_lens import RadialLens
 from extrags.raster.light import CameraLight
 from extrags.raster.native import missing_kernels_error, native_isa, rasterize_native
@@ -154,7 +154,7 @@ def _chosen(backend: Backend, means: Tensor) -> str:
             )
     if backend == "gsplat":
         if find_spec("gsplat") is None:
-            raise MissingDependencyError("gsplat is not installed: pip install extrags[cuda]")
+            raise MissingDependencyError(f"gsplat is not installed: {installed_with('cuda')}")
         if not (means.is_cuda and means.dtype == torch.float32):
             raise ConfigError(
                 f"backend gsplat takes float32 CUDA tensors, got {means.dtype} on {means.device}"

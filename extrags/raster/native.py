@@ -111,7 +111,7 @@ def missing_kernels_error() -> MissingDependencyError:
     """The error that says why there are no compiled kernels; its cause is that of the import."""
     if isinstance(_import_error, ModuleNotFoundError) and _import_error.name == "extrags.raster._native":
         why = (
-            "the native kernels are not built: pip install extrags builds them where there is a C++17 "
+            "the native kernels are not built: installing the package builds them where there is a C++17 "
             "compiler (GCC 12, Clang 14 or later)"
         )
     else:

@@ -16,7 +16,7 @@ import secrets
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from extrags.store.artefacts import Store
@@ -39,12 +39,15 @@ class Run:
         sequence: its display name.
         ended: UTC, ISO 8601; of runs that were killed, when they last recorded something.
         keys: artefacts it made or found.
+        interrupted: whether it was told to stop or was killed before its end; records of earlier versions do
+            not tell.
     """
 
     name: str
     sequence: str
     ended: str
     keys: frozenset[str]
+    interrupted: bool = False
 
 
 class RunRecord:
@@ -54,6 +57,7 @@ class RunRecord:
         self._store, self._sequence = store, sequence
         self._keys: set[str] = set()
         self._guard = threading.Lock()
+        self.interrupted = False
         folder = store.state / "runs" / "active"
         folder.mkdir(parents=True, exist_ok=True)
         self._path = folder / f"{secrets.token_hex(8)}.json"
@@ -94,7 +98,8 @@ class RunRecord:
         os.ftruncate(self._file, len(text))
 
     def _content(self) -> dict[str, Any]:
-        return {"sequence": self._sequence, "ended": _now(), "keys": sorted(self._keys)}
+        content = {"sequence": self._sequence, "ended": _now(), "keys": sorted(self._keys)}
+        return content | ({"interrupted": True} if self.interrupted else {})
 
 
 @contextmanager
@@ -108,6 +113,11 @@ def recorded_run(store: Store, sequence: str) -> Iterator[RunRecord | None]:
         return
     try:
         yield record
+    except Exception:
+        raise
+    except BaseException:
+        record.interrupted = True
+        raise
     finally:
         try:
             record.close()
@@ -124,7 +134,7 @@ def active_runs(store: Store) -> list[Run]:
 def runs_of(store: Store) -> list[Run]:
     """Runs that ended or were killed, by end; damaged records are left out."""
     found = [_run(name, record) for name, record in read_records(store, _PREFIX).items()]
-    found += [run for run, going_on in _unfinished(store) if not going_on]
+    found += [replace(run, interrupted=True) for run, going_on in _unfinished(store) if not going_on]
     return sorted((run for run in found if run is not None), key=lambda run: (run.ended, run.name))
 
 
@@ -136,7 +146,8 @@ def file_killed(store: Store) -> list[str]:
             continue
         if run.keys:
             content = {"sequence": run.sequence, "ended": run.ended, "keys": sorted(run.keys)}
-            write_record(store, _PREFIX + digest_of([run.sequence, sorted(run.keys)]), content)
+            name = _PREFIX + digest_of([run.sequence, sorted(run.keys)])
+            write_record(store, name, content | {"interrupted": True})
         (store.state / "runs" / run.name).unlink(missing_ok=True)
         filed.append(f"runs/{run.name}")
     return filed
@@ -183,7 +194,8 @@ def _parsed(name: str, text: bytes) -> Run | None:
 def _run(name: str, record: dict[str, Any]) -> Run | None:
     try:
         keys = frozenset(map(str, record["keys"]))
-        return Run(name, str(record["sequence"]), str(record["ended"]), keys)
+        interrupted = record.get("interrupted") is True
+        return Run(name, str(record["sequence"]), str(record["ended"]), keys, interrupted)
     except (KeyError, TypeError):
         return None
 

@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
-from flows.commands.common import store_root, write_json
+from flows.commands.common import counted, store_root, write_json
 from flows.commands.options import Parser, add_json, add_store, add_verb
 from flows.commands.status import size_text
 
@@ -107,7 +107,7 @@ def ls(given: argparse.Namespace) -> int:
         out = console()
         out.print(table)
         total = size_text(sum(item.bytes for item in manifests))
-        out.print(f"{len(manifests)} artefacts, {total}, in {store.root}", markup=False)
+        out.print(f"{counted(len(manifests), 'artefact')}, {total}, in {store.root}", markup=False)
     rows = [
         item.model_dump(mode="json", exclude={"contents"}) | {"damaged": item.key in damaged}
         for item in manifests
@@ -179,13 +179,18 @@ def rm(given: argparse.Namespace) -> int:
     """`extrags cache rm`.
 
     Raises:
-        StoreError: when there is no such store.
+        StoreError: when there is no such store, or nothing in it matches.
     """
     store = _existing_store(given)
     removed = [key for pattern in given.patterns for key in store.rm(pattern)]
+    if not removed:
+        raise StoreError(
+            f"nothing in {store.root} matches {' or '.join(given.patterns)} (keys, stages and sequences as "
+            "in extrags cache ls); nothing was removed"
+        )
     for key in removed:
         print(key)
-    print(f"{len(removed)} artefacts removed from {store.root}")
+    print(f"{counted(len(removed), 'artefact')} removed from {store.root}")
     return 0
 
 
@@ -216,7 +221,13 @@ def usage(given: argparse.Namespace) -> int:
             table.add_row(row.sequence, *numbers, row.made[:16], row.used[:16])
         out = console()
         out.print(table)
-        total = f"{sum(row.artefacts for row in rows)} artefacts, {sum(row.files for row in rows)} files"
+        total = ", ".join(
+            counted(number, noun)
+            for number, noun in (
+                (sum(row.artefacts for row in rows), "artefact"),
+                (sum(row.files for row in rows), "file"),
+            )
+        )
         out.print(f"{total}, {size_text(sum(row.bytes for row in rows))}, in {store.root}", markup=False)
     write_json([asdict(row) for row in rows], given.json)
     return 0
@@ -260,9 +271,9 @@ def gc(given: argparse.Namespace) -> int:
         for item in removed:
             print(f"artefacts/{item.key}  {item.sequence}  {size_text(item.bytes)}  {item.reason}")
         would = "would be " if given.dry_run else ""
-        print(f"{len(leftovers)} leftovers {would}removed from {store.root}")
+        print(f"{counted(len(leftovers), 'leftover')} {would}removed from {store.root}")
         freed = size_text(sum(item.bytes for item in removed))
-        print(f"{len(removed)} artefacts of {freed} {would}removed")
+        print(f"{counted(len(removed), 'artefact')} of {freed} {would}removed")
     rows = [asdict(item) for item in removed]
     write_json({"dry_run": given.dry_run, "leftovers": leftovers, "artefacts": rows}, given.json)
     return 0

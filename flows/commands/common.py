@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,22 +22,28 @@ if TYPE_CHECKING:
     from extrags.config.base import StageConfig
     from extrags.pipeline import StageName
     from flows.limits import StageLimits
+    from flows.outcome_records import OutcomeRecord
     from flows.wiring import SequenceRun
 
 __all__ = [
+    "counted",
     "finished_run",
     "further_settings",
     "items",
     "parsed_settings",
     "run_config",
+    "run_options",
     "set_up_logging",
     "showing",
     "stage_limits",
     "store_root",
     "training_settings",
+    "without_folders",
     "write_json",
     "write_page",
 ]
+
+DEFAULT_METHOD = "extrags"
 
 Settings = TypeVar("Settings", bound="StageConfig")
 
@@ -73,6 +80,11 @@ def _value(assignment: str, text: str) -> Any:
 def items(given: list[str]) -> list[str]:
     """`["a,b", "c"]` to `["a", "b", "c"]`."""
     return [item for text in given for item in text.split(",") if item]
+
+
+def counted(number: int, noun: str) -> str:
+    """`1 run`, `2 runs`."""
+    return f"{number} {noun}{'s' * (number != 1)}"
 
 
 def run_config(given: argparse.Namespace) -> PipelineConfig:
@@ -135,16 +147,53 @@ def _on_record(root: str, sequence: str) -> str:
     from flows.outcome_records import outcome_records
 
     wanted = comparable_name(sequence)
-    found: dict[str, None] = {}
-    for record in outcome_records(Store(root)).values():
-        same = comparable_name(str(record["sequence"])) == wanted
-        if same and record["status"] == "ok" and record.get("report"):
-            method = "" if record["method"] == "extrags" else f" --method {record['method']}"
-            seed = "" if record["seed"] is None else f" --seed {record['seed']}"
-            found[f"--profile {record['profile']}{method}{seed}"] = None
+    found = [
+        record
+        for record in sorted(outcome_records(Store(root)).values(), key=lambda item: str(item["ended"]))
+        if comparable_name(str(record["sequence"])) == wanted
+        and record["status"] == "ok"
+        and record.get("report")
+    ]
     if not found:
         return ""
-    return f". Finished runs of it had {', '.join(found)}: give the same, and the same further settings"
+    had = dict.fromkeys(_profile_method_and_seed(record) for record in found)
+    # Records of earlier versions do not know the settings.
+    last = f"; the last one had{run_options(found[-1])}" if "settings" in found[-1] else ""
+    return f". Finished runs of it had {', '.join(had)}: give the same, and the same further settings{last}"
+
+
+def _profile_method_and_seed(run: OutcomeRecord) -> str:
+    method = "" if run["method"] == DEFAULT_METHOD else f" --method {run['method']}"
+    seed = "" if run["seed"] is None else f" --seed {run['seed']}"
+    return f"--profile {run['profile']}{method}{seed}"
+
+
+def run_options(run: OutcomeRecord, *, elsewhere: bool = False) -> str:
+    """The options that a run on record had, as a command line takes them, with a space before each.
+
+    Args:
+        run: its record.
+        elsewhere: for another machine: of paths that this one alone knows, their last part.
+    """
+    settings = {**run.get("settings", {}), **run["variant"]}
+    more = "".join(
+        f" --set {shlex.quote(_assignment(name, value, elsewhere))}" for name, value in settings.items()
+    )
+    return f" {_profile_method_and_seed(run)}{more}"
+
+
+def _assignment(name: str, value: Any, elsewhere: bool) -> str:
+    """A setting as `--set` reads it: words have no quotes unless they would be read as something else."""
+    if isinstance(value, str):
+        value = without_folders(value) if elsewhere else value
+        if parsed_settings([f"{name}={value}"])[name] == value:
+            return f"{name}={value}"
+    return f"{name}={json.dumps(value)}"
+
+
+def without_folders(text: str) -> str:
+    """A name, or a path; of one that this machine alone knows its last part."""
+    return Path(text).name if Path(text).is_absolute() else text
 
 
 def stage_limits(given: argparse.Namespace) -> StageLimits:

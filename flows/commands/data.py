@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import SourceNotFoundError, StoreError, UnknownSequenceError
-from flows.commands.common import set_up_logging, write_json
+from flows.commands.common import counted, set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_settings, add_verb
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ def list_all(given: argparse.Namespace) -> int:
         out = console()
         out.print(table)
         here = sum(item.available for item in sequences)
-        out.print(f"{len(sequences)} sequences, {here} of them can be read here")
+        out.print(f"{counted(len(sequences), 'sequence')}, {here} of them can be read here")
     write_json([item.model_dump(mode="json") for item in sequences], given.json)
     return 0
 
@@ -160,7 +160,7 @@ def check(given: argparse.Namespace) -> int:
             if found.facts is not None:
                 shares = ("masked_share", "specular_share", "saturated_share")
                 told = ", ".join(f"{name.removesuffix('_share')} {found.facts[name]:.1%}" for name in shares)
-                out.print(f"  {found.facts['frames']} frames; pixels {told}")
+                out.print(f"  {counted(found.facts['frames'], 'frame')}; pixels {told}")
     write_json([{"ok": found.ok, **found.model_dump(mode="json")} for found in inspections], given.json)
     return 0 if all(found.ok for found in inspections) else 1
 

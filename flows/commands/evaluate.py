@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from extrags.errors import ConfigError
-from flows.commands.common import finished_run, run_config, set_up_logging, store_root, write_json
+from flows.commands.common import (
+    counted,
+    finished_run,
+    run_config,
+    set_up_logging,
+    store_root,
+    write_json,
+)
 from flows.commands.options import Parser, add_json, add_method
 
 __all__ = ["add_arguments", "evaluate"]
@@ -148,5 +155,5 @@ def _print(found: dict[str, Any]) -> None:
         out.print("surface: " + ", ".join(f"{name} {value:.3f}" for name, value in surface.items()))
     for name, reason in found["reasons"].items():
         out.print(f"no {name}: {reason}", soft_wrap=True, style="dim", markup=False)
-    told = f"{found['sequence']}: {found['n_views']} views, protocol {found['protocol']}"
+    told = f"{found['sequence']}: {counted(found['n_views'], 'view')}, protocol {found['protocol']}"
     out.print(told, markup=False)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from extrags.errors import ConfigError, StoreError
-from flows.commands.common import set_up_logging
+from flows.commands.common import counted, set_up_logging
 from flows.commands.options import Parser, add_method
 
 __all__ = ["add_arguments", "export"]
@@ -207,5 +207,5 @@ def _sequence(given: argparse.Namespace) -> int:
     except OSError as error:
         raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
     count = 0 if points is None else len(points)
-    print(f"{target}: {len(sequence)} frames with poses, {count} points")
+    print(f"{target}: {counted(len(sequence), 'frame')} with poses, {counted(count, 'point')}")
     return 0

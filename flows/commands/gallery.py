@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from extrags.errors import ConfigError, StoreError
-from flows.commands.common import items, parsed_settings, set_up_logging, store_root
+from flows.commands.common import items, run_options, set_up_logging, store_root, without_folders
 from flows.commands.options import Parser, add_store
 
 if TYPE_CHECKING:
     from flows.outcome_records import OutcomeRecord
-
-DEFAULT_METHOD = "extrags"
 
 __all__ = ["add_arguments", "gallery"]
 
@@ -98,7 +95,8 @@ def _commands(runs: Sequence[OutcomeRecord], given: argparse.Namespace) -> str:
     """What makes the runs and their gallery, for another machine: without a place of this one."""
     made: dict[str, list[str]] = {}
     for run in runs:
-        made.setdefault(_options(run), []).append(shlex.quote(_without_folders(run["sequence"])))
+        options = run_options(run, elsewhere=True)
+        made.setdefault(options, []).append(shlex.quote(without_folders(run["sequence"])))
     lines = [f"extrags run {' '.join(names)}{how}" for how, names in made.items()]
     filters = "".join(
         f" --{name} {' '.join(items(chosen))}"
@@ -106,27 +104,5 @@ def _commands(runs: Sequence[OutcomeRecord], given: argparse.Namespace) -> str:
         if chosen
     )
     out = "" if Path(given.out).is_absolute() else f" --out {shlex.quote(Path(given.out).as_posix())}"
-    names = " ".join(shlex.quote(_without_folders(run["sequence"])) for run in runs)
+    names = " ".join(shlex.quote(without_folders(run["sequence"])) for run in runs)
     return "\n".join([*lines, f"extrags gallery {names}{filters}{out}"])
-
-
-def _options(run: OutcomeRecord) -> str:
-    method = "" if run["method"] == DEFAULT_METHOD else f" --method {run['method']}"
-    seed = "" if run["seed"] is None else f" --seed {run['seed']}"
-    settings = {**run.get("settings", {}), **run["variant"]}
-    more = "".join(f" --set {shlex.quote(_assignment(name, value))}" for name, value in settings.items())
-    return f"{method} --profile {run['profile']}{seed}{more}"
-
-
-def _assignment(name: str, value: Any) -> str:
-    """A setting as `--set` reads it: words have no quotes unless they would be read as something else."""
-    if isinstance(value, str):
-        value = _without_folders(value)
-        if parsed_settings([f"{name}={value}"])[name] == value:
-            return f"{name}={value}"
-    return f"{name}={json.dumps(value)}"
-
-
-def _without_folders(text: str) -> str:
-    """A name, or a path; of one that this machine alone knows its last part."""
-    return Path(text).name if Path(text).is_absolute() else text

@@ -21,14 +21,17 @@ def add_arguments(parser: Parser) -> None:
 
 
 def report(given: argparse.Namespace) -> int:
-    """`extrags report`: from what is in the store, without running anything else."""
+    """`extrags report`: from what is in the store, without running anything else.
+
+    The page keeps the times of the run that made what it shows.
+    """
     set_up_logging(debug=given.debug, terminal=True, quiet=given.quiet)
     run = finished_run(given, "evaluate")
     from flows.runners import DirectRunner
     from tasks.report import PAGE
 
     run.runner = DirectRunner(run.store.root, refresh=True)
-    run.report()
+    run.report_again()
     page = run.store.open(run.refs["report"]) / PAGE
     if given.output:
         try:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags.errors import StoreError
-from flows.commands.common import store_root, write_json
+from flows.commands.common import counted, store_root, write_json
 from flows.commands.options import Parser, add_json, add_store
 
 if TYPE_CHECKING:
@@ -122,8 +122,8 @@ def _print(found: StoreStatus) -> None:
     counts = ", ".join(f"{count} {state}" for state, count in found.counts.items()) or "nothing on record"
     took = sum(row.seconds for row in found.rows)
     out.print(
-        f"{len(found.rows)} runs: {counts}; {duration(took)} in all, {size_text(found.bytes)}; "
-        f"{found.artefacts} artefacts in {found.store}, {found.unrecorded} of them of other runs",
+        f"{counted(len(found.rows), 'run')}: {counts}; {duration(took)} in all, {size_text(found.bytes)}; "
+        f"{counted(found.artefacts, 'artefact')} in {found.store}, {found.unrecorded} of them of other runs",
         soft_wrap=True,
         markup=False,
     )

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, installed_with
 from flows.commands.common import finished_run, run_config, set_up_logging
 from flows.commands.options import Parser, add_method
 from flows.interruption import until_told_to_stop
@@ -25,7 +25,7 @@ def add_arguments(parser: Parser) -> None:
     parser.description = (
         "Show a finished run's scene, or a file of Gaussians, in the browser: rendered on this machine, half "
         "resolution while the camera moves and full resolution once it rests, with light, layers and camera "
-        "paths to record. Needs extrags[view]."
+        "paths to record. Needs the extra `view`."
     )
     parser.set_defaults(command=view)
     parser.add_argument(
@@ -129,7 +129,7 @@ def _device(asked: str) -> str:
         return "cuda" if "gsplat" in available_backends() else "cpu"
     device = chosen_device(asked, "--device").type
     if device == "cuda" and "gsplat" not in available_backends():
-        raise ConfigError("--device=cuda needs gsplat: pip install extrags[cuda]")
+        raise ConfigError(f"--device=cuda needs gsplat: {installed_with('cuda')}")
     return device
 
 

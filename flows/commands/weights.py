@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Any, get_args
 
+from extrags.errors import installed_with
 from flows.commands.common import set_up_logging, write_json
 from flows.commands.options import Parser, add_json, add_verb
 
@@ -38,7 +39,7 @@ def add_arguments(parser: Parser) -> None:
         "--download",
         action="store_true",
         help="download missing backbones (AlexNet 233 MiB, VGG16 528 MiB, SqueezeNet 5 MiB) from "
-        "download.pytorch.org into torch's cache; the heads come with pip install 'extrags[lpips]'",
+        "download.pytorch.org into torch's cache; the heads come with " + installed_with("lpips"),
     )
     add_json(made)
 

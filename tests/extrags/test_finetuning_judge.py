@@ -19,6 +19,7 @@ from extrags.restoration.benchmark.variants import AsRendered
 from extrags.restoration.classical import ClassicalEnhancer
 from extrags.restoration.protocol import Clip, Enhancer, Restoration
 from extrags.restoration.restored_renders import RESTORED_SHARE, RestoredShares, restored_shares
+from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.training.frame_weights import FrameWeights, frame_weights
 from extrags.training.leave_out import MIN_FRAMES
@@ -90,6 +91,8 @@ def test_what_is_kept(
     assert words in found.reason
     assert f"{control_db:+.2f} dB" in found.reason
     assert found.left_out == (3, 4)
+    # Why guesses may stay that gain less than real views alone.
+    assert ("lose no more than 0.1 dB against the coarse scene" in found.reason) == bool(amount)
 
 
 def test_a_restorer_that_destroys_is_left_out(tube: Tube) -> None:
@@ -123,6 +126,20 @@ def test_it_tells_how_much_of_restored_views_serves(tube: Tube, monkeypatch: pyt
     # The tube's scene is the truth, far from what sixty steps reach.
     assert 0 < asked[0] < 0.5
     assert judged(tube, ClassicalEnhancer("")).restored_shares is None
+
+
+def test_errors_outside_the_masks_are_nobodys(tube: Tube) -> None:
+    mask, other = tube.sequence.mask.copy(), tube.sequence.rgb.copy()
+    mask[..., 40:] = False
+    other[:, :, 40:] = 255 - other[:, :, 40:]
+    gaussians = tube.scene.gaussians
+    brief = Scene(replace(gaussians, sh0=0.8 * gaussians.sh0), tube.scene.light)
+    shares = []
+    for rgb in (tube.sequence.rgb, other):
+        frames = replace(tube.sequence, rgb=rgb, mask=mask)
+        shares.append(finetuning_judge._error_share(tube.scene, frames, brief, frames))
+    assert 0 < shares[0] < 0.8
+    assert shares[1] == pytest.approx(shares[0])
 
 
 def test_the_control_is_compared_frame_by_frame(tube: Tube, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -57,6 +57,16 @@ class TestStart:
         assert said.stdout.rstrip().endswith("[]")
         assert "extrags run phantom/0@sparse" in said.stdout
 
+    @pytest.mark.parametrize("arguments", [["--version"], ["--help"], ["data", "list"]])
+    def test_a_reader_that_goes_is_no_failure(self, arguments: list[str]) -> None:
+        reading, writing = os.pipe()
+        os.close(reading)
+        code = "import sys\nfrom flows.cli import main\nsys.exit(main())"
+        command = [sys.executable, "-c", code, *arguments]
+        said = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+        os.close(writing)
+        assert (said.returncode, said.stderr) == (0, "")
+
     def test_data_and_cache_load_no_torch_and_no_prefect(self, tmp_path: Path) -> None:
         code = (
             "import sys\n"
@@ -403,6 +413,25 @@ class TestFinished:
         assert capsys.readouterr().out.strip() == str(page)
         assert "</html>" in page.read_text()
 
+    def test_report_keeps_the_times_of_the_run(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        from tasks.report import ROWS
+
+        store, page = Store(finished[0]), tmp_path / "page.html"
+        given = ["report", SEQUENCE, *settled(store.root), "-o", str(page)]
+        assert main(given) == 0
+        ref = finished[1].refs["report"]
+        rows = store.load_json(ROWS, ref)
+        assert {row["state"] for row in rows} == {"ran", "skipped"}
+        assert "came from the cache" not in page.read_text()
+        # Of a page that is gone, what its stages took when they ran.
+        store.rm("report-v*")
+        assert main(given) == 0
+        again = store.load_json(ROWS, ref)
+        assert {row["stage"]: row["state"] for row in again} == {row["stage"]: row["state"] for row in rows}
+        assert all(row["seconds"] == row["made_seconds"] for row in again if row["state"] == "ran")
+
     @pytest.mark.parametrize("scene", ["coarse", "final"])
     def test_export_writes_ply(
         self,
@@ -485,6 +514,13 @@ class TestCache:
         assert main(["cache", "rm", "*-0", "phantom/2", "--store", store]) == 0
         assert "2 artefacts removed" in capsys.readouterr().out
         assert [manifest.key for manifest in Store(store).ls()] == ["toy-v1-1"]
+        assert main(["cache", "rm", "toy-v1-1", "--store", store]) == 0
+        assert "1 artefact removed" in capsys.readouterr().out
+
+    def test_rm_of_what_is_not_there(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "rm", "nosuch*", "--store", store]) == 1
+        assert f"nothing in {store} matches nosuch*" in capsys.readouterr().err
+        assert len(Store(store).ls()) == 3
 
     def test_gc_removes_former_versions(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
         with Store(store).slot(stage="coarse", version=0, key="coarse-v0-a"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
@@ -66,6 +67,9 @@ def test_settings_of_a_finished_run_are_named_where_others_were_given(
     said = " ".join(capsys.readouterr().err.split())
     assert "run it first" in said
     assert "Finished runs of it had --profile quick: give the same, and the same further settings" in said
+    options = said.split("the last one had ")[1].removesuffix(" (--debug shows more)")
+    # As they stand there, they find the run.
+    assert main([*given, *shlex.split(options)]) == 0
 
 
 def final_scene(finished: Finished) -> Scene:

@@ -18,8 +18,7 @@ from extrags.sequence import EndoscopicSequence
 from extrags.store import Store, write_record
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
-from flows.commands.common import _on_record, parsed_settings
-from flows.commands.gallery import _options
+from flows.commands.common import _on_record, parsed_settings, run_options
 from flows.outcome import SequenceOutcome
 from flows.outcome_records import OUTCOME, outcome_records
 from flows.recorded_runs import (
@@ -97,6 +96,10 @@ def test_too_few_runs(store: Store) -> None:
     with pytest.raises(ConfigError, match=r"0 finished runs on record .* and 1 that did not come to a page"):
         chosen_runs(store, [SEQUENCE], methods=["3dgs"])
     with pytest.raises(ConfigError, match="a comparison takes two"):
+        chosen_runs(store, ["phantom/7@sparse"])
+    with pytest.raises(
+        ConfigError, match=r"a matrix .*--matrix coarse\.iterations=150,300.*pages of two runs"
+    ):
         chosen_runs(store, ["phantom/7@sparse"])
 
 
@@ -283,8 +286,11 @@ def test_frames_are_told_by_what_they_show(store: Store) -> None:
 )
 def test_settings_are_written_as_they_are_read(value: Any, said: str) -> None:
     run = {"sequence": "x", "method": "extrags", "profile": "quick", "seed": None, "variant": {}}
-    options = _options({**run, "settings": {"a.b": value}})
+    run["settings"] = {"a.b": value}
+    options = run_options(run, elsewhere=True)
     assert options == f" --profile quick --set {said}"
     (assignment,) = shlex.split(options)[3:]
     read = parsed_settings([assignment])["a.b"]
     assert read == (Path(value).name if isinstance(value, str) else value)
+    (assignment,) = shlex.split(run_options(run))[3:]
+    assert parsed_settings([assignment])["a.b"] == value

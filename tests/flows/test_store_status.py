@@ -12,6 +12,7 @@ from rich.console import Console
 from extrags.errors import UnknownSequenceError
 from extrags.pipeline import STAGES
 from extrags.store import Store
+from extrags.store.runs import recorded_run
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.outcome import SequenceOutcome, StageRow
@@ -60,6 +61,73 @@ def test_what_is_being_made(store: Store) -> None:
         assert [(row.sequence, row.state) for row in rows][1] == ("phantom/3@sparse", "running")
 
 
+def half_a_run(store: Store, finished: tuple[str, SequenceOutcome]) -> set[str]:
+    """Keys of a run that came as far as the restorer, in a store that has no record of it."""
+    for record in (Path(store.root) / "records").glob("outcome.*"):
+        record.unlink()
+    stages = [row for row in finished[1].stages if STAGES.index(row.stage) < STAGES.index("enhance")]
+    made = {key for row in finished[1].stages if row.stage == "enhance" for key in row.made}
+    return {key for row in stages for key in row.made} | {key for key in made if "train" in key}
+
+
+def test_a_first_run_that_is_going_on(store: Store, finished: tuple[str, SequenceOutcome]) -> None:
+    keys = half_a_run(store, finished)
+    with recorded_run(store, SEQUENCE) as record:
+        assert record is not None
+        record.add(keys)
+        found = store_status(store)
+    (row,) = found.rows
+    assert row.state == "running"
+    assert [row.stages[stage].state for stage in STAGES] == [
+        "done",
+        *["skipped"] * 2,
+        *["done"] * 5,
+        *["missing"] * 4,
+    ]
+    assert row.stages["coarse"].seconds > 0
+    assert found.unrecorded == found.artefacts - len(keys)
+    assert found.bytes == sum(store.manifest(ref).bytes for ref in map(store.find, keys) if ref is not None)
+
+
+def test_a_first_run_that_was_interrupted(store: Store, finished: tuple[str, SequenceOutcome]) -> None:
+    keys = half_a_run(store, finished)
+
+    def interrupted() -> None:
+        with recorded_run(store, SEQUENCE) as record:
+            assert record is not None
+            record.add(keys)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    (row,) = store_status(store).rows
+    assert (row.state, row.stages["explore"].state, row.stages["enhance"].state) == (
+        "stopped",
+        "done",
+        "missing",
+    )
+    assert main(["status", "--store", store.root]) == 0
+
+
+def test_frames_for_a_later_stage_do_not_make_it_done(
+    store: Store, finished: tuple[str, SequenceOutcome]
+) -> None:
+    keys = half_a_run(store, finished)
+    with recorded_run(store, SEQUENCE) as record:
+        assert record is not None
+        record.add(key for key in keys if key.startswith(("ingest-", "training-frames-")))
+        (row,) = store_status(store).rows
+    assert {stage for stage, item in row.stages.items() if item.state == "done"} == {"ingest"}
+    assert row.stages["coarse"].state == "missing"
+
+
+def test_a_name_that_is_nothing_is_refused(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(UnknownSequenceError):
+        store_status(store, ["nosuch"])
+    assert main(["status", "nosuch", "--store", store.root]) != 0
+    assert "nosuch" in capsys.readouterr().err
+
+
 def test_a_failure_says_why(store: Store) -> None:
     rows = [StageRow("ingest", "failed", reason="no pictures"), StageRow("poses", "skipped")]
     broken = SequenceCase("phantom/1@sparse", method="3dgs", seed=2, changed={"coarse.seed": 1})
@@ -84,7 +152,7 @@ def test_the_command(store: Store, tmp_path: Path, capsys: pytest.CaptureFixture
     assert main(["status", "--store", store.root, "--json", str(tmp_path / "status.json")]) == 0
     said = capsys.readouterr().out
     assert SEQUENCE in said
-    assert "1 runs: 1 done" in said
+    assert "1 run: 1 done" in said
     found = json.loads((tmp_path / "status.json").read_text())
     assert found["sequences"][0]["stages"]["coarse"]["state"] == "done"
     assert main(["status", "--store", str(tmp_path / "none")]) == 1

@@ -126,7 +126,7 @@ class TestRefused:
         with pytest.raises(MissingDependencyError):
             check_installed()
         assert main(["view", "a.ply"]) == 1
-        assert "pip install extrags[view]" in capsys.readouterr().err
+        assert "pip install -e '.[view]' in a checkout" in capsys.readouterr().err
 
     def test_a_port_that_is_taken(
         self,
@@ -303,7 +303,7 @@ class TestBrowser:
         server.stop()
 
 
-@pytest.mark.skipif(not REAL, reason="viser is not installed: pip install extrags[view]")
+@pytest.mark.skipif(not REAL, reason="viser is not installed: pip install -e '.[view]'")
 def test_a_real_server_answers_a_real_browser(
     renderer: SceneRenderer, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
 ) -> None:

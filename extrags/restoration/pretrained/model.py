@@ -17,7 +17,7 @@ import torch
 
 from extrags.config import PretrainedConfig
 from extrags.devices import chosen_device
-from extrags.errors import ConfigError, MissingDependencyError, WeightsError
+from extrags.errors import ConfigError, MissingDependencyError, WeightsError, installed_with
 from extrags.restoration.pretrained.parts import missing_part
 
 __all__ = [
@@ -31,7 +31,7 @@ __all__ = [
     "require_diffusers",
 ]
 
-INSTALL = "pip install extrags[diffusers]"
+INSTALL = installed_with("diffusers")
 PACKAGES = ("diffusers", "transformers", "accelerate", "ftfy")
 """ftfy because Wan's text clean-up fails with a NameError without it."""
 INDEX = "model_index.json"

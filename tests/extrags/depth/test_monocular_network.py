@@ -131,7 +131,7 @@ class TestDigest:
 class TestRefused:
     def test_without_transformers(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-        with pytest.raises(MissingDependencyError, match=r"pip install extrags\[monocular\]"):
+        with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[monocular\]'"):
             find_monocular(str(tmp_path))
 
     def test_no_folder(self, saved: Path, tmp_path: Path) -> None:

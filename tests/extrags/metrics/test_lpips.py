@@ -254,7 +254,7 @@ class TestPytorchsFiles:
     def test_without_heads(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         as_pytorch_has_it("alex", tmp_path, monkeypatch)
         monkeypatch.setattr(weights_module, "find_spec", lambda name: None)
-        with pytest.raises(WeightsError, match=r"pip install 'extrags\[lpips\]'"):
+        with pytest.raises(WeightsError, match=r"pip install -e '\.\[lpips\]'"):
             find_weights(None, "alex")
 
     def test_heads_of_torchmetrics_are_those_of_the_npz_file(self, weights_folder: Path) -> None:

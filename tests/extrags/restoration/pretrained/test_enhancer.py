@@ -208,7 +208,7 @@ class TestMissing:
             require_diffusers()
         assert str(caught.value) == (
             "the pretrained backends need diffusers, transformers, accelerate, ftfy: not installed. "
-            "Install with: pip install extrags[diffusers]"
+            "Install with: pip install -e '.[diffusers]' in a checkout of extrags"
         )
 
     def test_hub_id_that_is_not_here(
