@@ -157,5 +157,5 @@ class TestRefused:
         for name in [name for name in sys.modules if name.split(".")[0] == "pydicom"]:
             monkeypatch.delitem(sys.modules, name)
         monkeypatch.setattr("data_catalog.readers.dicom.find_spec", lambda name: None)
-        with pytest.raises(MissingDependencyError, match=r"extrags\[dicom\]"):
+        with pytest.raises(MissingDependencyError, match=r"pip install -e '\.\[dicom\]'"):
             read(file)
