@@ -283,15 +283,6 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
     elif model in ("SIMPLE_RADIAL", "RADIAL") or (model == "OPENCV" and not (named["k3"] or named["k4"])):
         model = "OPENCV"
     elif model == "OPENCV":
-        # nerfstudio's OPENCV has k1 to k4 as a polynomial; COLMAP's has two, the full one puts k4 below.
-        for key in ("k4", "k5", "k6"):
-            if named[key]:
-                raise SourceError(
-                    f"{key} with camera_model OPENCV is not understood; expected OPENCV_FISHEYE or {key} = 0",
-                    file=file,
-                    frame=frame,
-                    field=key,
-                )
         model = "FULL_OPENCV"
     names = LENS_PARAMETERS.get(model)
     if names is None or not set(names) <= set(named):
@@ -302,8 +293,10 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
             frame=frame,
             field="camera_model",
         )
+    # nerfstudio's OPENCV has k1 to k4 as a polynomial; COLMAP's has two, and the full one divides by k4 to k6.
+    others = ("k4", "k5", "k6") if stated == "OPENCV" else ()
     for key in _DISTORTION:
-        if named[key] and key not in names:
+        if named[key] and (key not in names or key in others):
             raise SourceError(
                 f"{key} = {named[key]:g} with camera_model {stated}, which has no such term; expected the "
                 f"model that the camera was calibrated with, or {key} = 0",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -89,3 +90,12 @@ def finished(
     if outcome.error is not None:
         raise outcome.error
     return store, outcome
+
+
+@pytest.fixture
+def untouched_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The command sets up Prefect through the environment; put it back."""
+    before = dict(os.environ)
+    yield
+    os.environ.clear()
+    os.environ.update(before)

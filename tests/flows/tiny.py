@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import json
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -120,3 +121,9 @@ if __name__ == "__main__":
     with spared():
         ended = run_sequence(SEQUENCE, tiny_config(), sys.argv[1], DirectRunner(sys.argv[1]), profile="quick")
     print(*[f"{row.stage}={row.state}" for row in ended.stages])
+
+
+def settled(store: str) -> list[str]:
+    """The options of a command on a finished run of `tiny_config` in a store."""
+    settings = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
+    return ["--profile", "quick", "--store", store, *settings]

@@ -60,7 +60,7 @@ def test_files_that_change_while_they_are_read(
     read = data_catalog.read
 
     def read_then_changed(*given: object) -> EndoscopicSequence:
-        found = read(*given)  # type: ignore[arg-type]
+        found = read(*given)
         (folder / "rgb" / "2.png").write_bytes((folder / "rgb" / "1.png").read_bytes())
         return found
 
@@ -79,7 +79,7 @@ def test_only_files_that_changed_are_read_again(
 
     def counted(*given: object, **named: object) -> object:
         read.append(1)
-        return blake2b(*given, **named)  # type: ignore[arg-type]
+        return blake2b(*given, **named)
 
     monkeypatch.setattr(hashlib, "blake2b", counted)
     before = source_fingerprint(source, CONFIG)

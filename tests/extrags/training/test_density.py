@@ -18,7 +18,7 @@ EXTENT = 20.0
 
 
 def strategy(n: int, *, cap: int | None = None, **changes: object) -> DefaultStrategy:
-    config = DensifyConfig(**changes)  # type: ignore[arg-type]
+    config = DensifyConfig(**changes)
     if cap is not None:  # smaller than a configuration allows
         config = config.model_copy(update={"max_gaussians": cap})
     return DefaultStrategy(config, EXTENT, 1000, n, seed=0)
@@ -73,7 +73,7 @@ class TestResets:
 
     def test_where_nothing_is_reset_any_threshold_does(self) -> None:
         for settings in ({}, {"reset_every": 50, "strategy": "mcmc"}, {"reset_every": 50, "enabled": False}):
-            assert DensifyConfig(prune_opacity=0.6, **settings).prune_opacity == 0.6  # type: ignore[arg-type]
+            assert DensifyConfig(prune_opacity=0.6, **settings).prune_opacity == 0.6
 
 
 class TestDefaultStrategy:

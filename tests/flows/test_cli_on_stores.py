@@ -1,0 +1,230 @@
+"""The command line on a store: verbs that need no run, and those that keep it tidy."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from extrags.store import Store
+from extrags.store.runs import runs_of
+from flows.cases import SequenceCase, record_outcome
+from flows.cli import main
+from flows.outcome import SequenceOutcome, StageRow
+from flows.outcome_records import outcome_records
+from tests.flows.tiny import SEQUENCE, TINY, settled
+
+pytestmark = pytest.mark.usefixtures("untouched_environment")
+
+
+class TestFinished:
+    """Verbs on a store in which everything is there: no server is needed."""
+
+    def test_run_is_all_cached(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store, first = finished
+        target = tmp_path / "deep" / "results.json"
+        assert main(["run", SEQUENCE, *settled(store), "--json", str(target), "--until", "evaluate"]) == 0
+        results = json.loads(target.read_text())
+        assert set(results) >= {"seconds", "sequences"}
+        (sequence,) = results["sequences"]
+        assert sequence["name"] == SEQUENCE
+        assert sequence["status"] == "ok"
+        assert {stage["state"] for stage in sequence["stages"]} == {"cached", "skipped"}
+        assert sequence["metrics"] == first.metrics
+        assert "9 cached, 2 skipped" in capsys.readouterr().err
+
+    def test_it_is_left_on_record(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        shutil.copytree(Path(finished[0]) / "artefacts", tmp_path / "store" / "artefacts")
+        store = Store(tmp_path / "store")
+        case = SequenceCase(SEQUENCE, profile="quick", settings=TINY)
+        failure = SequenceOutcome(SEQUENCE, "failed", [StageRow("ingest", "failed", reason="no")])
+        record_outcome(store, case, failure, "coarse", case.config())
+        assert main(["status", "--store", store.root]) == 1
+        arguments = ["run", SEQUENCE, *settled(store.root), "--until", "coarse"]
+        assert main([*arguments, "--only", "failed"]) == 0
+        assert main(["status", "--store", store.root]) == 0
+        (record,) = outcome_records(store).values()
+        assert (record["status"], record["until"]) == ("ok", "coarse")
+        capsys.readouterr()
+        assert main([*arguments, "--only", "failed"]) == 0
+        assert "no sequence is failed" in capsys.readouterr().err
+        # What it used is kept with it; the same run again replaces both records.
+        (used,) = runs_of(store)
+        assert used.keys == {key for row in record["stages"] for key in row["artefacts"]}
+        assert main(arguments) == 0
+        (again,) = runs_of(store)
+        assert (again.name, again.keys) == (used.name, used.keys)
+        assert again.ended > used.ended
+
+    def test_a_store_that_takes_no_record_is_read_all_the_same(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        shutil.copytree(Path(finished[0]) / "artefacts", tmp_path / "store" / "artefacts")
+        for name in ("records", "runs"):
+            (tmp_path / "store" / name).write_text("")
+        arguments = ["run", SEQUENCE, *settled(str(tmp_path / "store")), "--until", "coarse"]
+        assert main(arguments) == 0
+
+    def test_quiet_says_nothing_where_all_is_well(
+        self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["run", SEQUENCE, *settled(finished[0]), "--until", "evaluate", "--quiet"]) == 0
+        assert capsys.readouterr() == ("", "")
+
+    def test_plan_says_why(
+        self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store, _ = finished
+        assert main(["plan", SEQUENCE, *settled(store)]) == 0
+        said = capsys.readouterr().out
+        assert "explore" in said
+        assert "% of the pixels" in said
+        assert "saves s" in said
+        assert "without the plan" in " ".join(said.split())
+
+    def test_plan_as_json(
+        self, finished: tuple[str, SequenceOutcome], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store, _ = finished
+        assert main(["plan", SEQUENCE, *settled(store), "--json", "-"]) == 0
+        plan = json.loads(capsys.readouterr().out)
+        assert plan["sequence"] == SEQUENCE
+        assert {line["stage"] for line in plan["decisions"]} >= {"explore", "enhance", "finetune"}
+        assert all(line["saves_s"] is not None for line in plan["decisions"])
+        assert plan["without_plan"]["processor_seconds"] >= plan["predicted"]["processor_seconds"] > 0
+
+    def test_report_is_built_again(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        store, _ = finished
+        page = tmp_path / "page.html"
+        assert main(["report", SEQUENCE, *settled(store), "-o", str(page)]) == 0
+        assert capsys.readouterr().out.strip() == str(page)
+        assert "</html>" in page.read_text()
+
+    def test_report_keeps_the_times_of_the_run(
+        self, finished: tuple[str, SequenceOutcome], tmp_path: Path
+    ) -> None:
+        from tasks.report import ROWS
+
+        store, page = Store(finished[0]), tmp_path / "page.html"
+        given = ["report", SEQUENCE, *settled(store.root), "-o", str(page)]
+        assert main(given) == 0
+        ref = finished[1].refs["report"]
+        rows = store.load_json(ROWS, ref)
+        assert {row["state"] for row in rows} == {"ran", "skipped"}
+        assert "came from the cache" not in page.read_text()
+        # Of a page that is gone, what its stages took when they ran.
+        store.rm("report-v*")
+        assert main(given) == 0
+        again = store.load_json(ROWS, ref)
+        assert {row["stage"]: row["state"] for row in again} == {row["stage"]: row["state"] for row in rows}
+        assert all(row["seconds"] == row["made_seconds"] for row in again if row["state"] == "ran")
+
+    @pytest.mark.parametrize("scene", ["coarse", "final"])
+    def test_export_writes_ply(
+        self,
+        finished: tuple[str, SequenceOutcome],
+        tmp_path: Path,
+        scene: str,
+        capsys: pytest.CaptureFixture[str],
+    ) -> None:
+        from extrags.gaussians import Gaussians
+
+        store, first = finished
+        target = tmp_path / "scene.ply"
+        assert main(["export", SEQUENCE, *settled(store), "--scene", scene, "-o", str(target)]) == 0
+        assert len(Gaussians.read_ply(target)) == first.metrics[scene]["n_gaussians"]
+        assert "Gaussians" in capsys.readouterr().out
+
+    @pytest.mark.parametrize("verb", ["report", "export"])
+    def test_what_is_not_there_is_said(
+        self, verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        more = ["-o", str(tmp_path / "x.ply")]
+        assert main([verb, SEQUENCE, *settled(str(tmp_path / "store")), *more]) == 1
+        assert "run it first" in capsys.readouterr().err
+
+
+class TestCache:
+    @pytest.fixture
+    def store(self, tmp_path: Path) -> str:
+        store = Store(tmp_path / "store")
+        for index in range(3):
+            with store.slot(stage="toy", version=1, key=f"toy-v1-{index}", label=f"phantom/{index}") as slot:
+                (slot.path / "file").write_text("x" * 2000)
+        return store.root
+
+    def test_ls(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "ls", "--store", store]) == 0
+        said = capsys.readouterr().out
+        assert "toy-v1-2" in said
+        assert "3 artefacts, 5.9 KiB" in said
+
+    def test_ls_as_json(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "ls", "phantom/1", "--store", store, "--json", "-"]) == 0
+        (item,) = json.loads(capsys.readouterr().out)
+        assert item["key"] == "toy-v1-1"
+
+    def test_verify_finds_damage(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "ls", "--verify", "--store", store]) == 0
+        (Path(store) / "artefacts" / "toy-v1-1" / "file").write_text("y")
+        assert main(["cache", "ls", "--verify", "--store", store]) == 1
+        assert "DAMAGED" in capsys.readouterr().out
+
+    def test_verify(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "verify", "--store", store]) == 0
+        assert f"0 of 3 artefacts damaged in {store}" in capsys.readouterr().out
+        file = Path(store) / "artefacts" / "toy-v1-1" / "file"
+        file.write_text("y" * 2000)
+        assert main(["cache", "verify", "--store", store]) == 1
+        said = capsys.readouterr().out
+        assert "file: its content has changed since it was stored" in said
+        assert "1 of 3 artefacts damaged" in said
+        assert file.exists()
+
+    def test_verify_repairs(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        (Path(store) / "artefacts" / "toy-v1-1" / "file").unlink()
+        assert main(["cache", "verify", "--repair", "--store", store, "--json", "-"]) == 1
+        found = json.loads(capsys.readouterr().out)
+        (row,) = found.pop("damaged")
+        assert found == {"store": store, "artefacts": 3}
+        assert (row["stage"], row["key"], row["file"]) == ("toy", "toy-v1-1", "file")
+        assert (Path(row["set_aside"]) / "damage.json").is_file()
+        assert main(["cache", "verify", "--store", store]) == 0
+        assert "0 of 2 artefacts" in capsys.readouterr().out
+        assert Store(store).find("toy-v1-1") is None
+
+    def test_verify_wants_a_store(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "verify", "--store", str(tmp_path / "none")]) == 1
+        assert f"there is no store {tmp_path / 'none'}" in capsys.readouterr().err
+
+    def test_rm(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "rm", "*-0", "phantom/2", "--store", store]) == 0
+        assert "2 artefacts removed" in capsys.readouterr().out
+        assert [manifest.key for manifest in Store(store).ls()] == ["toy-v1-1"]
+        assert main(["cache", "rm", "toy-v1-1", "--store", store]) == 0
+        assert "1 artefact removed" in capsys.readouterr().out
+
+    def test_rm_of_what_is_not_there(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["cache", "rm", "nosuch*", "--store", store]) == 1
+        assert f"nothing in {store} matches nosuch*" in capsys.readouterr().err
+        assert len(Store(store).ls()) == 3
+
+    def test_gc_removes_former_versions(self, store: str, capsys: pytest.CaptureFixture[str]) -> None:
+        with Store(store).slot(stage="coarse", version=0, key="coarse-v0-a"):
+            pass
+        assert main(["cache", "gc", "--store", store]) == 0
+        # It was made a moment ago: a run may have it in hand.
+        assert "artefacts/coarse-v0-a" not in capsys.readouterr().out
+        os.utime(Path(store) / "artefacts" / "coarse-v0-a", (0, 0))
+        assert main(["cache", "gc", "--store", store]) == 0
+        assert "artefacts/coarse-v0-a" in capsys.readouterr().out
+        assert len(Store(store).ls()) == 3
