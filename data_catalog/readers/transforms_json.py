@@ -293,7 +293,7 @@ def _lens(values: dict[str, Any], image: Path, file: Path, frame: str) -> Lens:
             frame=frame,
             field="camera_model",
         )
-    # nerfstudio's OPENCV has k1 to k4 as a polynomial; COLMAP's has two, and the full one divides by k4 to k6.
+    # nerfstudio's OPENCV is a polynomial of k1 to k4; COLMAP's has two, and the full one divides by k4 to k6.
     others = ("k4", "k5", "k6") if stated == "OPENCV" else ()
     for key in _DISTORTION:
         if named[key] and (key not in names or key in others):
