@@ -1,7 +1,8 @@
 """What datasets there are, and how each is read into an `extrags.sequence.EndoscopicSequence`.
 
-The front door: `read`, `resolve`, `describe`, `list_sequences`, `source_fingerprint`, `Source`, `Descriptor`,
-`FolderReader`, `PosedFrame`, `SourceFrames`, `register_reader`. Each is loaded when it is first asked for.
+The front door: `read`, `resolve`, `describe`, `glance`, `list_sequences`, `source_fingerprint`, `Source`,
+`Descriptor`, `Glance`, `FolderReader`, `PosedFrame`, `SourceFrames`, `register_reader`. Each is loaded when
+it is first asked for.
 """
 
 from __future__ import annotations
@@ -10,19 +11,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from data_catalog.catalog import describe, list_sequences, read, resolve, source_fingerprint
+    from data_catalog.catalog import describe, glance, list_sequences, read, resolve, source_fingerprint
     from data_catalog.dataset import Descriptor, Source
-    from data_catalog.folder_reader import FolderReader
+    from data_catalog.folder_reader import FolderReader, Glance
     from data_catalog.folders import register_reader
     from data_catalog.posed_frames import PosedFrame, SourceFrames
 
 __all__ = [
     "Descriptor",
     "FolderReader",
+    "Glance",
     "PosedFrame",
     "Source",
     "SourceFrames",
     "describe",
+    "glance",
     "list_sequences",
     "read",
     "register_reader",
@@ -33,10 +36,12 @@ __all__ = [
 _MODULES = {
     "Descriptor": "dataset",
     "FolderReader": "folder_reader",
+    "Glance": "folder_reader",
     "PosedFrame": "posed_frames",
     "Source": "dataset",
     "SourceFrames": "posed_frames",
     "describe": "catalog",
+    "glance": "catalog",
     "list_sequences": "catalog",
     "read": "catalog",
     "register_reader": "folders",

@@ -16,6 +16,7 @@ from data_catalog.caverns.dataset import CAVERNS
 from data_catalog.checks import check_sequence
 from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
 from data_catalog.detail import DetailSize, source_detail
+from data_catalog.folder_reader import Glance
 from data_catalog.folders import FolderDataset
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
@@ -28,6 +29,7 @@ from extrags.sequence import EndoscopicSequence
 __all__ = [
     "DATASETS",
     "describe",
+    "glance",
     "list_sequences",
     "measured_detail",
     "read",
@@ -82,6 +84,26 @@ def resolve(name_or_path: str | Path) -> Source:
         if found is not None:
             return found
     raise _unknown(text)
+
+
+def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glance | None:
+    """What a folder, a video or a DICOM file holds, from names and headers: quick, and no picture is read.
+
+    Args:
+        name_or_path: what `resolve` takes.
+        config: settings it would be read with; defaults where None.
+
+    Returns:
+        None for a sequence that another dataset knows: its `Descriptor` tells.
+
+    Raises:
+        UnknownSequenceError: from `resolve`.
+        SourceError: what can be seen to be wrong without reading pictures; `read` would raise it as well.
+        ConfigError: settings that this source cannot be read with.
+    """
+    source = resolve(name_or_path)
+    dataset = _dataset(source)
+    return dataset.glance(source, config or IngestConfig()) if isinstance(dataset, FolderDataset) else None
 
 
 def read(source: Source | str | Path, config: IngestConfig | None = None) -> EndoscopicSequence:

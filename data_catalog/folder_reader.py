@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import struct
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -10,12 +12,59 @@ from pathlib import Path
 from typing import Any
 
 from data_catalog.dataset import Descriptor, file_digests
-from data_catalog.posed_frames import SourceFrames, assembled
+from data_catalog.posed_frames import SourceFrames, assembled, chosen_frames, planned_sampling
 from extrags.config import IngestConfig
 from extrags.errors import ExtragsError, SourceError
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["FolderReader", "understood"]
+__all__ = ["FolderReader", "Glance", "understood"]
+
+
+@dataclass(frozen=True)
+class Glance:
+    """What can be told of a sequence before a picture is read.
+
+    Args:
+        width: of its frames, in pixels.
+        height: of its frames, in pixels.
+        train: number of training frames; of footage, at most.
+        test: number of held-out frames; of footage, at most.
+        has_poses: whether the source has camera poses.
+        has_depth: whether it has depth.
+    """
+
+    width: int
+    height: int
+    train: int
+    test: int
+    has_poses: bool
+    has_depth: bool
+
+
+class _Unheard(logging.Filter, threading.local):
+    """Keeps back what readers say in threads that only look: it is said when they read."""
+
+    looking = False
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a record passes."""
+        return not self.looking
+
+
+_unheard_filter = _Unheard()
+
+
+@contextmanager
+def _unheard() -> Iterator[None]:
+    """Readers warn of nothing in this thread."""
+    for name, found in list(logging.root.manager.loggerDict.items()):
+        if name.partition(".")[0] == "data_catalog" and isinstance(found, logging.Logger):
+            found.addFilter(_unheard_filter)
+    _unheard_filter.looking = True
+    try:
+        yield
+    finally:
+        _unheard_filter.looking = False
 
 
 @contextmanager
@@ -63,6 +112,8 @@ class FolderReader:
         known_name: the catalogue's name for a folder, where it has one; None goes by `named_sets`.
         chosen: what `frames` goes by that is in none of these files, such as a camera that the folder's name
             tells, as plain JSON; part of cache keys. None, or nothing in it, where there is nothing.
+        outline: as `frames`, from headers alone, for sources of which `frames` decodes pictures; nothing is
+            read of what it gives. None where `frames` is as quick.
     """
 
     name: str
@@ -76,6 +127,7 @@ class FolderReader:
     named_sets: tuple[Descriptor, ...] = ()
     known_name: Callable[[Path], str | None] | None = None
     chosen: Callable[[Path], dict[str, Any]] | None = None
+    outline: Callable[[Path, IngestConfig], SourceFrames] | None = None
 
     def read(self, place: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
         """The sequence in a folder, under a name.
@@ -86,6 +138,26 @@ class FolderReader:
         """
         with understood(place):
             return assembled(self.frames(place, config), config, name)
+
+    def glance(self, place: Path, config: IngestConfig) -> Glance:
+        """What `read` will give, without reading any picture, and without its warnings.
+
+        Raises:
+            SourceError: what can be seen to be wrong so.
+            ConfigError: a size that the source cannot give.
+        """
+        with understood(place), _unheard():
+            source = (self.outline or self.frames)(place, config)
+            kept, split, world_from_camera = chosen_frames(source, config)
+            sampling = planned_sampling(source, kept[0], config)
+        return Glance(
+            width=sampling.width,
+            height=sampling.height,
+            train=len(split.train),
+            test=len(split.test),
+            has_poses=world_from_camera is not None,
+            has_depth=kept[0].depth_file is not None,
+        )
 
     def fingerprint(self, place: Path) -> dict[str, Any]:
         """What a folder or file contributes to a cache key.

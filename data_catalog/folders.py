@@ -13,7 +13,7 @@ from typing import Any
 from data_catalog.c3vd import reader as c3vd
 from data_catalog.calibration_files import with_calibration_file
 from data_catalog.dataset import Descriptor, Source
-from data_catalog.folder_reader import FolderReader, understood
+from data_catalog.folder_reader import FolderReader, Glance, understood
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
 from data_catalog.named_folders import find_folder, not_on_this_machine
 from data_catalog.posed_frames import assembled
@@ -112,6 +112,10 @@ class FolderDataset:
     def fingerprint(self, source: Source, config: IngestConfig) -> dict[str, Any]:
         """Reader, and content of each file it looks at."""
         return _reader(source).fingerprint(Path(source.paths[0]))
+
+    def glance(self, source: Source, config: IngestConfig) -> Glance:
+        """What its reader tells without reading pictures; `config.calibration` is not looked at."""
+        return _reader(source).glance(Path(source.paths[0]), config)
 
     def read(self, source: Source, config: IngestConfig) -> EndoscopicSequence:
         """Whatever its reader makes of it, with the lens of `config.calibration` where that is given."""

@@ -68,6 +68,10 @@ class Footage(Protocol):
         """Number of frames according to the file's header; 0 where it does not say."""
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of an upright frame in pixels."""
+
+    @property
     def pixel_aspect(self) -> float:
         """Width of a pixel over its height, of upright frames."""
 

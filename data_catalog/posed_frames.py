@@ -40,7 +40,7 @@ from extrags.lens import Lens
 from extrags.radial_lens import RadialLens
 from extrags.sequence import EndoscopicSequence, Split
 
-__all__ = ["MaskFinder", "PosedFrame", "SourceFrames", "assembled"]
+__all__ = ["MaskFinder", "PosedFrame", "SourceFrames", "assembled", "chosen_frames", "planned_sampling"]
 
 
 logger = logging.getLogger(__name__)
@@ -170,13 +170,7 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         PoseError: a pose that is no rigid motion.
         ConfigError: a size that the source cannot give.
     """
-    if not source.frames:
-        raise SourceError("there is no frame", file=source.pose_file, field="frames")
-    _check_for_all_or_none(source, "depth", [frame.depth_file for frame in source.frames])
-    _check_for_all_or_none(source, "world_from_camera", [frame.world_from_camera for frame in source.frames])
-    kept = [source.frames[index] for index in spread(len(source.frames), config.max_frames)]
-    split = _split(kept, source, config)
-    world_from_camera = _poses(kept, source)
+    kept, split, world_from_camera = chosen_frames(source, config)
     pixels = _Pixels(source, config, len(kept))
     for index, frame in enumerate(kept, start=source.looked_at + 1):
         pixels.read(frame)
@@ -217,6 +211,49 @@ def assembled(source: SourceFrames, config: IngestConfig, name: str) -> Endoscop
         lens=lens,
     )
     return sequence if source.truth is None else replace(sequence, truth=source.truth(sequence))
+
+
+def chosen_frames(
+    source: SourceFrames, config: IngestConfig
+) -> tuple[list[PosedFrame], Split, Float[np.ndarray, "f 4 4"] | None]:
+    """The frames that are read, their split, and their checked poses; None where there are none.
+
+    Args:
+        source: what a reader found.
+        config: number of frames, and the split of sources that name none.
+
+    Raises:
+        SourceError: no frame or a single one, or depth, poses or a split for some frames alone.
+        PoseError: a pose that is no rigid motion.
+    """
+    if not source.frames:
+        raise SourceError("there is no frame", file=source.pose_file, field="frames")
+    _check_for_all_or_none(source, "depth", [frame.depth_file for frame in source.frames])
+    _check_for_all_or_none(source, "world_from_camera", [frame.world_from_camera for frame in source.frames])
+    kept = [source.frames[index] for index in spread(len(source.frames), config.max_frames)]
+    return kept, _split(kept, source, config), _poses(kept, source)
+
+
+def planned_sampling(
+    source: SourceFrames, frame: PosedFrame, config: IngestConfig, first: Sampling | None = None
+) -> Sampling:
+    """How a frame is brought to the sequence's pinhole.
+
+    Args:
+        source: the frame's.
+        frame: of a lens that may be shared.
+        config: size and field of view.
+        first: sampling of the sequence's first lens; None for that lens itself.
+
+    Raises:
+        SourceError: intrinsics that are none.
+        ConfigError: a size that the source cannot give.
+    """
+    lens = frame.lens
+    if isinstance(lens, Lens):
+        named = source.intrinsics_file or source.pose_file
+        check_intrinsics(lens.K, lens.width, lens.height, frame=frame.label, file=named)
+    return source.sampling(lens, config, first)
 
 
 class _Pixels:
@@ -333,11 +370,8 @@ class _Pixels:
     def _sampling(self, frame: PosedFrame) -> Sampling:
         lens = frame.lens
         if lens not in self.samplings:
-            if isinstance(lens, Lens):
-                named = self.source.intrinsics_file or self.source.pose_file
-                check_intrinsics(lens.K, lens.width, lens.height, frame=frame.label, file=named)
             first = next(iter(self.samplings.values()), None)
-            self.samplings[lens] = self.source.sampling(lens, self.config, first)
+            self.samplings[lens] = planned_sampling(self.source, frame, self.config, first)
         return self.samplings[lens]
 
     def _mask(self, frame: PosedFrame, sampling: Sampling) -> Bool[np.ndarray, "h w"]:

@@ -32,8 +32,9 @@ from extrags.dense_flow import DenseFlow
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
 
-__all__ = ["Shot", "Survey", "choose_frames", "survey"]
+__all__ = ["NOTHING_DECODED", "Shot", "Survey", "choose_frames", "survey"]
 
+NOTHING_DECODED = "not a single frame can be decoded; is it a video, and whole?"
 STEP_SHARE = 0.03
 """Usual motion between two chosen frames, as a share of the image width."""
 _SMALLEST_STEP = 0.0015
@@ -167,7 +168,7 @@ def survey(frames: Iterable[FootageFrame], *, file: Path, announced: int = 0) ->
         if index % _PROGRESS_EVERY == 0 and announced > 0:
             emit(Progress("ingest", min(index, announced), 2 * announced))
     if not numbers:
-        raise SourceError("not a single frame can be decoded; is it a video, and whole?", file=file)
+        raise SourceError(NOTHING_DECODED, file=file)
     usable = np.array(sharpness)
     usable[shots.glitches] = 0.0
     return Survey(

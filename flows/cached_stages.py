@@ -153,11 +153,11 @@ class CachedStages(Pipeline):
                 row.processor_seconds = float(processor)
             elif row.processor_seconds is not None:
                 row.processor_seconds = round(row.processor_seconds + processor, 3)
-            row.made_seconds += manifest.seconds
+            row.made_seconds += manifest.elapsed_s
             row.made[manifest.key] = manifest.bytes
             row.tasks += 1
             if result.state == "ran":
-                row.spent_seconds += manifest.seconds
+                row.spent_seconds += manifest.elapsed_s
                 row.state = "ran"
 
     def _manifest(self, part: Part) -> Manifest:

@@ -31,7 +31,7 @@ from flows.selection import chosen_sequences
 from flows.sequence import open_store, reconstruct_sequence
 from flows.settings import run_store, task_runner
 from flows.tables import dataset_markdown
-from flows.workloads import known_work
+from flows.workloads import expected_work
 from tasks.progress import stages_interrupted
 from tasks.run_page import artifact_key, attempt
 
@@ -164,7 +164,7 @@ def reconstruct_dataset(
         return DatasetOutcome(outcomes, report)
 
     config = cases[0].config()
-    work = known_work(cases[0].sequence, config)
+    work = expected_work(cases[0].sequence, config)
     with (
         run_lease(store),
         run_page(name, config, until, sequences=len(cases), bars=False, work=work) as page,

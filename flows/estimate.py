@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from itertools import takewhile
 
 from extrags.config import PipelineConfig
+from extrags.cores import usable_cores
 from extrags.pipeline import STAGES, StageName
 from extrags.run_costs import Workload, packaged_model, stage_tasks
 from flows.workloads import task_repeats, usual_work
 from tasks.progress import StageProgress, duration_text
 
-__all__ = ["RunEstimate", "SequenceEstimate", "expected_seconds"]
+__all__ = ["RunEstimate", "SequenceEstimate", "expected_seconds", "usual_pace"]
 
 OTHER_SECONDS: dict[str, float] = {"poses": 20.0, "depth": 30.0, "report": 4.0}
 """Of processor time: tasks whose cost no model knows, for a recording of the phantom. Poses and depth grow
@@ -21,10 +23,15 @@ RESTORATION = {"enhance-keyframes": 0.1, "enhance-restore": 0.8, "enhance": 0.1}
 MEASURED_SCENES = 2
 """The coarse and the final scene."""
 
-LEARNED_SECONDS = 10.0
-"""So much of what is expected must have run before anything is said of what is left."""
+SEVERAL_LOOPS = frozenset({"enhance-train", "finetune-judge"})
+"""Tasks that count one thing after another: no count tells how far they are, only their time does."""
+
+USUAL_PACE_SECONDS = 10.0
+"""The usual pace weighs as much as so many expected seconds that have run."""
+USED_SHARE = 0.8
+"""Of every core but the first, which whole runs keep busy: the part of their time that threads divide."""
 ALMOST = 0.95
-"""Share of a task that has outlasted what was expected of it."""
+"""Share of a task, or of a step of one, that has outlasted what was expected of it."""
 
 
 def expected_seconds(
@@ -66,6 +73,11 @@ def expected_seconds(
     return found
 
 
+def usual_pace() -> float:
+    """Elapsed seconds per second of processor time, of a run that has this machine to itself."""
+    return 1 / (1 + USED_SHARE * (usable_cores() - 1))
+
+
 def _pixels_of_depth(work: Workload) -> float:
     """Of an image as depth is estimated from it."""
     share = 1.0 if work.width is None else min(1.0, work.config.depth.max_width / float(work.width))
@@ -90,7 +102,8 @@ class SequenceEstimate:
     _begun: float = 0.0
     _task: str = ""
     _task_begun: float = 0.0
-    _task_share: float | None = None
+    _counted: tuple[float, float, float] | None = None
+    """Of the task in work: its share at its last step, the share of a step, and when that was."""
 
     def receive(self, progress: StageProgress, now: float) -> None:
         """Take note of a step or the end of a stage."""
@@ -103,7 +116,7 @@ class SequenceEstimate:
             }
         if progress.state != "running":
             self.ended[progress.stage] = progress
-            self.stage, self.newest = "", None
+            self.stage, self.newest, self._task, self._counted = "", None, "", None
             return
         if progress.stage in self.expected and progress.stage != self.stage and not progress.total:
             # Announced by the flow: the next stage.
@@ -113,10 +126,11 @@ class SequenceEstimate:
         self.newest = progress
         if progress.stage in tasks:
             if progress.stage != self._task:
-                self._task, self._task_begun, self._task_share = progress.stage, now, None
-            # Several tasks of a kind may run at once; only the sum of `enhance-restore` would be a share.
-            if progress.total and progress.stage != "enhance-restore":
-                self._task_share = max(self._task_share or 0.0, min(1.0, progress.done / progress.total))
+                self._task, self._task_begun, self._counted = progress.stage, now, None
+            if progress.is_loop and progress.stage not in SEVERAL_LOOPS:
+                share = min(1.0, progress.done / progress.total)
+                if self._counted is None or share > self._counted[0]:
+                    self._counted = share, 1 / progress.total, now
 
     @property
     def failed(self) -> bool:
@@ -127,7 +141,7 @@ class SequenceEstimate:
         self.stage, self.newest = progress.stage, progress
         self._begun = self._task_begun = now
         self._task = next(iter(self._tasks(progress.stage)), "")
-        self._task_share = None
+        self._counted = None
 
     def share(self, now: float) -> float:
         """Of the expected time that stages to be run take, in [0, 1]."""
@@ -136,26 +150,24 @@ class SequenceEstimate:
         done = sum(self._seconds(stage) for stage in self._stages() if stage in well)
         return min(1.0, (done + self._stage_done(now)) / whole) if whole else 1.0
 
-    def seconds_left(self, now: float) -> float | None:
-        """At the pace of the stages that ran here; None before enough of them have."""
-        pace = self._pace(now)
-        if pace is None:
-            return None
+    def seconds_left(self, now: float) -> float:
+        """At the pace of what ran here, and the usual one as long as that is little."""
         waiting = [stage for stage in self._stages() if stage not in self.ended and stage != self.stage]
         rest = sum(self._seconds(stage) for stage in waiting)
         if self.stage:
             rest += self._seconds(self.stage) - self._stage_done(now)
-        return pace * rest
+        return self._pace(counted=True) * rest
 
-    def _pace(self, now: float) -> float | None:
-        """Seconds per expected second."""
+    def _pace(self, *, counted: bool) -> float:
+        """Seconds per expected second, of the stages that ran and of the steps of the one in work."""
         ran = [row for row in self.ended.values() if row.state == "ran" and row.stage in self._stages()]
-        expected = sum(self._seconds(row.stage) for row in ran)
-        took = sum(row.seconds for row in ran)
-        if self.stage and self._task_share:
-            expected += self._stage_done(now)
-            took += now - self._begun
-        return took / expected if expected >= LEARNED_SECONDS else None
+        expected = USUAL_PACE_SECONDS + sum(self._seconds(row.stage) for row in ran)
+        took = USUAL_PACE_SECONDS * usual_pace() + sum(row.seconds for row in ran)
+        if counted and self._counted is not None:
+            share, _, at = self._counted
+            expected += self._before_task() + share * self._tasks(self.stage).get(self._task, 0.0)
+            took += at - self._begun
+        return took / expected
 
     def _stages(self) -> list[StageName]:
         wanted = STAGES[: STAGES.index(self.until) + 1]
@@ -167,17 +179,22 @@ class SequenceEstimate:
     def _seconds(self, stage: str) -> float:
         return sum(self._tasks(stage).values())
 
+    def _before_task(self) -> float:
+        """Expected seconds of the tasks of the stage in work that are behind it."""
+        return sum(
+            seconds
+            for _, seconds in takewhile(lambda item: item[0] != self._task, self._tasks(self.stage).items())
+        )
+
     def _stage_done(self, now: float) -> float:
         """Expected seconds of the stage in work that are behind it."""
-        done = 0.0
-        for task, seconds in self._tasks(self.stage).items():
-            if task == self._task:
-                share = self._task_share
-                if share is None:
-                    share = min(ALMOST, (now - self._task_begun) / seconds) if seconds else ALMOST
-                return done + float(share * seconds)
-            done += seconds
-        return 0.0
+        seconds = self._tasks(self.stage).get(self._task, 0.0)
+        if not seconds:
+            return self._before_task()
+        share, most, since = (0.0, 1.0, self._task_begun) if self._counted is None else self._counted
+        # Between two steps time goes on: there may be few of them.
+        share += min(ALMOST * most, (now - since) / (seconds * self._pace(counted=False)))
+        return self._before_task() + min(1.0, share) * seconds
 
 
 class RunEstimate:
@@ -238,19 +255,17 @@ class RunEstimate:
         return min(1.0, done / self.sequences)
 
     def seconds_left(self, now: float) -> float | None:
-        """Those in work to their end, and the others as long as those before, as many at once as now."""
+        """Those in work to their end, and the others as long as those before, as many at once as now.
+
+        None before any has begun.
+        """
         in_work = {label: item.seconds_left(now) for label, item in self.in_work.items()}
         waiting = self.sequences - self.ended - len(in_work)
-        known = [left for left in in_work.values() if left is not None]
-        if len(known) < len(in_work):
-            return None
-        whole = self._ran_seconds or [
-            left + now - self._started_at[label] for label, left in in_work.items() if left is not None
-        ]
+        whole = self._ran_seconds or [left + now - self._started_at[label] for label, left in in_work.items()]
         if waiting > 0 and not whole:
             return None
         rest = waiting * sum(whole) / len(whole) / max(1, len(in_work)) if waiting > 0 else 0.0
-        return max(known, default=0.0) + rest
+        return max(in_work.values(), default=0.0) + rest
 
     def text(self, now: float) -> str:
         """What is in work, and what is left: `3 of 12 sequences done; some/scene: coarse, 7 of 9; ...`."""

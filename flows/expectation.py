@@ -9,22 +9,18 @@ from statistics import median
 
 from data_catalog.names import comparable_name
 from extrags.config import PipelineConfig
-from extrags.cores import usable_cores
-from extrags.errors import ConfigError
+from extrags.errors import ExtragsError
 from extrags.pipeline import STAGES, StageName
 from extrags.run_costs import Workload
 from extrags.store import Store, digest_of
 from flows.cases import SequenceCase
-from flows.estimate import expected_seconds
+from flows.estimate import expected_seconds, usual_pace
 from flows.methods import METHODS
 from flows.outcome_records import OutcomeRecord, outcome_records
-from flows.workloads import catalogue_work
+from flows.workloads import known_work, work_before_reading
 from tasks.progress import duration_text
 
 __all__ = ["Expectation", "expectations", "expected_words", "longest_first"]
-
-USED_SHARE = 0.8
-"""Of every core but the first, which whole runs keep busy: the part of their time that threads divide."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +76,7 @@ def expectations(
         wanted = [stage for stage in STAGES[: STAGES.index(until) + 1] if stage not in left_out]
         earlier = [*([own] if own is not None else []), *by_sequence.get(comparable_name(case.sequence), [])]
         times = _measured(earlier)
-        local = _pace(earlier) or pace or _usual_pace()
+        local = _pace(earlier) or pace or usual_pace()
         work, possible = _work(case.sequence, config, earlier)
         base = expected_seconds(config, work)
         seconds = 0.0
@@ -162,17 +158,15 @@ def _pace(records: Sequence[OutcomeRecord]) -> float | None:
     return median(paces) if paces else None
 
 
-def _usual_pace() -> float:
-    """Elapsed seconds per second of processor time, of a run that has this machine to itself."""
-    return 1 / (1 + USED_SHARE * (usable_cores() - 1))
-
-
 def _work(
     sequence: str, config: PipelineConfig, records: Sequence[OutcomeRecord]
 ) -> tuple[Workload | None, Collection[str]]:
     """Size and stages of a sequence as far as they are known before it is read: a path's by its last run."""
-    try:
-        return catalogue_work(sequence, config, ())
-    except ConfigError:
+    if known_work(sequence, config) is None:
         size = next((record["size"] for record in records if record.get("size")), None)
-        return None if size is None else Workload(config=config, **size), STAGES
+        if size is not None:
+            return Workload(config=config, **size), STAGES
+    try:
+        return work_before_reading(sequence, config, ())
+    except ExtragsError:
+        return None, STAGES

@@ -320,8 +320,8 @@ class _EndUse:
         from extrags.evaluation import evaluate
 
         metrics = evaluate(scene, self.given.sequence, lpips=self.lpips).to_json()["metrics"]
-        groups = {"whole": metrics, **{name: metrics.get(name) or {} for name in ("observed", "unobserved")}}
-        return {group: {"psnr": figures.get("psnr")} for group, figures in groups.items()}
+        groups = ("whole", "observed", "unobserved")
+        return {group: {"psnr": (metrics.get(group) or {}).get("psnr")} for group in groups}
 
 
 def _first_views(clips: Sequence[Clip], count: int) -> list[Clip]:

@@ -25,7 +25,7 @@ from extrags.store import Store
 from flows.estimate import RunEstimate, expected_seconds
 from flows.previews import stage_preview
 from flows.terminal import console
-from tasks.progress import IN_PARALLEL, Pace, StageProgress, duration_text, observed, rate_text
+from tasks.progress import Pace, StageProgress, duration_text, observed, rate_text
 
 __all__ = ["RunDisplay", "RunInView", "progress_display"]
 
@@ -155,7 +155,7 @@ class RunDisplay:
             self._over.discard(progress.label)
         if self._run.sequences and progress.label not in self._over:
             self._estimate.receive(progress, now)
-        if progress.total and progress.stage not in IN_PARALLEL:
+        if progress.is_loop:
             rate, left = self._pace.rate(progress, now), self._pace.seconds_left(progress, now)
             self._loops[progress.label] = progress, rate, left
 

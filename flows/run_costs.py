@@ -271,7 +271,7 @@ def recorded_costs(store: Store, fallback: PipelineConfig) -> tuple[list[Record]
         parts = [manifest, *_parts(manifest, manifests)]
         peaks = [float(value) for part in parts if isinstance(value := part.counts.get("peak_mib"), float)]
         peak = max(peaks, default=None)
-        elapsed.append((work, TaskCost(manifest.stage, sum(part.seconds for part in parts), peak)))
+        elapsed.append((work, TaskCost(manifest.stage, sum(part.elapsed_s for part in parts), peak)))
         spent = [part.counts.get("processor_s") for part in parts]
         if all(isinstance(value, int | float) for value in spent):
             seconds = sum(float(value) for value in spent if isinstance(value, int | float))

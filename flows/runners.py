@@ -22,6 +22,7 @@ from prefect.futures import PrefectFuture
 from extrags.errors import ExtragsError
 from extrags.store import Ref, Store
 from flows.limits import StageLimits
+from tasks.progress import IN_PARALLEL, StageProgress, notify
 from tasks.stage import at, stage_key
 
 __all__ = [
@@ -99,8 +100,9 @@ class PrefectRunner:
         """Submit all, wait for all; a task whose worker was lost is submitted again."""
         threads = _threads_for(len(calls))
         futures = [self._submit(call, label, threads) for call in calls]
-        for future in futures:
+        for ended, future in enumerate(futures, start=1):
             future.wait()
+            _tell(calls, label, ended)
         results = []
         for call, submitted in zip(calls, futures, strict=True):
             future = submitted
@@ -147,6 +149,13 @@ class PrefectRunner:
         return found
 
 
+def _tell(calls: Sequence[Call], label: str, ended: int) -> None:
+    """How many have ended, where each by itself tells nothing of how far the stage is."""
+    stage = calls[0].task.name
+    if len(calls) > 1 and stage in IN_PARALLEL:
+        notify(StageProgress(label, stage, "running", ended, len(calls), of_tasks=True))
+
+
 @cache
 def _peak_mib(store: str, stage: str) -> float | None:
     """The largest memory that a stage took before, in any sequence of the store."""
@@ -188,6 +197,7 @@ class DirectRunner:
             found = store.find_or_set_aside(key)
             ref = found or call.task.fn(store=self.store, label=label, **call.inputs)
             results.append(Result(ref, "ran" if found is None else "cached"))
+            _tell(calls, label, len(results))
         return results
 
 

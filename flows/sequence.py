@@ -26,7 +26,7 @@ from flows.runners import PrefectRunner
 from flows.settings import run_store
 from flows.tables import sequence_markdown
 from flows.wiring import run_sequence
-from flows.workloads import known_work
+from flows.workloads import expected_work
 from tasks.locks import sweep_locks
 from tasks.run_page import artifact_key, attempt
 
@@ -70,7 +70,7 @@ def reconstruct_sequence(
     case = SequenceCase(sequence, method, profile, seed, settings or {}, variant or {})
     config = case.config()
     store = run_store(store)
-    with run_lease(store), run_page(sequence, config, until, work=known_work(sequence, config)) as page:
+    with run_lease(store), run_page(sequence, config, until, work=expected_work(sequence, config)) as page:
         open_store(store)
         preflight(config, until, METHODS[method].leave_out)
         outcome = run_sequence(

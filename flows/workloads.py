@@ -6,21 +6,22 @@ from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
-from data_catalog import Descriptor, describe
+from data_catalog import Descriptor, Glance, describe, glance
 from extrags.config import PipelineConfig
-from extrags.errors import ConfigError, ExtragsError
+from extrags.errors import ExtragsError
 from extrags.pipeline import STAGES
 from extrags.run_costs import STAGE_TASKS, Workload
 
 __all__ = [
     "at_detail_size",
-    "catalogue_work",
     "detail_flags",
+    "expected_work",
     "frames_work",
     "known_work",
     "read_size",
     "task_repeats",
     "usual_work",
+    "work_before_reading",
 ]
 
 THUMBNAIL_DIVISORS = {"simcol3d": 2, "sinus": 4}
@@ -30,10 +31,18 @@ SINUS_BOX = (1048, 972)
 
 
 def known_work(name: str, config: PipelineConfig) -> Workload | None:
-    """That of a sequence as far as the catalogue tells; None for a path, which has to be read."""
+    """That of a sequence as far as the catalogue tells; None for a path."""
     try:
-        return catalogue_work(name, config, ())[0]
-    except ConfigError:
+        return _catalogue_work(describe(name), config)
+    except ExtragsError:
+        return None
+
+
+def expected_work(name: str, config: PipelineConfig) -> Workload | None:
+    """That of a sequence as far as can be told before it is read; None where it cannot be."""
+    try:
+        return work_before_reading(name, config, ())[0]
+    except ExtragsError:
         return None
 
 
@@ -89,29 +98,37 @@ def detail_flags(config: PipelineConfig, counts: Mapping[str, Any]) -> str:
     return f"--ingest.width {counts['detail_width']}{height}"
 
 
-def catalogue_work(
+def work_before_reading(
     name: str, config: PipelineConfig, leave_out: Collection[str]
 ) -> tuple[Workload, set[str]]:
-    """Size and settings of a sequence of the catalogue that has not been read, and the stages that may run.
+    """Size and settings of a sequence that has not been read, and the stages that may run.
 
-    How many frames are held out is not in the catalogue: half of them are taken to be, and all stages to run.
+    How many frames are held out is not in the catalogue: half of them are taken to be. Of folders and footage
+    names and headers tell; of footage, how many frames there will be at most. All stages are taken to run.
 
     Raises:
-        ConfigError: for a path, of which nothing is known before it is read.
+        UnknownSequenceError: neither a known name nor an existing path.
+        SourceError: a source that cannot be read.
+        ConfigError: a size that it cannot give.
     """
-    try:
-        about: Any = describe(name)
-    except ExtragsError as error:
-        raise ConfigError(
-            f"{name} is not in the catalogue: its size is known once it is read; leave out --before ({error})"
-        ) from error
-    width, height = read_size(about, config)
-    frames = float(min(about.frames, config.ingest.max_frames or about.frames))
+    seen = glance(name, config.ingest)
+    about: Glance | Descriptor = describe(name) if seen is None else seen
+    if isinstance(about, Descriptor):
+        work = _catalogue_work(about, config)
+    else:
+        counts = {name: getattr(about, name) for name in ("width", "height", "train", "test")}
+        work = frames_work({**counts, "frames": about.train + about.test}, config)
     stages = {str(stage) for stage in STAGES if stage not in leave_out}
     stages -= {"poses"} if about.has_poses and not config.poses.replace_given else set()
     stages -= {"depth"} if about.has_depth and not config.ingest.withhold_depth else set()
     stages -= set() if config.imported.scene is None else {"coarse"}
-    return Workload(float(width * height), frames, frames / 2, frames / 2, config, width=width), stages
+    return work, stages
+
+
+def _catalogue_work(about: Descriptor, config: PipelineConfig) -> Workload:
+    width, height = read_size(about, config)
+    frames = float(min(about.frames, config.ingest.max_frames or about.frames))
+    return Workload(float(width * height), frames, frames / 2, frames / 2, config, width=width)
 
 
 def read_size(about: Descriptor, config: PipelineConfig) -> tuple[float, float]:

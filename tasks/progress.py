@@ -37,7 +37,7 @@ LOG_EVERY_SECONDS = 30.0
 """Between two lines of the log on how far a sequence is."""
 
 IN_PARALLEL = frozenset({"explore-branch", "enhance-restore"})
-"""Tasks of which several run at once: the count of one says nothing about the stage."""
+"""Tasks of which several run at once: the count of one says nothing about the stage (`of_tasks` does)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +59,13 @@ class StageProgress:
     expected: Mapping[str, Mapping[str, float]] | None = None
     """Seconds of the tasks of each stage, where the stage that has ended told more of them: the size of the
     frames, or the budgets of the plan."""
+    of_tasks: bool = False
+    """Whether it counts those of several tasks of a kind that have ended, not the steps of one."""
+
+    @property
+    def is_loop(self) -> bool:
+        """Whether the count tells how far the stage is."""
+        return bool(self.total) and (self.of_tasks or self.stage not in IN_PARALLEL)
 
 
 Observer = Callable[[StageProgress], None]
@@ -183,6 +190,7 @@ class ProgressLog:
         self._clock = clock
         self._guard = threading.Lock()
         self._quiet_until: dict[str, float] = {}
+        self._failed: set[str] = set()
         self._pace = Pace()
 
     def __call__(self, progress: StageProgress) -> None:
@@ -196,13 +204,19 @@ class ProgressLog:
         place = f"{progress.label} {progress.stage}:"
         if progress.state != "running":
             self._pace.forget(progress.label)
+            if progress.state == "skipped" and progress.label in self._failed:
+                # After a failure every further stage is announced as skipped, and why has been said.
+                return None
+            if progress.state == "failed":
+                self._failed.add(progress.label)
             took = [] if progress.state in ("skipped", "cached") else [f"in {progress.seconds:.1f} s"]
             words = " ".join([place, progress.state, *took])
             return f"{words}: {progress.detail}" if progress.detail else words
         if not progress.total and not progress.detail:
+            self._failed.discard(progress.label)
             self._quiet_until[progress.label] = now + LOG_EVERY_SECONDS
             return f"{place} starts"
-        if progress.stage in IN_PARALLEL:
+        if progress.stage in IN_PARALLEL and not progress.of_tasks:
             return None
         parts = []
         if progress.total:

@@ -25,7 +25,6 @@ from prefect.artifacts import create_progress_artifact, update_progress_artifact
 from prefect.context import FlowRunContext, TaskRunContext
 
 from tasks.progress import (
-    IN_PARALLEL,
     Pace,
     ProgressLog,
     StageProgress,
@@ -191,7 +190,7 @@ class StageBars:
             if progress.state != "running":
                 self._end(progress)
                 return
-            if not progress.total or progress.stage in IN_PARALLEL:
+            if not progress.is_loop:
                 return
             begun = self._begun.setdefault(place, now)
             left = self._pace.seconds_left(progress, now)

@@ -35,10 +35,10 @@ from extrags.errors import ConfigError
 from extrags.store import Ref, Slot, Store, canonical, digest_of
 from tasks.locks import FlockManager
 from tasks.memory import peak_memory
-from tasks.processor_time import processor_time
 from tasks.progress import reporting
 from tasks.run_log import run_log
 from tasks.run_page import stage_page
+from tasks.spent_time import spent_time
 
 __all__ = [
     "ArtefactRecords",
@@ -201,13 +201,13 @@ def stage(
                 # Workers with other numbers of threads share the store.
                 with (
                     peak_memory() as peak,
-                    processor_time() as processor,
+                    spent_time() as spent,
                     kernel_threads(threads),
                     one_torch_thread(),
                 ):
                     body(slot, **inputs)  # type: ignore[call-arg]
                 slot.counts["peak_mib"] = peak.mib
-                slot.counts["processor_s"] = processor.seconds
+                slot.counts.update(elapsed_s=spent.elapsed_s, processor_s=spent.processor_s)
             return slot.ref
 
         own = list(inspect.signature(body).parameters.values())[1:]

@@ -81,6 +81,12 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     return _source_frames([_Part(video, range(len(video)), np.eye(4), EVALUATES)], mesh, {})
 
 
+def _outline(folder: Path, config: IngestConfig) -> SourceFrames:
+    """The same without the mesh, which takes a second or more to read."""
+    video = Video.open(folder)
+    return _source_frames([_Part(video, range(len(video)), np.eye(4), EVALUATES)], None, {})
+
+
 def _notes(folder: Path) -> tuple[str, ...]:
     video = Video.open(folder)
     depth = "with" if video.depth_files else "without"
@@ -119,6 +125,7 @@ READER = FolderReader(
     notes=_notes,
     known_name=_known_name,
     chosen=_chosen,
+    outline=_outline,
 )
 
 

@@ -35,7 +35,7 @@ from jaxtyping import Float, UInt8
 from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import DICOM_SUFFIXES, Footage, FootageFrame, TimeSpan
 from data_catalog.posed_frames import SourceFrames
-from data_catalog.readers.footage_frames import footage_frames
+from data_catalog.readers.footage_frames import footage_frames, footage_outline
 from data_catalog.readers.video import VideoFile, only_file, tell_about_stills, with_files_beside
 from extrags.config import IngestConfig
 from extrags.errors import (
@@ -109,6 +109,7 @@ class DicomFile:
         self._surplus_bits = max(0, int(header.get("BitsStored") or 8) - 8)
         self._times_s: list[float] = _times_s(header, self._announced, file).tolist()
         self._pixel_aspect = _pixel_aspect(header)
+        self._size = int(header.Columns), int(header.Rows)
 
     @property
     def file(self) -> Path:
@@ -119,6 +120,11 @@ class DicomFile:
     def announced(self) -> int:
         """Number of frames according to the header."""
         return self._announced
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of a frame in pixels."""
+        return self._size
 
     @property
     def pixel_aspect(self) -> float:
@@ -243,11 +249,19 @@ def _files(place: Path) -> list[Path]:
 
 
 def _frames(place: Path, config: IngestConfig) -> SourceFrames:
+    return footage_frames(_footage(place), config)
+
+
+def _outline(place: Path, config: IngestConfig) -> SourceFrames:
+    return footage_outline(_footage(place), config)
+
+
+def _footage(place: Path) -> Footage:
     file = _dicom_file(place)
     if file is None:
         raise SourceNotFoundError("no DICOM file here", file=place)
     tell_about_stills(place, file)
-    return footage_frames(open_dicom(file), config)
+    return open_dicom(file)
 
 
 READER = FolderReader(
@@ -257,6 +271,7 @@ READER = FolderReader(
     recognises=_recognises,
     files=_files,
     frames=_frames,
+    outline=_outline,
     conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
 )
 

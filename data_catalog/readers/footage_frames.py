@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Int, UInt8
@@ -22,12 +23,12 @@ from data_catalog.interlacing import deinterlaced
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frames_folder import INTRINSICS_FILE, mask_beside, read_intrinsics
 from data_catalog.sampling import Sampling
-from data_catalog.survey import Shot, Survey, choose_frames, survey
+from data_catalog.survey import NOTHING_DECODED, Shot, Survey, choose_frames, survey
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError
 from extrags.lens import Lens
 
-__all__ = ["MAX_FRAMES", "footage_frames"]
+__all__ = ["MAX_FRAMES", "footage_frames", "footage_outline"]
 
 logger = logging.getLogger(__name__)
 
@@ -54,10 +55,7 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
         ConfigError: a part that ends before it begins.
         SourceError: damaged, empty in that part, or a picture that hardly moves.
     """
-    file = footage.file
-    if config.end_s is not None and config.end_s <= config.start_s:
-        raise ConfigError(f"ingest.end_s = {config.end_s:g} is not after ingest.start_s = {config.start_s:g}")
-    span = TimeSpan(config.start_s, np.inf if config.end_s is None else config.end_s)
+    file, span = footage.file, _span(config)
     found = survey(_frames_of(footage, span), file=file, announced=footage.announced)
     shot = found.longest_shot()
     _report(found, shot, footage)
@@ -67,34 +65,61 @@ def footage_frames(footage: Footage, config: IngestConfig) -> SourceFrames:
     )
     numbers = found.numbers[here][chosen]
     logger.info("%s: %d of %d frames chosen", file.name, len(chosen), len(found))
+    second = _SecondPass(footage, span, numbers, found.numbers[here], interlaced=shot.interlaced)
+    unread = _unread(footage, config, numbers, found.width, found.height)
+    # No more frames were chosen than may be kept, so that each is asked for, in order.
+    return replace(unread, read_colour=second.image, masks=second, looked_at=len(found))
+
+
+def footage_outline(footage: Footage, config: IngestConfig) -> SourceFrames:
+    """About the frames that `footage_frames` will choose, from the header alone: their pixels are not read.
+
+    There are as many as may be chosen, or as the header announces; fewer will be where the picture hardly
+    moves, where there are cuts, or where a part was asked for.
+
+    Args:
+        footage: of one recording.
+        config: number of frames.
+
+    Raises:
+        ConfigError: a part that ends before it begins.
+        SourceError: no frame can be decoded, or intrinsics beside the file are damaged.
+    """
+    _span(config)
+    if not all(footage.size):
+        raise SourceError(NOTHING_DECODED, file=footage.file)
+    most = config.max_frames or MAX_FRAMES
+    there = footage.announced or most
+    return _unread(footage, config, np.array(spread(there, most)), *footage.size)
+
+
+def _span(config: IngestConfig) -> TimeSpan:
+    if config.end_s is not None and config.end_s <= config.start_s:
+        raise ConfigError(f"ingest.end_s = {config.end_s:g} is not after ingest.start_s = {config.start_s:g}")
+    return TimeSpan(config.start_s, np.inf if config.end_s is None else config.end_s)
+
+
+def _unread(
+    footage: Footage, config: IngestConfig, numbers: Int[np.ndarray, "n"], width: int, height: int
+) -> SourceFrames:
+    """Frames by their numbers, with what lies beside the file."""
+    file = footage.file
     K = read_intrinsics(
         file.parent,
-        found.width,
-        found.height,
+        width,
+        height,
         pixel_aspect=footage.pixel_aspect,
         guess_is_used=config.calibration is None,
     )
-    lens = Lens.pinhole(K, found.width, found.height)
-    mask_file = mask_beside(file.parent)
-    second = _SecondPass(footage, span, numbers, found.numbers[here], interlaced=shot.interlaced)
+    lens, mask_file = Lens.pinhole(K, width, height), mask_beside(file.parent)
     return SourceFrames(
         frames=[
-            PosedFrame(
-                name=f"{number:06d}",
-                file=file,
-                lens=lens,
-                mask_file=mask_file,
-                number=number,
-            )
+            PosedFrame(name=f"{number:06d}", file=file, lens=lens, mask_file=mask_file, number=number)
             for number in numbers.tolist()
         ],
         pose_file=file,
         metric=False,
-        # No more frames were chosen than may be kept, so that each is asked for, in order.
-        read_colour=second.image,
-        masks=second,
         intrinsics="given" if (file.parent / INTRINSICS_FILE).is_file() else "guessed",
-        looked_at=len(found),
     )
 
 

@@ -28,7 +28,7 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.footage import VIDEO_SUFFIXES, FootageFrame, TimeSpan, files_of_kind
 from data_catalog.images import image_entries
 from data_catalog.posed_frames import SourceFrames
-from data_catalog.readers.footage_frames import footage_frames
+from data_catalog.readers.footage_frames import footage_frames, footage_outline
 from data_catalog.readers.frames_folder import (
     FEWEST_FRAMES,
     INTRINSICS_FILE,
@@ -83,10 +83,15 @@ class VideoFile:
                 shown_s = float(stream.duration * stream.time_base)
                 self._announced = min(self._announced, round(shown_s * self._frames_per_s))
             aspect = float(stream.sample_aspect_ratio or 1)
-            turned_deg = next((frame.rotation for frame in _decoded(container, stream)), 0)
+            first = next(_decoded(container, stream), None)
+            turned_deg = 0 if first is None else first.rotation
+            stored = stream if first is None else first
+            self._size = int(stored.width), int(stored.height)
         # Counterclockwise, as numpy turns.
         self._quarter_turns = round(turned_deg / 90) % 4
-        self._pixel_aspect = 1 / aspect if self._quarter_turns % 2 else aspect
+        self._pixel_aspect = aspect
+        if self._quarter_turns % 2:
+            self._pixel_aspect, self._size = 1 / aspect, (self._size[1], self._size[0])
         if self._quarter_turns:
             logger.info(
                 "%s: turned by %d degrees, as the file says", self._file.name, -90 * self._quarter_turns % 360
@@ -101,6 +106,11 @@ class VideoFile:
     def announced(self) -> int:
         """Number of frames according to the header; 0 where it does not say."""
         return self._announced
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of an upright frame in pixels."""
+        return self._size
 
     @property
     def pixel_aspect(self) -> float:
@@ -212,11 +222,19 @@ def _files(place: Path) -> list[Path]:
 
 
 def _frames(place: Path, config: IngestConfig) -> SourceFrames:
+    return footage_frames(_video(place), config)
+
+
+def _outline(place: Path, config: IngestConfig) -> SourceFrames:
+    return footage_outline(_video(place), config)
+
+
+def _video(place: Path) -> VideoFile:
     file = only_file(place, VIDEO_SUFFIXES)
     if file is None:
         raise SourceNotFoundError("no video here", file=place)
     tell_about_stills(place, file)
-    return footage_frames(VideoFile(file), config)
+    return VideoFile(file)
 
 
 READER = FolderReader(
@@ -226,6 +244,7 @@ READER = FolderReader(
     recognises=_recognises,
     files=_files,
     frames=_frames,
+    outline=_outline,
     conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
 )
 

@@ -226,14 +226,17 @@ def _ceiling(
     baseline: str,
     about: Callable[[Run], dict[str, Any]],
 ) -> list[dict[str, Any]]:
-    """Share of the way from the baseline to the oracle: a ratio of means over seeds and sequences."""
+    """Share of the way from the baseline to the oracle: a ratio of means over seeds and sequences.
 
-    def gain_by_sequence(members: Sequence[Run], method: str, figure: Figure) -> dict[Any, float]:
+    Seeds count that baseline, method and oracle all have.
+    """
+
+    def gains(
+        members: Sequence[Run], method: str, figure: Figure
+    ) -> dict[tuple[Any, ...], tuple[Run, float]]:
         sign = 1 if figure.higher_is_better else -1
-        by_sequence: dict[Any, list[float]] = {}
-        for run, value in paired(members, method, baseline, figure.name):
-            by_sequence.setdefault((run["sequence"], run["setting"]), []).append(sign * value)
-        return {sequence: float(np.mean(values)) for sequence, values in by_sequence.items()}
+        pairs = paired(members, method, baseline, figure.name)
+        return {_identity(run): (run, sign * value) for run, value in pairs}
 
     rows = []
     for method in methods:
@@ -241,18 +244,25 @@ def _ceiling(
             continue
         for group, members in _groups(runs, about):
             found = {}
-            counted: set[Any] = set()
+            counted: dict[int, Run] = {}
             for figure in known:
-                ceiling = gain_by_sequence(members, CEILING, figure)
-                gains = gain_by_sequence(members, method, figure)
-                below = [key for key in gains if ceiling.get(key, 0.0) > 0]
-                counted.update(below)
+                whole, part = (gains(members, name, figure) for name in (CEILING, method))
+                by_sequence: dict[Any, list[tuple[float, float]]] = {}
+                partners: dict[Any, list[Run]] = {}
+                for key in part.keys() & whole.keys():
+                    run, gain = part[key]
+                    sequence = (run["sequence"], run["setting"])
+                    by_sequence.setdefault(sequence, []).append((gain, whole[key][1]))
+                    partners.setdefault(sequence, []).append(run)
+                means = {name: np.mean(values, axis=0).tolist() for name, values in by_sequence.items()}
+                # An oracle that is not above the baseline is no ceiling.
+                below = sorted(name for name, (_, way) in means.items() if way > 0)
+                counted |= {id(run): run for name in below for run in partners[name]}
                 if below:
-                    share = _share([gains[key] for key in below], [ceiling[key] for key in below])
+                    share = _share([means[name][0] for name in below], [means[name][1] for name in below])
                     found[figure.name] = asdict(share)
             if found:
-                own = [run for run in members if run["method"] == method]
-                sizes = _sizes([run for run in own if (run["sequence"], run["setting"]) in counted])
+                sizes = _sizes(list(counted.values()))
                 rows.append({**group, "method": method, "baseline": baseline, **sizes, "figures": found})
     return rows
 

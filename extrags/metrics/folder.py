@@ -190,9 +190,11 @@ def _color(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
 
     try:
         with Image.open(file) as image:
-            if image.mode not in ("RGB", "RGBA", "P"):
+            # Pillow opens files of 16 bits a channel as RGB, and drops the lower eight.
+            stored = f"{image.mode} of 16 bits" if "16" in str(image.tile) else image.mode
+            if stored not in ("RGB", "RGBA", "P"):
                 raise SourceError(
-                    f"expected an 8-bit colour image, found the mode {image.mode}", file=file, field="mode"
+                    f"expected an 8-bit colour image, found the mode {stored}", file=file, field="mode"
                 )
             levels = np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, OSError, SyntaxError) as error:

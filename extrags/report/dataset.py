@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import fmean
 from typing import Any, Literal
 
 import numpy as np
@@ -65,9 +66,9 @@ def build_dataset_report(
 ) -> str:
     """One self-contained HTML page that compares the sequences of a run.
 
-    Means are over the rows that have both a coarse and a final figure, with the standard deviation between
-    them; where a sequence has several, they are called runs. Sequences run with several seeds get a table of
-    their spread, each variant by itself. Failures stand at the top.
+    Means are over the sequences that have both a coarse and a final figure, with the standard deviation
+    between them; of several seeds of a sequence the mean counts, each variant by itself, and their spread
+    gets a table. Where there are more rows than sequences, rows are called runs. Failures stand at the top.
 
     Args:
         rows: the sequences, or runs of them, in the order they are to be shown.
@@ -104,9 +105,9 @@ def build_dataset_report(
         ],
         metrics=metrics,
         rows=[_table_row(row, metrics) for row in rows],
-        means=[_mean_cell(metric, rows, ()) for metric in metrics],
-        unobserved=[_mean_cell(metric, rows, ("unobserved",)) for metric in metrics],
-        compared=sum(_both(row, psnr, ()) is not None for row in rows),
+        means=[_mean_cell(metric, _means_of_seeds(rows, metric, ())) for metric in metrics],
+        unobserved=[_mean_cell(metric, _means_of_seeds(rows, metric, ("unobserved",))) for metric in metrics],
+        compared=len(_means_of_seeds(rows, psnr, ())),
         seeds=_seed_rows(rows, metrics),
         chart=chart,
         protocol={"version": None, "metrics": described_metrics(*trees)},
@@ -115,16 +116,16 @@ def build_dataset_report(
 
 def _summary(rows: Sequence[DatasetRow]) -> str:
     psnr = metric_named("psnr")
-    pairs = [pair for row in rows if (pair := _both(row, psnr, ())) is not None]
+    pairs = _pairs(rows, psnr, ())
     completed = sum(row.status == "completed" for row in rows)
     text = f"{completed} of {len(rows)} {_kind(rows)} completed."
     if not pairs:
         return f"{text} None of them has both a coarse and a final figure to compare."
-    change = np.array([final - coarse for coarse, final in pairs])
-    better = int((change > 0).sum())
+    better = sum(final > coarse for coarse, final in pairs)
+    change = fmean(final - coarse for coarse, final in _means_of_seeds(rows, psnr, ()))
     return (
         f"{text} Over the {len(pairs)} with a coarse and a final scene, PSNR on held-out views changes by "
-        f"{number(float(change.mean()), 2, signed=True)} dB on average; {better} of {len(pairs)} gain."
+        f"{number(change, 2, signed=True)} dB on average; {better} of {len(pairs)} gain."
     )
 
 
@@ -160,8 +161,29 @@ def _both(row: DatasetRow, metric: Metric, path: tuple[str, ...]) -> tuple[float
     return None if coarse is None or final is None else (coarse, final)
 
 
-def _mean_cell(metric: Metric, rows: Sequence[DatasetRow], path: tuple[str, ...]) -> dict[str, Any]:
-    pairs = [pair for row in rows if (pair := _both(row, metric, path)) is not None]
+def _pairs(rows: Sequence[DatasetRow], metric: Metric, path: tuple[str, ...]) -> list[tuple[float, float]]:
+    return [pair for row in rows if (pair := _both(row, metric, path)) is not None]
+
+
+def _by_sequence(rows: Sequence[DatasetRow]) -> dict[str, list[DatasetRow]]:
+    """The seeds of each sequence, each variant by itself."""
+    groups: dict[str, list[DatasetRow]] = {}
+    for row in rows:
+        groups.setdefault(replace(row, seed=None).label, []).append(row)
+    return groups
+
+
+def _means_of_seeds(
+    rows: Sequence[DatasetRow], metric: Metric, path: tuple[str, ...]
+) -> list[tuple[float, float]]:
+    """A pair for each sequence, whatever its number of seeds."""
+    found = [_pairs(group, metric, path) for group in _by_sequence(rows).values()]
+    return [
+        (fmean(first for first, _ in pairs), fmean(last for _, last in pairs)) for pairs in found if pairs
+    ]
+
+
+def _mean_cell(metric: Metric, pairs: Sequence[tuple[float, float]]) -> dict[str, Any]:
     if not pairs:
         return {"comparison": compare(metric, None, None), "deviation": ""}
     coarse, final = np.array(pairs).T
@@ -170,13 +192,13 @@ def _mean_cell(metric: Metric, rows: Sequence[DatasetRow], path: tuple[str, ...]
 
 
 def _seed_rows(rows: Sequence[DatasetRow], metrics: Sequence[Metric]) -> list[dict[str, Any]]:
-    groups: dict[str, list[DatasetRow]] = {}
-    for row in rows:
-        if row.seed is not None:
-            groups.setdefault(replace(row, seed=None).label, []).append(row)
     return [
-        {"label": label, "seeds": len(group), "cells": [_mean_cell(metric, group, ()) for metric in metrics]}
-        for label, group in groups.items()
+        {
+            "label": label,
+            "seeds": len(group),
+            "cells": [_mean_cell(metric, _pairs(group, metric, ())) for metric in metrics],
+        }
+        for label, group in _by_sequence([row for row in rows if row.seed is not None]).items()
         if len(group) > 1
     ]
 

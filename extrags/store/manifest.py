@@ -68,6 +68,15 @@ class Manifest(BaseModel):
     checksum: str = ""
     """In the file: over the text before it. Manifests from before there were checksums have none."""
 
+    @property
+    def elapsed_s(self) -> float:
+        """Its share of the time while it was made, where other artefacts were made at the same time.
+
+        Those of earlier versions have no share, and count in full.
+        """
+        share = self.counts.get("elapsed_s")
+        return float(share) if isinstance(share, int | float) else self.seconds
+
 
 def manifest_text(manifest: Manifest) -> bytes:
     """The JSON of a manifest, closed by a checksum over everything before it."""

@@ -28,7 +28,7 @@ def add_arguments(parser: Parser) -> None:
     parser.add_argument(
         "--before",
         action="store_true",
-        help="run nothing: predict the cost of all stages from what the catalogue says of the sequence",
+        help="run nothing: predict the cost from the catalogue, or from names and headers of the files",
     )
     add_method(parser)
     add_runner(parser)
@@ -53,9 +53,9 @@ def plan(given: argparse.Namespace) -> int:
         config = run_config(given)
         prepare(Store(store_root(given)).state, debug=given.debug)
         from flows.run_costs import predict_run
-        from flows.workloads import catalogue_work
+        from flows.workloads import work_before_reading
 
-        work, stages = catalogue_work(given.sequence, config, left_out)
+        work, stages = work_before_reading(given.sequence, config, left_out)
         scenes = 2 if "finetune" in stages else 1
         predicted = predict_run(Store(store_root(given)), work, stages, measured_scenes=scenes)
         if given.json != "-":

@@ -12,7 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from extrags.errors import ConfigError, DamagedArtefactError, ExtragsError, UnknownSequenceError
+from extrags.errors import (
+    ConfigError,
+    DamagedArtefactError,
+    ExtragsError,
+    SourceError,
+    UnknownSequenceError,
+)
 from flows.commands.common import (
     items,
     run_config,
@@ -24,12 +30,11 @@ from flows.commands.common import (
 )
 from flows.commands.options import Parser, add_json, add_method, add_runner, add_stages
 from flows.failures import describe_error
-from flows.outcome import DatasetFailedError, DatasetOutcome
+from flows.outcome import DatasetFailedError, DatasetOutcome, SequenceOutcome, StageRow
 
 if TYPE_CHECKING:
     from extrags.pipeline import StageName
     from flows.cases import SequenceCase
-    from flows.outcome import SequenceOutcome
 
 __all__ = ["Several", "add_arguments", "execute", "parsed_matrix", "parsed_methods", "run"]
 
@@ -254,6 +259,12 @@ def execute(
         if own_home:
             start_early()
     # The flow looks as well; here it is said without waiting for a server.
+    if len(cases) == 1:
+        refused = _wrong_source(cases[0], until)
+        if refused is not None:
+            stop_early()
+            _record(cases[0], refused, root, until)
+            return _raised(DatasetOutcome([refused]), given)
     from flows.preflight import preflight
 
     for method in several.methods:
@@ -267,7 +278,7 @@ def execute(
     from flows.dataset import reconstruct_dataset
     from flows.estimate import expected_seconds
     from flows.progress_display import RunInView, progress_display
-    from flows.workloads import known_work
+    from flows.workloads import expected_work
 
     # Names were checked by the parser; flows have literals for them.
     arguments: dict[str, Any] = {
@@ -288,7 +299,7 @@ def execute(
         "limits": stage_limits(given),
     }
     first_config = cases[0].config()
-    expected_of = expected_seconds(first_config, known_work(cases[0].sequence, first_config))
+    expected_of = expected_seconds(first_config, expected_work(cases[0].sequence, first_config))
     view = RunInView(len(cases), expected_of, until, root)
     with temporary_server(), without_heartbeat(), progress_display(showing(given), view):
         try:
@@ -296,11 +307,32 @@ def execute(
         except DatasetFailedError as error:
             # Said to Prefect; here each sequence is reported, and the exit code is 1 if any failed.
             outcome = error.outcome
+    return _raised(outcome, given)
+
+
+def _raised(outcome: DatasetOutcome, given: argparse.Namespace) -> DatasetOutcome:
+    """The outcome; with `--debug` the first error in it is raised instead, for its traceback."""
     if given.debug:
         for sequence in outcome.sequences:
             if sequence.error is not None:
                 raise sequence.error
     return outcome
+
+
+def _wrong_source(case: SequenceCase, until: StageName) -> SequenceOutcome | None:
+    """How a run would fail whose source can be seen to be wrong without reading pictures; else None."""
+    from data_catalog import glance
+    from data_catalog.names import plain_name
+    from extrags.pipeline import STAGES
+
+    try:
+        glance(case.sequence, case.config().ingest)
+    except SourceError as error:
+        rest = STAGES[1 : STAGES.index(until) + 1]
+        rows = [StageRow("ingest", "failed", reason=str(error))]
+        rows += [StageRow(stage, "skipped", reason="ingest failed") for stage in rest]
+        return SequenceOutcome(plain_name(case.sequence), "failed", rows, error=error)
+    return None
 
 
 def _may_be_finished(root: str, sequence: str, until: StageName) -> bool:

@@ -350,6 +350,29 @@ class TestThroughPrefect:
         assert "failed in ingest: " in said[0]
         assert "the folder is empty" in said[0]
 
+    def test_a_single_wrong_source_needs_no_flow(
+        self,
+        finished: tuple[str, SequenceOutcome],
+        tmp_path: Path,
+        capsys: pytest.CaptureFixture[str],
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        def started(**_: object) -> None:
+            pytest.fail("a flow was started")
+
+        monkeypatch.setattr("flows.dataset.reconstruct_dataset", started)
+        store, _ = finished
+        (tmp_path / "exam.mp4").write_text("hello")
+        target = tmp_path / "results.json"
+        assert main(["run", str(tmp_path / "exam.mp4"), *settled(store), "--json", str(target)]) == 1
+        (found,) = json.loads(target.read_text())["sequences"]
+        assert "cannot be opened as a video" in found["stages"][0]["reason"]
+        assert {row["state"] for row in found["stages"][1:]} == {"skipped"}
+        assert capsys.readouterr().err.count("cannot be opened as a video") == 1
+        # It is on record as any run that failed.
+        assert main(["status", "--store", store, "--json", "-"]) == 1
+        assert "cannot be opened as a video" in capsys.readouterr().out
+
 
 class TestBench:
     """The kernels' benchmarks at sizes that take no time."""

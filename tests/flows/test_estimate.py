@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
 
 from extrags.config import profile_config
 from extrags.pipeline import STAGES, StageName
-from flows.estimate import RunEstimate, SequenceEstimate, expected_seconds
+from flows.estimate import RunEstimate, SequenceEstimate, expected_seconds, usual_pace
 from flows.workloads import usual_work
 from tasks.progress import StageProgress
 from tasks.stage import all_stage_versions
@@ -62,27 +63,69 @@ class TestEstimate:
         assert depths[1] == pytest.approx(depths[0] * 256 * 144 / (160 * 128))
         assert depths[2] == pytest.approx(depths[1])
 
-    def test_nothing_is_said_before_something_ran(self) -> None:
-        estimate = SequenceEstimate(EXPECTED)
+    def test_the_usual_pace_counts_before_something_ran(self) -> None:
+        estimate = SequenceEstimate(EXPECTED, until="coarse")
         estimate.receive(step("ingest"), 0.0)
-        assert estimate.seconds_left(1.0) is None
+        whole = sum(sum(EXPECTED[stage].values()) for stage in ("ingest", "poses", "depth", "coarse"))
+        assert estimate.seconds_left(0.0) == pytest.approx(whole * usual_pace())
 
     def test_what_is_left_goes_at_the_pace_of_what_ran(self) -> None:
         estimate = SequenceEstimate(EXPECTED, until="coarse")
         estimate.receive(step("ingest"), 0.0)
-        estimate.receive(step("ingest", "ran", seconds=24.0), 24.0)
+        estimate.receive(step("ingest", "ran", seconds=2000.0), 2000.0)
         for skipped in ("poses", "depth"):
-            estimate.receive(step(skipped, "skipped"), 24.0)
-        # Ingestion took twice what was expected; 18 s are expected of the coarse scene.
-        assert estimate.seconds_left(24.0) == pytest.approx(36.0)
-        assert estimate.share(24.0) == pytest.approx(12 / 30)
-        estimate.receive(step("coarse"), 24.0)
-        estimate.receive(step("coarse", done=750, total=1500), 42.0)
-        assert estimate.share(42.0) == pytest.approx(21 / 30)
-        assert estimate.seconds_left(42.0) == pytest.approx(18.0)
-        estimate.receive(step("coarse", "ran", seconds=36.0), 60.0)
-        assert estimate.share(60.0) == 1.0
-        assert estimate.seconds_left(60.0) == 0.0
+            estimate.receive(step(skipped, "skipped"), 2000.0)
+        # Of 12 expected seconds each took 167, and the usual pace counts for 10 more; 18 s are expected of
+        # the coarse scene.
+        pace = (2000.0 + 10 * usual_pace()) / 22
+        assert estimate.seconds_left(2000.0) == pytest.approx(18 * pace)
+        assert estimate.share(2000.0) == pytest.approx(12 / 30)
+        estimate.receive(step("coarse"), 2000.0)
+        estimate.receive(step("coarse", done=750, total=1500), 2900.0)
+        assert estimate.share(2900.0) == pytest.approx(21 / 30)
+        assert estimate.seconds_left(2900.0) == pytest.approx(9 * (2900.0 + 10 * usual_pace()) / 31)
+        estimate.receive(step("coarse", "ran", seconds=1800.0), 3800.0)
+        assert estimate.share(3800.0) == 1.0
+        assert estimate.seconds_left(3800.0) == 0.0
+
+    def test_what_is_left_falls_between_steps(self) -> None:
+        estimate = SequenceEstimate(EXPECTED, until="coarse")
+        estimate.receive(step("ingest"), 0.0)
+        estimate.receive(step("ingest", "ran", seconds=12.0), 12.0)
+        for skipped in ("poses", "depth"):
+            estimate.receive(step(skipped, "skipped"), 12.0)
+        estimate.receive(step("coarse"), 12.0)
+        estimate.receive(step("coarse", done=1, total=3), 18.0)
+        said = [estimate.seconds_left(now) for now in (18.0, 20.0, 22.0, 24.0, 40.0, 60.0)]
+        assert said == sorted(said, reverse=True)
+        assert said[0] > said[2] + 1
+        # The second step has outlasted what was expected of it; of the third nothing is behind yet.
+        assert said[-1] == said[-2] > said[0] / 2
+
+    def test_what_counts_one_thing_after_another_goes_by_its_time(self) -> None:
+        estimate = SequenceEstimate(EXPECTED)
+        for name in ("ingest", "coarse"):
+            estimate.receive(step(name), 0.0)
+            estimate.receive(step(name, "ran", seconds=sum(EXPECTED[name].values())), 0.0)
+        estimate.receive(step("finetune"), 0.0)
+        shares = []
+        for now, (done, total) in enumerate([(300, 600), (600, 600), (1, 4), (4, 4), (100, 400)], start=1):
+            estimate.receive(step("finetune-judge", done=done, total=total), float(now))
+            shares.append(estimate.share(float(now)))
+        steps = [later - earlier for earlier, later in pairwise(shares)]
+        assert steps == pytest.approx([steps[0]] * len(steps))
+        assert steps[0] > 0
+
+    def test_tasks_that_ended_tell_how_far_several_at_once_are(self) -> None:
+        estimate = SequenceEstimate(EXPECTED)
+        estimate.receive(step("enhance"), 0.0)
+        estimate.receive(step("enhance-restore", done=4, total=4), 1.0)
+        before = estimate.share(1.0)
+        estimate.receive(replace(step("enhance-restore", done=2, total=3), of_tasks=True), 1.0)
+        whole = sum(sum(tasks.values()) for tasks in EXPECTED.values())
+        assert estimate.share(1.0) - before == pytest.approx(
+            2 / 3 * EXPECTED["enhance"]["enhance-restore"] / whole, rel=0.5
+        )
 
     def test_frames_that_are_read_tell_what_is_to_come(self) -> None:
         estimate = SequenceEstimate(EXPECTED, until="coarse")
@@ -91,7 +134,8 @@ class TestEstimate:
         estimate.receive(replace(step("ingest", "ran", seconds=24.0), expected=larger), 24.0)
         for skipped in ("poses", "depth"):
             estimate.receive(step(skipped, "skipped"), 24.0)
-        assert estimate.seconds_left(24.0) == pytest.approx(180.0)
+        pace = (24 + 10 * usual_pace()) / 34
+        assert estimate.seconds_left(24.0) == pytest.approx(180.0 * pace)
         assert estimate.share(24.0) == pytest.approx(24 / 204)
 
     def test_a_failure_keeps_its_share(self) -> None:
@@ -121,8 +165,9 @@ class TestEstimate:
         estimate = SequenceEstimate(EXPECTED)
         for name in ("ingest", "poses", "depth", "coarse"):
             estimate.receive(step(name), 0.0)
-            estimate.receive(step(name, "cached"), 0.0)
-        assert estimate.seconds_left(1.0) is None
+            estimate.receive(step(name, "cached", seconds=100.0), 0.0)
+        rest = sum(sum(tasks.values()) for name, tasks in EXPECTED.items() if name not in estimate.ended)
+        assert estimate.seconds_left(1.0) == pytest.approx(rest * usual_pace())
 
 
 class TestRun:

@@ -5,16 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from extrags.config import PipelineConfig, profile_config
-from extrags.errors import ConfigError
+from extrags.errors import SourceNotFoundError
 from extrags.run_costs import CostModel, Workload, packaged_model
 from extrags.store import Store
 from flows import run_costs
 from flows.run_costs import RunPrediction, predict_run, recorded_costs
 from flows.runners import DirectRunner
 from flows.wiring import run_sequence
-from flows.workloads import catalogue_work
+from flows.workloads import expected_work, work_before_reading
 from tests.flows.tiny import SEQUENCE, TINY
 
 CONFIG: PipelineConfig = profile_config("quick").with_overrides(TINY)
@@ -98,7 +99,7 @@ def test_the_restorer_of_a_record_is_the_one_it_was_made_with(filled: Store) -> 
 def test_without_history_a_probe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run_costs, "probe_seconds", lambda: 0.03)
     model = CostModel({"ingest": {"frames": 2.0}}, {}, 0.01)
-    work, stages = catalogue_work(SEQUENCE, CONFIG, {})
+    work, stages = work_before_reading(SEQUENCE, CONFIG, {})
     assert work.pixels == 48 * 40
     assert "poses" not in stages
     assert "depth" not in stages
@@ -107,6 +108,19 @@ def test_without_history_a_probe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert found.processor_seconds == pytest.approx(3 * 2 * 24)
 
 
-def test_nothing_is_known_of_a_path(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="not in the catalogue"):
-        catalogue_work(str(tmp_path), CONFIG, {})
+class TestWorkBeforeReading:
+    def test_of_a_path_names_and_headers_tell(self, tmp_path: Path) -> None:
+        for number in range(9):
+            Image.new("RGB", (60, 50), (90, 60, 50)).save(tmp_path / f"{number}.png")
+        # Nothing is read of the pictures.
+        (tmp_path / "3.png").write_bytes((tmp_path / "3.png").read_bytes()[:60])
+        work, stages = work_before_reading(str(tmp_path), CONFIG, {"depth"})
+        assert (work.pixels, work.width) == (48 * 40, 48)
+        assert (work.frames, work.train, work.test) == (9, 7, 2)
+        assert "poses" in stages
+        assert "depth" not in stages
+
+    def test_a_wrong_source_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(SourceNotFoundError, match="the folder is empty"):
+            work_before_reading(str(tmp_path), CONFIG, ())
+        assert expected_work(str(tmp_path), CONFIG) is None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import pytest
 
@@ -84,6 +85,42 @@ class TestLog:
         said = caplog.messages[1:]
         assert all(line.startswith("scene explore: ") for line in said)
         assert len(said) == 4  # In 120 seconds.
+
+    def test_of_several_tasks_at_once_those_that_ended_are_told(
+        self, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        caplog.set_level(logging.INFO, logger="extrags.progress")
+        clock = Clock()
+        write = ProgressLog(clock)
+        write(step("enhance"))
+        for ended in (1, 2, 3):
+            clock.now += LOG_EVERY_SECONDS
+            write(step("enhance-restore", 2, 4))
+            write(replace(step("enhance-restore", ended, 3), of_tasks=True))
+        assert caplog.messages[1:] == [
+            "scene enhance-restore: 1 of 3",
+            "scene enhance-restore: 2 of 3, 30 s each, about 30 s left",
+            "scene enhance-restore: 3 of 3, 30 s each",
+        ]
+
+    def test_what_a_failure_leaves_out_is_not_listed(self, caplog: pytest.LogCaptureFixture) -> None:
+        caplog.set_level(logging.INFO, logger="extrags.progress")
+        write = ProgressLog(Clock())
+        skipped = StageProgress("scene", "poses", "skipped", detail="ingest failed")
+        write(step("ingest"))
+        write(StageProgress("scene", "ingest", "failed", detail="no file", seconds=1.0))
+        write(skipped)
+        write(replace(skipped, label="another"))
+        # Another run of the same sequence.
+        write(step("ingest"))
+        write(replace(skipped, detail="the source has poses"))
+        assert caplog.messages == [
+            "scene ingest: starts",
+            "scene ingest: failed in 1.0 s: no file",
+            "another poses: skipped: ingest failed",
+            "scene ingest: starts",
+            "scene poses: skipped: the source has poses",
+        ]
 
     def test_each_sequence_has_an_interval_of_its_own(self, caplog: pytest.LogCaptureFixture) -> None:
         caplog.set_level(logging.INFO, logger="extrags.progress")

@@ -341,7 +341,8 @@ class RestorerBenchmark:
     @cached_property
     def _realism(self) -> Realism:
         network = None if self.lpips is None else self.lpips.get("alex")
-        return Realism(self._truth, self.regions, network if isinstance(network, Lpips) else None)
+        network = network if isinstance(network, Lpips) else None
+        return Realism(self._truth, self.regions, network, self.regions["valid"])
 
     @cached_property
     def _truth(self) -> Tensor:

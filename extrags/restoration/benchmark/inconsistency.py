@@ -73,9 +73,21 @@ def motion(
     column = np.clip(u, 0, width - 1).astype(np.int64)
     seen = depth_mm[other][row, column]
     same = (seen > 0) & (depth_mm[view] > 0) & (np.abs(z - seen) < SAME_SURFACE * np.maximum(seen, 1e-9))
-    common = inside & same & mask[view] & mask[other][row, column]
+    common = inside & same & mask[view] & _all_four(mask[other], u, v)
     grid = np.stack([2 * u / width - 1, 2 * v / height - 1], axis=-1).clip(-4, 4).astype(np.float32)
     return Motion(other, view, torch.from_numpy(grid)[None], torch.from_numpy(common))
+
+
+def _all_four(
+    mask: Bool[np.ndarray, "h w"], u: Float[np.ndarray, "h w"], v: Float[np.ndarray, "h w"]
+) -> Bool[np.ndarray, "h w"]:
+    """Whether all pixels count that an image is interpolated between, at positions with centres at +0.5."""
+    height, width = mask.shape
+    rows, columns = (
+        [np.clip(np.floor(position - 0.5).astype(np.int64) + step, 0, size - 1) for step in (0, 1)]
+        for position, size in ((v, height), (u, width))
+    )
+    return np.asarray(np.logical_and.reduce([mask[row, column] for row in rows for column in columns]))
 
 
 def carried(image: Float[Tensor, "h w c"], grid: Float[Tensor, "1 h w 2"]) -> Float[Tensor, "h w c"]:

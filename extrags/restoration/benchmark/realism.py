@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
@@ -44,6 +45,8 @@ class Realism:
         photographs: in [0, 1].
         regions: pixels that count, by name.
         lpips: whose backbone gives the features; None leaves the Fréchet distance out.
+        valid: what of the images counts at all. Fields of features and filters reach farther than a region;
+            outside they see the photograph.
     """
 
     def __init__(
@@ -51,8 +54,9 @@ class Realism:
         photographs: Float[Tensor, "v h w 3"],
         regions: dict[str, Bool[Tensor, "v h w"]],
         lpips: Lpips | None,
+        valid: Bool[Tensor, "v h w"],
     ) -> None:
-        self.photographs, self.regions, self.lpips = photographs, regions, lpips
+        self.photographs, self.regions, self.lpips, self.valid = photographs, regions, lpips, valid
 
     def figures(self, images: Float[Tensor, "v h w 3"]) -> dict[str, Any]:
         """Figures of restored views.
@@ -64,13 +68,15 @@ class Realism:
             `{frechet: {region: distance}, detail: {region: ratios}}`: see `extrags.metrics.frechet` and
             `extrags.metrics.detail`; None where a region is too small or there is no LPIPS.
         """
+        images = torch.where(self.valid[..., None], images, self.photographs)
         frechet: dict[str, float | None] = dict.fromkeys(self.regions)
         if self.lpips is not None:
             for name, region in self.regions.items():
                 own = cell_features(self.lpips, images, region)
                 frechet[name] = frechet_distance(own, self._features[name])
         detail = {
-            name: detail_ratios(images, self.photographs, region) for name, region in self.regions.items()
+            name: detail_ratios(images, self.photographs, region, self.valid)
+            for name, region in self.regions.items()
         }
         return {"frechet": frechet, "detail": detail}
 

@@ -158,6 +158,16 @@ class TestCeiling:
         # Lower is better: the same share of the way down.
         assert row["figures"]["lpips_alex"]["mean"] == pytest.approx(10 / 16)
 
+    def test_seeds_that_one_of_the_three_lacks_do_not_count(self) -> None:
+        runs = [
+            *(run("3dgs", "phantom/0", seed, value) for seed, value in ((0, 20.0), (1, 10.0))),
+            *(run("coarse", "phantom/0", seed, value) for seed, value in ((0, 21.0), (1, 20.0))),
+            run("oracle", "phantom/0", 0, 22.0),
+        ]
+        (row,) = compare_runs(runs, "3dgs")["ceiling_sequences"]
+        assert row["figures"]["psnr"]["mean"] == pytest.approx(0.5)
+        assert row["n_seeds"] == 1
+
     def test_a_sequence_with_hardly_any_way_to_go_decides_nothing(self) -> None:
         runs = []
         for number, best in enumerate((22.0, 22.0, 22.0, 20.002)):

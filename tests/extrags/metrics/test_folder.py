@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -208,6 +209,13 @@ class TestRefused:
         (folder / "2.png").write_bytes(b"no image")
         with pytest.raises(SourceError, match="no image that can be read"):
             read_renders(folder, sequence)
+
+    def test_sixteen_bits_are_not_cut_to_eight(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
+        folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})
+        cv2.imwrite(str(folder / "1.png"), LEVELS[1].astype(np.uint16) * 257)
+        with pytest.raises(SourceError, match="8-bit colour image, found the mode RGB of 16 bits") as refused:
+            read_renders(folder, sequence)
+        assert refused.value.file == str(folder / "1.png")
 
     def test_bad_depth(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})

@@ -165,10 +165,12 @@ def test_dataset_page_compares_and_names_failures() -> None:
     assert html == build_dataset_report(rows, name="phantom")
     assert "3 of 4 runs completed." in page.text
     assert "Sequences 3 Runs 4" in page.text
-    assert "changes by +1.00 dB on average; 2 of 3 gain" in page.text
+    # Of the sequences' means, 2 and -1.
+    assert "changes by +0.50 dB on average; 2 of 3 gain" in page.text
+    assert "Mean of 2, ± between them" in page.text
     assert "frame 0003: zero focal length" in page.text
     assert "+2.00 better ± 1.41" in page.text  # two seeds: 1 and 3
-    assert "+1.00 better ± 2.00" in page.text  # three rows: 1, 3, -1
+    assert "+0.50 better ± 2.12" in page.text  # two sequences: 2, -1
     assert [link for link in page.links[1:] if not link.startswith("data:")] == ["phantom-0.html"]
     assert all(load.startswith("data:image/") for load in page.loads)
 

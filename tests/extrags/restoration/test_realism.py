@@ -32,7 +32,7 @@ class TestRealism:
         generator = torch.Generator().manual_seed(3)
         photographs = torch.rand(2, 32, 32, 3, generator=generator)
         region = left_half(2, 32)
-        realism = Realism(photographs, {"hole": region, "well": ~region}, None)
+        realism = Realism(photographs, {"hole": region, "well": ~region}, None, torch.ones_like(region))
         smoothed = photographs.clone()
         smoothed[:, :, :16] = 0.5
         found = realism.figures(smoothed)
@@ -45,8 +45,25 @@ class TestRealism:
         generator = torch.Generator().manual_seed(4)
         photographs = torch.rand(6, 64, 64, 3, generator=generator)
         everywhere = torch.ones(6, 64, 64, dtype=torch.bool)
-        realism = Realism(photographs, {"all": everywhere}, lpips)
+        realism = Realism(photographs, {"all": everywhere}, lpips, everywhere)
         moved, flat = photographs.roll(17, dims=1), torch.full_like(photographs, 0.5)
         near, far = (realism.figures(images)["frechet"]["all"] for images in (moved, flat))
         assert realism.figures(photographs)["frechet"]["all"] == pytest.approx(0, abs=1e-6 * far)
         assert near < 0.2 * far
+
+    def test_what_lies_outside_the_mask_counts_nowhere(self, shared_data) -> None:
+        lpips = Lpips.load(shared_data / "lpips_weights")
+        generator = torch.Generator().manual_seed(5)
+        valid = ~left_half(6, 64)
+        # As an endoscope's round picture: black outside.
+        photographs = torch.rand(6, 64, 64, 3, generator=generator) * valid[..., None]
+        regions = {"valid": valid, "rim": valid & (torch.arange(64) < 40)}
+        realism = Realism(photographs, regions, lpips, valid)
+        filled = torch.where(valid[..., None], photographs, torch.full_like(photographs, 0.6))
+        found = realism.figures(filled)
+        assert found["detail"] == {name: pytest.approx([1, 1, 1], abs=1e-9) for name in regions}
+        far = realism.figures(torch.full_like(photographs, 0.5))["frechet"]["valid"]
+        assert found["frechet"]["valid"] == pytest.approx(0, abs=1e-5 * far)
+        # And the edge is no detail: half of the energy inside is half, at the rim too.
+        weaker = realism.figures((photographs - 0.5) * 0.5**0.5 + 0.5)
+        assert weaker["detail"]["rim"] == pytest.approx([0.5, 0.5, 0.5], rel=0.02)
