@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-__all__ = ["comparable_name", "plain_name"]
+__all__ = ["comparable_name", "path_of", "plain_name"]
 
 
 def plain_name(name_or_path: str) -> str:
@@ -19,6 +19,16 @@ def plain_name(name_or_path: str) -> str:
     """
     there = os.path.exists(os.path.expanduser(name_or_path))
     return str(Path(name_or_path)) if there else name_or_path
+
+
+def path_of(name_or_path: str) -> str | None:
+    """The absolute path of a sequence that is one, and exists; None for others.
+
+    Args:
+        name_or_path: what a user named.
+    """
+    there = os.path.exists(os.path.expanduser(name_or_path))
+    return comparable_name(name_or_path) if there else None
 
 
 def comparable_name(name: str) -> str:

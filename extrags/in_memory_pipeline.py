@@ -133,6 +133,7 @@ class InMemoryPipeline(Pipeline):
                 "give extrags.training.reconstruct the earlier scene"
             )
         self.result = Result(sequence)
+        self._given = len(sequence.train), len(sequence.test)
         self.true_surface = true_surface
         self._training = sequence
         """The frames that the reconstruction uses: from `coarse` on, the training frames alone."""
@@ -161,6 +162,11 @@ class InMemoryPipeline(Pipeline):
     def held_out_frames(self) -> int:
         """Number of held-out frames."""
         return len(self.result.sequence.test)
+
+    def frames_without_pose(self) -> tuple[int, int]:
+        """Numbers of training and of held-out frames that have left the sequence for want of a pose."""
+        left = self.result.sequence
+        return self._given[0] - len(left.train), self._given[1] - len(left.test)
 
     def virtual_views(self) -> int:
         """Number of virtual views the exploration found."""

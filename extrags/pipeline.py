@@ -150,6 +150,9 @@ class Pipeline(ABC):
         if stage == "enhance" and self.virtual_views() == 0:
             return "exploration found no view that adds anything"
         if stage == "evaluate" and self.held_out_frames() == 0:
+            _, without_pose = self.frames_without_pose()
+            if without_pose:
+                return f"no pose was found for any of the {without_pose} held-out frames"
             return "the sequence has no held-out frames"
         return None
 
@@ -188,6 +191,10 @@ class Pipeline(ABC):
     @abstractmethod
     def held_out_frames(self) -> int:
         """Number of held-out frames."""
+
+    @abstractmethod
+    def frames_without_pose(self) -> tuple[int, int]:
+        """Numbers of training and of held-out frames that have left the sequence for want of a pose."""
 
     @abstractmethod
     def virtual_views(self) -> int:

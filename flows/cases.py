@@ -9,11 +9,13 @@ from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, Literal
 
+from data_catalog.names import path_of
 from extrags import __version__
 from extrags.config import PipelineConfig
 from extrags.errors import ConfigError, DamagedArtefactError, StoreError
 from extrags.pipeline import STAGES, StageName
 from extrags.store import Store, digest_of, read_records, write_record
+from extrags.store.records import remove_record
 from flows.estimate import expected_seconds
 from flows.methods import METHODS, check_not_pinned, method_config, pinned_settings
 from flows.outcome import SequenceOutcome, StageRow
@@ -81,14 +83,22 @@ class SequenceCase:
         Other settings that are the same for all runs of a sequence are not part of it: who mends them runs
         the same case again.
         """
-        identity = {
-            "sequence": self.sequence,
+        return self._record_of(path_of(self.sequence) or self.sequence)
+
+    @property
+    def former_record(self) -> str:
+        """What earlier versions called it: with paths as they were written, from whichever folder."""
+        return self._record_of(self.sequence)
+
+    def _record_of(self, sequence: str) -> str:
+        told = {
+            "sequence": sequence,
             "method": self.method,
             "profile": self.profile,
             "seed": self.seed,
             "variant": self.distinguishing,
         }
-        return f"{OUTCOME}{digest_of(identity)}"
+        return f"{OUTCOME}{digest_of(told)}"
 
     def config(self) -> PipelineConfig:
         """All of its settings.
@@ -243,6 +253,7 @@ def record_outcome(
     }
     record: OutcomeRecord = {
         "sequence": case.sequence,
+        "path": path_of(case.sequence),
         "method": case.method,
         "profile": case.profile,
         "seed": case.seed,
@@ -262,6 +273,8 @@ def record_outcome(
         "extrags": __version__,
     }
     write_record(store, case.record, record)
+    if case.former_record != case.record:
+        remove_record(store, case.former_record)
 
 
 def record_outcome_quietly(

@@ -14,7 +14,7 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from typing import Any
 from urllib.error import URLError
 from urllib.request import urlopen
@@ -172,9 +172,17 @@ def _local_cluster(workers: int) -> distributed.LocalCluster:
             _cluster = distributed.LocalCluster(
                 n_workers=workers, threads_per_worker=1, dashboard_address=None
             )
-            # All tasks are done and their events sent: nothing is left to wait for.
-            atexit.register(_cluster.close, timeout=CLOSE_SECONDS)
+            atexit.register(_close, _cluster)
         return _cluster
+
+
+def _close(cluster: distributed.LocalCluster) -> None:
+    """All tasks are done and their events sent: nothing is left to wait for, nor to be told."""
+    for name in ("distributed.nanny", "distributed.scheduler", "distributed.worker", "distributed.core"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    # What has not ended by then is killed with the process.
+    with suppress(TimeoutError):
+        cluster.close(timeout=CLOSE_SECONDS)
 
 
 def _adopt(client: distributed.Client, run: str) -> None:

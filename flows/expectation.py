@@ -16,7 +16,7 @@ from extrags.store import Store, digest_of
 from flows.cases import SequenceCase
 from flows.estimate import expected_seconds, usual_pace
 from flows.methods import METHODS
-from flows.outcome_records import OutcomeRecord, outcome_records
+from flows.outcome_records import OutcomeRecord, outcome_records, recorded_name
 from flows.workloads import known_work, work_before_reading
 from tasks.progress import duration_text
 
@@ -64,7 +64,7 @@ def expectations(
     pace = _pace(list(records.values()))
     by_sequence: dict[str, list[OutcomeRecord]] = {}
     for record in records.values():
-        by_sequence.setdefault(comparable_name(str(record["sequence"])), []).append(record)
+        by_sequence.setdefault(recorded_name(record), []).append(record)
     found = []
     for case in cases:
         config = case.config()

@@ -168,10 +168,10 @@ def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolera
     """Hold a run against those before.
 
     Compared is the mean over seeds of each method on each sequence, with the median of the last
-    `tolerance.runs` runs that asked for the same settings and had these seeds: PSNR of all of them, run
-    time of those on the same kind of machine. Run time is processor time where enough of these runs have
-    measured it, since other work on the machine hardly changes it; elapsed time otherwise. A case that fails
-    now and did not before is worse, too.
+    `tolerance.runs` runs that did not fail, asked for the same settings and had these seeds: PSNR of all of
+    them, run time of those on the same kind of machine. Run time is processor time where enough of these runs
+    have measured it, since other work on the machine hardly changes it; elapsed time otherwise. A case that
+    fails is worse, too, until it is mended.
 
     Args:
         entry: of the run.
@@ -184,8 +184,9 @@ def judge(entry: Mapping[str, Any], earlier: Sequence[Mapping[str, Any]], tolera
     same = [_same_machine(item, entry) for item in earlier]
     for group, now in _comparable(entry, entry).items():
         label = _label(group)
-        past = [groups[group] for groups in before if group in groups][-tolerance.runs :]
-        good = [item for item in past if not item["error"]]
+        past = [groups[group] for groups in before if group in groups]
+        # However long it has failed, the last good runs are what it is held against.
+        good = [item for item in past if not item["error"]][-tolerance.runs :]
         if now["error"]:
             if len(good) >= tolerance.at_least:
                 found.regressions.append(f"{label} fails: {now['error']}")

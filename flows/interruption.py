@@ -26,7 +26,7 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-__all__ = ["INTERRUPTED", "interruptible", "until_told_to_stop"]
+__all__ = ["INTERRUPTED", "interruptible", "say_when_interrupted", "until_told_to_stop"]
 
 INTERRUPTED = "the run was interrupted; finished stages are kept, and the same command resumes"
 
@@ -36,6 +36,15 @@ CHILDREN_SECONDS = 0.7
 """How long children may take to end by themselves."""
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+_sentence = INTERRUPTED
+"""What the command that runs says when it is interrupted."""
+
+
+def say_when_interrupted(sentence: str) -> None:
+    """For a command whose interruption means something else than `INTERRUPTED`."""
+    global _sentence
+    _sentence = sentence
 
 
 class _Interruption:
@@ -70,7 +79,7 @@ class _Interruption:
             # What follows from the interruption is no news: Ctrl-C ends the server too, which others miss.
             logging.disable(logging.CRITICAL)
             # In one piece: other threads may be writing.
-            sys.stderr.write(f"extrags: {INTERRUPTED}\n")
+            sys.stderr.write(f"extrags: {_sentence}\n")
             sys.stderr.flush()
             progress = sys.modules.get("tasks.progress")
             if progress is not None:

@@ -8,14 +8,16 @@ from typing import Any
 
 from extrags.config import PipelineConfig
 from extrags.cores import usable_cores
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, DamagedArtefactError
 from extrags.memory_estimate import FrameSize, MemoryEstimate, estimate_memory, fitting_settings
 from extrags.pipeline import STAGES, StageName
+from flows.cached_stages import CachedStages
 from flows.estimate import expected_seconds
+from flows.runners import NotInStoreError
 from flows.workloads import frames_work
-from tasks.progress import duration_text
+from tasks.progress import duration_text, observed
 
-__all__ = ["check_memory"]
+__all__ = ["check_memory", "made_stages"]
 
 log = logging.getLogger(__name__)
 
@@ -27,6 +29,7 @@ def check_memory(
     limit_gb: float | None,
     until: StageName,
     leave_out: Collection[str],
+    made: Collection[str] = (),
 ) -> MemoryEstimate:
     """State what memory and time a run will need, and refuse one that needs more memory than it may.
 
@@ -40,6 +43,7 @@ def check_memory(
         limit_gb: in GB (1e9 bytes); None for no limit.
         until: last stage.
         leave_out: stages that the method leaves out.
+        made: stages that are in the store: they need neither memory nor time.
 
     Raises:
         ConfigError: when the estimate exceeds the limit; names settings that fit.
@@ -50,9 +54,15 @@ def check_memory(
     given -= {"poses"} if config.poses.replace_given else set()
     leave_out = {*leave_out, *given}
     found = estimate_memory(config, size, threads=threads, until=until, leave_out=leave_out)
+    to_make: dict[StageName, int] = {
+        stage: needed for stage, needed in found.by_stage.items() if stage not in made
+    }
+    if not to_make:
+        return found
+    found = MemoryEstimate(to_make)
     what = f"{name}: {size.frames} frames of {size.width} x {size.height} px take {found}"
     expected = expected_seconds(config, frames_work(counts, config))
-    ahead = set(STAGES[1 : STAGES.index(until) + 1]) - leave_out
+    ahead = set(STAGES[1 : STAGES.index(until) + 1]).difference(leave_out, made)
     seconds = sum(sum(expected[stage].values()) for stage in ahead)
     log.info("%s, and about %s of processor time", what, duration_text(seconds))
     if limit_gb is None or found.peak_gb <= limit_gb:
@@ -63,3 +73,23 @@ def check_memory(
     else:
         advice = "it fits with " + " ".join(f"--{key} {value}" for key, value in settings.items())
     raise ConfigError(f"{what}, more than the limit of {limit_gb:g} GB; {advice}")
+
+
+def made_stages(run: CachedStages, until: StageName) -> set[str]:
+    """The stages before the first one of which something would have to be made.
+
+    Args:
+        run: with a runner that only looks (`flows.runners.StoreRunner`); it has looked then.
+        until: last stage.
+    """
+
+    def ignore(_: object) -> None:
+        """Looking is no progress."""
+
+    try:
+        with observed(ignore):
+            run.run(until)
+    except (NotInStoreError, DamagedArtefactError):
+        # The last row is that of the stage in which something was missing.
+        return {row.stage for row in run.outcome.stages[:-1]}
+    return {row.stage for row in run.outcome.stages if row.state == "cached"}

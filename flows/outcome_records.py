@@ -5,19 +5,28 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from data_catalog.names import comparable_name
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.store import Store, read_records
 
-__all__ = ["OUTCOME", "OutcomeRecord", "held_out_trained_on", "outcome_records", "setting_text"]
+__all__ = [
+    "OUTCOME",
+    "OutcomeRecord",
+    "held_out_trained_on",
+    "outcome_records",
+    "recorded_name",
+    "setting_text",
+]
 
 OUTCOME = "outcome."
 """Begin of the names of these records."""
 
 OutcomeRecord = dict[str, Any]
-"""`{sequence, method, profile, seed, variant, settings, until, status, stage, reason, ended, seconds, config,
-size, stages, metrics, report, extrags}` of the last run of a case that came to an end: its size is that of
-`extrags.run_costs.Workload`. `settings` are those that were given (records of earlier versions lack them). Of
-each stage
+"""`{sequence, path, method, profile, seed, variant, settings, until, status, stage, reason, ended, seconds,
+config, size, stages, metrics, report, extrags}` of the last run of a case that came to an end.
+
+`path` is the absolute one of a sequence that is a path, else None, `settings` are those that were given
+(records of earlier versions lack both), and the size is that of `extrags.run_costs.Workload`. Of each stage
 `{stage, state, reason, made_seconds, expected_cpu_s, artefacts: {KEY: BYTES}}`: seconds that it took, and
 those of processor time that the cost model expects on its reference machine."""
 
@@ -29,6 +38,14 @@ def outcome_records(store: Store) -> dict[str, OutcomeRecord]:
         StoreError: when the store cannot be read.
     """
     return read_records(store, OUTCOME)
+
+
+def recorded_name(record: OutcomeRecord) -> str:
+    """What the sequence of a record has in common with other names of it (`comparable_name`).
+
+    A relative path of an earlier version's record is taken from where this is asked.
+    """
+    return str(record.get("path") or comparable_name(str(record["sequence"])))
 
 
 def held_out_trained_on(record: OutcomeRecord) -> bool:

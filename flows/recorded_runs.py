@@ -16,7 +16,13 @@ from extrags.errors import ConfigError, StoreError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.report.leaderboard import BoardRow
 from extrags.store import Manifest, Ref, Store
-from flows.outcome_records import OutcomeRecord, held_out_trained_on, outcome_records, setting_text
+from flows.outcome_records import (
+    OutcomeRecord,
+    held_out_trained_on,
+    outcome_records,
+    recorded_name,
+    setting_text,
+)
 
 if TYPE_CHECKING:
     from extrags.report.gallery import GalleryRun
@@ -118,7 +124,7 @@ def chosen_runs(
             found[key] = RecordedRun(manifest, record)
             continue
         for record in records:
-            same = comparable_name(str(record["sequence"])) == comparable_name(name)
+            same = recorded_name(record) == comparable_name(name)
             if not same or not _wanted(record, methods, profiles, seeds):
                 continue
             key = _key_of(record)

@@ -15,7 +15,7 @@ from extrags.pipeline import STAGES
 from extrags.store import Manifest, Store, in_work
 from extrags.store.manifest import stage_of
 from extrags.store.runs import Run, active_runs, runs_of
-from flows.outcome_records import OutcomeRecord, outcome_records, setting_text
+from flows.outcome_records import OutcomeRecord, outcome_records, recorded_name, setting_text
 from flows.selection import chosen_sequences
 
 __all__ = ["StageStatus", "StatusRow", "StoreStatus", "store_status"]
@@ -163,7 +163,7 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
             name that is in neither and no path.
         StoreError: when the store cannot be read.
     """
-    records = list(outcome_records(store).values())
+    records = _told_apart(outcome_records(store).values())
     keys = store.keys()
     there = set(keys)
     running: dict[str, set[str]] = {}
@@ -196,6 +196,18 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
         counts[row.state] = counts.get(row.state, 0) + 1
     unrecorded = sum(key not in recorded for key in keys)
     return StoreStatus(store.root, rows, len(keys), sum(bytes_of.values()), unrecorded, counts)
+
+
+def _told_apart(records: Iterable[OutcomeRecord]) -> list[OutcomeRecord]:
+    """The records, with whole paths where relative ones of several places are the same."""
+    found = list(records)
+    places: dict[str, set[str]] = {}
+    for record in found:
+        places.setdefault(str(record["sequence"]), set()).add(recorded_name(record))
+    return [
+        {**record, "sequence": recorded_name(record)} if len(places[str(record["sequence"])]) > 1 else record
+        for record in found
+    ]
 
 
 def _unfinished(store: Store, going_on: Sequence[Run], ended: set[str]) -> dict[str, Run]:

@@ -27,7 +27,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from importlib import metadata
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import NamedTemporaryFile, TemporaryDirectory
 from typing import TYPE_CHECKING
 from unittest.mock import patch
 from urllib.parse import quote
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
 __all__ = ["ServerError", "start_early", "stop_early", "temporary_server"]
 
 POLL_SECONDS = 0.1
+ROOM_BYTES = 1 << 20
+"""Where so much cannot be written, a database cannot either."""
 END_SECONDS = 2.0
 """How long the server may take to end by itself."""
 
@@ -54,7 +56,7 @@ _started: dict[str, subprocess.Popen[bytes]] = {}
 
 
 class ServerError(ExtragsError, RuntimeError):
-    """The temporary server did not start."""
+    """The temporary server did not start, or cannot go on."""
 
 
 def start_early() -> None:
@@ -81,9 +83,17 @@ def temporary_server() -> Iterator[None]:
     The server itself stays until the process ends, because Prefect sends its last events then.
 
     Raises:
-        ServerError: when the server ends, or does not answer, before the time that Prefect's settings allow.
+        ServerError: when the server ends, or does not answer, before the time that Prefect's settings allow;
+            and when it cannot write its database any more.
     """
-    from prefect.settings import PREFECT_API_URL, PREFECT_SERVER_EPHEMERAL_ENABLED, temporary_settings
+    import httpx
+    from prefect.exceptions import PrefectHTTPStatusError
+    from prefect.settings import (
+        PREFECT_API_URL,
+        PREFECT_HOME,
+        PREFECT_SERVER_EPHEMERAL_ENABLED,
+        temporary_settings,
+    )
 
     if PREFECT_API_URL.value() or not PREFECT_SERVER_EPHEMERAL_ENABLED.value():
         stop_early()
@@ -94,7 +104,32 @@ def temporary_server() -> Iterator[None]:
         address = _start()
     # The environment is for workers in other processes: each would start a server of its own.
     with temporary_settings({PREFECT_API_URL: address}), patch.dict(os.environ, PREFECT_API_URL=address):
-        yield
+        try:
+            yield
+        except PrefectHTTPStatusError as error:
+            # All that it answers to a full disk.
+            if error.response.status_code >= httpx.codes.INTERNAL_SERVER_ERROR:
+                _check_room(PREFECT_HOME.value())
+            raise
+
+
+def _check_room(home: Path) -> None:
+    """Write into the folder of the database as much as would be missed.
+
+    Raises:
+        ServerError: when that cannot be written, with the reason.
+    """
+    try:
+        with NamedTemporaryFile(dir=home) as probe:
+            probe.write(bytes(ROOM_BYTES))
+            probe.flush()
+            os.fsync(probe.fileno())
+    except OSError as error:
+        reason = error.strerror or error
+        raise ServerError(
+            f"the run cannot go on: Prefect's database in {home} cannot be written ({reason}); "
+            "what is finished stays in the store, and the same command goes on from there once there is room"
+        ) from error
 
 
 def _start() -> str:

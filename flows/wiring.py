@@ -14,7 +14,7 @@ from extrags.store import Ref
 from flows.cached_stages import CachedStages
 from flows.continuation import coarse_call
 from flows.imported import imported_call, of_imported_scene
-from flows.memory_limit import check_memory
+from flows.memory_limit import check_memory, made_stages
 from flows.outcome import SequenceOutcome, StageRow
 from flows.runners import Call, Runner, StoreRunner
 from tasks.assess import assess, measuring_settings, plan, planning_settings
@@ -85,10 +85,13 @@ def run_sequence(
         NotInStoreError: from a runner that only looks.
         ConfigError: for a stage that does not exist.
     """
-    run = SequenceRun(name, config, store, runner, profile, leave_out=leave_out)
+    run, limit = SequenceRun(name, config, store, runner, profile, leave_out=leave_out), memory_limit_gb
     if not isinstance(runner, StoreRunner):
-        limit = memory_limit_gb
-        run.check_frames = lambda counts: check_memory(name, config, counts, limit, until, run.leave_out)
+        made: set[str] = set()
+        if limit is not None and not getattr(runner, "refresh", False):
+            look = StoreRunner(store)
+            made = made_stages(SequenceRun(name, config, store, look, leave_out=leave_out), until)
+        run.check_frames = lambda told: check_memory(name, config, told, limit, until, run.leave_out, made)
     return run.run(until)
 
 
@@ -116,6 +119,12 @@ class SequenceRun(CachedStages):
     def held_out_frames(self) -> int:
         """Number of held-out frames."""
         return int(self._manifest("sequence").counts["test"] or 0)
+
+    def frames_without_pose(self) -> tuple[int, int]:
+        """Numbers of training and of held-out frames that have left the sequence for want of a pose."""
+        given, left = (self._manifest(part).counts for part in ("ingest", "sequence"))
+        train, test = (int(given[name] or 0) - int(left[name] or 0) for name in ("train", "test"))
+        return train, test
 
     def virtual_views(self) -> int:
         """Number of virtual views the exploration found."""
@@ -449,6 +458,7 @@ class SequenceRun(CachedStages):
         return {
             "parts": {part: self.refs[part] for part in REPORT_PARTS if part in self.refs},
             "skipped": skipped,
+            "without_pose": self.frames_without_pose(),
             "config": self.config,
             "profile": self.profile,
             "rows": [item.to_json() for item in self.outcome.stages if item.stage != "report"],

@@ -47,13 +47,14 @@ REPORT_PARTS: tuple[ReportPart, ...] = get_args(ReportPart)
 
 # `rows` holds the times of the stages in this run. The page shows them, but they are not part of its cache
 # key.
-@stage("report", version=13, ignore=("rows",))
+@stage("report", version=14, ignore=("rows",))
 def report(
     slot: Slot,
     parts: dict[str, Ref],
     skipped: dict[str, str],
     config: PipelineConfig,
     profile: str,
+    without_pose: tuple[int, int],
     rows: list[dict[str, Any]],
 ) -> None:
     """Build the page; writes `report.html`, `content.json` and `stages.json`.
@@ -64,6 +65,7 @@ def report(
         skipped: why stages were skipped, by name.
         config: settings of the run, the plan's budgets included.
         profile: name of the profile they started from.
+        without_pose: numbers of training and of held-out frames that left the sequence for want of a pose.
         rows: `{stage, state, seconds, reason, made_seconds}` of each stage.
     """
     from extrags.depth.estimate import DepthEstimate
@@ -114,6 +116,7 @@ def report(
         environment=_environment(slot.store, parts),
         config=config,
         profile=profile,
+        without_pose=without_pose,
         absent=_absent(skipped),
     )
     page, content = build_pages(inputs, config.report)

@@ -88,6 +88,7 @@ def build_pages(inputs: ReportInputs, config: ReportConfig) -> tuple[str, str]:
         **_space(inputs),
         plan=plan_rows(inputs),
         plan_absent=inputs.why_absent("plan", "assess"),
+        without_pose=inputs.without_pose[1],
         stages_absent="No stage times were handed to this report.",
         protocol=protocol(inputs),
         settings=setting_groups(inputs.config),

@@ -187,6 +187,7 @@ class ReportInputs:
         made: when the report was made, in words; nothing is said when empty.
         absent: why a part is missing, by name (`final`, `pseudo`, `trajectories`, `grid`, `mesh`, ...);
             overrides what the plan and the stages say.
+        without_pose: numbers of training and of held-out frames that left the sequence for want of a pose.
 
     Raises:
         ShapeError: when renders and held-out frames do not fit each other.
@@ -218,6 +219,7 @@ class ReportInputs:
     profile: str = ""
     made: str = ""
     absent: Mapping[str, str] = field(default_factory=dict)
+    without_pose: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         frames = self.frames

@@ -29,8 +29,8 @@ def facts(inputs: ReportInputs) -> list[tuple[str, str]]:
     sequence = inputs.sequence
     final = metrics_of(inputs.final_metrics) or metrics_of(inputs.coarse_metrics)
     facts = [
-        ("Training frames", count(len(sequence.train))),
-        ("Held-out frames", count(len(inputs.frames))),
+        ("Training frames", _frames(len(sequence.train), inputs.without_pose[0])),
+        ("Held-out frames", _frames(len(inputs.frames), inputs.without_pose[1])),
         ("Split", sequence.split.name),
         ("Image size", f"{sequence.width} \N{MULTIPLICATION SIGN} {sequence.height} px"),
     ]
@@ -45,6 +45,12 @@ def facts(inputs: ReportInputs) -> list[tuple[str, str]]:
     if inputs.stages:
         facts.append(("Run time", duration(_spent(inputs))))
     return facts
+
+
+def _frames(there: int, without_pose: int) -> str:
+    if not without_pose:
+        return count(there)
+    return f"{count(there)} of {count(there + without_pose)}, the others without a pose"
 
 
 def plan_rows(inputs: ReportInputs) -> dict[str, Any] | None:

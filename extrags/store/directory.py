@@ -221,13 +221,21 @@ class DirectoryBackend:
         raise StoreError(f"artefact {manifest.key} is being replaced by others again and again")
 
     def discard(self, key: str) -> bool:
-        """Remove an artefact: it is first renamed, so that it disappears atomically, then deleted."""
+        """Remove an artefact: it is first renamed, so that it disappears atomically, then deleted.
+
+        Raises:
+            StoreError: when the store cannot be written.
+        """
         aside = self.scratch / f"{key}.{secrets.token_hex(4)}.removed"
-        self.scratch.mkdir(parents=True, exist_ok=True)
         try:
+            self.scratch.mkdir(parents=True, exist_ok=True)
             (self.artefacts / key).rename(aside)
         except FileNotFoundError:
             return False
+        except OSError as error:
+            raise StoreError(
+                f"{key} cannot be removed from {self.root}: {error.strerror or error}"
+            ) from error
         shutil.rmtree(aside, ignore_errors=True)
         return True
 

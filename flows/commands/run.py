@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import logging
 import re
 import sys
 import time
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     from flows.cases import SequenceCase
 
 __all__ = ["Several", "add_arguments", "execute", "parsed_matrix", "parsed_methods", "run"]
+
+log = logging.getLogger(__name__)
 
 
 def add_arguments(parser: Parser) -> None:
@@ -250,15 +253,21 @@ def execute(
     if not cases:
         stop_early()
         return DatasetOutcome([])
+    try:
+        _check_working_distance(cases)
+    except ConfigError:
+        stop_early()
+        raise
     if not always:
         # Nothing to make: no need to wait for a server.
         found = _from_store(cases, root, until, several_seeds=len(several.seeds) > 1)
         if found is not None:
             stop_early()
             return found
-        if own_home:
-            start_early()
-    # The flow looks as well; here it is said without waiting for a server.
+    # The flow looks as well; here it is said without waiting for a server, which writes into the store.
+    Store(root).check_writable()
+    if own_home:
+        start_early()
     if len(cases) == 1:
         refused = _wrong_source(cases[0], until)
         if refused is not None:
@@ -317,6 +326,42 @@ def _raised(outcome: DatasetOutcome, given: argparse.Namespace) -> DatasetOutcom
             if sequence.error is not None:
                 raise sequence.error
     return outcome
+
+
+def _check_working_distance(cases: Sequence[SequenceCase]) -> None:
+    """Refuse `poses.working_distance_mm` where no poses are estimated, and warn where some are not.
+
+    Only the poses stage looks at it, which sources with poses of their own skip.
+
+    Raises:
+        ConfigError: every sequence that it is given for has poses.
+    """
+    from data_catalog import describe, glance
+
+    given, posed = set(), []
+    for case in cases:
+        config = case.config()
+        if config.poses.working_distance_mm is None or config.poses.replace_given or case.sequence in given:
+            continue
+        given.add(case.sequence)
+        try:
+            about = glance(case.sequence, config.ingest) or describe(case.sequence)
+        except (SourceError, UnknownSequenceError):
+            # What is wrong with a source is said by the run, for each by itself.
+            continue
+        if about.has_poses:
+            posed.append(case.sequence)
+    if not posed:
+        return
+    first = posed[0] if len(posed) == 1 else f"{posed[0]} and {len(posed) - 1} more"
+    problem = (
+        f"{first}: poses.working_distance_mm makes estimated poses metric, and these are the source's own; "
+        "ingest.scale_mm_per_unit (--scale) says what their unit is where it is arbitrary, and "
+        "poses.replace_given estimates others in their place"
+    )
+    if len(posed) == len(given):
+        raise ConfigError(problem)
+    log.warning("%s", problem)
 
 
 def _wrong_source(case: SequenceCase, until: StageName) -> SequenceOutcome | None:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import argparse
 import os
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from extrags.errors import ConfigError
 from flows.commands.common import set_up_logging, store_root
 from flows.commands.options import Parser, add_store
+from flows.interruption import say_when_interrupted
 
 if TYPE_CHECKING:
     from flows.deployments import Declared
 
 __all__ = ["add_arguments", "serve"]
+
+ENDED = "nothing is served any more; runs that were going on are interrupted, and what they finished is kept"
+PAUSED = f"{ENDED}; schedules are paused"
 
 
 def add_arguments(parser: Parser) -> None:
@@ -67,6 +72,9 @@ def serve(given: argparse.Namespace) -> int:
             "extrags serve needs a Prefect server that lasts: start one (prefect server start), and set "
             "PREFECT_API_URL to its address, http://127.0.0.1:4200/api"
         )
+    say_when_interrupted(PAUSED if given.schedules else ENDED)
+    # Prefect's handler of SIGTERM asks its runner to stop, and ends before that is awaited.
+    warnings.filterwarnings("ignore", message="coroutine 'Runner.astop' was never awaited")
     prefect_serve(
         *[_deployment(item, schedules=given.schedules) for item in chosen],
         limit=given.limit,

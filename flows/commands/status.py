@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from extrags.errors import StoreError
@@ -60,9 +59,10 @@ def status(given: argparse.Namespace) -> int:
     from flows.store_status import store_status
 
     root = store_root(given)
-    if "://" not in root and not Path(root).is_dir():
+    store = Store(root)
+    if not store.exists():
         raise StoreError(f"there is no store {root}")
-    found = store_status(Store(root), given.patterns)
+    found = store_status(store, given.patterns)
     if given.json != "-":
         _print(found)
     write_json(found.to_json(), given.json)

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from extrags.errors import ConfigError
-from extrags.store import Store
+from extrags.store import Store, write_record
 from flows.cases import SequenceCase, cases_of, matrix_points, record_outcome, selected
 from flows.cli import main
 from flows.dataset import reconstruct_dataset
@@ -36,6 +36,49 @@ def test_a_run_of_an_imported_scene_stands_beside_the_sequence_own() -> None:
     assert own.record != imported.record
     assert own.record == SequenceCase(SEQUENCE, profile="quick").record
     assert imported.distinguishing == {"imported.scene": "their.ply"}
+
+
+class TestPaths:
+    def test_relative_ones_of_several_places_are_several_sequences(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        store = str(tmp_path / "store")
+        for place in ("a", "b"):
+            (tmp_path / place / "frames").mkdir(parents=True)
+        monkeypatch.chdir(tmp_path / "a")
+        first = case("frames")
+        record = first.record
+        assert record == case(str(tmp_path / "a" / "frames")).record == case("../a/frames").record
+        leave(store, first, StageRow("ingest", "failed"), status="failed", until="report")
+        assert selected([first], "failed", store, "report") == [first]
+        (shown,) = store_status(Store(store)).rows
+        assert shown.sequence == "frames"
+
+        monkeypatch.chdir(tmp_path / "b")
+        second = case("frames")
+        assert second.record != record
+        assert selected([second], "failed", store, "report") == []
+        leave(store, second, StageRow("ingest", "failed"), status="failed", until="report")
+        assert [row.sequence for row in store_status(Store(store)).rows] == [
+            str(tmp_path / place / "frames") for place in ("a", "b")
+        ]
+
+    def test_a_record_of_an_earlier_version_is_replaced(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        (tmp_path / "frames").mkdir()
+        monkeypatch.chdir(tmp_path)
+        own, store = case("frames"), Store(tmp_path / "store")
+        write_record(store, own.former_record, {"sequence": "frames"})
+        leave(store.root, own, StageRow("ingest", "failed"), status="failed")
+        assert list(outcome_records(store)) == [own.record]
+
+    def test_names_of_the_catalogue_are_what_they_were(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        record = case().record
+        monkeypatch.chdir(tmp_path)
+        assert case().record == case().former_record == record
 
 
 class TestMatrix:

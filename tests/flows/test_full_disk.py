@@ -103,3 +103,19 @@ def test_a_full_disk_is_named_with_stage_path_and_store(disk: Path) -> None:
     ballast.unlink()
     assert store.keys() == []
     assert list(store.backend.scratch.iterdir()) == []
+
+
+def test_a_full_disk_is_told_where_the_server_of_the_run_only_fails(disk: Path) -> None:
+    """The database lies in the store: where there is no room, Prefect's server answers 500."""
+    from flows.temporary_server import ServerError, _check_room
+
+    home = disk / "prefect"
+    home.mkdir()
+    _check_room(home)
+    fill(disk, 4096)
+    try:
+        with pytest.raises(ServerError, match=r"prefect cannot be written \(No space left on device\)"):
+            _check_room(home)
+    finally:
+        (disk / "ballast").unlink()
+    assert list(home.iterdir()) == []

@@ -150,6 +150,16 @@ class TestRegressions:
         (line,) = judge(both, BEFORE, Tolerance(psnr_db=None)).regressions
         assert "above the median" in line
 
+    def test_a_case_is_worse_until_it_is_mended(self) -> None:
+        good, failed = [entry()] * 10, [entry(psnr=None)] * 7
+        for count in range(len(failed)):
+            found = judge(entry(psnr=None), [*good, *failed[:count]], Tolerance())
+            assert len(found.regressions) == 1, count
+        # And then it is held against what it was before it failed.
+        assert judge(entry(), [*good, *failed], Tolerance()).not_judged == []
+        (worse,) = judge(entry(psnr=10), [*good, *failed], Tolerance()).regressions
+        assert "below the median" in worse
+
     def test_the_last_runs_count(self) -> None:
         slow = [entry(day=day, seconds=300) for day in range(6, 9)]
         assert judge(entry(seconds=300), [*BEFORE, *slow], Tolerance(runs=3)).regressions == []

@@ -63,3 +63,18 @@ def test_nothing_but_ingest_is_made_of_a_refused_sequence(tmp_path: Path) -> Non
     assert outcome.stages[0].stage == "ingest"
     assert outcome.stages[0].state == "failed"
     assert {row.state for row in outcome.stages[1:]} == {"skipped"}
+
+
+def test_what_is_in_the_store_needs_no_memory(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    store, config = str(tmp_path), tiny_config()
+    assert run_sequence(SEQUENCE, config, store, DirectRunner(store), until="coarse").status == "ok"
+    again = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="coarse", memory_limit_gb=0.01)
+    assert {row.state for row in again.stages} == {"cached", "skipped"}
+    # What comes after it is held against the limit, and alone.
+    caplog.set_level("INFO", logger="flows.memory_limit")
+    more = run_sequence(SEQUENCE, config, store, DirectRunner(store), until="surface", memory_limit_gb=0.01)
+    assert isinstance(more.error, ConfigError)
+    assert "in surface" in caplog.text
+    anew = DirectRunner(store, refresh=True)
+    refused = run_sequence(SEQUENCE, config, store, anew, until="coarse", memory_limit_gb=0.01)
+    assert isinstance(refused.error, ConfigError)

@@ -16,6 +16,7 @@ from extrags.assessment import measure
 from extrags.config import ExploreConfig
 from extrags.errors import CaptureError, ConfigError
 from extrags.exploration import Exploration
+from extrags.in_memory_pipeline import InMemoryPipeline
 from extrags.pipeline import HELD_OUT_TRAINED_ON, INDISPENSABLE, NEED_GAUSSIANS, NEEDS, STAGES, needs_plan
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
@@ -200,6 +201,18 @@ class TestRules:
         default = measure(scene, frames, config.assess, ExploreConfig().coverage)
         assert own["coverage_share"] != pytest.approx(default["coverage_share"], rel=0.05)
         assert outcome.plan["measurements"] == result.plan.measurements == own
+
+    def test_held_out_frames_without_a_pose_are_no_absent_ones(self, in_memory: extrags.Result) -> None:
+        sequence = in_memory.sequence
+        run = InMemoryPipeline(sequence, tiny_config())
+        assert run.reason_to_skip("evaluate") is None
+        run.result.sequence = sequence.training_part()
+        assert run.frames_without_pose() == (0, len(sequence.test))
+        assert run.reason_to_skip("evaluate") == (
+            f"no pose was found for any of the {len(sequence.test)} held-out frames"
+        )
+        none_given = InMemoryPipeline(sequence.training_part(), tiny_config())
+        assert none_given.reason_to_skip("evaluate") == "the sequence has no held-out frames"
 
     def test_nothing_rests_on_a_scene_that_has_seen_held_out_frames(self) -> None:
         sequence = extrags.read(SEQUENCE, tiny_config().ingest)

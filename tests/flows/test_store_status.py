@@ -178,6 +178,15 @@ def test_a_store_with_brackets_in_its_name(tmp_path: Path, capsys: pytest.Captur
     assert "run[/old]" in capsys.readouterr().out.replace("\n", "")
 
 
+@pytest.mark.parametrize("root", ["nowhere", "memory://nowhere/store"])
+def test_a_store_that_is_not_there_is_no_empty_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], root: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["status", "--store", root]) == 1
+    assert "there is no store" in capsys.readouterr().err
+
+
 def test_every_sequence_with_a_record_has_a_row(store: Store) -> None:
     (record,) = (Path(store.root) / "records").glob("outcome.*")
     text = record.read_text()

@@ -1,14 +1,23 @@
-"""The database of the temporary server, which is copied from a template."""
+"""The temporary server: its database, which is copied from a template, and what it says when it fails."""
 
 from __future__ import annotations
 
 import sqlite3
+import subprocess
 from contextlib import closing
 from pathlib import Path
 
+import httpx
 import pytest
+from prefect.exceptions import PrefectHTTPStatusError
+from prefect.settings import (
+    PREFECT_API_URL,
+    PREFECT_HOME,
+    PREFECT_SERVER_EPHEMERAL_ENABLED,
+    temporary_settings,
+)
 
-from flows.temporary_server import DATABASE, copy_database, database_address
+from flows.temporary_server import DATABASE, ServerError, copy_database, database_address, temporary_server
 
 
 def made(path: Path, word: str = "whole") -> Path:
@@ -62,3 +71,27 @@ def test_a_database_that_somebody_chose_stays() -> None:
     chosen = {"PREFECT_HOME": "/a%20b", "PREFECT_API_DATABASE_CONNECTION_URL": "postgresql://host/runs"}
     assert database_address(chosen) == {}
     assert database_address({}) == {}
+
+
+@pytest.mark.parametrize(("status", "told"), [(500, ServerError), (404, PrefectHTTPStatusError)])
+def test_a_server_that_fails_because_it_cannot_write_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, status: int, told: type[Exception]
+) -> None:
+    server = subprocess.Popen(["sleep", "60"])
+    monkeypatch.setattr("flows.temporary_server._started", {"http://127.0.0.1:9/api": server})
+    request = httpx.Request("POST", "http://127.0.0.1:9/api/flow_runs")
+    error = PrefectHTTPStatusError("", request=request, response=httpx.Response(status, request=request))
+    # A home that is not there cannot be written, whoever asks.
+    settings = {
+        PREFECT_API_URL: None,
+        PREFECT_SERVER_EPHEMERAL_ENABLED: True,
+        PREFECT_HOME: tmp_path / "gone",
+    }
+    try:
+        with temporary_settings(settings), pytest.raises(told) as raised, temporary_server():
+            raise error
+    finally:
+        server.kill()
+        server.wait()
+    if told is ServerError:
+        assert "cannot be written (No such file or directory)" in str(raised.value)

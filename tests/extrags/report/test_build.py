@@ -212,6 +212,15 @@ def test_one_camera_and_nothing_held_out(inputs: ReportInputs) -> None:
     assert "1 training and 0 held-out cameras" in str(page.images[0]["alt"])
 
 
+def test_frames_that_left_for_want_of_a_pose_are_told(inputs: ReportInputs, page: Page) -> None:
+    held_out = len(inputs.frames)
+    told = Page(build_report(replace(inputs, without_pose=(0, 3)), CONFIG))
+    assert f"Held-out frames {held_out} of {held_out + 3}, the others without a pose" in told.text
+    assert "the 3 without a pose are not among them" in told.text
+    assert f"Training frames {len(inputs.sequence.train)} Held-out" in told.text
+    assert "without a pose" not in page.text
+
+
 def test_names_are_escaped(inputs: ReportInputs) -> None:
     html = build_report(replace(inputs, name='<script>alert("x")</script>'), CONFIG)
     assert "<script>alert" not in html
