@@ -74,7 +74,7 @@ class StageRow:
     tasks: int = 0
     """Task runs it consists of."""
     made: dict[str, int] = field(default_factory=dict)
-    """Bytes of the artefacts it consists of, by key; not in the JSON."""
+    """Bytes of the artefacts it consists of, by key; in the JSON the keys alone."""
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object."""
@@ -88,6 +88,7 @@ class StageRow:
             "processor_seconds": self.processor_seconds,
             "peak_mib": self.peak_mib,
             "tasks": self.tasks,
+            "artefacts": sorted(self.made),
         }
 
 

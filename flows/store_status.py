@@ -49,12 +49,14 @@ class StageStatus:
         seconds: it took to make what is there.
         bytes: of what is there.
         reason: why it failed or was skipped.
+        artefacts: keys of what it consists of, which other sequences may share.
     """
 
     state: State
     seconds: float = 0.0
     bytes: int = 0
     reason: str = ""
+    artefacts: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True)
@@ -113,6 +115,13 @@ class StoreStatus:
     bytes: int
     unrecorded: int
     counts: Mapping[State, int] = field(default_factory=dict)
+
+    @property
+    def seconds(self) -> float:
+        """All rows together took; a stage that several of them share counts once."""
+        found = [stage for row in self.rows for stage in row.stages.values()]
+        shared = {stage.artefacts: stage.seconds for stage in found if stage.artefacts}
+        return sum(shared.values()) + sum(stage.seconds for stage in found if not stage.artefacts)
 
     def to_json(self) -> dict[str, Any]:
         """A JSON object; keys as in docs/command_line.md."""
@@ -306,7 +315,8 @@ def _stage(row: Mapping[str, Any], there: set[str], running: set[str]) -> StageS
         state = row["state"]
     else:
         state = "done" if len(left) == len(row["artefacts"]) else "missing"
-    return StageStatus(state, row["made_seconds"] if left else 0.0, sum(left), row["reason"])
+    seconds = row["made_seconds"] if left else 0.0
+    return StageStatus(state, seconds, sum(left), row["reason"], frozenset(row["artefacts"]))
 
 
 def _unrecorded(

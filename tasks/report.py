@@ -157,7 +157,7 @@ def _absent(skipped: dict[str, str]) -> dict[str, str]:
     }
 
 
-@stage("dataset-report", version=5, ignore=("rows",))
+@stage("dataset-report", version=6, ignore=("rows",))
 def dataset_report(
     slot: Slot,
     name: str,

@@ -33,10 +33,11 @@ class DatasetRow:
     Args:
         name: of the sequence.
         status: `completed` or `failed`.
-        seconds: run time.
+        seconds: that its stages took when they were made.
         coarse: metrics of the coarse scene, as the `metrics` of an `EvaluationResult`.
         final: the same of the fine-tuned scene; None when the plan left fine-tuning out.
-        stages: `{stage, state, seconds, reason}`.
+        stages: `{stage, state, seconds, reason, made_seconds, artefacts}` of each, the last two where they
+            are known: keys of its artefacts, which other rows may share.
         error: what went wrong, for a failed sequence.
         seed: of the run, when there are several of the same sequence and variant.
         variant: what else sets it apart from other runs of the same sequence, in words.
@@ -98,7 +99,7 @@ def build_dataset_report(
             *([("Runs", count(len(rows)))] if _kind(rows) == "runs" else []),
             ("Completed", count(sum(row.status == "completed" for row in rows))),
             ("Failed", count(sum(row.status == "failed" for row in rows))),
-            ("Run time of all", duration(sum(row.seconds for row in rows))),
+            ("Time to make all", duration(_seconds_of_all(rows))),
         ],
         failures=[
             (row.label, row.error or "no reason was recorded") for row in rows if row.status == "failed"
@@ -127,6 +128,18 @@ def _summary(rows: Sequence[DatasetRow]) -> str:
         f"{text} Over the {len(pairs)} with a coarse and a final scene, PSNR on held-out views changes by "
         f"{number(change, 2, signed=True)} dB on average; {better} of {len(pairs)} gain."
     )
+
+
+def _seconds_of_all(rows: Sequence[DatasetRow]) -> float:
+    """A stage that several rows share counts once."""
+    shared: dict[tuple[str, ...], float] = {}
+    alone = 0.0
+    for row in rows:
+        told = {tuple(stage.get("artefacts", ())): stage.get("made_seconds", 0.0) for stage in row.stages}
+        told.pop((), None)
+        shared |= told
+        alone += max(0.0, row.seconds - sum(told.values()))
+    return sum(shared.values()) + alone
 
 
 def _kind(rows: Sequence[DatasetRow]) -> Literal["sequences", "runs"]:

@@ -120,9 +120,9 @@ def _print(found: StoreStatus) -> None:
             where = f"{row.sequence} ({row.variant})" if row.variant else row.sequence
             out.print(f"[red]{escape(where)} failed in {escape(row.reason)}[/]", soft_wrap=True)
     counts = ", ".join(f"{count} {state}" for state, count in found.counts.items()) or "nothing on record"
-    took = sum(row.seconds for row in found.rows)
     out.print(
-        f"{counted(len(found.rows), 'run')}: {counts}; {duration(took)} in all, {size_text(found.bytes)}; "
+        f"{counted(len(found.rows), 'run')}: {counts}; "
+        f"{duration(found.seconds)} in all, {size_text(found.bytes)}; "
         f"{counted(found.artefacts, 'artefact')} in {found.store}, {found.unrecorded} of them of other runs",
         soft_wrap=True,
         markup=False,

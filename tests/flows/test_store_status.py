@@ -16,7 +16,7 @@ from extrags.store.runs import recorded_run
 from flows.cases import SequenceCase, record_outcome
 from flows.cli import main
 from flows.outcome import SequenceOutcome, StageRow
-from flows.store_status import store_status
+from flows.store_status import StageStatus, StatusRow, StoreStatus, store_status
 from tests.flows.tiny import GIVEN, SEQUENCE, TINY, tiny_config
 
 CASE = SequenceCase(SEQUENCE, profile="quick", settings=TINY)
@@ -176,6 +176,19 @@ def test_a_store_with_brackets_in_its_name(tmp_path: Path, capsys: pytest.Captur
     place.mkdir(parents=True)
     assert main(["status", "--store", str(place)]) == 0
     assert "run[/old]" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_what_sequences_share_took_its_time_once() -> None:
+    coarse, first, second = (
+        StageStatus("done", seconds, artefacts=frozenset({key}))
+        for seconds, key in ((40.0, "a"), (30.0, "b"), (5.0, "c"))
+    )
+    rows = [
+        StatusRow(name, "", "done", "", "", None, {"coarse": coarse, "evaluate": own})
+        for name, own in (("phantom/0@sparse", first), ("phantom/0@distanced", second))
+    ]
+    assert [row.seconds for row in rows] == [70, 45]
+    assert StoreStatus("", rows, 3, 0, 0).seconds == 75
 
 
 @pytest.mark.parametrize("root", ["nowhere", "memory://nowhere/store"])

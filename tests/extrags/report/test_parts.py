@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -179,6 +182,21 @@ def test_dataset_page_of_one_run_a_sequence_speaks_of_sequences() -> None:
     page = Page(build_dataset_report([row("phantom/0", 1.0), row("phantom/1", 2.0)]))
     assert "2 of 2 sequences completed." in page.text
     assert "Runs" not in page.text
+
+
+def test_stages_that_rows_share_took_their_time_once() -> None:
+    def made(stage: str, seconds: float, *keys: str) -> dict[str, Any]:
+        return {"stage": stage, "state": "ran", "made_seconds": seconds, "artefacts": list(keys)}
+
+    shared, first, second = (
+        made(*told) for told in (("coarse", 40.0, "a"), ("evaluate", 30.0, "b"), ("evaluate", 5.0, "c"))
+    )
+    rows = [
+        replace(row("phantom/0", 1.0), seconds=70.0, stages=[shared, first]),
+        # And 2 s of a stage that nothing is known of.
+        replace(row("phantom/1", 1.0), seconds=47.0, stages=[shared, second]),
+    ]
+    assert "Time to make all 1 min 17 s" in Page(build_dataset_report(rows)).text
 
 
 def test_dataset_page_names_variants() -> None:
