@@ -8,7 +8,8 @@ from typing import Any, Literal, TypeVar, get_args
 
 from extrags.config import PipelineConfig
 from extrags.redaction import without_credentials
-from extrags.store import Ref, Slot, Storable, Store, digest_of
+from extrags.store import Ref, Slot, Storable, digest_of
+from extrags.store.slot import Artefacts
 from tasks.coarse import HISTORY
 from tasks.evaluate import METRICS_FILE
 from tasks.stage import stage
@@ -137,7 +138,7 @@ def _save_page(slot: Slot, page: str, content: str) -> None:
     slot.save_json(CONTENT, {"digest": digest_of(without_credentials(content))})
 
 
-def _environment(store: Store, parts: dict[str, Ref]) -> dict[str, str]:
+def _environment(store: Artefacts, parts: dict[str, Ref]) -> dict[str, str]:
     """Software the scene was made with, and the machine this page is made on."""
     made_with = store.manifest(parts["coarse" if "coarse" in parts else "sequence"]).software
     return {**made_with, "machine": platform.machine(), "system": platform.system()}

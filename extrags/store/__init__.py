@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from extrags.store.artefacts import Slot, Store
+from extrags.store.artefacts import Store
 from extrags.store.canonical import Ref, canonical, digest_of
 from extrags.store.integrity import content_digest
 from extrags.store.kept import forget_loaded
 from extrags.store.manifest import MANIFEST, Manifest
 from extrags.store.records import in_work, read_records, write_record
+from extrags.store.slot import Slot
 from extrags.store.storable import Storable
 
 __all__ = [

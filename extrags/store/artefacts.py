@@ -21,10 +21,11 @@ from extrags.store.integrity import Damage, Depth, default_depth, find_damage, l
 from extrags.store.kept import kept_or_read
 from extrags.store.manifest import Manifest, is_name, software_versions, stage_of
 from extrags.store.refusal import refused_write
+from extrags.store.slot import Slot
 from extrags.store.storable import Storable
 from extrags.store.url import UrlBackend
 
-__all__ = ["Slot", "Store"]
+__all__ = ["Store"]
 
 log = logging.getLogger(__name__)
 
@@ -33,70 +34,6 @@ S = TypeVar("S", bound=Storable)
 
 _opened: set[tuple[str, str, int, Depth]] = set()
 """Artefacts whose contents this process has compared: path, digest, inode (another one after a repair)."""
-
-
-class Slot:
-    """A scratch directory that becomes an artefact when its `with` block ends without an exception.
-
-    Args:
-        path: where the stage writes.
-        counts: numbers for the manifest, filled by the stage.
-        run_files: names of files that tell of this run, such as its times, filled by the stage. They are kept
-            and compared as all others, but the artefact's digest does not cover them.
-    """
-
-    def __init__(self, path: Path, store: Store) -> None:
-        self.path = path
-        self.store = store
-        self.counts: dict[str, float | int | str | None] = {}
-        self.run_files: set[str] = set()
-        self._debug = path.with_name("debug")
-        self._manifest: Manifest | None = None
-        self._inputs: dict[str, Ref] = {}
-
-    def open(self, ref: Ref) -> Path:
-        """Files of an input artefact."""
-        self._inputs[ref.digest] = ref
-        return self.store.open(ref)
-
-    def load(self, kind: type[S], ref: Ref) -> S:
-        """An object from an input artefact, as `Store.load`."""
-        self._inputs[ref.digest] = ref
-        return self.store.load(kind, ref)
-
-    def load_json(self, file: str, ref: Ref) -> Any:
-        """Plain JSON from an input artefact, as `Store.load_json`."""
-        self._inputs[ref.digest] = ref
-        return self.store.load_json(file, ref)
-
-    def save(self, value: Storable) -> None:
-        """Write an object to its place in the artefact (`Storable.stored_as`)."""
-        value.save(self.path / value.stored_as)
-
-    def save_json(self, file: str, value: Any, *, indent: int | None = None) -> None:
-        """Write a JSON file.
-
-        Raises:
-            ValueError: for NaN and infinity, which JSON cannot represent.
-        """
-        (self.path / file).write_text(json.dumps(value, indent=indent, allow_nan=False), encoding="utf-8")
-
-    @property
-    def debug(self) -> Path:
-        """Directory for debugging files; kept only if the stage fails."""
-        self._debug.mkdir(exist_ok=True)
-        return self._debug
-
-    @property
-    def ref(self) -> Ref:
-        """Reference to the finished artefact.
-
-        Raises:
-            StoreError: while the block still runs, or after it failed.
-        """
-        if self._manifest is None:
-            raise StoreError("an unfinished artefact has no ref; read it after the block")
-        return self.store._ref(self._manifest)
 
 
 class Store:
@@ -184,7 +121,7 @@ class Store:
         if damage is not None:
             raise self._damaged(key, damage)
         self.backend.touch(key)
-        return self._ref(manifest)
+        return self.ref_of(manifest)
 
     def find_or_set_aside(self, key: str) -> Ref | None:
         """As `find`, for who can make an artefact anew: a damaged one is set aside, and None returned."""
@@ -368,7 +305,8 @@ class Store:
             damage.problem, file=damage.file, stage=stage_of(key), key=key, store=self.root
         )
 
-    def _ref(self, manifest: Manifest) -> Ref:
+    def ref_of(self, manifest: Manifest) -> Ref:
+        """Reference to the artefact of a manifest."""
         return Ref(uri=self.backend.uri(manifest.key), digest=manifest.digest)
 
     @contextmanager

@@ -93,7 +93,7 @@ def finished(
 
 
 @pytest.fixture
-def untouched_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def untouched_environment() -> Iterator[None]:
     """The command sets up Prefect through the environment; put it back."""
     before = dict(os.environ)
     yield

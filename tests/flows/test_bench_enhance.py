@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,21 +10,14 @@ import pytest
 from flows.cli import main
 from tests.flows.tiny import SEQUENCE, TINY
 
+pytestmark = pytest.mark.usefixtures("untouched_environment")
+
 SETTINGS = [
     part
     for name, value in TINY.items()
     if name.startswith(("ingest.", "coarse.", "enhance."))
     for part in ("--set", f"{name}={json.dumps(value)}")
 ]
-
-
-@pytest.fixture(autouse=True)
-def untouched_environment() -> Iterator[None]:
-    """The command sets how waiting threads behave; put it back."""
-    before = dict(os.environ)
-    yield
-    os.environ.clear()
-    os.environ.update(before)
 
 
 def test_a_table_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,16 +31,9 @@ from tests.extrags.restoration.pretrained.fake_clone import write_clone
 from tests.extrags.restoration.pretrained.tiny_pipelines import ADAPTERS
 from tests.flows.tiny import SEQUENCE, tiny_config
 
+pytestmark = pytest.mark.usefixtures("untouched_environment")
+
 MISSING = {"enhance.pretrained_weights": "no/such.safetensors"}
-
-
-@pytest.fixture(autouse=True)
-def untouched_environment(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """The command sets up Prefect through the environment; put it back."""
-    before = dict(os.environ)
-    yield
-    os.environ.clear()
-    os.environ.update(before)
 
 
 @pytest.fixture

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,14 +33,7 @@ from flows.runners import DirectRunner
 from flows.wiring import run_sequence
 from tests.flows.tiny import SEQUENCE, tiny_config
 
-
-@pytest.fixture(autouse=True)
-def untouched_environment() -> Iterator[None]:
-    """The commands set up Prefect through the environment; put it back."""
-    before = dict(os.environ)
-    yield
-    os.environ.clear()
-    os.environ.update(before)
+pytestmark = pytest.mark.usefixtures("untouched_environment")
 
 
 @pytest.fixture(scope="module")
@@ -199,6 +190,14 @@ def test_gallery_from_the_command_line(
     assert f"{made}\nextrags gallery {SEQUENCE}\n" in text
     assert str(tmp_path) not in text
     assert "Virtual view" in text
+
+
+def test_the_command_of_a_gallery_has_its_options(store: Store, tmp_path: Path) -> None:
+    folder = tmp_path / "gallery"
+    options = ["--profiles", "quick", "--name", "My scenes", "--kb", "300"]
+    assert main(["gallery", "phantom/*", "--store", store.root, "--out", str(folder), *options]) == 0
+    text = (folder / "index.md").read_text(encoding="utf-8")
+    assert f"extrags gallery {SEQUENCE} --profiles quick --name 'My scenes' --kb 300\n" in text
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
 import sys
 import threading
 import time
@@ -32,18 +31,11 @@ from tests.extrags.lit_tube import build_tube, tube_cameras
 from tests.flows import viser_stand_in
 from tests.flows.tiny import SEQUENCE, TINY
 
+pytestmark = pytest.mark.usefixtures("untouched_environment")
+
 Finished = tuple[str, SequenceOutcome]
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={json.dumps(value)}")]
 REAL = importlib.util.find_spec("viser") is not None
-
-
-@pytest.fixture(autouse=True)
-def untouched_environment() -> Iterator[None]:
-    """The command sets up Prefect through the environment; put it back."""
-    before = dict(os.environ)
-    yield
-    os.environ.clear()
-    os.environ.update(before)
 
 
 @pytest.fixture(scope="module")

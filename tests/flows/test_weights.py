@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +20,7 @@ from flows.wiring import run_sequence
 from tasks.weights import lpips_weights
 from tests.flows.tiny import SEQUENCE, tiny_config
 
-
-@pytest.fixture(autouse=True)
-def untouched_environment() -> Iterator[None]:
-    """The command sets up Prefect through the environment; put it back."""
-    before = dict(os.environ)
-    yield
-    os.environ.clear()
-    os.environ.update(before)
+pytestmark = pytest.mark.usefixtures("untouched_environment")
 
 
 def test_profiles() -> None:
