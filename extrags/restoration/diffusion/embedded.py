@@ -167,7 +167,10 @@ class EmbeddedEnhancer:
         # What a keyframe has invented is as sure as its colour.
         opacity = torch.maximum(clip.layers.get("alpha"), clip.layers.get("invented_weight"))[:, 0]
         K = torch.from_numpy(clip.cameras.K).to(rgb)
-        return depth_from_image(network, rgb, filled_mm, guess_mm[:, 0], opacity, K)[:, None]
+        half = self.half_precision
+        return depth_from_image(network, rgb, filled_mm, guess_mm[:, 0], opacity, K, half_precision=half)[
+            :, None
+        ]
 
     def restored_layers(
         self,
@@ -376,7 +379,12 @@ class EmbeddedEnhancer:
 
 @cache
 def _reader_of_depth() -> CompletionNetwork:
-    return load_hidden()
+    network = load_hidden()
+    for parameter in network.parameters():
+        # Of convolutions: in this layout they are a seventh faster.
+        if parameter.dim() == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return network
 
 
 def _read_patches(file: Path) -> Float[Tensor, "r 3 s s"] | None:
