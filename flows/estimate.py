@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 from itertools import takewhile
 
@@ -14,9 +15,19 @@ from tasks.progress import StageProgress, duration_text
 
 __all__ = ["RunEstimate", "SequenceEstimate", "expected_seconds", "usual_pace"]
 
-OTHER_SECONDS: dict[str, float] = {"poses": 20.0, "depth": 30.0, "report": 4.0}
-"""Of processor time: tasks whose cost no model knows, for a recording of the phantom. Poses and depth grow
-with the pixels of all frames, for depth as far as it looks at them (`depth.max_width`)."""
+OTHER_SECONDS: dict[str, float] = {"depth": 30.0, "report": 4.0}
+"""Of processor time: tasks whose cost no model knows, for a recording of the phantom. Depth grows with the
+pixels of all frames, as far as it looks at them (`depth.max_width`)."""
+FEATURE_SECONDS_PER_PX = 3.9e-6
+MAPPING_SECONDS = 0.1
+"""Of a frame."""
+PAIR_SECONDS = (0.015, 0.105)
+"""Of a pair of frames: matched by few features, and what `poses.n_features` in both add. With the two above
+from four recordings (48 frames of 160 x 128 px: 20 s, 40 of 675 x 540: about 170, 35 of 1048 x 972: 208, and
+features of 1920 x 1080: 8 s a frame), which they give within a quarter."""
+USUAL_FEATURES = 6000
+FEATURES_PER_PX = 0.04
+"""About so many are found in small frames."""
 RESTORATION = {"enhance-keyframes": 0.1, "enhance-restore": 0.8, "enhance": 0.1}
 """Shares of its tasks in the time of the restoration, which is modelled as one."""
 
@@ -49,10 +60,7 @@ def expected_seconds(
     """
     model, work = packaged_model(), usual_work(config) if work is None else work
     usual = usual_work(config)
-    larger = {
-        "poses": work.pixels * work.frames / (usual.pixels * usual.frames),
-        "depth": _pixels_of_depth(work) * work.train / (_pixels_of_depth(usual) * usual.train),
-    }
+    larger = {"depth": _pixels_of_depth(work) * work.train / (_pixels_of_depth(usual) * usual.train)}
     found: dict[StageName, dict[str, float]] = {}
     restored = int(config.evaluate.restored != "none")
     work = replace(work, stacks=MEASURED_SCENES + restored)
@@ -63,7 +71,9 @@ def expected_seconds(
         for task, times in repeats.items():
             if task not in run:
                 continue
-            if task in model.time and stage not in OTHER_SECONDS:
+            if task == "poses":
+                seconds = _seconds_of_poses(work)
+            elif task in model.time and stage not in OTHER_SECONDS:
                 seconds = times * model.predict(task, work).seconds
             else:
                 seconds = OTHER_SECONDS.get(task, 0.0) * larger.get(stage, 1.0)
@@ -76,6 +86,21 @@ def expected_seconds(
 def usual_pace() -> float:
     """Elapsed seconds per second of processor time, of a run that has this machine to itself."""
     return 1 / (1 + USED_SHARE * (usable_cores() - 1))
+
+
+def _seconds_of_poses(work: Workload) -> float:
+    """Features, matches of all pairs, and the map."""
+    settings, train = work.config.poses, work.train
+    near, spread = settings.sequential_overlap, settings.exhaustive_below
+    if train <= spread:
+        pairs = train * (train - 1) / 2 + work.test * train
+    else:
+        # See `extrags.poses.pairs`: neighbours, frames a power of two apart, and evenly spread ones.
+        farther = max(0.0, math.log2(train) - math.log2(near))
+        pairs = train * (near + farther) + spread * (spread - 1) / 2 + work.test * (2 * near + spread)
+    share = min(1.0, FEATURES_PER_PX * work.pixels / settings.n_features)
+    of_pair = PAIR_SECONDS[0] + PAIR_SECONDS[1] * share**2 * (settings.n_features / USUAL_FEATURES) ** 2
+    return work.frames * (FEATURE_SECONDS_PER_PX * work.pixels + MAPPING_SECONDS) + pairs * of_pair
 
 
 def _pixels_of_depth(work: Workload) -> float:

@@ -54,6 +54,25 @@ class TestEstimate:
         assert plain["evaluate-views"] < restored["evaluate-views"]
         assert "enhance-train" not in expected("enhance", enhance__backend="classical")
 
+    def test_poses_take_as_long_as_they_did(self) -> None:
+        """Against recorded stages; far more frames are not paired with one another all."""
+        config = profile_config("balanced")
+
+        def expected(width: int, height: int, frames: int, train: int) -> float:
+            size = {"pixels": float(width * height), "width": float(width)}
+            counts = {"frames": frames, "train": train, "test": frames - train}
+            work = replace(usual_work(config), **size, **counts)
+            return sum(expected_seconds(config, work)["poses"].values())
+
+        for recorded, size in (
+            (20, (160, 128, 48, 20)),
+            (170, (675, 540, 40, 20)),
+            (208, (1048, 972, 35, 30)),
+        ):
+            assert expected(*size) == pytest.approx(recorded, rel=0.25)
+        few, many = expected(675, 540, 60, 53), expected(675, 540, 600, 525)
+        assert 8 * few < many < 20 * few
+
     def test_depth_looks_at_frames_of_a_bounded_width(self) -> None:
         config = profile_config("balanced")
         depths = [
