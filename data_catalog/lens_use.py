@@ -8,15 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.content import content_circle, looked_at, view_mask
-from data_catalog.sampling import OFF_CENTRE_SHARE, LensSampling, source_areas
-from extrags.lens import Lens, Undistortion
+from data_catalog.sampling import OFF_CENTRE_SHARE, LensSampling
+from extrags.lens import MUCH_LEFT_OUT, Lens, Undistortion, left_out_share
 
 __all__ = ["LensUse", "left_out_share"]
 
 logger = logging.getLogger(__name__)
 
-MUCH_LEFT_OUT = 0.2
-"""Share of a source's picture that the pinhole may leave out without a warning."""
 _WIDTH = 320
 """Pictures are looked at in images that are no wider."""
 
@@ -87,37 +85,6 @@ class LensUse:
 
     def _counts(self, index: int, lens: object) -> bool:
         return self._plan is not None and index in self._looked_at and lens == self._lens
-
-
-def left_out_share(lens: Lens, plan: Undistortion, picture: Float[np.ndarray, "h w"]) -> float:
-    """Share of a source's picture that its pinhole does not show.
-
-    Args:
-        lens: of the source.
-        plan: to the pinhole.
-        picture: how much each pixel belongs to the picture, from 0 to 1, at any size of the source's
-            proportion.
-
-    Returns:
-        0 where there is no picture.
-    """
-    import cv2
-
-    height, width = picture.shape
-    pixel = lens.width * lens.height / picture.size
-    total = float(picture.sum()) * pixel
-    if not total:
-        return 0.0
-    # OpenCV counts from pixel centres.
-    columns, rows = plan.u * width / lens.width - 0.5, plan.v * height / lens.height - 0.5
-    found = cv2.remap(
-        picture.astype(np.float32),
-        columns.astype(np.float32),
-        rows.astype(np.float32),
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
-    return 1 - float((source_areas(plan.u, plan.v) * plan.valid * found).sum()) / total
 
 
 def _picture(rgb: UInt8[np.ndarray, "f h w 3"]) -> Bool[np.ndarray, "h w"]:

@@ -15,7 +15,7 @@ from data_catalog.images import Resampling
 from extrags.cameras import field_mask
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError
-from extrags.lens import Lens, Undistortion, size_for_focal
+from extrags.lens import Lens, Undistortion, keeps_central_resolution, pinhole_size, source_areas
 from extrags.radial_lens import LensFit, RadialLens
 
 __all__ = ["CameraModel", "LensSampling", "Sampling", "keeps_central_resolution", "source_areas"]
@@ -88,18 +88,11 @@ class Sampling(Protocol):
 
 def _enlarged_size(lens: Lens, config: IngestConfig, first: Sampling | None) -> tuple[int, int] | None:
     """Size at which a pinhole of the given field of view keeps the central resolution; None: the lens's."""
-    if config.field_of_view_deg is None or not keeps_central_resolution(config):
-        return None
-    if isinstance(first, LensSampling):
+    size = pinhole_size(lens, config)
+    if size is not None and isinstance(first, LensSampling):
         # Frames of several lenses share the first one's size.
         return first.resampling.source_width, first.resampling.source_height
-    focal = float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))
-    return size_for_focal(lens.width, lens.height, float(np.radians(config.field_of_view_deg)), focal)
-
-
-def keeps_central_resolution(config: IngestConfig) -> bool:
-    """Whether a pinhole wider than the source's centre allows grows instead of losing resolution."""
-    return config.size == "central" and config.width is None and config.downscale is None
+    return size
 
 
 @dataclass(frozen=True)
@@ -287,9 +280,3 @@ class LensSampling:
         """
         straight = depth if self.undistortion is None else self.undistortion.depth(depth)
         return self.resampling.depth(straight, file=file, frame=frame)
-
-
-def source_areas(u: Float[np.ndarray, "h w"], v: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Area in source pixels of each pixel that is looked up at (u, v); 0 where that is unknown."""
-    (u_down, u_right), (v_down, v_right) = np.gradient(u), np.gradient(v)
-    return np.asarray(np.nan_to_num(np.abs(u_right * v_down - u_down * v_right)))

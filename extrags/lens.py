@@ -17,17 +17,23 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.radial_lens import LARGEST_ANGLE_RAD, LensFit, RadialLens, fitted_lens
 
 __all__ = [
     "LENS_PARAMETERS",
+    "MUCH_LEFT_OUT",
     "Lens",
     "Undistortion",
     "distortion_of_pinhole",
+    "keeps_central_resolution",
+    "left_out_share",
+    "pinhole_size",
     "resized_depth",
     "sample_depth",
     "size_for_focal",
+    "source_areas",
 ]
 
 LENS_PARAMETERS: dict[str, tuple[str, ...]] = {
@@ -55,6 +61,9 @@ _FOLD_STEP = 0.05
 
 LARGEST_PX = 65_535
 """Longest side of an image; what announces more is damaged."""
+
+MUCH_LEFT_OUT = 0.2
+"""Share of a source's picture that the pinhole may leave out without a warning."""
 
 
 @dataclass(frozen=True)
@@ -399,3 +408,53 @@ def resized_depth(depth: Float[np.ndarray, "h w"], width: int, height: int) -> F
     u = (np.arange(width) + 0.5) * depth.shape[1] / width
     v = (np.arange(height) + 0.5) * depth.shape[0] / height
     return sample_depth(depth, *np.meshgrid(u, v)).astype(depth.dtype)
+
+
+def keeps_central_resolution(config: IngestConfig) -> bool:
+    """Whether a pinhole wider than the source's centre allows grows instead of losing resolution."""
+    return config.size == "central" and config.width is None and config.downscale is None
+
+
+def pinhole_size(lens: Lens, config: IngestConfig) -> tuple[int, int] | None:
+    """Size at which a pinhole of the given field of view keeps the central resolution; None: the lens's."""
+    if config.field_of_view_deg is None or not keeps_central_resolution(config):
+        return None
+    focal = float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))
+    return size_for_focal(lens.width, lens.height, float(np.radians(config.field_of_view_deg)), focal)
+
+
+def left_out_share(lens: Lens, plan: Undistortion, picture: Float[np.ndarray, "h w"]) -> float:
+    """Share of a source's picture that its pinhole does not show.
+
+    Args:
+        lens: of the source.
+        plan: to the pinhole.
+        picture: how much each pixel belongs to the picture, from 0 to 1, at any size of the source's
+            proportion.
+
+    Returns:
+        0 where there is no picture.
+    """
+    import cv2
+
+    height, width = picture.shape
+    pixel = lens.width * lens.height / picture.size
+    total = float(picture.sum()) * pixel
+    if not total:
+        return 0.0
+    # OpenCV counts from pixel centres.
+    columns, rows = plan.u * width / lens.width - 0.5, plan.v * height / lens.height - 0.5
+    found = cv2.remap(
+        picture.astype(np.float32),
+        columns.astype(np.float32),
+        rows.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return 1 - float((source_areas(plan.u, plan.v) * plan.valid * found).sum()) / total
+
+
+def source_areas(u: Float[np.ndarray, "h w"], v: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Area in source pixels of each pixel that is looked up at (u, v); 0 where that is unknown."""
+    (u_down, u_right), (v_down, v_right) = np.gradient(u), np.gradient(v)
+    return np.asarray(np.nan_to_num(np.abs(u_right * v_down - u_down * v_right)))

@@ -15,7 +15,7 @@ from flows.cached_stages import CachedStages
 from flows.continuation import coarse_call
 from flows.imported import imported_call, of_imported_scene
 from flows.memory_limit import check_memory, made_stages
-from flows.outcome import SequenceOutcome, StageRow
+from flows.outcome import Part, SequenceOutcome, StageRow
 from flows.runners import Call, Runner, StoreRunner
 from tasks.assess import assess, measuring_settings, plan, planning_settings
 from tasks.coarse import coarse, refined_frames
@@ -38,7 +38,7 @@ from tasks.explore import branch, explore, merge, next_anchors, start
 from tasks.finetune import finetune, finetuning_settings, judge
 from tasks.freespace import freespace
 from tasks.ingest import ingest, training_frames
-from tasks.poses import estimating_settings, poses
+from tasks.poses import estimating_settings, lens_settings, poses
 from tasks.report import PAGE, REPORT_PARTS, ROWS, report
 from tasks.stage import stage_key
 from tasks.surface import surface
@@ -152,7 +152,8 @@ class SequenceRun(CachedStages):
         """The artefact `sequence` again, with poses."""
         with self._stage("poses") as row:
             self.config.check_imported_has_cameras()
-            inputs = {"sequence": self.refs["sequence"], "config": estimating_settings(self.config.poses)}
+            config, ingest = estimating_settings(self.config.poses), lens_settings(self.config.ingest)
+            inputs = {"sequence": self.refs["sequence"], "config": config, "ingest": ingest}
             self.refs["poses"] = self.refs["sequence"] = self._run_task(row, Call(poses, inputs))
             row.reason = str(self._manifest("poses").counts["summary"])
 
@@ -351,9 +352,8 @@ class SequenceRun(CachedStages):
         """Held-out views of both scenes, and their figures."""
         with self._stage("evaluate") as row:
             sequence = self.refs["sequence"]
-            scenes = [self.refs["coarse"]]
-            if "finetune" in self.refs:
-                scenes.append(self.refs["finetune"])
+            parts: tuple[Part, ...] = ("coarse", "finetune")
+            scenes = [self.refs[part] for part in parts if part in self.refs]
             if self.config.uc_nerf.enabled:
                 calls = [Call(render_uc_nerf, {"scene": ref, "sequence": sequence}) for ref in scenes]
             else:

@@ -29,8 +29,9 @@ class PosesConfig(StageConfig):
     )
     lenient_retry: bool = Field(
         True,
-        description="where COLMAP registers too few training frames and there is no depth to align them "
-        "by, try again with guided matching and lower thresholds: poses are less exact then",
+        description="where COLMAP leaves more than a tenth of the training frames without a pose and there "
+        "is no depth to align them by, try again with guided matching and lower thresholds; taken where that "
+        "registers clearly more, since poses are less exact then",
     )
     fallback: Literal["auto", "never", "rgbd"] = Field(
         "auto",
@@ -56,8 +57,8 @@ class PosesConfig(StageConfig):
         None,
         gt=0,
         le=1000,
-        description="median distance from lens to tissue; makes an estimate by COLMAP metric where no depth "
-        "does. None: its scale is arbitrary",
+        description="median distance from lens to tissue; makes an estimate metric where no depth in "
+        "millimetres does. None: its scale is arbitrary",
     )
     rgbd_width: int = Field(192, ge=32, description="alignment by colour and depth works at most so wide")
     rgbd_neighbours: int = Field(6, ge=1, description="frames each frame is aligned with")

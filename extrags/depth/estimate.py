@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -29,6 +28,7 @@ from extrags.depth.stereo import (
     multi_view_stereo,
     sweep_around,
 )
+from extrags.depth.unmatched import scale_error, unmatched_frames
 from extrags.depth.weights import BUNDLED, NONE, completion_digest, load_completion
 from extrags.devices import chosen_device
 from extrags.errors import CaptureError
@@ -62,10 +62,6 @@ STEREO_TRUST_ERRORS = 1.5
 
 ERROR_FACTOR = 1.25
 """Of the network's expected error, which is so much too small on phantoms; it saw none of them."""
-
-UNKNOWN_SCALE_ERROR = 0.4
-"""Expected relative error of the scale of a frame that no other could be matched with, in a recording without
-any stereo to fit brightness to."""
 
 STEREO_GAIN = 0.4
 """Share of the network's expected error that agreeing stereo removes."""
@@ -207,7 +203,7 @@ def estimate_depth(
         "points_from": origin,
         "n_points": len(points),
         "sources_median": float(stereo.n_sources.median()),
-        "frames_alone": int((stereo.n_sources == 0).sum()),
+        "frames_alone": int(unmatched_frames(stereo, frames.mask).sum()),
         "agreeing_share": float(confirmed.sum() / frames.mask.sum().clamp_min(1)),
         "shading": [
             {
@@ -388,23 +384,8 @@ def _completed(
     weight = weight * torch.exp(-0.5 * away.square())
     mixed = log_depth + weight * (stereo.fused - log_depth)
     expected = ERROR_FACTOR * error * (1 - STEREO_GAIN * weight)
-    return mixed, torch.hypot(expected, _scale_error(stereo)[:, None, None]), stereo
-
-
-def _scale_error(stereo: StereoDepth) -> Tensor:
-    """Expected relative error of the scale of each frame, [F]; zero where other frames tell it.
-
-    A frame that nothing matches has the mean intercept of its recording's fit of brightness: it is as wrong
-    as the intercepts of the other frames differ.
-    """
-    error = torch.zeros(len(stereo.n_sources), device=stereo.n_sources.device)
-    for number, fit in enumerate(stereo.fits):
-        own = torch.nonzero(stereo.recording == number)[:, 0]
-        alone = stereo.n_sources[own] == 0
-        known = math.isfinite(fit.scatter) and int((~alone).sum()) >= 2
-        spread = float(fit.intercepts[~alone].std()) if known else UNKNOWN_SCALE_ERROR
-        error[own[alone]] = min(spread, UNKNOWN_SCALE_ERROR)
-    return error
+    of_scale = scale_error(stereo, unmatched_frames(stereo, frames.mask))
+    return mixed, torch.hypot(expected, of_scale[:, None, None]), stereo
 
 
 @torch.no_grad()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from extrags.poses.calibration import LensCalibration, with_calibration
+from extrags.poses.calibration import LensCalibration, check_lens_use, with_calibration
 from extrags.poses.estimate import PoseEstimate, estimate_poses, with_estimated_poses
 from extrags.poses.registration_report import errors_against_given
 from extrags.poses.rgbd import RgbdAlignment, align_by_depth
@@ -16,6 +16,7 @@ __all__ = [
     "RgbdAlignment",
     "Triangulation",
     "align_by_depth",
+    "check_lens_use",
     "depth_scale",
     "errors_against_given",
     "estimate_poses",

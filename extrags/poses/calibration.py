@@ -2,18 +2,36 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from extrags.errors import ShapeError
+from extrags.cameras import field_mask
+from extrags.config import IngestConfig
+from extrags.errors import ConfigError, ShapeError, SourceError
 from extrags.frame_stacks import stacked
-from extrags.lens import LENS_PARAMETERS, Lens, Undistortion
+from extrags.lens import (
+    LENS_PARAMETERS,
+    MUCH_LEFT_OUT,
+    Lens,
+    Undistortion,
+    left_out_share,
+    pinhole_size,
+)
+from extrags.radial_lens import LensFit
 from extrags.sequence import EndoscopicSequence
 
-__all__ = ["LensCalibration", "with_calibration"]
+__all__ = ["LensCalibration", "check_lens_use", "with_calibration"]
+
+LARGEST_FIT_ERROR_PX = 1.0
+"""Root mean square over the image: frames of a lens that a radial model is farther from do not keep their
+pixels."""
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -51,10 +69,30 @@ class LensCalibration:
         """Horizontal, of the pinhole with this focal length."""
         return float(np.degrees(2 * np.arctan(self.lens.width / 2 / self.focal_px)))
 
+    @cached_property
+    def radial(self) -> LensFit | None:
+        """The lens as frames that keep their pixels have it; None where no radial model is near enough."""
+        try:
+            fit = self.lens.radial()
+        except SourceError:
+            return None
+        return fit if fit.rms_px <= LARGEST_FIT_ERROR_PX else None
+
+    @property
+    def own_field_of_view_deg(self) -> float:
+        """Horizontal, of the lens itself, as far as its model holds; of the pinhole where no radial fits."""
+        if self.lens.is_pinhole or self.radial is None:
+            return self.field_of_view_deg
+        K, radial = self.radial.K, self.radial.lens
+        edges = np.array([K[0, 2], self.lens.width - K[0, 2]]) / K[0, 0]
+        return float(np.degrees(np.minimum(radial.angle(edges), radial.max_angle_rad).sum()))
+
     @property
     def summary(self) -> str:
         """Focal length with its uncertainty and origin, for plans, logs and reports."""
-        view = f"field of view {self.field_of_view_deg:.0f} degrees"
+        view = f"field of view {self.own_field_of_view_deg:.0f} degrees"
+        if not self.lens.is_pinhole:
+            view += f", {self.field_of_view_deg:.0f} as a pinhole"
         if not self.determined:
             return f"focal length {self.focal_px:.1f} px ({view}), guessed: {self.reason}"
         bent = [name for name in LENS_PARAMETERS[self.lens.model] if name.startswith("k")]
@@ -87,23 +125,40 @@ class LensCalibration:
         return cls(lens, **{name: content[name] for name in rest})
 
 
-def with_calibration(sequence: EndoscopicSequence, calibration: LensCalibration) -> EndoscopicSequence:
-    """The sequence as a pinhole camera of the calibrated lens sees it.
+def check_lens_use(ingest: IngestConfig) -> None:
+    """Refuse settings that contradict each other once a distorted lens is found.
 
-    A lens without distortion only replaces `K`. Else all frames, held-out ones too, are resampled to the
-    pinhole of the lens's central resolution; what the lens did not see leaves the validity mask. Poses and
+    Raises:
+        ConfigError: frames are to keep the lens's own field, and a pinhole's is asked for.
+    """
+    if ingest.lens == "native" and ingest.field_of_view_deg is not None:
+        raise ConfigError("ingest.lens=native keeps the lens's own field: leave ingest.field_of_view_deg out")
+
+
+def with_calibration(
+    sequence: EndoscopicSequence, calibration: LensCalibration, ingest: IngestConfig | None = None
+) -> EndoscopicSequence:
+    """The sequence with the calibrated lens: as a pinhole sees it, or with the pixels it has.
+
+    A lens without distortion only replaces `K`. Else all frames, held-out ones too, are resampled to a
+    pinhole: that of the lens's central resolution, or of `ingest.field_of_view_deg`; what the lens did not
+    see leaves the validity mask, and a warning says how much of the picture the pinhole leaves out. With
+    `ingest.lens=native` pixels stay, and the sequence's `lens` is the radial model of the lens. Poses and
     points are of the camera's centre and stay as they are. Pixels that were not square are.
 
     Args:
         sequence: frames as the lens made them; their pixels need not be square.
         calibration: of all of them.
+        ingest: settings of reading, of which those of distorted sources count; None takes the defaults.
 
     Returns:
         A copy with `intrinsics` set to `estimated`; the same sequence where nothing was determined.
 
     Raises:
         ShapeError: when the frames, with square pixels, have another size than the lens.
+        ConfigError: from `check_lens_use`.
     """
+    ingest = IngestConfig() if ingest is None else ingest
     lens, given = calibration.lens, sequence
     sequence = sequence.with_square_pixels()
     if (lens.width, lens.height) != (sequence.width, sequence.height):
@@ -116,8 +171,62 @@ def with_calibration(sequence: EndoscopicSequence, calibration: LensCalibration)
     known = replace(sequence, intrinsics="estimated", focal_std_px=calibration.focal_std_px)
     if lens.is_pinhole:
         return replace(known, K=np.tile(lens.K, (len(sequence), 1, 1)))
-    plan = Undistortion.planned(lens)
+    check_lens_use(ingest)
+    if ingest.lens == "native":
+        if calibration.radial is not None:
+            return _kept(known, calibration.radial)
+        _LOG.warning(
+            "%s: no radial model is near the lens that was estimated; frames are resampled to a pinhole "
+            "although ingest.lens is native",
+            sequence.name,
+            extra={"topic": "lens"},
+        )
+    plan = Undistortion.planned(lens, ingest.field_of_view_deg, size=pinhole_size(lens, ingest))
+    _tell_left_out(sequence, calibration, plan)
+    return _resampled(known, plan)
 
+
+def _kept(sequence: EndoscopicSequence, fit: LensFit) -> EndoscopicSequence:
+    """Frames that keep their pixels; what lies beyond the lens's field leaves the mask."""
+    seen = field_mask(fit.K, fit.lens, sequence.width, sequence.height)
+    _LOG.info(
+        "%s: lens kept up to %.1f degrees from its axis: the radial model is at most %.2f px from the "
+        "estimated one, %.2f px in the root mean square",
+        sequence.name,
+        np.degrees(fit.lens.max_angle_rad),
+        fit.error_px,
+        fit.rms_px,
+    )
+    return replace(
+        sequence,
+        K=np.tile(fit.K, (len(sequence), 1, 1)),
+        lens=fit.lens,
+        mask=stacked((mask & seen for mask in sequence.mask), len(sequence)),
+    )
+
+
+def _tell_left_out(sequence: EndoscopicSequence, calibration: LensCalibration, plan: Undistortion) -> None:
+    """Warn where the pinhole shows much less than the lens did."""
+    picture = np.zeros(sequence.mask.shape[1:])
+    for mask in sequence.mask:
+        picture += mask / len(sequence)
+    left_out = left_out_share(calibration.lens, plan, picture)
+    if left_out <= MUCH_LEFT_OUT:
+        return
+    shown_deg = 2 * np.degrees(np.arctan(plan.valid.shape[1] / 2 / plan.K[0, 0]))
+    _LOG.warning(
+        "%s: the pinhole of %.0f degrees leaves out %.0f %% of the picture of the lens that was estimated, "
+        "which sees %.0f degrees from side to side; a larger ingest.field_of_view_deg shows more of it, and "
+        "ingest.lens=native all",
+        sequence.name,
+        shown_deg,
+        100 * left_out,
+        calibration.own_field_of_view_deg,
+        extra={"topic": "lens"},
+    )
+
+
+def _resampled(sequence: EndoscopicSequence, plan: Undistortion) -> EndoscopicSequence:
     def through(change: Callable[[np.ndarray], np.ndarray], stack: np.ndarray | None) -> Any:
         return None if stack is None else stacked((change(frame) for frame in stack), len(stack))
 
@@ -126,7 +235,7 @@ def with_calibration(sequence: EndoscopicSequence, calibration: LensCalibration)
         return np.asarray(plan.valid & ~plan.mask(~specular))
 
     return replace(
-        known,
+        sequence,
         K=np.tile(plan.K, (len(sequence), 1, 1)),
         rgb=through(plan.colour, sequence.rgb),
         mask=through(plan.mask, sequence.mask),

@@ -10,25 +10,26 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from extrags.cameras import as_rotation
-from extrags.config import PosesConfig
-from extrags.errors import CaptureError, ShapeError
+from extrags.config import IngestConfig, PosesConfig
+from extrags.errors import CaptureError, ConfigError, ShapeError
 from extrags.frame_stacks import frames_of, stacked
+from extrags.poses.attempts import attempted, enough_registered
 from extrags.poses.calibration import LensCalibration, with_calibration
 from extrags.poses.job import PoseJob, PoseJobResult, run_job
 from extrags.poses.registration_report import (
-    colmap_report,
+    MIN_TRAINING_FRAMES,
     errors_against_given,
+    expected_frames,
     failure_message,
     frames_without_pose,
 )
 from extrags.poses.rgbd import align_by_depth
-from extrags.poses.scale import depth_scale
+from extrags.poses.scale import DENSE_SHARE, depth_scale, typical_depth
 from extrags.sequence import EndoscopicSequence, ScaleSource, Split
 from extrags.sparse_depth import MIN_POINTS_PER_VIEW, interpolated_depth, pixel_lattice
 
-__all__ = ["PoseEstimate", "estimate_poses", "with_estimated_poses"]
+__all__ = ["MIN_TRAINING_FRAMES", "PoseEstimate", "estimate_poses", "with_estimated_poses"]
 
-MIN_TRAINING_FRAMES = 3
 _LOG = logging.getLogger(__name__)
 
 
@@ -76,6 +77,8 @@ class PoseEstimate:
         if "colmap" in found:
             failed = found["colmap"]
             why = f" (COLMAP registered only {failed['registered_train']})"
+        elif found.get("lenient"):
+            why = f" in a second, lenient attempt ({found['first_attempt']['registered_train']} in the first)"
         lens = "" if self.calibration is None else f"; {self.calibration.summary}"
         return (
             f"by {by}: {found['registered_train']} of {found['n_train']} training frames"
@@ -118,12 +121,13 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     frames alone; the largest model counts. Held-out frames are registered afterwards against the finished
     map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the millimetre
     (`extrags.poses.depth_scale`); where it has none and `config.working_distance_mm` is given, the median
-    depth of the pixels, interpolated between the points that a frame observes, becomes that. COLMAP runs in
+    depth of the pixels, interpolated between the points that a frame observes, becomes that. Of depth in an
+    arbitrary unit, known at half of the pixels, the median itself becomes that. COLMAP runs in
     a process of its own.
 
-    Where that registers too few training frames, and no depth is there to align them by, a second attempt
-    with guided matching and lower thresholds is made (`config.lenient_retry`), and taken if it registers
-    more.
+    Where that leaves more than a tenth of the training frames without a pose, and no depth is there to align
+    them by, a second attempt with guided matching and lower thresholds is made (`config.lenient_retry`), and
+    taken if it registers clearly more (`extrags.poses.attempts`).
 
     *An unknown lens* (`sequence.intrinsics` is `guessed`, see `PosesConfig.refine_intrinsics`): focal
     length and radial distortion are estimated with the map (`extrags.poses.self_calibration`), and the
@@ -145,6 +149,8 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     Raises:
         CaptureError: when too few training frames register, with a report of why; or when COLMAP's
             process ends on its own.
+        ConfigError: when `ingest.scale_mm_per_unit` gave the unit of the source's own poses, and nothing
+            gives that of others.
 
     Source: Schönberger and Frahm: Structure-from-Motion Revisited, CVPR 2016.
     """
@@ -154,6 +160,16 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     if not sequence.training_depth_known:
         # Held-out frames may have depth for the evaluation alone.
         sequence = replace(sequence, depth_mm=None)
+    if (
+        sequence.scale_source == "setting"
+        and sequence.depth_mm is None
+        and config.working_distance_mm is None
+    ):
+        raise ConfigError(
+            f"{sequence.name}: ingest.scale_mm_per_unit is the unit of the source's poses, and "
+            "poses.replace_given estimates others, whose unit it says nothing of; leave it out, or give "
+            "poses.working_distance_mm instead"
+        )
     if len(sequence.train) < MIN_TRAINING_FRAMES:
         raise CaptureError(
             f"{sequence.name}: poses need at least {MIN_TRAINING_FRAMES} training frames, "
@@ -166,29 +182,15 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     # The lenses that are tried have one focal length.
     seen = sequence.with_square_pixels() if unknown_lens else sequence
     job = _job(seen, config, unknown_lens=unknown_lens)
-    result = _run(job, sequence.name)
-    registered = np.isfinite(result.world_from_camera).all((1, 2))
-    report = colmap_report(sequence, result, registered)
     no_depth = sequence.depth_mm is None or config.fallback == "never"
-    if config.lenient_retry and no_depth and not _enough(report, config):
-        _LOG.warning(
-            "%s: COLMAP registered %d of %d training frames; trying again with guided matching and lower "
-            "thresholds, which makes less exact poses",
-            sequence.name,
-            report["registered_train"],
-            report["n_train"],
-        )
-        again = _run(replace(job, lenient=True), sequence.name)
-        registered_again = np.isfinite(again.world_from_camera).all((1, 2))
-        report_again = colmap_report(sequence, again, registered_again)
-        if report_again["registered_train"] > report["registered_train"]:
-            result, registered, report = again, registered_again, report_again | {"lenient": True}
+    attempt = attempted(seen, job, config, _run, retry=no_depth)
+    result, registered, report = attempt.result, attempt.registered, attempt.report
     calibration = None
     if "calibration" in report:
         calibration = LensCalibration.from_json(report["calibration"])
         told = _LOG.info if calibration.determined else _LOG.warning
         told("%s: %s", sequence.name, calibration.summary)
-    if _enough(report, config):
+    if enough_registered(report, config):
         _warn_of_missing(sequence, report)
         found = _from_colmap(seen, result, registered, report, config)
         return replace(found, calibration=calibration)
@@ -259,13 +261,19 @@ def _from_colmap(
         mm_per_unit, scale_source = scale.mm_per_unit, "depth"
         report["scale"] = asdict(scale)
     elif config.working_distance_mm is not None:
-        mm_per_unit, scale_source = (
-            _told_scale(sequence, poses, result, config.working_distance_mm),
-            "working_distance",
-        )
+        typical = None
+        if scale is not None and sequence.depth_mm is not None:
+            mapped = sequence.train[registered[sequence.train]]
+            typical = typical_depth(sequence.depth_mm, sequence.mask, mapped, least_share=DENSE_SHARE)
+        if scale is not None and typical is not None:
+            depth_factor = config.working_distance_mm / typical
+            mm_per_unit = scale.mm_per_unit * depth_factor
+        else:
+            mm_per_unit = _told_scale(sequence, poses, result, config.working_distance_mm)
+            if scale is not None:
+                depth_factor = mm_per_unit / scale.mm_per_unit
+        scale_source = "working_distance"
         report["scale"] = {"mm_per_unit": mm_per_unit, "working_distance_mm": config.working_distance_mm}
-        if scale is not None:
-            depth_factor = mm_per_unit / scale.mm_per_unit
     length = mm_per_unit
     if length is None and scale is not None:
         # Of no known unit, but of one with the depth.
@@ -322,10 +330,11 @@ def _by_depth(
     report = found.report | frames_without_pose(sequence, registered)
     if failed is not None:
         report["colmap"] = failed
-    if not _enough(report, config):
+    if not enough_registered(report, config):
         message = (
             f"{sequence.name}: alignment by colour and depth placed {report['registered_train']} of "
-            f"{report['n_train']} training frames, expected at least {config.min_registered_share:.0%}. "
+            f"{report['n_train']} training frames, expected "
+            f"{expected_frames(config.min_registered_share, report)}. "
             f"Without a pose: {', '.join(report['unregistered_train'])}; of these without depth: "
             f"{', '.join(report['without_depth']) or 'none'}. Give frames nearer together, or less "
             "noisy depth"
@@ -340,30 +349,55 @@ def _by_depth(
             message = f"{because} {message}"
         raise CaptureError(message)
     _warn_of_missing(sequence, report)
+    poses, points = _cleaned(found.world_from_camera, registered), found.points
+    scale_source: ScaleSource = "depth" if sequence.metric else "source"
+    depth_factor = 1.0
+    if config.working_distance_mm is not None and not sequence.metric and sequence.depth_mm is not None:
+        placed = sequence.train[registered[sequence.train]]
+        typical = typical_depth(sequence.depth_mm, sequence.mask, placed)
+        if typical is not None:
+            # The poses are in the unit of the depth.
+            depth_factor, scale_source = config.working_distance_mm / typical, "working_distance"
+            poses[:, :3, 3] *= depth_factor
+            points = points * depth_factor
+            report["scale"] = {
+                "mm_per_unit": depth_factor,
+                "working_distance_mm": config.working_distance_mm,
+            }
     return PoseEstimate(
         method="rgbd",
-        world_from_camera=_cleaned(found.world_from_camera, registered),
+        world_from_camera=poses,
         registered=registered,
-        points=found.points.astype(np.float32),
+        points=points.astype(np.float32),
         points_rgb=found.points_rgb,
         mean_reprojection_px=None,
-        metric=sequence.metric,
+        metric=scale_source != "source",
         report=report,
-        scale_source="depth" if sequence.metric else "source",
+        depth_factor=depth_factor,
+        scale_source=scale_source,
     )
 
 
-def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -> EndoscopicSequence:
+def with_estimated_poses(
+    sequence: EndoscopicSequence, estimate: PoseEstimate, ingest: IngestConfig | None = None
+) -> EndoscopicSequence:
     """The sequence with poses and points, without the frames that did not register.
 
     Frames keep their names; the split is renumbered. `truth` is kept and told that the world is another
     (`world`). Depth is brought to the unit of the poses, that which was withheld for the evaluation as well,
     and left out where nothing tells that unit.
     Where a lens was estimated, `K` is that of its pinhole, and frames of a distorted lens are resampled to it
-    (`extrags.poses.with_calibration`).
+    or keep their pixels (`extrags.poses.with_calibration`).
+
+    Args:
+        sequence: what poses were estimated of.
+        estimate: of its frames.
+        ingest: settings of reading, which say what becomes of frames of a distorted lens; None takes the
+            defaults.
 
     Raises:
         ShapeError: when the estimate is of another sequence.
+        ConfigError: when the frames are to keep a distorted lens, and a pinhole's field of view is asked for.
     """
     if len(estimate.registered) != len(sequence):
         raise ShapeError(
@@ -414,7 +448,7 @@ def with_estimated_poses(sequence: EndoscopicSequence, estimate: PoseEstimate) -
         pose_source="estimated" if estimate.method == "colmap" else "aligned",
         truth={**sequence.truth, "world": "estimated"} if sequence.truth else {},
     )
-    return posed if estimate.calibration is None else with_calibration(posed, estimate.calibration)
+    return posed if estimate.calibration is None else with_calibration(posed, estimate.calibration, ingest)
 
 
 def _run(job: PoseJob, name: str) -> PoseJobResult:
@@ -427,11 +461,6 @@ def _cleaned(found: np.ndarray, registered: np.ndarray) -> np.ndarray:
     for frame in np.flatnonzero(registered):
         poses[frame, :3, :3] = as_rotation(poses[frame, :3, :3], frame=int(frame))
     return poses
-
-
-def _enough(report: dict[str, Any], config: PosesConfig) -> bool:
-    share = report["registered_train"] / report["n_train"]
-    return bool(report["registered_train"] > 0 and share >= config.min_registered_share)
 
 
 def _warn_of_missing(sequence: EndoscopicSequence, report: dict[str, Any]) -> None:

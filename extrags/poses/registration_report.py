@@ -12,13 +12,17 @@ from extrags.poses.job import PoseJobResult
 from extrags.sequence import EndoscopicSequence
 
 __all__ = [
+    "MIN_TRAINING_FRAMES",
     "colmap_report",
     "errors_against_given",
+    "expected_frames",
     "failure_message",
     "frames_without_pose",
     "triangulation_angles_deg",
 ]
 
+MIN_TRAINING_FRAMES = 3
+"""A map of fewer tells the surface from two views alone; COLMAP keeps such a map where it has no other."""
 FEW_FEATURES = 100
 FEW_INLIERS = 30
 FEW_PARTNERS = 4
@@ -96,8 +100,11 @@ def errors_against_given(
 
     Returns:
         `{alignment, train: {...}, test: {...}}` with `frames`, `ate_rmse`, `ate_max`, `rotation_mean_deg`,
-        and for training frames `rpe_translation_rmse` and `rpe_rotation_rmse_deg` from frame to frame; empty
-        without poses to compare with, or with fewer than three training frames.
+        `rotation_without_common_turn_mean_deg`, and for training frames `rpe_translation_rmse` and
+        `rpe_rotation_rmse_deg` from frame to frame; empty without poses to compare with, or with fewer than
+        three training frames. Positions alone align: a straight path leaves the turn about it open, and
+        `rotation_mean_deg` has it in full. The other is what is left after the turn that all training frames
+        have in common.
     """
     given = sequence.world_from_camera
     found = np.isfinite(world_from_camera).all((1, 2))
@@ -106,6 +113,7 @@ def errors_against_given(
         return {}
     align = umeyama(world_from_camera[train, :3, 3], given[train, :3, 3], with_scale=not metric)
     errors: dict[str, Any] = {"alignment": "se3" if metric else "sim3"}
+    common = _common_turn(align.apply_to_poses(world_from_camera[train]), given[train])
     for kind, frames in (("train", train), ("test", sequence.test[found[sequence.test]])):
         if len(frames) == 0:
             continue
@@ -117,6 +125,9 @@ def errors_against_given(
             "ate_rmse": float(np.sqrt(np.mean(distance**2))),
             "ate_max": float(distance.max()),
             "rotation_mean_deg": float(angle.mean()),
+            "rotation_without_common_turn_mean_deg": float(
+                rotation_angle_deg(there[:, :3, :3], common @ given[frames, :3, :3]).mean()
+            ),
         }
     drift = relative_pose_error(world_from_camera[train], given[train], alignment="se3" if metric else "sim3")
     errors["train"] |= {
@@ -124,6 +135,20 @@ def errors_against_given(
         "rpe_rotation_rmse_deg": drift.rotation_rmse_deg,
     }
     return errors
+
+
+def _common_turn(found: np.ndarray, given: np.ndarray) -> np.ndarray:
+    """The rotation of the world that brings given poses nearest to those found, [3, 3]."""
+    left, _, right = np.linalg.svd(np.einsum("fij,fkj->ik", found[:, :3, :3], given[:, :3, :3]))
+    left[:, -1] *= np.linalg.det(left @ right)
+    return np.asarray(left @ right)
+
+
+def expected_frames(min_share: float, report: dict[str, Any]) -> str:
+    """How many training frames had to have a pose, in words; `report` says how many have."""
+    few = report["registered_train"] < MIN_TRAINING_FRAMES
+    enough = report["registered_train"] >= min_share * report["n_train"]
+    return f"at least {min_share:.0%}" + (f" and {MIN_TRAINING_FRAMES} frames" if few and enough else "")
 
 
 def failure_message(name: str, report: dict[str, Any], min_share: float, *, instead: str) -> str:
@@ -139,7 +164,7 @@ def failure_message(name: str, report: dict[str, Any], min_share: float, *, inst
     pairs, verified = report["pairs"], report["pairs_verified"]
     parts = [
         f"{name}: COLMAP found poses for {report['registered_train']} of {report['n_train']} training "
-        f"frames ({share:.0%}), expected at least {min_share:.0%}.",
+        f"frames ({share:.0%}), expected {expected_frames(min_share, report)}.",
         f"Features per frame: {report['features_median']:.0f} (median), "
         f"{report['features_fewest']} at least; pairs matched: {pairs}, verified: {verified}; "
         f"inliers per verified pair: {report['inliers_median']:.0f} (median); angle between the rays of "

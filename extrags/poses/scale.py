@@ -7,10 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-__all__ = ["DepthScale", "depth_scale"]
+from extrags.frame_quantiles import median_of_frames
+
+__all__ = ["DENSE_SHARE", "DepthScale", "depth_scale", "typical_depth"]
 
 MIN_OBSERVATIONS = 20
 """A median over fewer is no measurement of scale."""
+
+DENSE_SHARE = 0.5
+"""Of the valid pixels: depth that is known at fewer need not be typical of the others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,3 +75,30 @@ def depth_scale(
     ratios = true[counts] / found[counts]
     median = float(np.median(ratios))
     return DepthScale(median, float(np.median(np.abs(ratios - median)) / median), int(counts.sum()))
+
+
+def typical_depth(
+    depth: Float[np.ndarray, "f h w"],
+    mask: Bool[np.ndarray, "f h w"],
+    frames: Int[np.ndarray, "n"],
+    *,
+    least_share: float = 0.0,
+) -> float | None:
+    """Median depth of the valid pixels of frames.
+
+    Args:
+        depth: z-depth, 0 where unknown.
+        mask: pixels that count.
+        frames: whose pixels.
+        least_share: of the valid pixels that must have depth.
+
+    Returns:
+        In the unit of the depth; None where too few pixels have any.
+    """
+    known, valid = 0, 0
+    for frame in frames:
+        known += int((mask[frame] & (depth[frame] > 0)).sum())
+        valid += int(mask[frame].sum())
+    if known == 0 or known < least_share * valid:
+        return None
+    return median_of_frames(lambda: (depth[k][mask[k] & (depth[k] > 0)] for k in frames))

@@ -9,13 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from extrags.config import CoarseConfig, PosesConfig
+from data_catalog.visibility import observed_from_depth
+from extrags.config import CoarseConfig, IngestConfig, PosesConfig
+from extrags.errors import ConfigError
 from extrags.sequence import EndoscopicSequence
 from extrags.store import Ref, Slot, Store
 from extrags.zarr_io import group_exists
 from tasks.coarse import coarse, refined_frames
 from tasks.ingest import training_frames
-from tasks.poses import poses
+from tasks.poses import _observed_by_those_left, lens_settings, poses
 from tasks.stage import stage
 from tests.extrags.poses.textured_room import room_sequence
 
@@ -24,6 +26,15 @@ from tests.extrags.poses.textured_room import room_sequence
 def room(slot: Slot) -> None:
     """A sequence with exact poses; its depth is known, so no COLMAP is needed."""
     room_sequence(7, width=120, height=90, holdout_every=4).save(slot.path / "sequence")
+
+
+@stage("poses-test-guessed-source", version=1)
+def guessed_room(slot: Slot) -> None:
+    """Nothing states its lens."""
+    replace(room_sequence(4, width=40, height=30), intrinsics="guessed").save(slot.path / "sequence")
+
+
+DROPPED = [4, 5, 6]
 
 
 @pytest.fixture(scope="module")
@@ -61,6 +72,78 @@ def test_the_method_stands_in_counts_and_account(store: str, posed: Ref) -> None
     assert sequence.pose_source == "aligned"
     assert sequence.world_from_camera is not None
     np.testing.assert_array_equal(sequence.world_from_camera[0], np.eye(4))
+
+
+@stage("poses-test-dropping-source", version=1)
+def dropping_room(slot: Slot, with_poses: bool = True) -> None:
+    """Half of the training frames have neither texture nor depth; nearly all is said to be observed."""
+    room = room_sequence(7, width=120, height=90, holdout_every=4)
+    rgb, depth = room.rgb.copy(), room.depth_mm
+    assert depth is not None
+    depth = depth.copy()
+    rgb[DROPPED], depth[DROPPED] = 128, 0
+    # The others do not see one side.
+    depth[:3, :, :50] = 0
+    observed = np.zeros_like(room.mask)
+    observed[room.test] = True
+    observed[room.test, :10] = False
+    poses = room.world_from_camera if with_poses else None
+    replace(room, rgb=rgb, depth_mm=depth, observed=observed, world_from_camera=poses).save(
+        slot.path / "sequence"
+    )
+
+
+class TestDroppedTrainingFrames:
+    def test_what_they_alone_observed_is_not_observed_any_more(self, store: str) -> None:
+        source = dropping_room.fn(store=store)
+        ref = poses.fn(store=store, sequence=source, config=PosesConfig(fallback="rgbd"))
+        before, after = read(store, source), read(store, ref)
+        assert len(after.train) == len(before.train) - len(DROPPED)
+        assert before.depth_mm is not None
+        assert before.observed is not None
+        left = np.setdiff1d(before.train, DROPPED)
+        expected = observed_from_depth(before.cameras, before.depth_mm, left, before.test)
+        expected &= before.observed
+        assert after.observed is not None
+        np.testing.assert_array_equal(after.observed[after.test], expected[before.test])
+        shares = [
+            stack[frames].mean()
+            for stack, frames in zip(
+                (before.observed, after.observed), (before.test, after.test), strict=True
+            )
+        ]
+        assert 0.5 * shares[0] < shares[1] < 0.99 * shares[0]
+
+    def test_without_poses_nothing_is_said(self, store: str, caplog: pytest.LogCaptureFixture) -> None:
+        source = dropping_room.fn(store=store, with_poses=False)
+        ref = poses.fn(store=store, sequence=source, config=PosesConfig(fallback="rgbd"))
+        assert read(store, ref).observed is None
+        assert "3 training frames are dropped" in caplog.text
+
+    def test_with_all_of_them_it_stays(self) -> None:
+        room = replace(room_sequence(4, width=40, height=30), intrinsics="guessed")
+        told = replace(room, observed=room.mask)
+        assert _observed_by_those_left(told, np.ones(4, dtype=bool)) is told.observed
+
+
+class TestLensSettings:
+    def test_sizes_count_where_the_pinhole_is_widened(self) -> None:
+        narrow = IngestConfig(width=80, holdout_every=5, size="central")
+        assert lens_settings(narrow) == IngestConfig()
+        wide = narrow.model_copy(update={"field_of_view_deg": 110.0})
+        expected = IngestConfig(field_of_view_deg=110.0, width=80, size="central")
+        assert lens_settings(wide) == expected
+        assert lens_settings(narrow.model_copy(update={"lens": "native"})).lens == "native"
+
+    def test_what_contradicts_is_refused_before_the_estimate(
+        self, store: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        asked: list[EndoscopicSequence] = []
+        monkeypatch.setattr("extrags.poses.estimate_poses", lambda sequence, _: asked.append(sequence))
+        both = IngestConfig(lens="native", field_of_view_deg=100)
+        with pytest.raises(ConfigError, match=r"leave ingest\.field_of_view_deg out"):
+            poses.fn(store=store, sequence=guessed_room.fn(store=store), config=PosesConfig(), ingest=both)
+        assert asked == []
 
 
 def test_refined_poses_are_kept_and_held_out_frames_go_along(store: str, posed: Ref, training: Ref) -> None:

@@ -15,7 +15,6 @@ from extrags.depth import estimate as depth_estimate
 from extrags.depth.completion import CompletionNetwork
 from extrags.depth.estimate import DepthEstimate, estimate_depth, posed_frames
 from extrags.depth.frames import PosedFrames
-from extrags.depth.shading import ShadingFit
 from extrags.depth.stereo import StereoDepth, StereoSettings, multi_view_stereo
 from extrags.errors import CaptureError, ConfigError
 from extrags.events import Progress, subscribed
@@ -288,14 +287,3 @@ def test_stereo_that_others_look_through_is_not_mixed_in(
     torch.testing.assert_close(mixed[..., :20], expected[..., :20])
     assert (mixed - expected)[..., 20:].min() > 0.05
     assert left[..., :20].min() > 1.5 * left[..., 20:].max()
-
-
-def test_only_what_nothing_matches_has_an_error_of_its_scale(
-    plane_stereo: tuple[PosedFrames, StereoDepth],
-) -> None:
-    _, stereo = plane_stereo
-    fit = ShadingFit(0.5, torch.tensor([0.0, 9.0, 0.1, 0.2, 0.3]), 0.1, 0.2, 1000)
-    found = depth_estimate._scale_error(replace(stereo, n_sources=torch.tensor([2, 0, 2, 1, 2]), fits=[fit]))
-    # As far as the intercepts of the others differ.
-    spread = float(np.std([0.0, 0.1, 0.2, 0.3], ddof=1))
-    torch.testing.assert_close(found, torch.tensor([0.0, spread, 0.0, 0.0, 0.0]))

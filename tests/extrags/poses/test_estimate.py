@@ -317,6 +317,9 @@ def test_a_second_attempt_is_lenient_and_counts_where_it_registers_more(
     found = estimate_poses(hidden, CONFIG)
     assert [job.lenient for job in jobs] == [False, True]
     assert found.report["lenient"]
+    assert found.summary.startswith(
+        "by COLMAP: 7 of 7 training frames in a second, lenient attempt (0 in the first), 1 of 2 held-out"
+    )
     assert "trying again with guided matching" in caplog.text
     np.testing.assert_array_equal(found.registered, run.estimate.registered)
     with pytest.raises(CaptureError, match="for 0 of 7 training frames"):

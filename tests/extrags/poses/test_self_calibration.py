@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from extrags.cameras import Cameras, look_at
-from extrags.config import PosesConfig
-from extrags.errors import ShapeError
+from extrags.config import IngestConfig, PosesConfig
+from extrags.errors import ConfigError, ShapeError
 from extrags.lens import Lens
 from extrags.poses import LensCalibration, estimate_poses, with_calibration, with_estimated_poses
 from extrags.poses.estimate import PoseEstimate
@@ -21,6 +21,7 @@ from tests.extrags.poses.textured_room import render_room, room_sequence, turnin
 WIDTH, HEIGHT = 200, 150
 TRUE_FOCAL_PX = 0.7 * WIDTH
 CONFIG = PosesConfig(n_features=600, fallback="never")
+WIDE = Lens("RADIAL_FISHEYE", (115.0, WIDTH / 2, HEIGHT / 2, -0.2, 0.05), WIDTH, HEIGHT)
 BENT = Lens("SIMPLE_RADIAL", (TRUE_FOCAL_PX, WIDTH / 2, HEIGHT / 2, -0.25), WIDTH, HEIGHT)
 
 
@@ -221,3 +222,80 @@ class TestWithCalibration:
             "focal length 100.0 px (field of view 90 degrees), guessed: no map could be made"
         )
         assert LensCalibration.from_json(kept.to_json()) == kept
+
+    def test_words_of_a_wide_lens(self) -> None:
+        found = LensCalibration(WIDE, determined=True, std={"f": 1.0})
+        assert "(field of view 118 degrees, 82 as a pinhole, fisheye, k1 -0.200, k2 0.050)" in found.summary
+
+
+class TestWideLens:
+    """What becomes of frames of a lens that is estimated to be wide."""
+
+    CALIBRATION = LensCalibration(WIDE, determined=True, std={"f": 1.0})
+
+    def test_what_the_pinhole_leaves_out_is_told(
+        self, room: EndoscopicSequence, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        with_calibration(guessed(room), self.CALIBRATION)
+        assert "the pinhole of 82 degrees leaves out 44 %" in caplog.text
+        assert "which sees 118 degrees from side to side" in caplog.text
+        assert "ingest.field_of_view_deg" in caplog.text
+        assert "ingest.lens=native" in caplog.text
+        caplog.clear()
+        # Dark corners are no picture, and little bent is little lost.
+        centre = np.hypot(*np.meshgrid(np.arange(WIDTH) - WIDTH / 2, np.arange(HEIGHT) - HEIGHT / 2)) < 60
+        with_calibration(replace(guessed(room), mask=room.mask & centre), self.CALIBRATION)
+        little = replace(BENT, parameters=(*BENT.parameters[:3], -0.1))
+        with_calibration(guessed(room), LensCalibration(little, determined=True))
+        assert caplog.text == ""
+
+    def test_a_larger_field_of_view_shows_more(
+        self, room: EndoscopicSequence, caplog: pytest.LogCaptureFixture
+    ) -> None:
+        wide = IngestConfig(field_of_view_deg=115)
+        posed = with_calibration(guessed(room), self.CALIBRATION, wide)
+        assert posed.K[0, 0, 0] == pytest.approx(WIDTH / 2 / np.tan(np.radians(57.5)))
+        assert posed.rgb.shape == room.rgb.shape
+        assert caplog.text == ""
+        grown = with_calibration(guessed(room), self.CALIBRATION, wide.model_copy(update={"size": "central"}))
+        assert grown.width > 1.7 * WIDTH
+        assert grown.K[0, 0, 0] == pytest.approx(115.0, rel=0.01)
+
+    def test_frames_keep_their_pixels(self, room: EndoscopicSequence) -> None:
+        given = guessed(room)
+        posed = with_calibration(given, self.CALIBRATION, IngestConfig(lens="native"))
+        assert posed.rgb is given.rgb
+        assert posed.intrinsics == "estimated"
+        assert posed.lens is not None
+        assert posed.mask.mean() > 0.99
+        # Rays fall where the estimated lens puts them.
+        poses = np.tile(np.eye(4), (1, 1, 1))
+        cameras = Cameras(posed.K[:1], poses, WIDTH, HEIGHT, posed.lens)
+        slopes = np.array([[0.0, 0, 1], [0.5, -0.3, 1], [1.2, 0.4, 1], [-1.3, 0.5, 1]])
+        (pixels,), _ = cameras.project(slopes)
+        np.testing.assert_allclose(
+            pixels, np.stack(WIDE.project(slopes[:, 0], slopes[:, 1]), axis=1), atol=0.1
+        )
+
+    def test_pixels_beyond_the_lens_are_masked(self, room: EndoscopicSequence) -> None:
+        """A polynomial that folds back inside the picture says nothing of its corners."""
+        folding = replace(WIDE, model="SIMPLE_RADIAL", parameters=(70.0, WIDTH / 2, HEIGHT / 2, -0.15))
+        found = LensCalibration(folding, determined=True)
+        posed = with_calibration(guessed(room), found, IngestConfig(lens="native"))
+        assert posed.lens is not None
+        assert not posed.mask[:, 0, 0].any()
+        assert posed.mask[:, HEIGHT // 2, WIDTH // 2].all()
+
+    def test_a_lens_that_no_radial_model_is_near_is_undone(
+        self, room: EndoscopicSequence, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("extrags.poses.calibration.LARGEST_FIT_ERROR_PX", -1.0)
+        found = LensCalibration(WIDE, determined=True)
+        posed = with_calibration(guessed(room), found, IngestConfig(lens="native"))
+        assert posed.lens is None
+        assert "no radial model is near the lens that was estimated" in caplog.text
+
+    def test_a_pinhole_of_a_lens_that_is_kept_is_refused(self, room: EndoscopicSequence) -> None:
+        both = IngestConfig(lens="native", field_of_view_deg=100)
+        with pytest.raises(ConfigError, match=r"leave ingest\.field_of_view_deg out"):
+            with_calibration(guessed(room), self.CALIBRATION, both)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from extrags.config import PosesConfig
-from extrags.errors import CaptureError
-from extrags.poses import estimate
+from extrags.errors import CaptureError, ConfigError
+from extrags.poses import RgbdAlignment, estimate
 from extrags.poses.estimate import _from_colmap, with_estimated_poses
 from extrags.poses.job import PoseJob, PoseJobResult
 from extrags.radial_lens import RadialLens
@@ -84,6 +84,72 @@ def test_depth_and_points_are_in_one_unit(
     np.testing.assert_allclose(after.points[:, 2], far, rtol=1e-5)
     baseline = np.ptp(after.cameras.centers[:, 0])
     assert baseline == pytest.approx(2 * far / FAR, rel=1e-5)
+
+
+def depth_beside_the_points(depth: float, *, share: float) -> np.ndarray:
+    """`FAR` where a point is observed, and another depth at a share of the other pixels."""
+    result = found()
+    image = np.zeros((FRAMES, HEIGHT, WIDTH), np.float32)
+    image.reshape(FRAMES, -1)[:, : round(share * HEIGHT * WIDTH)] = depth
+    column, row = result.observed_px.astype(int).T
+    image[result.observed_frame, row, column] = FAR
+    return image
+
+
+@pytest.mark.parametrize(
+    ("share", "unit"), [pytest.param(0.9, 50 / 4, id="dense"), pytest.param(0.1, 50 / FAR, id="sparse")]
+)
+def test_the_working_distance_is_the_median_of_dense_depth(share: float, unit: float) -> None:
+    """Of sparse depth the median need not be that of the others: that of the points counts, interpolated."""
+    given = replace(sequence(metric=False), depth_mm=depth_beside_the_points(4.0, share=share))
+    after = posed(given, 50.0)
+    assert after.metric
+    assert after.scale_words == "millimetres from the working distance given"
+    assert after.depth_mm is not None
+    assert given.depth_mm is not None
+    np.testing.assert_allclose(after.depth_mm, given.depth_mm * unit, rtol=0.02)
+    assert np.ptp(after.cameras.centers[:, 0]) == pytest.approx(2 * unit, rel=0.02)
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_the_working_distance_scales_an_alignment_by_depth(
+    metric: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placed = found()
+    aligned = RgbdAlignment(placed.world_from_camera, placed.points, placed.points_rgb, {"without_depth": []})
+    monkeypatch.setattr(estimate, "align_by_depth", lambda *_: aligned)
+    given = sequence(metric=metric)
+    made = estimate.estimate_poses(given, PosesConfig(fallback="rgbd", working_distance_mm=50.0))
+    after = with_estimated_poses(given, made)
+    unit = 1.0 if metric else 50 / FAR
+    assert after.metric
+    assert after.scale_source == ("depth" if metric else "working_distance")
+    assert after.depth_mm is not None
+    assert after.points is not None
+    np.testing.assert_allclose(after.depth_mm, unit * FAR)
+    np.testing.assert_allclose(after.points, unit * placed.points, rtol=1e-5)
+    np.testing.assert_allclose(after.cameras.centers, unit * placed.world_from_camera[:, :3, 3])
+    assert ("working distance" in made.summary) != metric
+
+
+def test_a_scale_of_the_poses_that_are_replaced_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of other poses it says nothing, and they would be of no unit without a word."""
+
+    def ran(*_given: object, **_named: object) -> PoseJobResult:
+        raise CaptureError("COLMAP ran")
+
+    monkeypatch.setattr(estimate, "run_job", ran)
+    scaled = replace(sequence(metric=True), scale_source="setting")
+    blind = replace(scaled, depth_mm=None)
+    with pytest.raises(ConfigError, match=r"ingest\.scale_mm_per_unit.*poses\.working_distance_mm instead"):
+        estimate.estimate_poses(blind, PosesConfig())
+    for given, config in (
+        (scaled, PosesConfig()),
+        (blind, PosesConfig(working_distance_mm=30.0)),
+        (replace(blind, scale_source="source"), PosesConfig()),
+    ):
+        with pytest.raises(CaptureError, match="COLMAP ran"):
+            estimate.estimate_poses(given, config)
 
 
 @pytest.mark.parametrize("working_distance_mm", [None, 50.0])
