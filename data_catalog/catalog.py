@@ -7,6 +7,7 @@ datasets are asked in order; what each of them knows stands in its own module.
 from __future__ import annotations
 
 from difflib import get_close_matches
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from data_catalog.checks import check_sequence
 from data_catalog.dataset import Dataset, Descriptor, Source, file_digests
 from data_catalog.detail import DetailSize, source_detail
 from data_catalog.folder_reader import Glance
-from data_catalog.folders import FolderDataset
+from data_catalog.folders import FolderDataset, find_reader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.specular import with_specular
@@ -44,6 +45,10 @@ DATASETS: tuple[Dataset, ...] = (
     C3vdDataset(),
 )
 """Folders first: a path that exists wins over a name spelled the same."""
+
+
+_UNCUT = {name: IngestConfig.model_fields[name].default for name in ("start_s", "end_s")}
+"""What the settings of a part of a recording are where all of it is read."""
 
 
 def list_sequences() -> tuple[Descriptor, ...]:
@@ -77,8 +82,11 @@ def resolve(name_or_path: str | Path) -> Source:
         UnknownSequenceError: neither a known name nor an existing path; suggests the nearest name.
         SourceNotFoundError: a known name whose files are not on this machine.
         SourceError: a folder that holds no sequence, or a file where a folder is needed.
+        ConfigError: neither a text nor a path, such as a sequence that was read before.
     """
-    text = str(name_or_path)
+    if not isinstance(name_or_path, str | PathLike):
+        raise _no_name(name_or_path)
+    text = fspath(name_or_path)
     for dataset in DATASETS:
         found = dataset.resolve(text)
         if found is not None:
@@ -101,9 +109,10 @@ def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glan
         SourceError: what can be seen to be wrong without reading pictures; `read` would raise it as well.
         ConfigError: settings that this source cannot be read with.
     """
-    source = resolve(name_or_path)
+    source, config = resolve(name_or_path), config or IngestConfig()
     dataset = _dataset(source)
-    return dataset.glance(source, config or IngestConfig()) if isinstance(dataset, FolderDataset) else None
+    _check_time_span(source, config)
+    return dataset.glance(source, config) if isinstance(dataset, FolderDataset) else None
 
 
 def read(source: Source | str | Path, config: IngestConfig | None = None) -> EndoscopicSequence:
@@ -117,7 +126,7 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
         SourceError: a file is wrong; names file, frame and field. `SourceNotFoundError` and `PoseError`
             are kinds of it.
         UnknownSequenceError: from `resolve`.
-        ConfigError: settings that this source cannot be read with.
+        ConfigError: settings that this source cannot be read with, or `source` is no name and no path.
     """
     source = source if isinstance(source, Source) else resolve(source)
     dataset, config = _dataset(source), config or IngestConfig()
@@ -126,6 +135,7 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
             f"ingest.calibration is given, but {source.name} states its intrinsics itself; give one of the "
             "two"
         )
+    _check_time_span(source, config)
     detail = source_detail(dataset, source, config)
     sequence = dataset.read(source, config if detail is None else detail.applied_to(config))
     check_sequence(sequence, file=source.path or source.name)
@@ -181,6 +191,28 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
         raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
     told = {"calibration": file_digests([("calibration", file)]), "calibration_version": CALIBRATION_VERSION}
     return found | told
+
+
+def _check_time_span(source: Source, config: IngestConfig) -> None:
+    """Refuse a part of a recording of a source whose frames have no times: it would be passed over."""
+    given = [name for name in ("start_s", "end_s") if getattr(config, name) != _UNCUT[name]]
+    reader = find_reader(source.format)
+    if given and not (reader is not None and reader.is_footage):
+        settings = " and ".join(f"ingest.{name} = {getattr(config, name):g}" for name in given)
+        raise ConfigError(
+            f"{source.name}: {settings} cut a video or a DICOM file by its times, and this source's frames "
+            "have none; ingest.max_frames thins them evenly, and a part of them is taken by removing the "
+            "others"
+        )
+
+
+def _no_name(given: object) -> ConfigError:
+    if isinstance(given, EndoscopicSequence):
+        return ConfigError(
+            f"{given.name} is a sequence that has been read already, and needs no reading; expected the name "
+            "of a sequence or a path"
+        )
+    return ConfigError(f"expected the name of a sequence or a path, found {type(given).__name__}")
 
 
 def _scaled(sequence: EndoscopicSequence, mm_per_unit: float) -> EndoscopicSequence:

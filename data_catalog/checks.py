@@ -9,6 +9,7 @@ depth itself contradicts. What is readable but questionable is reported by `data
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float
@@ -36,6 +37,8 @@ _CONVINCING_ERROR = 0.10
 _CLEARLY_BETTER = 0.35
 # A pair of views whose points mostly leave the image tells nothing.
 _MIN_INSIDE_SHARE = 0.15
+# Nor does depth of few pixels: what a narrow or inverted mask keeps is soon outside the next frame.
+_MIN_COMPARED_SHARE = 0.2
 _CHECKED_PAIRS = 6
 _CHECKED_POINTS = 400
 # Factors by which depth may be off: a tenth of a thousandth to ten thousand, in steps of 5 %.
@@ -167,6 +170,7 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
 
     Raises:
         PoseError: another reading of the axes fits the depth much better.
+        SourceError: the mask keeps what is no tissue; outside of it the poses fit as they are.
     """
     if sequence.world_from_camera is None or sequence.depth_mm is None:
         return
@@ -188,6 +192,7 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
             if error < best_error:
                 best_error, best_name = error, reading_name(axes, inverted)
     if best_error < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
+        _check_polarity(sequence, pairs, as_given, file)
         raise PoseError(
             f"the poses contradict the depth: carried from frame to frame it is off by {as_given:.0%} "
             f"(median), but only by {best_error:.1%} when the poses are read as {best_name}. "
@@ -205,7 +210,8 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     nothing, and where cameras move little any large factor fits as well as no motion: that is no unit.
 
     Raises:
-        SourceError: another factor, at least 1.5 times more or less, fits much better.
+        SourceError: another factor, at least 1.5 times more or less, fits much better; or the mask keeps
+            what is no tissue, and outside of it depth and poses fit as they are.
         PoseError: no motion at all fits much better, and no factor much better than that.
     """
     if sequence.world_from_camera is None or sequence.depth_mm is None:
@@ -229,6 +235,7 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     clearly_other = max(factor, 1 / factor) >= _CLEARLY_OTHER_FACTOR
     if not clearly_other or best >= min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
         return
+    _check_polarity(sequence, pairs, as_given, file)
     still = error_with(np.inf)
     if best >= _CLEARLY_BETTER * still and still < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
         raise PoseError(
@@ -248,6 +255,29 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
         file=file,
         field="depth_mm",
     )
+
+
+def _check_polarity(
+    sequence: EndoscopicSequence, pairs: list[tuple[int, int]], as_given: float, file: object
+) -> None:
+    """Before poses or units are blamed: refuse a mask outside of which all of them fit the depth.
+
+    Raises:
+        SourceError: the depth that the mask leaves out agrees with the poses.
+    """
+    depth = sequence.depth_mm
+    turned = replace(sequence, mask=~sequence.mask)
+    if depth is None or not set(pairs) <= set(_comparable_pairs(turned)):
+        return
+    outside = _reprojection_error(turned, np.asarray(sequence.world_from_camera, dtype=np.float64), pairs)
+    if outside < _SUSPICIOUS_ERROR:
+        raise SourceError(
+            f"depth carried from frame to frame is off by {as_given:.0%} (median) where the mask keeps it, "
+            f"and by {outside:.1%} where the mask leaves it out: the mask is inverted. Expected white on "
+            "tissue",
+            file=file,
+            field="mask",
+        )
 
 
 def _check_split(sequence: EndoscopicSequence, file: object) -> None:
@@ -277,11 +307,15 @@ def neighbouring_frames(sequence: EndoscopicSequence, at_most: int = _CHECKED_PA
 
 
 def _comparable_pairs(sequence: EndoscopicSequence) -> list[tuple[int, int]]:
-    """Of `neighbouring_frames` those with depth in both: others tell nothing of axes and units."""
-    depth = sequence.depth_mm
+    """Of `neighbouring_frames` those with depth in enough of both masks: others tell nothing."""
+    depth, mask = sequence.depth_mm, sequence.mask
     if depth is None:
         return []
-    return [pair for pair in neighbouring_frames(sequence) if all((depth[index] > 0).any() for index in pair)]
+    return [
+        pair
+        for pair in neighbouring_frames(sequence)
+        if all(((depth[index] > 0) & mask[index]).mean() >= _MIN_COMPARED_SHARE for index in pair)
+    ]
 
 
 def _reprojection_error(

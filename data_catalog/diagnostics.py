@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from data_catalog.checks import axis_readings, reading_name
 from data_catalog.findings import Finding, warning
 from data_catalog.images import natural_key
+from data_catalog.mask_findings import mask_findings
 from data_catalog.matches import match_neighbours, pose_support
 from data_catalog.sampling import OFF_CENTRE_SHARE
 from extrags.cameras import Cameras, invert_poses, rotation_angle_deg
@@ -164,42 +165,6 @@ def _exposure(sequence: EndoscopicSequence) -> Iterator[Finding]:
         )
 
 
-def _masks(sequence: EndoscopicSequence) -> Iterator[Finding]:
-    """Masks that keep the dark frame and leave the picture out."""
-    kept = np.array([float(mask.mean()) for mask in sequence.mask])
-    if 1 - kept.mean() < 0.02:
-        return
-    lit_inside, lit_outside = _shares(sequence, (image.max(axis=-1) > 25 for image in sequence.rgb))
-    if lit_inside < 0.3 and lit_outside > 0.6:
-        yield Finding(
-            kind="error",
-            topic="mask polarity",
-            sentence=f"{1 - lit_inside:.0%} of the pixels that the mask keeps are dark and {lit_outside:.0%} "
-            "of those it leaves out are lit: the mask is inverted. Expected white on tissue",
-            field="mask",
-        )
-        return
-    if sequence.depth_mm is not None:
-        known_inside, known_outside = _shares(sequence, (depth > 0 for depth in sequence.depth_mm))
-        if known_inside < 0.2 and known_outside > 0.8:
-            yield Finding(
-                kind="error",
-                topic="mask polarity",
-                sentence=f"depth is known for {known_inside:.0%} of the pixels that the mask keeps and for "
-                f"{known_outside:.0%} of those it leaves out: the mask is inverted. Expected white on tissue",
-                field="mask",
-            )
-            return
-    if kept.min() < 0.05:
-        index = int(kept.argmin())
-        yield warning(
-            "mask",
-            f"the mask keeps {kept[index]:.1%} of the image",
-            frame=sequence.frame_name(index),
-            field="mask",
-        )
-
-
 def _intrinsics(sequence: EndoscopicSequence) -> Iterator[Finding]:
     """Intrinsics that are possible but unlikely for images of this size."""
     width, height = sequence.width, sequence.height
@@ -241,6 +206,14 @@ def _count(sequence: EndoscopicSequence) -> Iterator[Finding]:
     from extrags.poses.estimate import MIN_TRAINING_FRAMES
 
     train, test = len(sequence.train), len(sequence.test)
+    if sequence.world_from_camera is not None and train == 1:
+        yield warning(
+            "number of frames",
+            f"1 of {train + test} frames is to train on, and the others are held out (ingest.holdout_every, "
+            "or the source's own split). One view tells nothing of what is beside it, and without a second "
+            "nothing can be triangulated: give more frames",
+            field="split",
+        )
     if sequence.world_from_camera is None and train < MIN_TRAINING_FRAMES:
         yield Finding(
             kind="error",
@@ -264,6 +237,9 @@ def _poses(sequence: EndoscopicSequence) -> Iterator[Finding]:
         ).max()
     )
     distance = _scene_distance(sequence)
+    if len(train) == 1:
+        # One camera reaches over nothing, which says nothing of the poses; `_count` tells.
+        return
     if reach == 0 and turn < 1e-6:
         yield warning(
             "parallax",
@@ -431,7 +407,7 @@ _CHECKS: tuple[Callable[[EndoscopicSequence], Iterator[Finding]], ...] = (
     _order,
     _images,
     _exposure,
-    _masks,
+    mask_findings,
     _intrinsics,
     _count,
     _poses,
@@ -465,21 +441,6 @@ def _brightness(sequence: EndoscopicSequence) -> Float[np.ndarray, "f"]:
     return np.array(
         [image[mask].sum(dtype=np.float64) / (3 * max(1, int(mask.sum()))) for image, mask in frames]
     )
-
-
-def _shares(sequence: EndoscopicSequence, frames: Iterable[Bool[np.ndarray, "h w"]]) -> tuple[float, float]:
-    """Share of the pixels that the mask keeps, and of those it leaves out, for which something holds.
-
-    Args:
-        sequence: whose mask it is.
-        frames: where it holds, one frame after another.
-    """
-    within, beyond = 0, 0
-    for holds, mask in zip(frames, sequence.mask, strict=True):
-        within += int((holds & mask).sum())
-        beyond += int((holds & ~mask).sum())
-    inside = sum(int(mask.sum()) for mask in sequence.mask)
-    return within / max(1, inside), beyond / max(1, sequence.mask.size - inside)
 
 
 def _scene_distance(sequence: EndoscopicSequence) -> float | None:

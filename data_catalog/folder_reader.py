@@ -99,7 +99,7 @@ class FolderReader:
     Args:
         name: identifier, part of cache keys.
         version: raised by hand when the same files are read into other arrays; part of cache keys.
-        summary: one line for messages.
+        summary: one line that describes the layout, for messages.
         recognises: whether a path holds this layout, from file names (of a file without suffix, from its
             first bytes).
         files: every file that `frames` and its result may look at, as a sorted list.
@@ -114,6 +114,8 @@ class FolderReader:
             tells, as plain JSON; part of cache keys. None, or nothing in it, where there is nothing.
         outline: as `frames`, from headers alone, for sources of which `frames` decodes pictures; nothing is
             read of what it gives. None where `frames` is as quick.
+        is_footage: whether frames have times, of which `ingest.start_s` and `ingest.end_s` choose a part; the
+            reader also chooses among them.
     """
 
     name: str
@@ -128,6 +130,7 @@ class FolderReader:
     known_name: Callable[[Path], str | None] | None = None
     chosen: Callable[[Path], dict[str, Any]] | None = None
     outline: Callable[[Path, IngestConfig], SourceFrames] | None = None
+    is_footage: bool = False
 
     def read(self, place: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
         """The sequence in a folder, under a name.

@@ -156,9 +156,18 @@ def _recognised(path: Path) -> FolderReader:
                 f"{len(found)} {kind} in this folder: {_listed(found)}; give the path of the one to read",
                 file=path,
             )
-    kinds = "; ".join(f"{reader.name}: {reader.summary}" for reader in readers())
-    empty = "the folder is empty" if not any(path.iterdir()) else "no sequence recognised in this folder"
-    raise SourceNotFoundError(f"{empty}; expected one of: {kinds}", file=path)
+    if not any(path.iterdir()):
+        raise SourceNotFoundError(
+            "the folder is empty; expected images, a video, or frames with their poses", file=path
+        )
+    # Those of the catalogue are described where the message says; others nowhere else.
+    more = "".join(f", {reader.name} ({reader.summary})" for reader in _registered)
+    raise SourceNotFoundError(
+        "no sequence recognised in this folder; expected images, a video, a DICOM file, a COLMAP model, "
+        f"transforms.json, poses.json, C3VD, SimCol3D, EndoNeRF or the sinus set{more} (the layout of each: "
+        "docs/sources.md)",
+        file=path,
+    )
 
 
 def _listed(files: list[Path]) -> str:

@@ -15,8 +15,8 @@ from data_catalog.catalog import read, resolve
 from data_catalog.dataset import Source
 from data_catalog.diagnostics import diagnose
 from data_catalog.findings import Finding, warning
+from data_catalog.folder_reader import FolderReader
 from data_catalog.folders import find_reader
-from data_catalog.readers import dicom, video
 from data_catalog.specular import specular_masks
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, ExtragsError, SourceError, UnknownSequenceError
@@ -25,7 +25,6 @@ from extrags.sequence import EndoscopicSequence, saturated_mask
 
 __all__ = ["Finding", "Inspection", "contact_sheet", "facts", "inspect"]
 
-_FOOTAGE = (video.READER.name, dicom.READER.name)
 _TILE_WIDTH = 240
 _MAX_TILES = 30
 
@@ -64,6 +63,7 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
         ConfigError: settings that this source cannot be read with.
     """
     source: Source | None = None
+    reader: FolderReader | None = None
     sequence: EndoscopicSequence | None = None
     conventions = ""
     notes: tuple[str, ...] = ()
@@ -81,8 +81,12 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
             findings = [_as_finding(error)]
     if sequence is not None and source is not None:
         # Of footage the reader itself chooses frames.
-        thinned = source.format in _FOOTAGE or (config is not None and config.max_frames is not None)
-        findings = diagnose(sequence, source.path or source.name, thinned=thinned)
+        chosen = reader is not None and reader.is_footage
+        thinned = chosen or (config is not None and config.max_frames is not None)
+        # What reading has warned of is said once.
+        said = {item.topic for item in heard.findings}
+        found = diagnose(sequence, source.path or source.name, thinned=thinned)
+        findings = [item for item in found if item.topic not in said]
         findings += [item.model_copy(update={"file": source.path or source.name}) for item in heard.findings]
     return Inspection(
         name=source.name if source is not None else str(name_or_path),
@@ -220,7 +224,8 @@ class _HeardWarnings(logging.Handler):
         if topic is None:
             self.messages.append(record.getMessage())
         else:
-            self.findings.append(warning(topic, record.getMessage(), field="K"))
+            field = getattr(record, "field", "K")
+            self.findings.append(warning(topic, record.getMessage(), field=field))
 
     def __enter__(self) -> _HeardWarnings:
         logging.getLogger("data_catalog").addHandler(self)

@@ -6,6 +6,7 @@ only where its name says that it is about the lens.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from extrags.errors import SourceError
 
-__all__ = ["LensKind", "lens_kind", "tells_distortion"]
+__all__ = ["LensKind", "check_pinhole", "is_about_lens", "lens_kind", "tells_distortion"]
 
 LensKind = Literal["pinhole", "polynomial", "fisheye"]
 """`pinhole`: undistorted, or nothing is said of distortion; `polynomial`: OpenCV's radial and tangential
@@ -45,6 +46,7 @@ _WORDS_OF_LENSES = re.compile(
 _EXAMPLES = "pinhole, plumb_bob, rational_polynomial, opencv, fisheye or equidistant"
 _YES, _NO = ("1", "true", "yes", "on"), ("0", "false", "no", "off")
 _EMPTY = ("", "none", "null")
+_LONGEST_SHOWN = 60
 
 
 def _is_named_distortion(name: str) -> bool:
@@ -55,6 +57,11 @@ def _is_named_distortion(name: str) -> bool:
     if name in _MODEL_NAMES:
         return False
     return name == "D" or _TERM.fullmatch(name) is not None or _DISTORTION.search(name) is not None
+
+
+def is_about_lens(name: str) -> bool:
+    """Whether an entry is one that `check_pinhole` looks at, by its name."""
+    return _is_named_distortion(name) or name in (*_MODEL_NAMES, *_SWITCHES)
 
 
 def tells_distortion(name: str, value: Any) -> bool:
@@ -88,6 +95,36 @@ def lens_kind(name: str, value: Any, file: Path) -> LensKind | None:
         problem = f"found {value!r}; expected a lens model that is known here, such as {_EXAMPLES}"
         raise SourceError(problem, file=file, field=name)
     return found
+
+
+def check_pinhole(entries: Mapping[str, Any], instead: str, *, file: Path, frame: object = None) -> None:
+    """Refuse entries that describe a lens with distortion, where they would otherwise be passed over.
+
+    Args:
+        entries: by name.
+        instead: how such a lens is given, as a sentence.
+        file: that holds them.
+        frame: whose they are; None for all frames.
+
+    Raises:
+        SourceError: names the entry.
+    """
+    for name, value in entries.items():
+        if tells_distortion(name, value) or _names_other_lens(name, value, file):
+            shown = json.dumps(value)
+            shown = shown if len(shown) <= _LONGEST_SHOWN else f"{shown[:_LONGEST_SHOWN]} ..."
+            problem = f"{shown}; expected a pinhole here. {instead}"
+            raise SourceError(problem, file=file, frame=frame, field=name)
+
+
+def _names_other_lens(name: str, value: Any, file: Path) -> bool:
+    """Whether an entry names a lens that is no pinhole, or one that is not known."""
+    try:
+        kind = lens_kind(name, value, file)
+    except SourceError:
+        return True
+    # A model of distortion is a pinhole's where its terms are zero, and these are looked at by themselves.
+    return kind == "fisheye" or (kind == "polynomial" and name in ("camera_model", "model"))
 
 
 def _kind_in_mapping(name: str, entries: Mapping[str, Any], file: Path) -> LensKind | None:

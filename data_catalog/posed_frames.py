@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from data_catalog.checks import check_depth, check_intrinsics, check_pose
+from data_catalog.depth_steps import DepthSteps
 from data_catalog.guessed_intrinsics import fitted_to_picture
 from data_catalog.images import (
     COLOUR_SUFFIXES,
@@ -267,6 +268,7 @@ class _Pixels:
         self.depths = FrameStack(count)
         self.brightest = 0
         self.unfinite: dict[Path, int] = {}
+        self._depth_steps = DepthSteps()
         # A field of view that was asked for is meant to leave out what is beyond it.
         self._use = LensUse(count) if config.field_of_view_deg is None else None
         # Many frames share one file: it is read again only when another one, or another lens, comes.
@@ -294,6 +296,7 @@ class _Pixels:
             # Before shrinking, so that row, column and count are those of the file.
             check_depth(depth, frame=frame.label, file=frame.depth_file)
             _check_size(depth, frame, frame.depth_file, "depth", None)
+            self._depth_steps.see(depth, frame.depth_file)
             self.depths.append(sampling.depth(depth, file=frame.depth_file, frame=frame.label))
 
     def tell(self, frames: Sequence[PosedFrame]) -> None:

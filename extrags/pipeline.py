@@ -144,7 +144,8 @@ class Pipeline(ABC):
         if stage in NEEDS and NEEDS[stage] in self.skipped:
             return f"it needs the stage {NEEDS[stage]}, which was skipped"
         if stage == "poses" and self.has_poses() and not self.config.poses.replace_given:
-            return "the source has poses"
+            unused = self.config.poses.working_distance_mm is not None
+            return "the source has poses" + ("; poses.working_distance_mm is of no use" if unused else "")
         if stage == "depth":
             return self._reason_to_skip_depth()
         if stage == "enhance" and self.virtual_views() == 0:

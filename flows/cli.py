@@ -42,6 +42,7 @@ VERBS = {
     "benchmark": "compare methods over sequences and seeds",
     "bench": "measure speed and error of the parts or of the whole",
     "pretrain": "make the restorer's weights anew from procedural scenes",
+    "completion": "a script that completes commands, options, settings and sequences in a shell",
 }
 """Each verb with what it does, in the order of the help."""
 

@@ -9,10 +9,11 @@ from typing import Any
 from extrags.config import PipelineConfig, profile_config
 from extrags.cores import usable_cores
 from extrags.data_directories import DATA_VARIABLE, user_directories
-from extrags.errors import ConfigError
+from extrags.errors import ConfigError, did_you_mean
 
 __all__ = [
     "DEFAULT_STORE",
+    "check_runner",
     "default_store",
     "pipeline_config",
     "run_store",
@@ -20,6 +21,7 @@ __all__ = [
 ]
 
 DEFAULT_STORE = ".extrags"
+RUNNERS = ("threads", "dask")
 STORE_VARIABLE = "EXTRAGS_STORE"
 
 PLACES = (STORE_VARIABLE, DATA_VARIABLE, "EXTRAGS_LPIPS_WEIGHTS", "EXTRAGS_CACHE")
@@ -83,6 +85,22 @@ def pipeline_config(
     return config.with_overrides(settings or {})
 
 
+def check_runner(name: str) -> tuple[str, str]:
+    """The kind of a task runner, and the address of its scheduler; empty where none is named.
+
+    Args:
+        name: as `task_runner` takes it.
+
+    Raises:
+        ConfigError: for any other name.
+    """
+    kind, _, address = name.partition(":")
+    if kind not in RUNNERS or (kind == "threads" and address):
+        meant = did_you_mean(kind, RUNNERS) if kind not in RUNNERS else ""
+        raise ConfigError(f"no task runner {name!r}; expected threads, dask or dask:ADDRESS{meant}")
+    return kind, address
+
+
 def task_runner(name: str, at_once: int = 1) -> Any:
     """A Prefect task runner by name.
 
@@ -94,14 +112,12 @@ def task_runner(name: str, at_once: int = 1) -> Any:
     Raises:
         ConfigError: for any other name.
     """
-    kind, _, address = name.partition(":")
-    if kind == "threads" and not address:
+    kind, address = check_runner(name)
+    if kind == "threads":
         from prefect.task_runners import ThreadPoolTaskRunner
 
         # One worker per core: the branches of a wave share the machine instead of fighting for it.
         return ThreadPoolTaskRunner(max_workers=usable_cores())
-    if kind == "dask":
-        from flows.dask_runner import ClusterTaskRunner
+    from flows.dask_runner import ClusterTaskRunner
 
-        return ClusterTaskRunner(address or None, usable_cores(), at_once)
-    raise ConfigError(f"no task runner {name!r}; expected threads, dask or dask:ADDRESS")
+    return ClusterTaskRunner(address or None, usable_cores(), at_once)

@@ -31,7 +31,7 @@ from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
 from data_catalog.guessed_intrinsics import ASSUMED_FIELD_OF_VIEW_DEG, intrinsics_of_field_of_view
 from data_catalog.images import check_links, image_entries, image_size, read_colour, spread
 from data_catalog.interlacing import is_combed, is_interlaced
-from data_catalog.lens_entries import lens_kind, tells_distortion
+from data_catalog.lens_entries import check_pinhole
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.sampling import Sampling
 from extrags.config import IngestConfig
@@ -309,14 +309,8 @@ def _check_described(content: dict[str, Any], width: int, height: int, file: Pat
     Raises:
         SourceError: names the entry.
     """
-    for name, value in content.items():
-        if tells_distortion(name, value) or _names_other_lens(name, value, file):
-            raise SourceError(
-                f"{json.dumps(value)}; expected a pinhole here. A lens with distortion is told by a "
-                "calibration file (ingest.calibration)",
-                file=file,
-                field=name,
-            )
+    instead = "A lens with distortion is told by a calibration file (ingest.calibration)"
+    check_pinhole(content, instead, file=file)
     for names in _SIZES:
         told = [content.get(name) for name in names]
         if None not in told and told != [width, height]:
@@ -325,13 +319,3 @@ def _check_described(content: dict[str, Any], width: int, height: int, file: Pat
                 file=file,
                 field=names[0],
             )
-
-
-def _names_other_lens(name: str, value: Any, file: Path) -> bool:
-    """Whether an entry names a lens that is no pinhole, or one that is not known."""
-    try:
-        kind = lens_kind(name, value, file)
-    except SourceError:
-        return True
-    # A model of distortion is a pinhole's where its terms are zero, and these are looked at by themselves.
-    return kind == "fisheye" or (kind == "polynomial" and name in ("camera_model", "model"))

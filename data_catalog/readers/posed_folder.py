@@ -5,7 +5,7 @@
     my_sequence/
         poses.json
         rgb/0000.png ...          8-bit colour (PNG, JPEG, ...)
-        depth/0000.npy ...        optional: z-depth in the length unit, float `.npy`, or TIFF; 0 = unknown
+        depth/0000.npy ...        optional: z-depth in the length unit, `.npy`, TIFF or PNG; 0 = unknown
         mask/0000.png ...         optional: white is tissue
 
 `poses.json`::
@@ -22,8 +22,13 @@
       ]
     }
 
+Other keys are passed over with a warning, except those that begin with `_` or `/`, which are remarks. Keys
+that tell of distortion are refused where it is not zero.
+
 Camera axes are OpenCV's (x right, y down, z forward), matrices map camera to world, row by row; K is in
 pixels of the files with pixel centres at +0.5. Every image in `rgb/` needs an entry, every entry an image.
+Numbers of depth files are lengths as they are: a level of integers, as in a PNG, is one whole unit, which is
+coarse beside the few centimetres that an endoscope sees.
 Depth is looked for as `depth/<name>.npy|.tiff|.tif|.png`, for all frames or for none, and masks as
 `mask/<name>` with the suffix of any image, in upper or lower case; <name> is the path below `rgb/`, else its
 last part, without suffix. No two frames share a file. Frames without a mask are tissue throughout, which the
@@ -42,8 +47,10 @@ from data_catalog.checks import check_intrinsics
 from data_catalog.folder_reader import FolderReader
 from data_catalog.images import COLOUR_SUFFIXES, colour_files, image_size
 from data_catalog.inside import inside
+from data_catalog.lens_entries import check_pinhole
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frame_list import FilesBeside, load_frame_list, matrix_of, warn_of_unmasked
+from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
@@ -55,6 +62,12 @@ logger = logging.getLogger(__name__)
 POSES_FILE = "poses.json"
 _DEPTH_SUFFIXES = (".npy", ".tiff", ".tif", ".png")
 _LENGTH_UNITS = ("mm", "arbitrary")
+_KEYS = ("frames", "K", "length_unit")
+_KEYS_OF_FRAMES = ("file", "world_from_camera", "K", "split", "recording")
+_OTHER_LENSES = (
+    "Undistort the images, or give frames and poses as a transforms.json or a COLMAP model, which describe "
+    "lenses with distortion"
+)
 _LARGEST_RECORDING = 1_000_000
 
 
@@ -79,6 +92,10 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
     entries = content["frames"]
     _check_count(folder, entries)
     _check_splits(entries, file)
+    for frame, described in ((None, content), *((entry["file"], entry) for entry in entries)):
+        further = {name: described[name] for name in described if name not in (*_KEYS, *_KEYS_OF_FRAMES)}
+        check_pinhole(further, _OTHER_LENSES, file=file, frame=frame)
+    warn_of_unknown_keys(content, known=_KEYS, known_of_frames=_KEYS_OF_FRAMES, frame_name="file", file=file)
     names = [entry["file"] for entry in entries]
     depth_files, mask_files = _depth_files(folder, names), _mask_files(folder, names)
     return SourceFrames(

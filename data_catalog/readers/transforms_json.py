@@ -6,8 +6,9 @@ nothing else), `fl_x`, `fl_y` or `camera_angle_x`, `camera_angle_y`, `cx`, `cy`,
 may be missing; frames without a file are left out, with a warning), `mask_path` (white is tissue),
 `depth_file_path`; `train_filenames`, `test_filenames` and `val_filenames` (frames in none of them are left
 out); `ply_file_path` (points that are not finite are left out, with a warning). A `null` is as good as no
-value. Images of distorted cameras are resampled to a pinhole; a term of distortion that the camera's model
-has not is refused, unless it is 0.
+value. Other keys are passed over; a warning names those that look misspelt or tell of distortion. Images of
+distorted cameras are resampled to a pinhole; a term of distortion that the camera's model has not is refused,
+unless it is 0.
 
 Depth is z-depth; a value times `depth_unit_scale_factor` is in the unit of the poses. Where the file does not
 say, that is nerfstudio's 0.001 (or, for integers, instant-ngp's `integer_depth_scale`). 0 is unknown.
@@ -34,6 +35,7 @@ from data_catalog.images import COLOUR_SUFFIXES, image_size, natural_key, read_d
 from data_catalog.inside import inside
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.readers.frame_list import listed_split, load_frame_list, matrix_of, present_frames
+from data_catalog.readers.unknown_keys import warn_of_unknown_keys
 from extrags.array_files import load_ply_vertices
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
@@ -50,6 +52,20 @@ _NERFSTUDIO_DEPTH_SCALE = 1e-3
 _MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "arbitrary": 1.0}
 _FILE_KEYS = ("file_path", "mask_path", "depth_file_path")
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+_KEYS = (
+    *("frames", "transform_matrix", "length_unit", "depth_unit_scale_factor", "integer_depth_scale"),
+    *("train_filenames", "test_filenames", "val_filenames", "ply_file_path", *_FILE_KEYS),
+    *("camera_model", "is_fisheye", "fl_x", "fl_y", "cx", "cy", "w", "h", *_DISTORTION),
+    *("camera_angle_x", "camera_angle_y"),
+)
+"""What is read, of all frames or of one."""
+_OTHER_KEYS = (
+    *("scale", "offset", "aabb_scale", "applied_transform", "applied_scale", "orientation_override"),
+    # Of a rolling shutter; the matrix of the frame as a whole stands beside them.
+    *("transform_matrix_start", "transform_matrix_end", "depth_path", "normal_file_path"),
+)
+"""What programs write, what changes nothing here, and is spelt like a key that does."""
 
 
 def _recognises(folder: Path) -> bool:
@@ -91,6 +107,9 @@ def _frames(folder: Path, config: IngestConfig) -> SourceFrames:
             file=file,
             field="length_unit",
         )
+    warn_of_unknown_keys(
+        content, known=_KEYS, known_of_frames=_KEYS, frame_name="file_path", file=file, others=_OTHER_KEYS
+    )
     scale = _MM_PER_UNIT[unit]
     listed = sorted(content["frames"], key=lambda entry: natural_key(entry["file_path"]))
     files = {}

@@ -245,6 +245,7 @@ READER = FolderReader(
     files=_files,
     frames=_frames,
     outline=_outline,
+    is_footage=True,
     conventions="no poses and no depth; the poses stage finds them, in an arbitrary unit",
 )
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from extrags.errors import ConfigError, StoreError
 from flows.commands.common import counted, set_up_logging
+from flows.commands.export_scene import ALONG
 from flows.commands.options import Parser, add_method
 
 __all__ = ["add_arguments", "export"]
@@ -180,6 +181,9 @@ def _check(given: argparse.Namespace) -> None:
     for panel in [] if given.panels is None else given.panels.split(","):
         if panel not in PANELS:
             raise ConfigError(f"--panels: no panel {panel!r}; known: {', '.join(PANELS)}")
+    if given.along not in (None, *ALONG) and not Path(given.along).is_file():
+        wanted = f"expected {', '.join(ALONG)} or a FILE.json"
+        raise ConfigError(f"--along {given.along}: there is no such file; {wanted}")
     suffixes = SUFFIXES.get(given.to)
     if suffixes and Path(given.output).suffix.lower() not in suffixes:
         raise ConfigError(f"--output {given.output}: the name must end in {' or '.join(suffixes)}")

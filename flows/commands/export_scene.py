@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from extrags.errors import ConfigError, StoreError
+from extrags.errors import ConfigError, ExtragsError, StoreError
 from flows.commands.common import finished_run, run_config, set_up_logging, showing
 
 if TYPE_CHECKING:
@@ -23,7 +23,10 @@ if TYPE_CHECKING:
     from extrags.sequence import EndoscopicSequence
     from flows.wiring import SequenceRun
 
-__all__ = ["export_scene", "posed_sequence"]
+__all__ = ["ALONG", "export_scene", "posed_sequence"]
+
+ALONG = ("training", "held-out", "virtual")
+"""Cameras of a run to fly through; anything else that `--along` names is the file of a camera path."""
 
 
 def export_scene(given: argparse.Namespace) -> int:
@@ -43,7 +46,8 @@ def export_scene(given: argparse.Namespace) -> int:
         try:
             with _folder(target.parent):
                 said = write.get(given.to, _gaussians)(given, target)
-        except StoreError:
+        except ExtragsError:
+            # Some are errors of files as well, and say themselves which one and why.
             raise
         except OSError as error:
             raise StoreError(f"{target} cannot be written: {error.strerror or error}") from error
@@ -228,15 +232,13 @@ def _flight(given: argparse.Namespace) -> CameraPath:
     from extrags.export import CameraPath, read_camera_path
 
     along, steps = given.along or "training", given.between or 1
-    if along in ("training", "held-out", "virtual"):
+    if along in ALONG:
         path = CameraPath(_cameras(given, along, steps), given.fps or 24.0)
-    elif Path(along).suffix.lower() == ".json" or Path(along).exists():
+    else:
         if given.between is not None:
             raise ConfigError("--between adds nothing to a camera path from a file: it is taken as it is")
         read = read_camera_path(Path(along))
         path = CameraPath(read.cameras, given.fps or read.fps)
-    else:
-        raise ConfigError(f"--along {along}: expected training, held-out, virtual or a FILE.json")
     if given.width is None:
         return path
     height = max(1, round(path.cameras.height * given.width / path.cameras.width))

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 __all__ = ["add_arguments", "gallery"]
 
+TITLE, LARGEST_KB = "Gallery", 1000
+"""What the page is called, and how large its images are together, where nothing else is asked for."""
+
 
 def add_arguments(parser: Parser) -> None:
     """The options of `extrags gallery`."""
@@ -40,11 +43,11 @@ def add_arguments(parser: Parser) -> None:
             help=f"only runs of these {name}: {', '.join(known)}",
         )
     add_store(parser)
-    parser.add_argument("--name", default="Gallery", help="title of the page (default: %(default)s)")
+    parser.add_argument("--name", default=TITLE, help="title of the page (default: %(default)s)")
     parser.add_argument(
         "--kb",
         type=int,
-        default=1000,
+        default=LARGEST_KB,
         metavar="N",
         help="bound on all images together (default: %(default)s)",
     )
@@ -98,11 +101,13 @@ def _commands(runs: Sequence[OutcomeRecord], given: argparse.Namespace) -> str:
         options = run_options(run, elsewhere=True)
         made.setdefault(options, []).append(shlex.quote(without_folders(run["sequence"])))
     lines = [f"extrags run {' '.join(names)}{how}" for how, names in made.items()]
-    filters = "".join(
+    options = "".join(
         f" --{name} {' '.join(items(chosen))}"
         for name, chosen in (("methods", given.methods), ("profiles", given.profiles))
         if chosen
     )
+    options += "" if given.name == TITLE else f" --name {shlex.quote(given.name)}"
+    options += "" if given.kb == LARGEST_KB else f" --kb {given.kb}"
     out = "" if Path(given.out).is_absolute() else f" --out {shlex.quote(Path(given.out).as_posix())}"
     names = " ".join(shlex.quote(without_folders(run["sequence"])) for run in runs)
-    return "\n".join([*lines, f"extrags gallery {names}{filters}{out}"])
+    return "\n".join([*lines, f"extrags gallery {names}{options}{out}"])

@@ -127,11 +127,23 @@ def add_json(parser: Parser) -> None:
     )
 
 
+def _runner(name: str) -> str:
+    """A task runner by name: what is wrong with it is said before anything is planned."""
+    from flows.settings import check_runner
+
+    try:
+        check_runner(name)
+    except ConfigError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return name
+
+
 def add_runner(parser: Parser) -> None:
     """`--runner`, `--retries` and `--stage-time-limit`."""
     parser.add_argument(
         "--runner",
         default="threads",
+        type=_runner,
         metavar="threads|dask[:ADDRESS]",
         help="where tasks run; an address is that of a Dask scheduler that is already up",
     )
@@ -194,15 +206,26 @@ def add_method(parser: Parser) -> None:
 
 
 def add_settings(parser: Parser, group: str = "") -> None:
-    """`--set`, a flag for every setting, and `--help-settings`.
+    """`--config`, `--set`, a flag for every setting, and `--help-settings`.
 
-    All of them end up in `settings`, by dotted name; what stands last on the command line counts.
+    All of them end up in `settings`, by dotted name; what stands last on the command line counts, and what a
+    file sets where the command line sets nothing else.
 
     Args:
         parser: of a verb.
-        group: settings of this group only.
+        group: settings of this group only; of a file with others, they are passed over.
     """
     known = _settings(group)
+    parser.add_argument(
+        "--config",
+        dest="settings",
+        metavar="FILE",
+        action=_TakeFile,
+        const=group,
+        default=argparse.SUPPRESS,
+        help="take settings from a YAML or JSON file, by dotted name or in groups, where neither --set nor a "
+        "flag gives them; repeatable: the last file counts",
+    )
     parser.add_argument(
         "--set",
         dest="settings",
@@ -261,8 +284,32 @@ class _Assign(argparse.Action):
         else:
             name = SHORT_NAMES.get(str(option_string), str(option_string).removeprefix("--"))
             changed = {name: _settings()[name].parse(values)}
-        # Not in place: the dictionary that is there first is the parser's default.
-        setattr(namespace, self.dest, {**getattr(namespace, self.dest), **changed})
+        # Not in place: what is there first is the parser's default.
+        namespace.said_settings = {**getattr(namespace, "said_settings", {}), **changed}
+        setattr(namespace, self.dest, _all_settings(namespace))
+
+
+class _TakeFile(argparse.Action):
+    """`--config FILE` to entries of `settings`, wherever on the command line it stands."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        from flows.commands.settings_file import settings_of_file
+
+        of_file = settings_of_file(Path(values))
+        taken = {name: of_file[name] for name in _settings(str(self.const)) if name in of_file}
+        namespace.file_settings = {**getattr(namespace, "file_settings", {}), **taken}
+        setattr(namespace, self.dest, _all_settings(namespace))
+
+
+def _all_settings(namespace: argparse.Namespace) -> dict[str, Any]:
+    """Settings of files, and over them those of the command line itself."""
+    return {**getattr(namespace, "file_settings", {}), **getattr(namespace, "said_settings", {})}
 
 
 class _HelpSettings(argparse.Action):

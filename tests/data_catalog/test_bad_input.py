@@ -12,9 +12,11 @@ from PIL import Image
 
 from data_catalog.catalog import read
 from data_catalog.checks import check_axes, check_sequence
+from data_catalog.diagnostics import diagnose
+from data_catalog.inspection import inspect
 from extrags.cameras import invert_poses
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
-from extrags.sequence import Split
+from extrags.sequence import EndoscopicSequence, Split
 
 
 def set_pose(change):
@@ -234,6 +236,113 @@ class TestFolder:
             entry["split"] = "test"
         (posed_folder / "poses.json").write_text(json.dumps(content))
         with pytest.raises(SourceError, match="no training frame"):
+            read(posed_folder)
+
+
+class TestCoarseDepth:
+    """Rounded depth makes stairs of surfaces; the range alone does not show it."""
+
+    @staticmethod
+    def said(folder) -> list[str]:
+        found = inspect(folder).findings
+        return [str(finding) for finding in found if finding.topic == "depth resolution"]
+
+    @staticmethod
+    def rewritten(folder, suffix: str, levels) -> None:
+        for file in sorted((folder / "depth").iterdir()):
+            depth = levels(np.load(file))
+            file.unlink()
+            if suffix == ".npy":
+                np.save(file, depth)
+            else:
+                Image.fromarray(depth).save(file.with_suffix(suffix))
+
+    @pytest.mark.parametrize("suffix", [".png", ".tiff", ".npy"])
+    def test_whole_units(self, posed_folder, suffix) -> None:
+        self.rewritten(posed_folder, suffix, lambda depth: depth.astype(np.uint16))
+        (found,) = self.said(posed_folder)
+        assert f"0000{suffix}: depth in steps of 1, " in found
+        assert "expected finer values" in found
+
+    def test_a_warning_in_a_run_as_well(self, posed_folder, caplog) -> None:
+        self.rewritten(posed_folder, ".png", lambda depth: depth.astype(np.uint16))
+        read(posed_folder)
+        assert "stairs of surfaces" in caplog.text
+
+    @pytest.mark.parametrize("suffix", [".npy", ".tiff"])
+    def test_floats_are_fine(self, posed_folder, suffix) -> None:
+        self.rewritten(posed_folder, suffix, lambda depth: depth)
+        assert self.said(posed_folder) == []
+
+    def test_fine_steps_are_fine(self, posed_folder) -> None:
+        self.rewritten(posed_folder, ".npy", lambda depth: np.round(depth * 20) / 20)
+        assert self.said(posed_folder) == []
+
+
+class TestMasksBeforePoses:
+    """Poses and units that the mask alone speaks against are not blamed."""
+
+    @staticmethod
+    def masked(folder, white) -> None:
+        (folder / "mask").mkdir()
+        for file in (folder / "rgb").iterdir():
+            Image.fromarray(np.where(white, 255, 0).astype(np.uint8)).save(folder / "mask" / file.name)
+
+    @staticmethod
+    def along_a_wall(mask: np.ndarray) -> EndoscopicSequence:
+        """Cameras that move to the right before a slanted wall: what is on their left soon leaves them."""
+        count, (height, width), focal = 8, mask.shape, 60.0
+        poses = np.repeat(np.eye(4)[None], count, axis=0)
+        poses[:, 0, 3] = 4.0 * np.arange(count)
+        slope = (np.arange(width) + 0.5 - width / 2) / focal
+        depth = (20 + 0.3 * poses[:, 0, 3])[:, None] / (1 - 0.3 * slope)[None]
+        rng = np.random.default_rng(0)
+        return EndoscopicSequence(
+            name="wall",
+            rgb=rng.integers(60, 255, (count, height, width, 3), dtype=np.uint8),
+            K=np.repeat([[[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]], count, axis=0),
+            mask=np.repeat(mask[None], count, axis=0),
+            split=Split("first", np.arange(1, count), np.arange(1)),
+            world_from_camera=poses,
+            depth_mm=np.repeat(depth[:, None, :], height, axis=1).astype(np.float32),
+        )
+
+    def test_a_narrow_one_tells_nothing_of_poses(self) -> None:
+        """The cameras seemed to stand still, since what the mask keeps is outside the next frame."""
+        white = np.zeros((64, 80), dtype=bool)
+        white[:, :10] = True
+        sequence = self.along_a_wall(white)
+        check_sequence(sequence)
+        (found,) = diagnose(sequence, "wall")
+        assert (found.topic, found.field) == ("mask polarity", "mask")
+        assert "keeps 12% of the pixels" in found.sentence
+        whole = self.along_a_wall(np.ones_like(white))
+        check_sequence(whole)
+        assert diagnose(whole, "wall") == []
+
+    def test_an_inverted_one_is_told_from_another_unit(self, posed_folder) -> None:
+        """Outside the picture there is other depth, and the mask keeps that alone."""
+        white = np.zeros((40, 48), dtype=bool)
+        white[:, :14] = True
+        self.masked(posed_folder, white)
+        for file in (posed_folder / "depth").iterdir():
+            np.save(file, np.load(file) * np.where(white, 5, 1).astype(np.float32))
+        with pytest.raises(SourceError, match="where the mask leaves it out: the mask is inverted") as caught:
+            read(posed_folder)
+        assert caught.value.field == "mask"
+
+    def test_wrong_poses_are_found_with_a_mask(self, posed_folder, edit_poses) -> None:
+        white = np.ones((40, 48), dtype=bool)
+        white[:, :14] = False
+        self.masked(posed_folder, white)
+
+        def to_opengl(content) -> None:
+            for entry in content["frames"]:
+                pose = np.array(entry["world_from_camera"]) @ np.diag([1.0, -1, -1, 1])
+                entry["world_from_camera"] = pose.tolist()
+
+        edit_poses(to_opengl)
+        with pytest.raises(PoseError, match="read as OpenGL axes"):
             read(posed_folder)
 
 

@@ -2,7 +2,9 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 
 from data_catalog.catalog import (
     describe,
+    glance,
     list_sequences,
     read,
     resolve,
@@ -17,6 +20,7 @@ from data_catalog.catalog import (
 )
 from data_catalog.dataset import Source
 from data_catalog.phantom.dataset import PHANTOM
+from data_catalog.readers.posed_folder import READER as posed_folder_reader
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceError, SourceNotFoundError, UnknownSequenceError
 
@@ -90,13 +94,28 @@ class TestFolders:
         assert resolve(posed_folder).format == "extrags"
 
     def test_empty_folder(self, tmp_path) -> None:
-        with pytest.raises(SourceNotFoundError, match=r"the folder is empty; expected one of: .*poses\.json"):
+        with pytest.raises(SourceNotFoundError, match="the folder is empty; expected images, a video, or fr"):
             resolve(tmp_path)
 
     def test_folder_without_a_sequence(self, tmp_path) -> None:
         (tmp_path / "notes.txt").write_text("nothing here")
-        with pytest.raises(SourceNotFoundError, match="no sequence recognised"):
+        with pytest.raises(SourceNotFoundError, match="no sequence recognised") as caught:
             read(tmp_path)
+        # It stands in columns of tables.
+        assert len(caught.value.problem) < 350
+        for kind in ("a video", "DICOM", "COLMAP", "transforms.json", "poses.json", "C3VD", "SimCol3D"):
+            assert kind in caught.value.problem
+        assert "docs/sources.md" in caught.value.problem
+
+    def test_a_reader_from_outside_is_named_with_its_layout(self, tmp_path, monkeypatch) -> None:
+        def never(folder: Path) -> bool:
+            return False
+
+        reader = replace(posed_folder_reader, name="theirs", summary="one theirs.xml", recognises=never)
+        monkeypatch.setattr("data_catalog.folders._registered", [reader])
+        (tmp_path / "notes.txt").write_text("nothing here")
+        with pytest.raises(SourceNotFoundError, match=r"or the sinus set, theirs \(one theirs\.xml\) \("):
+            resolve(tmp_path)
 
     @pytest.mark.parametrize(("suffix", "kind"), [("mp4", "videos"), ("dcm", "DICOM files")])
     def test_several_recordings_are_named(self, tmp_path, suffix, kind) -> None:
@@ -143,6 +162,44 @@ class TestPhantomSettings:
         assert sequence.split.name == "distanced"
         assert sequence.train.size >= 1
         assert sequence.test.size >= 1
+
+
+class TestWhatIsNoName:
+    def test_a_sequence_that_was_read(self) -> None:
+        sequence = read("phantom/7@sparse", IngestConfig(width=40, max_frames=4))
+        with pytest.raises(ConfigError, match=r"^phantom/7@sparse is a sequence that has been read already"):
+            read(sequence)
+
+    @pytest.mark.parametrize(
+        ("given", "kind"), [(7, "int"), (None, "NoneType"), ([1], "list"), (b"a", "bytes")]
+    )
+    def test_other_things(self, given, kind) -> None:
+        for function in (read, resolve, glance, source_fingerprint):
+            with pytest.raises(ConfigError, match=f"expected the name of a sequence or a path, found {kind}"):
+                function(given)
+
+
+class TestPartsOfRecordings:
+    """Frames without times have no part between two moments; once all of them were read without a word."""
+
+    @pytest.mark.parametrize(
+        ("settings", "told"),
+        [
+            ({"start_s": 5}, "ingest.start_s = 5 cut"),
+            ({"end_s": 7.5}, "ingest.end_s = 7.5 cut"),
+            ({"start_s": 5, "end_s": 7}, "ingest.start_s = 5 and ingest.end_s = 7 cut"),
+        ],
+    )
+    def test_are_of_footage_alone(self, posed_folder, settings, told) -> None:
+        config = IngestConfig.model_validate(settings)
+        for source in (posed_folder, posed_folder / "rgb", "phantom/3@sparse"):
+            for function in (read, glance):
+                with pytest.raises(ConfigError, match=re.escape(told)) as caught:
+                    function(source, config)
+                assert "ingest.max_frames" in str(caught.value)
+
+    def test_all_of_it_is_no_part(self, posed_folder) -> None:
+        assert len(read(posed_folder, IngestConfig(start_s=0.0, end_s=None))) == 10
 
 
 class TestFingerprint:

@@ -218,9 +218,9 @@ DAMAGES = {
     "depth in 8 bits": Damage(
         "extrags",
         depth(lambda values: np.round(values / 5) * 5),
-        "different depths; expected a continuous map",
-        "0000",
-        "depth_mm",
+        "depth in steps of 5, .* expected finer values",
+        None,
+        "depth",
     ),
     "a depth file cut off": Damage(
         "extrags", cut("depth/0002.npy"), "cannot be read", "rgb/0002.png", "depth", "0002.npy"
@@ -463,7 +463,7 @@ DAMAGES = {
         "intrinsics.json",
     ),
     "an empty folder": Damage(
-        "frames", emptied, "the folder is empty; expected one of", None, None, "frames"
+        "frames", emptied, "the folder is empty; expected images", None, None, "frames"
     ),
     "no video": Damage("frames", no_video, "cannot be opened as a video", None, None, "exam.mp4"),
 }

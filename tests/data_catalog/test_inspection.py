@@ -53,6 +53,17 @@ class TestRightSources:
             assert item.kind == "error"
             assert f"{frames - 1} of {frames} frames are to train on" in item.sentence
 
+    def test_a_single_training_frame_is_no_camera_that_stands_still(self, posed_folder) -> None:
+        content = json.loads((posed_folder / "poses.json").read_text())
+        for entry in content["frames"][2:]:
+            for part, suffix in (("rgb", ".png"), ("depth", ".npy")):
+                (posed_folder / part / Path(entry["file"]).with_suffix(suffix).name).unlink()
+        content["frames"] = content["frames"][:2]
+        (posed_folder / "poses.json").write_text(json.dumps(content))
+        (found,) = inspect(posed_folder).findings
+        assert (found.kind, found.topic, found.field) == ("warning", "number of frames", "split")
+        assert found.sentence.startswith("1 of 2 frames is to train on, and the others are held out")
+
     def test_assumptions_are_notes(self, shared_data) -> None:
         found = inspect(shared_data / "sinus_hopkins" / "images", IngestConfig(downscale=8, max_frames=6))
         assert any("assuming a horizontal field of view of 90 degrees" in note for note in found.notes)

@@ -403,6 +403,7 @@ class TestShots:
         class Long:
             file = tmp_path / "long"
             announced = 420
+            size = (64, 48)
             pixel_aspect = 1.0
 
             def frames(self, span: TimeSpan, numbers: Collection[int] | None = None):

@@ -272,31 +272,38 @@ class TestUsage:
         assert said.count("\n") == 1
 
     @pytest.mark.parametrize(
-        ("along", "code", "message"),
+        ("along", "message"),
         [
-            ("sideways", 2, "expected training, held-out, virtual or a FILE.json"),
-            ("no.json", 1, "no such file"),
+            ("sideways", "expected training, held-out, virtual or a FILE.json"),
+            ("no.json", "--along no.json: there is no such file; expected training"),
         ],
     )
     def test_a_trajectory_that_is_not_there(
         self,
         along: str,
-        code: int,
         message: str,
         finished: Finished,
         tmp_path: Path,
         capsys: pytest.CaptureFixture[str],
     ) -> None:
         target = tmp_path / "a.json"
-        assert export(finished, "--to", "camera-path", "--along", along, "-o", str(target)) == code
+        assert export(finished, "--to", "camera-path", "--along", along, "-o", str(target)) == 2
         assert message in capsys.readouterr().err
         assert not target.exists()
 
-    def test_folders_are_made_for_what_is_written_alone(self, finished: Finished, tmp_path: Path) -> None:
+    def test_folders_are_made_for_what_is_written_alone(
+        self, finished: Finished, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
         target = tmp_path / "there" / "new" / "a.json"
         target.parents[1].mkdir()
         arguments = ["--to", "camera-path", "-o", str(target)]
-        assert export(finished, *arguments, "--along", "sideways") == 2
+        path = tmp_path / "path.json"
+        path.write_text("{")
+        assert export(finished, *arguments, "--along", str(path)) == 1
+        # It is said of the file that is wrong, not of the one that was to be written.
+        said = capsys.readouterr().err
+        assert "path.json" in said
+        assert "cannot be written" not in said
         assert target.parents[1].is_dir()
         assert not target.parent.exists()
         assert export(finished, *arguments) == 0
