@@ -28,6 +28,7 @@ from extrags.config import (
 from extrags.depth.estimate import DepthEstimate, estimate_depth, with_estimated_depth
 from extrags.evaluation import evaluate, render
 from extrags.exploration import Exploration, explore
+from extrags.frame_arrays import sequence_from_arrays
 from extrags.freespace import FreeSpace, carve
 from extrags.gaussians import Gaussians
 from extrags.illumination import NearFieldLight
@@ -100,6 +101,7 @@ __all__ = [
     "render",
     "restore",
     "run_pipeline",
+    "sequence_from_arrays",
     "with_estimated_depth",
     "with_estimated_poses",
 ]

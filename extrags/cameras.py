@@ -72,6 +72,10 @@ class Cameras:
     def __len__(self) -> int:
         return int(self.world_from_camera.shape[0])
 
+    def __repr__(self) -> str:
+        lens = "pinholes" if self.lens is None else "radial lens"
+        return f"Cameras({len(self)} views of {self.width} x {self.height} px, {lens})"
+
     def __getitem__(self, index: int | slice | Sequence[int] | np.ndarray) -> Cameras:
         """Select cameras; an integer keeps the batch axis."""
         chosen = np.arange(len(self))[index]

@@ -71,6 +71,9 @@ class Gaussians:
     def __len__(self) -> int:
         return int(self.means.shape[0])
 
+    def __repr__(self) -> str:
+        return f"Gaussians({len(self)}, SH degree {self.sh_degree}, on {self.device})"
+
     @property
     def n_gaussians(self) -> int:
         """Number of Gaussians, N."""

@@ -189,7 +189,7 @@ class InMemoryPipeline(Pipeline):
             self.config.check_imported_has_cameras()
             sequence = self.result.sequence
             estimate = estimate_poses(sequence, self.config.poses)
-            self.result.sequence = with_estimated_poses(sequence, estimate)
+            self.result.sequence = with_estimated_poses(sequence, estimate, self.config.ingest)
 
     def depth(self) -> None:
         """`extrags.depth.estimate.estimate_depth` of the training frames alone."""
@@ -444,7 +444,7 @@ def run_pipeline(
     events go to the subscriber of `extrags.events.subscribed`.
 
     Args:
-        sequence: the frames, from `extrags.read`.
+        sequence: the frames, from `extrags.read` or `extrags.sequence_from_arrays`.
         config: settings of all stages, e.g. `extrags.PROFILES["quick"]`; None takes the defaults.
         until: last stage to run.
         leave_out: stages to skip regardless of the plan, with the reason.
@@ -457,10 +457,15 @@ def run_pipeline(
         CaptureError: when the frames are not sufficient for a reconstruction.
         DivergedError: when an optimisation produces NaN or infinity.
         WeightsError: when a model that the settings name does not exist.
-        ConfigError: when settings are incompatible with each other.
+        ConfigError: when settings are incompatible with each other, or are none of a pipeline.
+        TypeError: when `sequence` is none, such as a name.
+        SourceError: when its arrays cannot be those of a recording (`extrags.sequence_checks.check_arrays`).
     """
-    pipeline = InMemoryPipeline(
-        sequence, PipelineConfig() if config is None else config, leave_out, true_surface=true_surface
-    )
+    from extrags.arguments import check_sequence_argument, check_settings_argument
+
+    check_sequence_argument(sequence, "run_pipeline")
+    config = PipelineConfig() if config is None else config
+    check_settings_argument(config, PipelineConfig, "run_pipeline", 'extrags.PROFILES["quick"]')
+    pipeline = InMemoryPipeline(sequence, config, leave_out, true_surface=true_surface)
     pipeline.run_stages(until)
     return pipeline.result

@@ -37,6 +37,9 @@ class Scene(Storable):
     gaussians: Gaussians
     light: NearFieldLight | None = None
 
+    def __repr__(self) -> str:
+        return f"Scene({self.gaussians!r}, {'without' if self.light is None else 'near-field'} light)"
+
     @property
     def near(self) -> float:
         """z-depth, in world units, up to which nothing is rendered.

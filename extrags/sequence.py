@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from extrags.array_shapes import check_array, check_instance
 from extrags.cameras import Cameras
 from extrags.errors import ShapeError
 from extrags.frame_stacks import frames_of, stacked
 from extrags.lens import Undistortion, resized_depth
+from extrags.provenance import SCALE_WORDS, IntrinsicsSource, PoseSource, ScaleSource
 from extrags.radial_lens import VIRTUAL_FIELD_DEG, RadialLens
+from extrags.splits import Split
 from extrags.store.storable import Storable
 from extrags.thresholds import RELIABLE_DEPTH_ERROR, SATURATED
 from extrags.zarr_io import has_array, new_group, open_group, read_array, write_array, write_frames
@@ -32,43 +35,6 @@ _SQUARE = 0.01
 """Focal lengths across and down that differ by a smaller share are those of square pixels."""
 ALL_OF_AREA = 0.999
 """A downscaled pixel is valid above this share of valid area; below one because of rounding."""
-
-PoseSource = Literal["given", "estimated", "aligned", "refined"]
-"""Origin of the poses. given: by the source; estimated: by COLMAP; aligned: by RGB-D alignment; refined:
-corrected during the reconstruction."""
-
-IntrinsicsSource = Literal["given", "guessed", "estimated"]
-"""Origin of the intrinsics. given: by the source or a calibration file; guessed: a usual field of view,
-because nothing states them; estimated: by bundle adjustment, with the poses."""
-
-
-ScaleSource = Literal["source", "setting", "depth", "working_distance"]
-"""What the unit of length rests on. source: what the source says of it; setting: `ingest.scale_mm_per_unit`;
-depth: known depth that estimated poses were scaled by; working_distance: `poses.working_distance_mm`."""
-
-_SCALE_WORDS: dict[ScaleSource, str] = {
-    "source": "millimetres as the source has them",
-    "setting": "millimetres from the scale given",
-    "depth": "millimetres from known depth",
-    "working_distance": "millimetres from the working distance given",
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Split:
-    """Training and held-out frames; always defined by a manifest, never by file names.
-
-    Args:
-        name: e.g. `sparse`, `distanced`, `every8`.
-        train: indices of frames the reconstruction may see.
-        test: indices of held-out frames.
-        version: version of the rule behind the name; raised by hand when the rule changes.
-    """
-
-    name: str
-    train: Int[np.ndarray, "n_train"]
-    test: Int[np.ndarray, "n_test"]
-    version: int = 1
 
 
 @dataclass(frozen=True)
@@ -137,10 +103,10 @@ class EndoscopicSequence(Storable):
     lens: RadialLens | None = None
 
     def __post_init__(self) -> None:
+        check_array(self.rgb, f"{self.name}: rgb", (None, None, None, 3), np.uint8)
         frames, height, width = self.rgb.shape[:3]
         images = (frames, height, width)
         for name, array, shape, kind in (
-            ("rgb", self.rgb, (*images, 3), np.uint8),
             ("mask", self.mask, images, np.bool_),
             ("K", self.K, (frames, 3, 3), np.floating),
             ("world_from_camera", self.world_from_camera, (frames, 4, 4), np.floating),
@@ -151,10 +117,9 @@ class EndoscopicSequence(Storable):
             ("specular", self.specular, images, np.bool_),
             ("recording", self.recording, (frames,), np.integer),
         ):
-            if array is not None and (array.shape != shape or not np.issubdtype(array.dtype, kind)):
-                raise ShapeError(
-                    f"{self.name}: {name} is {array.dtype} {array.shape}, expected {kind.__name__} {shape}"
-                )
+            if array is not None or name in ("mask", "K"):
+                check_array(array, f"{self.name}: {name}", shape, kind)
+        check_instance(self.split, f"{self.name}: split", Split)
         for name, index in (("train", self.split.train), ("test", self.split.test)):
             if len(index) and not 0 <= int(np.min(index)) <= int(np.max(index)) < frames:
                 raise ShapeError(
@@ -163,6 +128,20 @@ class EndoscopicSequence(Storable):
                 )
         if self.frame_names and len(self.frame_names) != frames:
             raise ShapeError(f"{self.name}: {len(self.frame_names)} frame names for {frames} frames")
+
+    def __repr__(self) -> str:
+        """What it holds, in a line: its arrays would fill pages."""
+        depth = "no depth" if self.depth_mm is None else "depth of training frames"
+        if self.depth_mm is not None and not self.training_depth_known:
+            depth = "depth for the evaluation alone"
+        elif self.depth_error is not None:
+            depth = "estimated depth"
+        poses = "no poses" if self.world_from_camera is None else f"poses {self.pose_source}"
+        return (
+            f"EndoscopicSequence({self.name!r}, {len(self)} frames of {self.width} x {self.height} px, "
+            f"{len(self.train)} train and {len(self.test)} held out ({self.split.name}), {poses}, {depth}, "
+            f"{self.scale_words}, {'pinhole' if self.lens is None else 'radial lens'})"
+        )
 
     def __len__(self) -> int:
         return int(self.rgb.shape[0])
@@ -226,7 +205,7 @@ class EndoscopicSequence(Storable):
     @property
     def scale_words(self) -> str:
         """What lengths are, and what says so, for tables and reports."""
-        return _SCALE_WORDS[self.scale_source] if self.metric else "arbitrary scale"
+        return SCALE_WORDS[self.scale_source] if self.metric else "arbitrary scale"
 
     def in_millimetres(self, mm_per_unit: float, source: ScaleSource) -> EndoscopicSequence:
         """A copy of a posed sequence with all lengths multiplied, which makes it metric.

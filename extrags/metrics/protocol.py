@@ -92,6 +92,12 @@ class RenderedViews(Storable):
     def __len__(self) -> int:
         return int(self.rgb.shape[0])
 
+    def __repr__(self) -> str:
+        height, width = self.rgb.shape[1:3]
+        of = "" if self.n_gaussians is None else f", of {self.n_gaussians} Gaussians"
+        depth = "with" if self.has_depth else "without"
+        return f"RenderedViews({len(self)} views of {width} x {height} px, {depth} depth{of})"
+
     def save(self, path: Path) -> None:
         """Write a zarr v3 group, one view per chunk."""
         with new_group(path) as group:

@@ -17,13 +17,17 @@ from extrags.gaussians import Gaussians
 from extrags.scene import NEAR, SHALLOWEST, Scene
 from extrags.sequence import EndoscopicSequence
 from extrags.splat_files.reading import read_splat_file
+from extrags.splat_files.scale_search import LARGEST_SCALE, SMALLEST_SCALE, ScaleSearch
 
 __all__ = ["ImportedScene", "import_scene"]
 
 _FARTHEST = 1e7
 _LARGEST_LOG_SCALE = 16.0
 _MIN_SEEN_SHARE = 0.05
-_LARGEST_RATIO = 2.0
+_CERTAIN_MISFIT = 0.05
+"""Where known depth agrees so well, no other scale is looked for."""
+_LOOSE_SCALE = 1.5
+_LOW_CORRELATION = 0.5
 _SAMPLE = 20_000
 """So many Gaussians tell how far away a scene is."""
 _WIDTH_PX = 160
@@ -61,9 +65,9 @@ def import_scene(
         config: scale of the file's unit.
 
     Raises:
-        SourceError: when the file is damaged, numbers are out of range, scene and cameras do not fit each
-            other, or the unit of both is too large for a scene without light: the message says how, and names
-            the scale.
+        SourceError: when the file is damaged, numbers are out of range, another scale fits the frames clearly
+            better (it is named, and was rendered), none fits, or the unit of scene and cameras is too large
+            for a scene without light.
         PoseError: when the sequence's poses are not those of its source: estimated ones have their own world.
     """
     config = ImportedConfig() if config is None else config
@@ -74,7 +78,8 @@ def import_scene(
             file=path,
             field="world_from_camera",
         )
-    scene = _in_range(_scaled(read_splat_file(path), config.scale), path)
+    given = read_splat_file(path)
+    scene = _in_range(_scaled(given, config.scale), path)
     statements = []
     if scene.light is not None and len(scene.light.log_exposure) != len(sequence.train):
         statements.append(
@@ -82,31 +87,86 @@ def import_scene(
             f"{len(sequence.train)} training frames: they start from the mean"
         )
         scene = Scene(scene.gaussians, replace(scene.light, log_exposure=torch.zeros(len(sequence.train))))
-    depth = None if scene.light is not None else _typical_depth(scene, sequence)
-    if depth is not None and depth < SHALLOWEST:
-        raise SourceError(
-            f"the typical depth in {sequence.name} is {depth:.3g} units, too small without light, as nothing "
-            f"nearer than {NEAR:g} is rendered; scale its poses and depth up, and imported.scale, now "
-            f"{config.scale:g}, by the same factor",
-            file=path,
-            field="imported.scale",
-        )
+    # Known depth says how large the unit is whatever the scale; without it the scale has to be right first.
+    if sequence.training_depth_known:
+        _check_unit(scene, sequence, config.scale, path)
+    statements += _scale_statements(given, sequence, config.scale, path)
+    if not sequence.training_depth_known:
+        _check_unit(scene, sequence, config.scale, path)
     seen, error, ratio = _compared(scene, sequence)
     if seen < _MIN_SEEN_SHARE:
-        raise SourceError(_elsewhere(scene, sequence, seen), file=path, field="means")
-    if ratio is not None and not 1 / _LARGEST_RATIO < ratio < _LARGEST_RATIO:
         raise SourceError(
-            f"its depth is {ratio:.3g} times that of the frames (median): its unit is another, or it was "
-            f"made with other cameras. imported.scale is {config.scale:g}; {config.scale / ratio:.4g} "
-            "would make the depths equal",
+            f"{_elsewhere(scene, sequence, seen)}. Were other cameras used, other axes, or another light?",
             file=path,
-            field="imported.scale",
+            field="means",
         )
     if scene.light is None:
         statements.append("without light: its colours hold the brightness of its recording")
     statements.append("it may have been made from held-out frames too: nothing in the file says so")
     psnr = -10 * math.log10(max(error, 1e-20))
     return ImportedScene(scene, seen, psnr, ratio, tuple(statements))
+
+
+def _check_unit(scene: Scene, sequence: EndoscopicSequence, scale: float, path: Path) -> None:
+    depth = None if scene.light is not None else _typical_depth(scene, sequence)
+    if depth is not None and depth < SHALLOWEST:
+        raise SourceError(
+            f"the typical depth in {sequence.name} is {depth:.3g} units, too small without light, as nothing "
+            f"nearer than {NEAR:g} is rendered; scale its poses and depth up, and imported.scale, now "
+            f"{scale:g}, by the same factor",
+            file=path,
+            field="imported.scale",
+        )
+
+
+def _scale_statements(given: Scene, sequence: EndoscopicSequence, scale: float, path: Path) -> list[str]:
+    """Refuse a scale that the frames contradict; returns what has to be known of one that they do not.
+
+    Args:
+        given: in the unit of its file.
+        sequence: posed frames.
+        scale: units of the sequence in one of the file.
+        path: the file, for messages.
+
+    Raises:
+        SourceError: another scale is clearly better, and was rendered; or none fits.
+    """
+    search = ScaleSearch(given, sequence)
+    found = search.at(scale)
+    if found.correlation is None and found.depth_error is None:
+        return ["the frames have neither depth nor contrast: nothing tells its scale"]
+    statements = []
+    if found.misfit > _CERTAIN_MISFIT or found.depth_error is None or not found.fits:
+        tried = search.along()
+        least = min(tried, key=lambda fit: fit.misfit)
+        best = search.refined(least)
+        if best.fits and (best.clearly_better_than(found) or not found.fits):
+            raise SourceError(
+                f"with imported.scale {scale:g}, the training views {found.words}; with {best.scale:g}, "
+                f"which fits, they {best.words}",
+                file=path,
+                field="imported.scale",
+            )
+        if not found.fits:
+            raise SourceError(
+                f"{_elsewhere(_scaled(given, scale), sequence, found.shown_share)}. No scale from "
+                f"{SMALLEST_SCALE:g} to {LARGEST_SCALE:g} puts it where the frames show it: with the best, "
+                f"{best.scale:g}, they {best.words}. Were other cameras used, other axes, or another light?",
+                file=path,
+                field="means",
+            )
+        alike = [fit.scale for fit in tried if not least.clearly_better_than(fit)]
+        if found.depth_error is None and max(alike) > _LOOSE_SCALE * min(alike):
+            statements.append(
+                "its scale was taken as given: the frames have no depth, and their pictures fit alike from "
+                f"{min(alike):.2g} to {max(alike):.2g}"
+            )
+    if found.correlation is not None and found.correlation < _LOW_CORRELATION:
+        statements.append(
+            f"its pictures and the training frames correlate by {found.correlation:.2f} only: its cameras or "
+            "its light may be others"
+        )
+    return statements
 
 
 def _scaled(scene: Scene, scale: float) -> Scene:
@@ -213,7 +273,6 @@ def _elsewhere(scene: Scene, sequence: EndoscopicSequence, seen: float) -> str:
         return f"({', '.join(f'{value:.3g}' for value in center)}), half of them within {spread:.3g}"
 
     return (
-        f"the training views of {sequence.name} hardly see it: {100 * seen:.1f} % of their pixels; its "
-        f"Gaussians are around {place(means)}, the cameras around {place(centers)} units. Were other cameras "
-        "used, other axes, or another unit (imported.scale)?"
+        f"the training views of {sequence.name} show it in {100 * seen:.1f} % of their pixels; its Gaussians "
+        f"are around {place(means)}, the cameras around {place(centers)} units"
     )

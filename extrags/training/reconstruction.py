@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Int
 
+from extrags.arguments import check_sequence_argument, check_settings_argument
 from extrags.cameras import Cameras
 from extrags.config import CoarseConfig, DensifyConfig
 from extrags.errors import CaptureError, ConfigError
@@ -51,9 +52,12 @@ def reconstruct(
         earlier: a scene of some of the frames to go on from, for the iterations it names; None starts anew.
 
     Raises:
+        TypeError: when `sequence` is none, such as a name.
+        SourceError: when its arrays cannot be those of a recording (`extrags.sequence_checks.check_arrays`).
         CaptureError: with fewer than one frame, nothing to start from, or a unit of length too large for a
             scene without light.
-        ConfigError: where poses are refined and there is an earlier scene, which belongs to other poses.
+        ConfigError: for other settings than those of the coarse scene, and where poses are refined and there
+            is an earlier scene, which belongs to other poses.
         ShapeError: for an earlier scene that does not fit (`extrags.training.continuing.continued_start`).
         DivergedError: when the optimisation does not stay finite.
 
@@ -65,7 +69,9 @@ def reconstruct(
     Source: the loss of 3DGS [ExtraGS, eq. 3] inside the mask, with inverse depth where it is known; see
     docs/references.md.
     """
+    check_sequence_argument(sequence, "reconstruct")
     config = CoarseConfig() if config is None else config
+    check_settings_argument(config, CoarseConfig, "reconstruct", 'extrags.PROFILES["quick"].coarse')
     if not sequence.training_depth_known:
         # The oracle is given held-out frames too, whose depth is for the evaluation alone.
         sequence = replace(sequence, depth_mm=None)

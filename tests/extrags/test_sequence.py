@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -156,6 +157,41 @@ class TestSequence:
         sequence = small_sequence()
         with pytest.raises(ShapeError, match=rf"split.{name} has indices"):
             replace(sequence, split=replace(sequence.split, **{name: np.array([0, index])}))
+
+    @pytest.mark.usefixtures("unchecked")
+    @pytest.mark.parametrize(
+        ("field", "value", "message"),
+        [
+            ("mask", None, r"test/0@half: mask is NoneType, expected a NumPy array, bool"),
+            ("K", None, "K is NoneType"),
+            ("rgb", None, "rgb is NoneType"),
+            ("rgb", [[0]], "rgb is list, expected a NumPy array, uint8"),
+            ("split", None, "split is NoneType, expected Split"),
+            ("split", ([0], [1]), "split is tuple, expected Split"),
+        ],
+    )
+    def test_what_is_no_array_is_refused_by_name(self, field: str, value: Any, message: str) -> None:
+        with pytest.raises(ShapeError, match=message):
+            replace(small_sequence(), **{field: value})
+
+    @pytest.mark.usefixtures("unchecked")
+    @pytest.mark.parametrize("indices", [[0, 2], np.array([True, False]), np.array([0.0]), np.array(1)])
+    def test_a_split_of_anything_but_indices_is_refused(self, indices: np.ndarray) -> None:
+        with pytest.raises(ShapeError, match=r"split half: train is .*, expected .*integer \(any\)"):
+            Split("half", indices, np.array([1]))
+
+    def test_its_representation_is_a_line(self) -> None:
+        sequence = replace(small_sequence(), truth={"exposure": list(range(5000))})
+        assert repr(sequence) == (
+            "EndoscopicSequence('test/0@half', 4 frames of 8 x 6 px, 2 train and 2 held out (half), "
+            "poses given, depth of training frames, millimetres as the source has them, pinhole)"
+        )
+        hidden = replace(sequence, world_from_camera=None).without_training_depth()
+        assert "no poses, depth for the evaluation alone" in repr(hidden)
+        bare = replace(sequence, depth_mm=None, metric=False)
+        assert "no depth, arbitrary scale" in repr(bare)
+        estimated = replace(sequence, depth_error=np.zeros((4, 6, 8), np.float32))
+        assert "estimated depth" in repr(estimated)
 
     @pytest.mark.usefixtures("unchecked")
     def test_wrong_number_of_names(self) -> None:

@@ -1,0 +1,118 @@
+"""A sequence from arrays in memory, checked as a reader checks a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Real, UInt8
+
+from extrags.errors import ShapeError, SourceError
+from extrags.frame_stacks import stacked
+from extrags.sequence import EndoscopicSequence
+from extrags.sequence_checks import check_arrays, check_pose
+from extrags.splits import Split, every_nth
+
+__all__ = ["sequence_from_arrays"]
+
+_HELD_OUT_EVERY = 8
+
+
+def sequence_from_arrays(
+    rgb: UInt8[np.ndarray, "f h w 3"] | Float[np.ndarray, "f h w 3"],
+    K: Real[np.ndarray, "3 3"] | Real[np.ndarray, "f 3 3"],
+    *,
+    world_from_camera: Real[np.ndarray, "f 4 4"] | None = None,
+    depth_mm: Real[np.ndarray, "f h w"] | None = None,
+    mask: Bool[np.ndarray, "h w"] | Bool[np.ndarray, "f h w"] | None = None,
+    specular: Bool[np.ndarray, "f h w"] | None = None,
+    split: Split | None = None,
+    name: str = "arrays",
+    metric: bool = False,
+    frame_names: Sequence[str] = (),
+) -> EndoscopicSequence:
+    """A sequence of pinhole frames from arrays, with the checks that every reader's sequence passes.
+
+    What numbers alone do not tell is not checked: OpenGL axes, poses from world to camera, or depth in
+    another unit than poses; readers refuse those where frames have depth.
+
+    Args:
+        rgb: colours as the camera encoded them: 8-bit, or floats in [0, 1], which are rounded to 8 bits.
+        K: intrinsics in pixels, of all frames or of each; pixel centres are at +0.5.
+        world_from_camera: camera to world, OpenCV axes (x right, y down, z forward). None: the poses stage
+            estimates them.
+        depth_mm: z-depth (not along the ray) in the unit of the poses; 0, NaN and infinity are unknown.
+        mask: true where a pixel shows tissue, of all frames or of each; None: everywhere.
+        specular: true on specular highlights, which then have no weight in training. None: not known;
+            readers look for them, this function does not.
+        split: training and held-out frames. None holds out frames 0, 8, 16, ...
+        name: for messages and reports.
+        metric: whether lengths are millimetres; else their unit is arbitrary.
+        frame_names: one per frame, for messages.
+
+    Raises:
+        ShapeError: sizes or types do not fit, or the split names frames that are not there.
+        PoseError: a pose is no rigid motion: mirrored, scaled, transposed or not finite.
+        SourceError: colours out of range, intrinsics that are no pinhole of this size, negative depth, no
+            depth at all, a mask without a pixel, a frame in both parts of the split; names frame and field.
+
+    Returns:
+        The sequence; arrays that need no conversion are not copied.
+    """
+    rgb = np.asarray(rgb)
+    if rgb.ndim != 4 or rgb.shape[-1] != 3 or not len(rgb):
+        raise ShapeError(f"{name}: rgb is {rgb.dtype} {rgb.shape}, expected uint8 or float [F, H, W, 3]")
+    frames, height, width = rgb.shape[:3]
+    labels = tuple(frame_names) or tuple(f"{k:04d}" for k in range(frames))
+    if len(labels) != frames:
+        raise ShapeError(f"{name}: {len(labels)} frame names for {frames} frames")
+    K = np.asarray(K, dtype=np.float64)
+    mask = np.ones((height, width), dtype=np.bool_) if mask is None else np.asarray(mask)
+    sequence = EndoscopicSequence(
+        name=name,
+        rgb=_as_bytes(rgb, labels),
+        K=np.tile(K, (frames, 1, 1)) if K.shape == (3, 3) else K,
+        mask=np.broadcast_to(mask, (frames, height, width)) if mask.shape == (height, width) else mask,
+        split=every_nth(frames, _HELD_OUT_EVERY) if split is None else split,
+        world_from_camera=None if world_from_camera is None else _rigid(world_from_camera, labels),
+        depth_mm=None if depth_mm is None else _without_gaps(np.asarray(depth_mm)),
+        specular=None if specular is None else np.asarray(specular),
+        metric=metric,
+        frame_names=labels,
+    )
+    check_arrays(sequence)
+    if not len(sequence.train):
+        raise SourceError("no training frame is left; expected at least one", field="split")
+    if sequence.depth_mm is not None and not any(bool((depth > 0).any()) for depth in sequence.depth_mm):
+        raise SourceError(
+            "no pixel of any frame has a depth; pass None where none is known", field="depth_mm"
+        )
+    return sequence
+
+
+def _as_bytes(rgb: np.ndarray, labels: Sequence[str]) -> np.ndarray:
+    if not np.issubdtype(rgb.dtype, np.floating):
+        return rgb
+    for image, label in zip(rgb, labels, strict=True):
+        low, high = float(image.min()), float(image.max())
+        # Also false for NaN.
+        if not 0 <= low <= high <= 1:
+            raise SourceError(
+                f"colours are {rgb.dtype} from {low:g} to {high:g}; expected floats in [0, 1], or uint8",
+                frame=label,
+                field="rgb",
+            )
+    return stacked((np.rint(image * 255).astype(np.uint8) for image in rgb), len(rgb))
+
+
+def _rigid(poses: np.ndarray, labels: Sequence[str]) -> np.ndarray:
+    given = np.asarray(poses, dtype=np.float64)
+    if given.shape != (len(labels), 4, 4):
+        raise ShapeError(f"world_from_camera is {given.shape}, expected ({len(labels)}, 4, 4)")
+    return np.stack([check_pose(pose, frame=label) for pose, label in zip(given, labels, strict=True)])
+
+
+def _without_gaps(depth_mm: np.ndarray) -> np.ndarray:
+    """As float32, 0 where it is not finite."""
+    known = (np.where(np.isfinite(depth), depth, 0).astype(np.float32) for depth in depth_mm)
+    return stacked(known, len(depth_mm))

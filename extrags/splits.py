@@ -1,0 +1,47 @@
+"""Which frames train and which are held out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int
+
+from extrags.array_shapes import check_array
+
+__all__ = ["Split", "every_nth"]
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Training and held-out frames; always defined by a manifest, never by file names.
+
+    Args:
+        name: e.g. `sparse`, `distanced`, `every8`.
+        train: indices of frames the reconstruction may see.
+        test: indices of held-out frames.
+        version: version of the rule behind the name; raised by hand when the rule changes.
+
+    Raises:
+        ShapeError: when the indices are no arrays of integers, such as `np.array([0, 2])`.
+    """
+
+    name: str
+    train: Int[np.ndarray, "n_train"]
+    test: Int[np.ndarray, "n_test"]
+    version: int = 1
+
+    def __post_init__(self) -> None:
+        for part, indices in (("train", self.train), ("test", self.test)):
+            check_array(indices, f"split {self.name}: {part}", (None,), np.integer)
+
+
+def every_nth(frames: int, holdout_every: int) -> Split:
+    """Hold out frames 0, n, 2n, ... in the order of the recording; of one frame, which trains, none.
+
+    Source: the convention (n = 8) of Barron et al., Mip-NeRF 360, CVPR 2022, and Kerbl et al., 3D Gaussian
+    Splatting, 2023.
+    """
+    index = np.arange(frames)
+    held_out = (index % holdout_every == 0) & (frames > 1)
+    return Split(f"every{holdout_every}", index[~held_out], index[held_out])
