@@ -22,6 +22,7 @@ from data_catalog.folders import FolderDataset, find_reader
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES
 from data_catalog.phantom.dataset import PHANTOM
 from data_catalog.specular import with_specular
+from extrags.arguments import check_settings_argument
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError, SourceNotFoundError, UnknownSequenceError
 from extrags.redaction import without_credentials
@@ -126,10 +127,12 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
         SourceError: a file is wrong; names file, frame and field. `SourceNotFoundError` and `PoseError`
             are kinds of it.
         UnknownSequenceError: from `resolve`.
-        ConfigError: settings that this source cannot be read with, or `source` is no name and no path.
+        ConfigError: settings that this source cannot be read with, or `source` is no name and no path, or
+            `config` other settings, such as those of all stages.
     """
     source = source if isinstance(source, Source) else resolve(source)
-    dataset, config = _dataset(source), config or IngestConfig()
+    dataset, config = _dataset(source), IngestConfig() if config is None else config
+    check_settings_argument(config, IngestConfig, "read", 'extrags.PROFILES["quick"].ingest')
     if config.calibration is not None and not isinstance(dataset, FolderDataset):
         raise ConfigError(
             f"ingest.calibration is given, but {source.name} states its intrinsics itself; give one of the "

@@ -3,7 +3,8 @@
 What is refused: non-finite or mirrored poses, intrinsics that are no pinhole, depth with NaN, infinity or
 negative values (0 is the one mark for "unknown"; files' NaN and infinity were turned into 0), depth that is
 known in no frame, a frame without any valid mask, a split that leaks, and camera axes or a depth scale that
-depth itself contradicts. What is readable but questionable is reported by `data_catalog.diagnostics`.
+depth itself contradicts. What the numbers alone show is looked for by `extrags.sequence_checks`; here stands
+what takes several frames. What is readable but questionable is reported by `data_catalog.diagnostics`.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from extrags.cameras import as_rotation, invert_poses, project_points, transform_points, unproject_pixels
+from extrags.cameras import invert_poses, project_points, transform_points, unproject_pixels
 from extrags.errors import PoseError, SourceError
 from extrags.sequence import EndoscopicSequence
+from extrags.sequence_checks import check_arrays, check_depth, check_intrinsics, check_pose
 
 __all__ = [
     "axis_readings",
@@ -67,98 +69,13 @@ def check_sequence(sequence: EndoscopicSequence, *, file: object = None) -> None
         PoseError: a pose that is not a rigid motion, or axes or positions that the depth contradicts.
         SourceError: anything else; names frame and field.
     """
-    _check_split(sequence, file)
-    for index in range(len(sequence)):
-        name = sequence.frame_name(index)
-        check_intrinsics(sequence.K[index], sequence.width, sequence.height, frame=name, file=file)
-        if not sequence.mask[index].any():
-            raise SourceError("the mask leaves no pixel", file=file, frame=name, field="mask")
-        if sequence.world_from_camera is not None:
-            check_pose(sequence.world_from_camera[index], frame=name, file=file)
-        if sequence.depth_mm is not None:
-            check_depth(sequence.depth_mm[index], frame=name, file=file)
+    if not sequence.train.size:
+        raise SourceError("no training frame is left; expected at least one", file=file, field="split")
+    check_arrays(sequence, file=file)
     if sequence.depth_mm is not None and not any((depth > 0).any() for depth in sequence.depth_mm):
         raise SourceError("no pixel of any frame has a depth", file=file, field="depth_mm")
     check_axes(sequence, file=file)
     check_depth_scale(sequence, file=file)
-
-
-def check_pose(
-    pose: Float[np.ndarray, "4 4"], *, frame: object = None, file: object = None
-) -> Float[np.ndarray, "4 4"]:
-    """The rigid motion a matrix stands for, its rotation projected to SO(3) where it lost digits.
-
-    Raises:
-        PoseError: not finite, not a rotation, mirrored, or a last row other than 0, 0, 0, 1.
-    """
-    if not np.isfinite(pose).all():
-        raise PoseError(
-            f"{int((~np.isfinite(pose)).sum())} of 16 entries are NaN or infinite",
-            file=file,
-            frame=frame,
-            field="world_from_camera",
-        )
-    if not np.allclose(pose[3], (0, 0, 0, 1), atol=1e-6):
-        hint = " The matrix looks transposed" if np.allclose(pose[:, 3], (0, 0, 0, 1), atol=1e-6) else ""
-        raise PoseError(
-            f"the last row is {np.round(pose[3], 4).tolist()}, expected [0, 0, 0, 1].{hint}",
-            file=file,
-            frame=frame,
-            field="world_from_camera",
-        )
-    rigid = np.eye(4)
-    rigid[:3, :3] = as_rotation(np.asarray(pose[:3, :3], dtype=np.float64), frame=frame, file=file)
-    rigid[:3, 3] = pose[:3, 3]
-    return rigid
-
-
-def check_intrinsics(
-    K: Float[np.ndarray, "3 3"], width: int, height: int, *, frame: object = None, file: object = None
-) -> None:
-    """Refuse a K that is no pinhole for an image of this size.
-
-    Raises:
-        SourceError: names the entry that is wrong.
-    """
-
-    def refuse(problem: str) -> SourceError:
-        return SourceError(problem, file=file, frame=frame, field="K")
-
-    if not np.isfinite(K).all():
-        raise refuse("K holds NaN or infinity")
-    for name, focal, size in (("fx", K[0, 0], width), ("fy", K[1, 1], height)):
-        if focal <= 0:
-            raise refuse(f"focal length {name} = {focal:g} px; expected a positive number")
-        if not 0.05 * size < focal < 100 * size:
-            raise refuse(f"focal length {name} = {focal:g} px does not fit an image of {width} x {height} px")
-    if not np.allclose([K[1, 0], K[2, 0], K[2, 1], K[2, 2]], (0, 0, 0, 1), atol=1e-9) or abs(K[0, 1]) > 1e-9:
-        raise refuse(f"expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], found {np.round(K, 4).tolist()}")
-    for name, center, size in (("cx", K[0, 2], width), ("cy", K[1, 2], height)):
-        if not -size < center < 2 * size:
-            raise refuse(f"principal point {name} = {center:g} px lies far outside {width} x {height} px")
-
-
-def check_depth(depth_mm: Float[np.ndarray, "h w"], *, frame: object = None, file: object = None) -> None:
-    """Refuse a depth map with values that are no depth; 0 means unknown, and may stand throughout.
-
-    Raises:
-        SourceError: names the kind of value and how many there are.
-    """
-    for found, kind in (
-        (np.isnan(depth_mm), "NaN"),
-        (np.isinf(depth_mm), "infinite"),
-        (depth_mm < 0, "negative"),
-    ):
-        count = int(found.sum())
-        if count:
-            v, u = np.argwhere(found)[0]
-            raise SourceError(
-                f"{count} of {depth_mm.size} depth values are {kind}, the first at row {v}, column {u}; "
-                "expected millimetres, 0 where unknown",
-                file=file,
-                frame=frame,
-                field="depth_mm",
-            )
 
 
 def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
@@ -277,22 +194,6 @@ def _check_polarity(
             "tissue",
             file=file,
             field="mask",
-        )
-
-
-def _check_split(sequence: EndoscopicSequence, file: object) -> None:
-    for name, indices in (("train", sequence.train), ("test", sequence.test)):
-        if np.unique(indices).size != indices.size:
-            raise SourceError(f"the {name} split names a frame twice", file=file, field="split")
-    if not sequence.train.size:
-        raise SourceError("no training frame is left; expected at least one", file=file, field="split")
-    shared = np.intersect1d(sequence.train, sequence.test)
-    if shared.size:
-        raise SourceError(
-            f"{shared.size} frames both train and evaluate, this one is the first",
-            file=file,
-            frame=sequence.frame_name(int(shared[0])),
-            field="split",
         )
 
 

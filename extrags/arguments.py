@@ -42,8 +42,9 @@ def check_settings_argument(config: object, expected: type[object], function: st
         ConfigError: says what to pass.
     """
     if not isinstance(config, expected):
+        article = "an" if expected.__name__[0] in "AEIOU" else "a"
         raise ConfigError(
-            f"{function} was given {_given(config)} as its config; pass a {expected.__name__}, "
+            f"{function} was given {_given(config)} as its config; pass {article} {expected.__name__}, "
             f"such as {example}"
         )
 

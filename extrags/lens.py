@@ -119,6 +119,18 @@ class Lens:
         parameters = (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
         return cls("PINHOLE", parameters, width, height)
 
+    def scaled(self, width: int, height: int) -> Lens:
+        """The same lens in images of another size.
+
+        Args:
+            width: image width in pixels.
+            height: image height in pixels; of nearly the same proportion where there is one focal length.
+        """
+        across, down = width / self.width, height / self.height
+        factors = {"f": across, "fx": across, "cx": across, "fy": down, "cy": down}
+        named = zip(LENS_PARAMETERS[self.model], self.parameters, strict=True)
+        return Lens(self.model, tuple(value * factors.get(name, 1.0) for name, value in named), width, height)
+
     @classmethod
     def fisheye(cls, K: Float[np.ndarray, "3 3"], radial: RadialLens, width: int, height: int) -> Lens:
         """OpenCV's fisheye of a radial lens.

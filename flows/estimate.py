@@ -98,9 +98,11 @@ def _seconds_of_poses(work: Workload) -> float:
         # See `extrags.poses.pairs`: neighbours, frames a power of two apart, and evenly spread ones.
         farther = max(0.0, math.log2(train) - math.log2(near))
         pairs = train * (near + farther) + spread * (spread - 1) / 2 + work.test * (2 * near + spread)
-    share = min(1.0, FEATURES_PER_PX * work.pixels / settings.n_features)
+    narrower = 1.0 if work.width is None else min(1.0, settings.max_width / float(work.width))
+    pixels = work.pixels * narrower**2
+    share = min(1.0, FEATURES_PER_PX * pixels / settings.n_features)
     of_pair = PAIR_SECONDS[0] + PAIR_SECONDS[1] * share**2 * (settings.n_features / USUAL_FEATURES) ** 2
-    return work.frames * (FEATURE_SECONDS_PER_PX * work.pixels + MAPPING_SECONDS) + pairs * of_pair
+    return work.frames * (FEATURE_SECONDS_PER_PX * pixels + MAPPING_SECONDS) + pairs * of_pair
 
 
 def _pixels_of_depth(work: Workload) -> float:

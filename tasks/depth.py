@@ -14,6 +14,7 @@ BUNDLED = "bundled"
 
 TRIANGULATION = frozenset(
     {
+        "max_width",
         "n_features",
         "peak_threshold",
         "edge_threshold",

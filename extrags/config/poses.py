@@ -14,6 +14,12 @@ __all__ = ["PosesConfig"]
 class PosesConfig(StageConfig):
     """Camera poses, for sources without them."""
 
+    max_width: int = Field(
+        800,
+        ge=64,
+        description="features are looked for in frames that are at most so many pixels wide: larger ones "
+        "take several times as long",
+    )
     n_features: int = Field(6000, ge=100, description="SIFT features per image")
     peak_threshold: float = Field(
         0.001, gt=0, description="SIFT peak threshold; COLMAP's default is too high for mucosa"

@@ -103,6 +103,25 @@ class LensCalibration:
             f"({view}{f', {kind}{terms}' if terms else ''}), estimated"
         )
 
+    def scaled(self, width: int, height: int) -> LensCalibration:
+        """The same for images of another size, in whose pixels all figures then are."""
+        across = width / self.lens.width
+        focal_px, residual_px = (
+            None if value is None else value * across for value in (self.estimated_focal_px, self.residual_px)
+        )
+        in_pixels = {"f", "fx", "fy", "cx", "cy"}
+        std = {
+            name: value if value is None or name not in in_pixels else value * across
+            for name, value in self.std.items()
+        }
+        return replace(
+            self,
+            lens=self.lens.scaled(width, height),
+            estimated_focal_px=focal_px,
+            residual_px=residual_px,
+            std=std,
+        )
+
     def to_json(self) -> dict[str, Any]:
         """As plain JSON; `from_json` reads it."""
         return {

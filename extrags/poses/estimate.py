@@ -117,12 +117,13 @@ class PoseEstimate:
 def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = None) -> PoseEstimate:
     """Find the cameras of a sequence: by COLMAP, and where that fails, by colour and depth.
 
-    *COLMAP*: SIFT inside the validity mask, known intrinsics held fixed, incremental mapping on the training
-    frames alone; the largest model counts. Held-out frames are registered afterwards against the finished
-    map, so that nothing of them reaches it. Where the sequence has depth, the unit becomes the millimetre
-    (`extrags.poses.depth_scale`); where it has none and `config.working_distance_mm` is given, the median
-    depth of the pixels, interpolated between the points that a frame observes, becomes that. Of depth in an
-    arbitrary unit, known at half of the pixels, the median itself becomes that. COLMAP runs in
+    *COLMAP*: SIFT inside the validity mask, in frames of at most `config.max_width` pixels across, known
+    intrinsics held fixed, incremental mapping on the training frames alone; the largest model counts.
+    Held-out frames are registered afterwards against the finished map, so that nothing of them reaches it.
+    Where the sequence has depth, the unit becomes the millimetre (`extrags.poses.depth_scale`); where it has
+    none and `config.working_distance_mm` is given, the median depth of the pixels, interpolated between the
+    points that a frame observes, becomes that. Of depth in an arbitrary unit, known at half of the pixels,
+    the median itself becomes that. COLMAP runs in
     a process of its own.
 
     Where that leaves more than a tenth of the training frames without a pose, and no depth is there to align
@@ -180,14 +181,18 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
         return _by_depth(sequence, config, None)
     unknown_lens = _estimates_lens(sequence, config, native=native)
     # The lenses that are tried have one focal length.
-    seen = sequence.with_square_pixels() if unknown_lens else sequence
+    square = sequence.with_square_pixels() if unknown_lens else sequence
+    seen = square.at_most_width(config.max_width)
     job = _job(seen, config, unknown_lens=unknown_lens)
     no_depth = sequence.depth_mm is None or config.fallback == "never"
     attempt = attempted(seen, job, config, _run, retry=no_depth)
     result, registered, report = attempt.result, attempt.registered, attempt.report
+    # Told in the pixels of the frames.
+    report["mean_reprojection_px"] *= square.width / seen.width
     calibration = None
     if "calibration" in report:
-        calibration = LensCalibration.from_json(report["calibration"])
+        calibration = LensCalibration.from_json(report["calibration"]).scaled(square.width, square.height)
+        report["calibration"] = calibration.to_json()
         told = _LOG.info if calibration.determined else _LOG.warning
         told("%s: %s", sequence.name, calibration.summary)
     if enough_registered(report, config):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -93,8 +93,10 @@ def triangulate_points(
         raise ShapeError(f"{sequence.name} has no poses yet; the poses stage finds them")
     if len(sequence.train) < MIN_TRAINING_FRAMES:
         return _assessed(sequence, _no_points(sequence))
-    module = "extrags.poses.colmap_triangulation"
-    return _assessed(sequence, run_job(module, _job(sequence, config), sequence.name, stage=stage))
+    module, seen = "extrags.poses.colmap_triangulation", sequence.at_most_width(config.max_width)
+    result = run_job(module, _job(seen, config), sequence.name, stage=stage)
+    larger = np.array([sequence.width / seen.width, sequence.height / seen.height])
+    return _assessed(sequence, replace(result, observed_px=result.observed_px * larger))
 
 
 def _job(sequence: EndoscopicSequence, config: PosesConfig) -> PoseJob:

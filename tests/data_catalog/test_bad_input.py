@@ -349,7 +349,7 @@ class TestMasksBeforePoses:
 class TestChecks:
     def test_leaking_split(self, sparse) -> None:
         leaking = replace(sparse, split=Split("bad", np.arange(21), np.arange(20, 48)))
-        with pytest.raises(SourceError, match="1 frames both train and evaluate"):
+        with pytest.raises(SourceError, match="1 of 48 frames both train and evaluate"):
             check_sequence(leaking)
 
     def test_empty_mask(self, sparse) -> None:

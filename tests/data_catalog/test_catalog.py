@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import extrags
 from data_catalog.catalog import (
     describe,
     glance,
@@ -167,16 +168,24 @@ class TestPhantomSettings:
 class TestWhatIsNoName:
     def test_a_sequence_that_was_read(self) -> None:
         sequence = read("phantom/7@sparse", IngestConfig(width=40, max_frames=4))
-        with pytest.raises(ConfigError, match=r"^phantom/7@sparse is a sequence that has been read already"):
-            read(sequence)
+        for function in (read, extrags.read):
+            with pytest.raises(ConfigError, match=r"^phantom/7@sparse is a sequence that has been read"):
+                function(sequence)
 
     @pytest.mark.parametrize(
         ("given", "kind"), [(7, "int"), (None, "NoneType"), ([1], "list"), (b"a", "bytes")]
     )
     def test_other_things(self, given, kind) -> None:
-        for function in (read, resolve, glance, source_fingerprint):
+        for function in (read, extrags.read, resolve, glance, source_fingerprint):
             with pytest.raises(ConfigError, match=f"expected the name of a sequence or a path, found {kind}"):
                 function(given)
+
+
+class TestWhatAreNoSettingsOfReading:
+    @pytest.mark.parametrize("given", [extrags.PROFILES["quick"], "quick", {}, {"width": 40}, 0])
+    def test_are_refused(self, given) -> None:
+        with pytest.raises(ConfigError, match=r"^read was given .* as its config; pass an Ingest"):
+            extrags.read("phantom/7@sparse", given)
 
 
 class TestPartsOfRecordings:

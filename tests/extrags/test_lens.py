@@ -57,6 +57,18 @@ def test_resampling_error_is_below_a_tenth_of_a_pixel(model) -> None:
         assert error_px.max() < 0.1
 
 
+@pytest.mark.parametrize("model", sorted(LENS_PARAMETERS))
+def test_a_lens_of_larger_images_sees_the_same_rays(model: str) -> None:
+    values = {"f": 100.0, "fx": 100.0, "fy": 102.0, "cx": 61.0, "cy": 47.0, "omega": 0.9}
+    lens = Lens(model, tuple(values.get(name, 0.01) for name in LENS_PARAMETERS[model]), 120, 90)
+    larger = lens.scaled(240, 180)
+    assert (larger.width, larger.height) == (240, 180)
+    np.testing.assert_array_equal(larger.K[:2], 2 * lens.K[:2])
+    x, y = np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.3, 0.3, 5))
+    np.testing.assert_array_equal(larger.distorted(x, y), lens.distorted(x, y))
+    assert larger.scaled(120, 90) == lens
+
+
 def test_a_plane_keeps_its_depth() -> None:
     """z-depth of a slanted plane seen through a lens, resampled to the pinhole."""
     import pycolmap

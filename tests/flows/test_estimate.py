@@ -56,7 +56,7 @@ class TestEstimate:
 
     def test_poses_take_as_long_as_they_did(self) -> None:
         """Against recorded stages; far more frames are not paired with one another all."""
-        config = profile_config("balanced")
+        config = profile_config("balanced").with_overrides({"poses.max_width": 4000})
 
         def expected(width: int, height: int, frames: int, train: int) -> float:
             size = {"pixels": float(width * height), "width": float(width)}
@@ -72,6 +72,9 @@ class TestEstimate:
             assert expected(*size) == pytest.approx(recorded, rel=0.25)
         few, many = expected(675, 540, 60, 53), expected(675, 540, 600, 525)
         assert 8 * few < many < 20 * few
+        # They are looked for in frames of a bounded width.
+        config = profile_config("balanced")
+        assert expected(1600, 1000, 60, 53) == expected(800, 500, 60, 53)
 
     def test_depth_looks_at_frames_of_a_bounded_width(self) -> None:
         config = profile_config("balanced")

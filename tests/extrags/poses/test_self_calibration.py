@@ -91,6 +91,29 @@ class TestFocalLength:
         # Nothing was bent: the frames, held-out ones too, are the very same.
         np.testing.assert_array_equal(posed.rgb, room.rgb)
 
+    def test_of_smaller_frames_it_is_told_in_pixels_of_the_given_ones(
+        self, found: PoseEstimate, room: EndoscopicSequence
+    ) -> None:
+        smaller = estimate_poses(guessed(room), CONFIG.model_copy(update={"max_width": 160}))
+        assert smaller.calibration is not None
+        assert found.calibration is not None
+        lens = smaller.calibration.lens
+        assert (lens.width, lens.height) == (WIDTH, HEIGHT)
+        np.testing.assert_allclose(lens.K[:2, 2], [WIDTH / 2, HEIGHT / 2])
+        assert smaller.calibration.focal_px == pytest.approx(TRUE_FOCAL_PX, rel=0.03)
+        assert smaller.report["calibration"] == smaller.calibration.to_json()
+        # Of other features: not the same, and told in the same unit.
+        assert smaller.calibration.focal_px != found.calibration.focal_px
+        for part, whole in (
+            (smaller.calibration.focal_std_px, found.calibration.focal_std_px),
+            (smaller.calibration.residual_px, found.calibration.residual_px),
+            (smaller.mean_reprojection_px, found.mean_reprojection_px),
+        ):
+            assert part == pytest.approx(whole, rel=0.7)
+        assert smaller.registered.all()
+        posed = with_estimated_poses(guessed(room), smaller)
+        assert posed.rgb.shape == room.rgb.shape
+
     def test_same_bits(self, found: PoseEstimate, room: EndoscopicSequence) -> None:
         again = estimate_poses(guessed(room), CONFIG)
         assert again.calibration == found.calibration

@@ -63,6 +63,19 @@ def test_observations_are_those_of_training_frames(
     assert float(np.median(points.reprojection_px)) < 0.5
 
 
+def test_of_smaller_frames_observations_are_in_pixels_of_the_given_ones(
+    sequence: EndoscopicSequence, found: tuple[Triangulation, list[Event]]
+) -> None:
+    points = triangulate_points(sequence, CONFIG.model_copy(update={"max_width": 120}))
+    assert len(points) > 100
+    assert len(points) != len(found[0])
+    assert points.observed_px[:, 0].max() > 130
+    # Features of smaller frames are four thirds as far off.
+    assert float(np.median(points.reprojection_px)) < 0.7
+    off_wall = np.abs(np.abs(points.points) - HALF_SIZE_MM).min(1)
+    assert float(np.median(off_wall)) < 0.2
+
+
 def test_progress_and_account(found: tuple[Triangulation, list[Event]]) -> None:
     points, events = found
     steps = [event for event in events if isinstance(event, Progress)]
