@@ -159,7 +159,8 @@ def estimate_memory(
     references = REFERENCE * train * working
     small = round(pixels * min(1.0, SURFACE_WIDTH / size.width) ** 2)
     matched = round(pixels * min(1.0, config.depth.max_width / size.width) ** 2)
-    features = FEATURES * threads * pixels
+    looked_at = round(pixels * min(1.0, config.poses.max_width / size.width) ** 2)
+    features = FEATURES * threads * looked_at
     metrics = METRICS * max(pixels, min(PIXELS_MEASURED_AT_ONCE, pixels * max(1, all_frames - train)))
     whole = PROCESS + _held(SEQUENCE_STACKS, all_frames * pixels)
     rendered = RENDERED_VIEW * max(0, all_frames - train) * pixels
