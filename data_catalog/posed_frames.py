@@ -31,13 +31,13 @@ from data_catalog.images import (
 from data_catalog.lens_use import LensUse
 from data_catalog.sampling import CameraModel, LensSampling, Sampling
 from data_catalog.splits import every_nth
-from data_catalog.visibility import observed_by_depth
 from extrags.cameras import Cameras, rotation_about
 from extrags.config import IngestConfig
 from extrags.errors import SourceError
 from extrags.events import Progress, emit
 from extrags.frame_stacks import FrameStack, stacked
 from extrags.lens import Lens
+from extrags.observed_surface import observed_by_depth
 from extrags.radial_lens import RadialLens
 from extrags.sequence import EndoscopicSequence, Split
 

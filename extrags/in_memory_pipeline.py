@@ -183,12 +183,20 @@ class InMemoryPipeline(Pipeline):
 
     def poses(self) -> None:
         """`extrags.poses.estimate_poses`; frames that cannot be registered are dropped."""
-        from extrags.poses import estimate_poses, with_estimated_poses
+        from extrags.poses import (
+            check_lens_use,
+            estimate_poses,
+            observed_by_those_left,
+            with_estimated_poses,
+        )
 
         with self._timed("poses"):
             self.config.check_imported_has_cameras()
             sequence = self.result.sequence
+            if sequence.intrinsics == "guessed":
+                check_lens_use(self.config.ingest)
             estimate = estimate_poses(sequence, self.config.poses)
+            sequence = replace(sequence, observed=observed_by_those_left(sequence, estimate.registered))
             self.result.sequence = with_estimated_poses(sequence, estimate, self.config.ingest)
 
     def depth(self) -> None:

@@ -19,7 +19,7 @@ from extrags.store.records import remove_record
 from flows.estimate import expected_seconds
 from flows.methods import METHODS, check_not_pinned, method_config, pinned_settings
 from flows.outcome import SequenceOutcome, StageRow
-from flows.outcome_records import OUTCOME, OutcomeRecord, outcome_records, setting_text
+from flows.outcome_records import OUTCOME, OutcomeRecord, outcome_records, record_of, setting_text
 from flows.runners import NotInStoreError, StoreRunner
 from flows.selection import Chosen
 from flows.wiring import run_sequence
@@ -192,10 +192,11 @@ def selected(
         return [case for case in cases if _would_run(case, root, until)]
     records = outcome_records(Store(root))
     if only == "failed":
-        return [case for case in cases if records.get(case.record, {}).get("status") == "failed"]
+        found = [(case, record_of(records, case.record, case.former_record)) for case in cases]
+        return [case for case, record in found if record is not None and record["status"] == "failed"]
 
     def came_so_far(case: SequenceCase) -> bool:
-        record = records.get(case.record)
+        record = record_of(records, case.record, case.former_record)
         return record is not None and (
             record["status"] == "failed" or not _is_earlier(record["until"], until)
         )
@@ -241,7 +242,8 @@ def record_outcome(
     Raises:
         StoreError: when it cannot be read or written.
     """
-    before = read_records(store, case.record).get(case.record)
+    names = (case.record, case.former_record)
+    before = record_of({key: row for name in names for key, row in read_records(store, name).items()}, *names)
     if before is not None and outcome.status != "failed" and _is_earlier(until, before["until"]):
         return
     failed = next((row for row in outcome.stages if row.state == "failed"), None)

@@ -111,7 +111,7 @@ def reconstruct_dataset(
     cases = selected(every, only, store, until)
     expected = expectations(cases, store, until, refresh=refresh)
     if cases:
-        log.info("%s: %s", name, expected_words(expected, at_once))
+        log.info("%s: %s", name, expected_words(expected, at_once, processes=runner != "threads"))
     else:
         log.info("%s: none of %d runs is %s; nothing to do", name, len(every), only)
         return DatasetOutcome([])

@@ -16,7 +16,7 @@ from extrags.store import Store, digest_of
 from flows.cases import SequenceCase
 from flows.estimate import expected_seconds, usual_pace
 from flows.methods import METHODS
-from flows.outcome_records import OutcomeRecord, outcome_records, recorded_name
+from flows.outcome_records import OutcomeRecord, outcome_records, record_of, recorded_name
 from flows.workloads import known_work, work_before_reading
 from tasks.progress import duration_text
 
@@ -68,7 +68,7 @@ def expectations(
     found = []
     for case in cases:
         config = case.config()
-        own = records.get(case.record)
+        own = record_of(records, case.record, case.former_record)
         if not refresh and own is not None and _is_finished(own, config, until, keys):
             found.append(Expectation(case, 0.0, measured=True))
             continue
@@ -96,9 +96,16 @@ def longest_first(expected: Sequence[Expectation]) -> list[Expectation]:
     return sorted(expected, key=lambda item: -item.seconds)
 
 
-def expected_words(expected: Sequence[Expectation], at_once: int = 1) -> str:
-    """`24 runs, about 3 h; 20 as measured in earlier runs, 4 by their frames`."""
-    busy = [0.0] * max(1, at_once)
+def expected_words(expected: Sequence[Expectation], at_once: int = 1, *, processes: bool = False) -> str:
+    """`24 runs, about 3 h; 20 as measured in earlier runs, 4 by their frames`.
+
+    Args:
+        expected: of all runs.
+        at_once: how many go on at the same time.
+        processes: each of these on cores of its own; in one process they share the cores, and each is charged
+            its share of the time.
+    """
+    busy = [0.0] * (max(1, at_once) if processes else 1)
     for item in longest_first(expected) if at_once > 1 else expected:
         busy[busy.index(min(busy))] += item.seconds
     known = sum(item.measured for item in expected)

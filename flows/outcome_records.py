@@ -14,6 +14,7 @@ __all__ = [
     "OutcomeRecord",
     "held_out_trained_on",
     "outcome_records",
+    "record_of",
     "recorded_name",
     "setting_text",
 ]
@@ -46,6 +47,17 @@ def recorded_name(record: OutcomeRecord) -> str:
     A relative path of an earlier version's record is taken from where this is asked.
     """
     return str(record.get("path") or comparable_name(str(record["sequence"])))
+
+
+def record_of(records: Mapping[str, OutcomeRecord], name: str, former_name: str) -> OutcomeRecord | None:
+    """The record of a case by its name, else by that which earlier versions gave it.
+
+    Args:
+        records: from `outcome_records`.
+        name: `flows.cases.SequenceCase.record`.
+        former_name: `flows.cases.SequenceCase.former_record`.
+    """
+    return records.get(name) or records.get(former_name)
 
 
 def held_out_trained_on(record: OutcomeRecord) -> bool:

@@ -63,6 +63,11 @@ class RecordedRun:
         """Its sequence."""
         return self.report.label if self.record is None else str(self.record["sequence"])
 
+    @property
+    def place(self) -> str:
+        """What the names of its sequence have in common."""
+        return comparable_name(self.report.label) if self.record is None else recorded_name(self.record)
+
     def traits(self) -> dict[str, str]:
         """What tells it from other runs of its sequence: method, profile, seed and settings of a matrix."""
         if self.record is None:
@@ -134,7 +139,7 @@ def chosen_runs(
             else:
                 unfinished += 1
     runs = list(found.values())
-    sequences = sorted({comparable_name(run.sequence): run.sequence for run in runs}.values())
+    sequences = sorted({run.place: run.sequence for run in runs}.values())
     if len(sequences) > 1:
         raise ConfigError(
             f"runs of one sequence are compared; these are of {', '.join(sequences)} "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 from data_catalog.catalog import resolve
@@ -172,7 +172,10 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
             name that is in neither and no path.
         StoreError: when the store cannot be read.
     """
-    records = _told_apart(outcome_records(store).values())
+    found = list(outcome_records(store).values())
+    shown_as = _told_apart(found)
+    places = {name: recorded_name(record) for record, name in zip(found, shown_as, strict=True)}
+    labels = {str(record["sequence"]) for record in found}
     keys = store.keys()
     there = set(keys)
     running: dict[str, set[str]] = {}
@@ -181,17 +184,20 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
     going_on = active_runs(store)
     for run in going_on:
         running.setdefault(run.sequence, set())
-    unfinished = _unfinished(store, going_on, {str(record["sequence"]) for record in records})
-    names = _names(patterns, [*(str(record["sequence"]) for record in records), *running, *unfinished])
+    unfinished = _unfinished(store, going_on, labels)
+    # What is in work is known by the name that it was given: of which of several places, nothing tells.
+    others = {*running, *unfinished} - (labels - set(shown_as))
+    names = _names(patterns, {**{name: comparable_name(name) for name in others}, **places})
     rows: list[StatusRow] = []
     bytes_of: dict[str, int] = {}
     recorded: set[str] = {key for run in (*going_on, *unfinished.values()) for key in run.keys}
-    for record in records:
+    for record, name in zip(found, shown_as, strict=True):
         made = {key: size for row in record["stages"] for key, size in row["artefacts"].items()}
         recorded |= set(made)
-        if record["sequence"] in names:
+        if name in names:
             bytes_of |= {key: size for key, size in made.items() if key in there}
-            rows.append(_row(record, there, running.get(record["sequence"], set())))
+            row = _row(record, there, running.get(record["sequence"], set()))
+            rows.append(replace(row, sequence=name))
     shown = {row.sequence for row in rows}
     for name in names:
         if name not in shown:
@@ -207,15 +213,14 @@ def store_status(store: Store, patterns: Sequence[str] = ()) -> StoreStatus:
     return StoreStatus(store.root, rows, len(keys), sum(bytes_of.values()), unrecorded, counts)
 
 
-def _told_apart(records: Iterable[OutcomeRecord]) -> list[OutcomeRecord]:
-    """The records, with whole paths where relative ones of several places are the same."""
-    found = list(records)
+def _told_apart(records: Sequence[OutcomeRecord]) -> list[str]:
+    """The name of each record's sequence: its path where relative ones of several places are the same."""
     places: dict[str, set[str]] = {}
-    for record in found:
+    for record in records:
         places.setdefault(str(record["sequence"]), set()).add(recorded_name(record))
     return [
-        {**record, "sequence": recorded_name(record)} if len(places[str(record["sequence"])]) > 1 else record
-        for record in found
+        recorded_name(record) if len(places[str(record["sequence"])]) > 1 else str(record["sequence"])
+        for record in records
     ]
 
 
@@ -247,19 +252,27 @@ def _manifests(store: Store, keys: Iterable[str]) -> list[Manifest]:
     return found
 
 
-def _names(patterns: Sequence[str], on_record: Iterable[str]) -> list[str]:
-    known = sorted(set(on_record))
+def _names(patterns: Sequence[str], on_record: Mapping[str, str]) -> list[str]:
+    """The names that patterns stand for.
+
+    Args:
+        patterns: see `store_status`.
+        on_record: what each name that is known has in common with others of its sequence.
+    """
+    known = sorted(on_record)
     if not patterns:
         return known
     names: dict[str, None] = {}
     for pattern in patterns:
         # A sequence may be in the store although its data are not on this machine.
         same = comparable_name(pattern)
-        found = [name for name in known if is_named(name, pattern) or comparable_name(name) == same]
+        found = [name for name in known if is_named(name, pattern) or on_record[name] == same]
         try:
             chosen = [item.name for item in chosen_sequences([pattern])]
             for name in chosen:
-                if comparable_name(name) not in {comparable_name(other) for other in found}:
+                if comparable_name(name) not in {
+                    on_record.get(other, comparable_name(other)) for other in found
+                }:
                     _check_known(name)
                     found.append(name)
         except ExtragsError:

@@ -2,24 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
-from typing import TYPE_CHECKING
-
-import numpy as np
 
 from extrags.config import IngestConfig, PosesConfig
 from extrags.store import Ref, Slot
 from tasks.stage import stage
 
-if TYPE_CHECKING:
-    from jaxtyping import Bool
-
-    from extrags.sequence import EndoscopicSequence
-
 __all__ = ["estimating_settings", "lens_settings", "poses"]
-
-_LOG = logging.getLogger(__name__)
 
 
 def estimating_settings(config: PosesConfig) -> PosesConfig:
@@ -50,14 +39,19 @@ def poses(slot: Slot, sequence: Ref, config: PosesConfig, ingest: IngestConfig |
         config: from `estimating_settings`.
         ingest: from `lens_settings`; None takes the defaults.
     """
-    from extrags.poses import check_lens_use, estimate_poses, with_estimated_poses
+    from extrags.poses import (
+        check_lens_use,
+        estimate_poses,
+        observed_by_those_left,
+        with_estimated_poses,
+    )
     from extrags.sequence import EndoscopicSequence
 
     unposed = slot.load(EndoscopicSequence, sequence)
     if ingest is not None and unposed.intrinsics == "guessed":
         check_lens_use(ingest)  # what would be refused after the estimate
     estimate = estimate_poses(unposed, config)
-    told = replace(unposed, observed=_observed_by_those_left(unposed, estimate.registered))
+    told = replace(unposed, observed=observed_by_those_left(unposed, estimate.registered))
     posed = with_estimated_poses(told, estimate, ingest)
     slot.save(posed)
     slot.save_json("poses.json", estimate.to_json(unposed), indent=1)
@@ -75,36 +69,3 @@ def poses(slot: Slot, sequence: Ref, config: PosesConfig, ingest: IngestConfig |
         focal_px=float(posed.K[0, 0, 0]),
         focal_std_px=posed.focal_std_px,
     )
-
-
-def _observed_by_those_left(
-    sequence: EndoscopicSequence, registered: Bool[np.ndarray, "f"]
-) -> Bool[np.ndarray, "f h w"] | None:
-    """What is observed in held-out frames once training frames without a pose have left.
-
-    By true depth and the source's own poses; what no training frame saw before stays unobserved. Where these
-    are not known nothing tells what the others saw, and nothing is said.
-
-    Args:
-        sequence: as it came.
-        registered: frames that stay.
-    """
-    from data_catalog.visibility import observed_from_depth
-    from extrags.events import subscribed
-
-    left = sequence.train[registered[sequence.train]]
-    if sequence.observed is None or len(left) == len(sequence.train):
-        return sequence.observed
-    depth = sequence.true_depth_mm
-    if depth is None or sequence.world_from_camera is None or sequence.intrinsics == "guessed":
-        _LOG.warning(
-            "%s: %d training frames are dropped, and without true depth and poses nothing tells what the "
-            "others observed: observed and unobserved pixels are not told apart",
-            sequence.name,
-            len(sequence.train) - len(left),
-        )
-        return None
-    # The search tells its progress as that of another stage.
-    with subscribed(lambda _event: None):
-        seen = observed_from_depth(sequence.cameras, depth, left, sequence.test)
-    return np.asarray(seen & sequence.observed)

@@ -30,10 +30,10 @@ from data_catalog.folder_reader import FolderReader
 from data_catalog.images import image_size, spread
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.sampling import Sampling
-from data_catalog.visibility import observed_by_depth
 from extrags.cameras import Cameras
 from extrags.config import IngestConfig
 from extrags.errors import SourceError, SourceNotFoundError
+from extrags.observed_surface import observed_by_depth
 from extrags.sequence import EndoscopicSequence, Split
 
 __all__ = ["READER", "open_recording", "pair_files", "pair_frames"]

@@ -28,11 +28,11 @@ from data_catalog.images import image_size, natural_key, read_depth
 from data_catalog.posed_frames import PosedFrame, SourceFrames
 from data_catalog.rotations import quaternion_rotation
 from data_catalog.sampling import LensSampling
-from data_catalog.visibility import observed_by_depth
 from extrags.cameras import compose
 from extrags.config import IngestConfig
 from extrags.errors import PoseError, SourceError, SourceNotFoundError
 from extrags.lens import Lens
+from extrags.observed_surface import observed_by_depth
 
 __all__ = ["DEPTH_STEP_MM", "READER", "decode_depth_mm", "intrinsics", "read_poses"]
 

@@ -191,7 +191,8 @@ def _color(file: Path, shape: tuple[int, int]) -> Float[np.ndarray, "h w 3"]:
     try:
         with Image.open(file) as image:
             # Pillow opens files of 16 bits a channel as RGB, and drops the lower eight.
-            stored = f"{image.mode} of 16 bits" if "16" in str(image.tile) else image.mode
+            raw = " ".join(str(tile[-1]) for tile in getattr(image, "tile", ()))
+            stored = f"{image.mode} of 16 bits" if ";16" in raw else image.mode
             if stored not in ("RGB", "RGBA", "P"):
                 raise SourceError(
                     f"expected an 8-bit colour image, found the mode {stored}", file=file, field="mode"

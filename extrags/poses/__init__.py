@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from extrags.poses.calibration import LensCalibration, check_lens_use, with_calibration
 from extrags.poses.estimate import PoseEstimate, estimate_poses, with_estimated_poses
+from extrags.poses.observed import observed_by_those_left
 from extrags.poses.registration_report import errors_against_given
 from extrags.poses.rgbd import RgbdAlignment, align_by_depth
 from extrags.poses.scale import DepthScale, depth_scale
@@ -20,6 +21,7 @@ __all__ = [
     "depth_scale",
     "errors_against_given",
     "estimate_poses",
+    "observed_by_those_left",
     "triangulate_points",
     "with_calibration",
     "with_estimated_poses",

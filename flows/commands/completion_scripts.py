@@ -127,28 +127,76 @@ _extrags_completions() {
     printf '%s\n' "$_extrags_table" | awk '@AWK@' "$@"
 }
 
+# Words of the line as the command gets them, into `words`. Into `typed` what readline replaces, as it stands:
+# it begins behind the last word break (of which `@` is replaced too), or behind a quote that is open, which
+# is then in `quote`.
+_extrags_split() {
+    local i mark word="" begun=""
+    words=() typed="" quote=""
+    for (( i = 0; i < ${#1}; i++ )); do
+        mark="${1:i:1}"
+        if [[ $quote == *\\ ]]; then
+            if [[ $quote == \"\\ && $mark != [\"\\\$\`] ]]; then word+=\\; fi
+            word+="$mark" typed+="\\$mark" quote="${quote%\\}"
+        elif [[ $mark == \\ && $quote != \' ]]; then
+            begun=1 quote+=\\
+        elif [[ -n $quote && $mark == "$quote" ]]; then
+            typed="$before$quote$typed$quote" quote=""
+        elif [[ -n $quote ]]; then
+            word+="$mark" typed+="$mark"
+        elif [[ $mark == [\"\'] ]]; then
+            begun=1 before="$typed" typed="" quote="$mark"
+        elif [[ $mark == [[:space:]] ]]; then
+            if [[ -n $begun ]]; then words+=("$word"); fi
+            word="" begun="" typed=""
+        else
+            begun=1 word+="$mark" typed+="$mark"
+            if [[ $mark == [=:@] && $COMP_WORDBREAKS == *"$mark"* ]]; then typed="${mark#[=:]}"; fi
+        fi
+    done
+    words+=("$word")
+    quote="${quote%\\}"
+}
+
+# One more proposal: a whole word, of which the end that is not typed yet is quoted as its beginning is.
+_extrags_add() {
+    local current="${words[${#words[@]}-1]}" i end=""
+    local more="${1:${#current}}"
+    if [[ $1 != "$current"* ]]; then return; fi
+    case $quote in
+        \") for (( i = 0; i < ${#more}; i++ )); do
+                if [[ ${more:i:1} == [\"\\\$\`] ]]; then end+=\\; fi
+                end+="${more:i:1}"
+            done ;;
+        \') end="${more//\'/\'\\\'\'}" ;;
+        *) if [[ -n $more ]]; then printf -v end %q "$more"; fi ;;
+    esac
+    COMPREPLY+=("$typed$end")
+}
+
 _extrags() {
-    local IFS=$' \t\n' line="${COMP_LINE:0:COMP_POINT}" current rest reply head file mark
+    local current reply head file place tilde typed quote before
     local -a words
     COMPREPLY=()
-    read -ra words <<< "$line"
-    if [[ -z $line || $line == *[[:space:]] ]]; then words+=(""); fi
+    _extrags_split "${COMP_LINE:0:COMP_POINT}"
     current="${words[${#words[@]}-1]}"
-    # readline replaces only what follows the last of its word breaks.
-    rest="$current"
-    for mark in = : @; do
-        if [[ $COMP_WORDBREAKS == *"$mark"* ]]; then rest="${rest##*"$mark"}"; fi
-    done
     while IFS= read -r reply; do
         if [[ $reply == $'\t'* ]]; then
             head="${reply:1}"
             while IFS= read -r file; do
-                if [[ -d $file ]]; then file+=/; fi
-                file="$head$file"
-                COMPREPLY+=("${file:${#current}-${#rest}}")
+                # What is in a variable is not expanded by the shell: `~` and `~NAME` are no folders to -d.
+                tilde="${file%%/*}" place="$file"
+                if [[ $tilde =~ ^~[[:alnum:]_.-]*$ ]]; then
+                    eval "place=$tilde"
+                    place+="${file:${#tilde}}"
+                fi
+                if [[ -d $place && $file != */ ]]; then file+=/; fi
+                _extrags_add "$head$file"
             done < <(compgen -f -- "${current:${#head}}")
+            # readline closes no quote behind a folder then.
+            if [[ -n $quote ]]; then compopt -o filenames -o noquote 2> /dev/null; fi
         else
-            COMPREPLY+=("${reply:${#current}-${#rest}}")
+            _extrags_add "$reply"
         fi
     done < <(_extrags_completions "${words[@]}")
     if [[ ${#COMPREPLY[@]} -eq 1 && ${COMPREPLY[0]} == *[./=] ]]; then

@@ -283,7 +283,10 @@ def execute(
     if terminal and not given.quiet and len(cases) > 1:
         # Elsewhere it is a line of the log.
         expected = expectations(cases, root, until, refresh=refresh)
-        print(f"extrags: {expected_words(expected, at_once)}", file=sys.stderr)
+        print(
+            f"extrags: {expected_words(expected, at_once, processes=given.runner != 'threads')}",
+            file=sys.stderr,
+        )
     from flows.dataset import reconstruct_dataset
     from flows.estimate import expected_seconds
     from flows.progress_display import RunInView, progress_display
@@ -346,7 +349,7 @@ def _check_working_distance(cases: Sequence[SequenceCase]) -> None:
         given.add(case.sequence)
         try:
             about = glance(case.sequence, config.ingest) or describe(case.sequence)
-        except (SourceError, UnknownSequenceError):
+        except (ConfigError, SourceError, UnknownSequenceError):
             # What is wrong with a source is said by the run, for each by itself.
             continue
         if about.has_poses:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin
 
 from extrags.errors import ConfigError
+
+if TYPE_CHECKING:
+    from extrags.config.settings import Setting
 
 __all__ = ["settings_of_file"]
 
@@ -25,7 +28,7 @@ def settings_of_file(file: Path) -> dict[str, Any]:
 
     Raises:
         ConfigError: a file that cannot be read, or a setting that is unknown (with the nearest), there twice,
-            or of a wrong kind.
+            or of a wrong kind or out of range. It names the file.
     """
     from extrags.config import PipelineConfig
     from extrags.config.settings import settings_of, unknown_setting
@@ -40,12 +43,33 @@ def settings_of_file(file: Path) -> dict[str, Any]:
         try:
             if name not in known:
                 raise unknown_setting(name, known)
-            # A word, such as `none` or `1e-3`, means what it means after the setting's own flag.
-            found[name] = known[name].parse(value) if isinstance(value, str) else value
+            found[name] = _checked(known[name], value)
         except ConfigError as error:
             option = f"; --{name} is an option of the command line" if name in _OPTIONS else ""
             raise ConfigError(f"--config {file}: {error}{option}") from error
     return found
+
+
+def _checked(setting: Setting, value: Any) -> Any:
+    """The value of a setting, if it may have it; a text is parsed."""
+    from pydantic import TypeAdapter, ValidationError
+
+    if isinstance(value, str):
+        # A word, such as `none` or `1e-3`, means what it means after the setting's own flag.
+        return setting.parse(value)
+    several = get_origin(setting.annotation) is tuple and isinstance(value, list)
+    # pydantic takes `true` for 1.
+    if bool not in (setting.annotation, *get_args(setting.annotation)) and any(
+        isinstance(part, bool) for part in (value if several else [value])
+    ):
+        raise setting.refused(setting.text(value))
+    try:
+        # The name, because `Annotated` wants at least one thing to hold; pydantic passes over it.
+        kind: Any = Annotated[setting.annotation, setting.name, *setting.limits]
+        TypeAdapter(kind).validate_python(value)
+    except ValidationError:
+        raise setting.refused(setting.text(value)) from None
+    return value
 
 
 def _content(file: Path) -> Mapping[Any, Any]:
@@ -60,7 +84,9 @@ def _content(file: Path) -> Mapping[Any, Any]:
         problem = getattr(error, "strerror", None) or error
         raise ConfigError(f"--config {file} cannot be read: {problem}") from error
     try:
-        content = json.loads(text) if kind == "JSON" else yaml.safe_load(text)
+        content = _of_json(text) if kind == "JSON" else _of_yaml(text)
+    except _RepeatedKeyError as error:
+        raise ConfigError(f"--config {file}: {error}") from error
     except (RecursionError, ValueError, yaml.YAMLError) as error:
         raise ConfigError(f"--config {file} is no {kind}: {' '.join(str(error).split())}") from error
     if content is None:
@@ -68,6 +94,45 @@ def _content(file: Path) -> Mapping[Any, Any]:
     if not isinstance(content, dict):
         raise ConfigError(f"--config {file}: expected settings by name, e.g. coarse.iterations: 500")
     return content
+
+
+class _RepeatedKeyError(Exception):
+    """A key that one object of a file has twice: of the two values, parsers keep the last."""
+
+
+def _of_json(text: str) -> Any:
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        made: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in made:
+                raise _RepeatedKeyError(f"{key} is there twice")
+            made[key] = value
+        return made
+
+    return json.loads(text, object_pairs_hook=unique)
+
+
+def _of_yaml(text: str) -> Any:
+    import yaml
+
+    class UniqueKeys(yaml.SafeLoader):
+        # Not where objects are constructed: by then, `<<` may have put keys there that others override.
+        def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+            node = super().compose_mapping_node(anchor)
+            seen = set()
+            for key, _ in node.value:
+                if isinstance(key, yaml.ScalarNode):
+                    if (key.tag, key.value) in seen:
+                        line = key.start_mark.line + 1
+                        raise _RepeatedKeyError(f"{key.value} is there twice, again in line {line}")
+                    seen.add((key.tag, key.value))
+            return node
+
+    loader = UniqueKeys(text)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
 
 
 def _entries(

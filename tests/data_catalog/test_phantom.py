@@ -13,10 +13,10 @@ from data_catalog.phantom.recording import Phantom, record
 from data_catalog.phantom.thorough import PASSES, examination, sees_pocket
 from data_catalog.phantom.trajectories import MIN_CLEARANCE_MM, camera_path, path_style, styled_path
 from data_catalog.ray_casting import RayCaster
-from data_catalog.visibility import observed_from_depth
 from extrags.cameras import Cameras, invert_poses, pixel_rays
 from extrags.config import IngestConfig
 from extrags.errors import ConfigError
+from extrags.observed_surface import observed_from_depth
 from extrags.sequence import EndoscopicSequence
 
 

@@ -10,6 +10,8 @@ import pytest
 
 from extrags.errors import ConfigError
 from extrags.store import Store, write_record
+from extrags.store.records import remove_record
+from extrags.store.runs import recorded_run
 from flows.cases import SequenceCase, cases_of, matrix_points, record_outcome, selected
 from flows.cli import main
 from flows.dataset import reconstruct_dataset
@@ -59,18 +61,35 @@ class TestPaths:
         assert second.record != record
         assert selected([second], "failed", store, "report") == []
         leave(store, second, StageRow("ingest", "failed"), status="failed", until="report")
-        assert [row.sequence for row in store_status(Store(store)).rows] == [
-            str(tmp_path / place / "frames") for place in ("a", "b")
-        ]
+        both = [str(tmp_path / place / "frames") for place in ("a", "b")]
+        assert [row.sequence for row in store_status(Store(store)).rows] == both
+        # By either spelling, from anywhere.
+        for asked in ("frames", both[1]):
+            (shown,) = store_status(Store(store), [asked]).rows
+            assert (shown.sequence, shown.state) == (both[1], "failed")
+        # Which of them is in work nothing tells; it is no third one.
+        with recorded_run(Store(store), "frames"):
+            assert [row.sequence for row in store_status(Store(store)).rows] == both
 
-    def test_a_record_of_an_earlier_version_is_replaced(
+    def test_records_of_earlier_versions_count_until_they_are_replaced(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         (tmp_path / "frames").mkdir()
         monkeypatch.chdir(tmp_path)
-        own, store = case("frames"), Store(tmp_path / "store")
-        write_record(store, own.former_record, {"sequence": "frames"})
-        leave(store.root, own, StageRow("ingest", "failed"), status="failed")
+        own, root = case("frames"), str(tmp_path / "store")
+        store = Store(root)
+        leave(root, own, StageRow("report", "ran"), until="report")
+        (finished,) = outcome_records(store).values()
+        remove_record(store, own.record)
+        former = {name: value for name, value in finished.items() if name != "path"}
+        write_record(store, own.former_record, former)
+        # A plan has no figures to put in the place of those of a finished run.
+        leave(root, own, StageRow("assess", "ran"), until="assess")
+        assert outcome_records(store) == {own.former_record: former}
+        write_record(store, own.former_record, {**former, "status": "failed"})
+        assert selected([own], "failed", root, "report") == [own]
+        assert selected([own], "missing", root, "report") == []
+        leave(root, own, StageRow("report", "ran"), until="report")
         assert list(outcome_records(store)) == [own.record]
 
     def test_names_of_the_catalogue_are_what_they_were(
@@ -245,7 +264,9 @@ class TestExpected:
         assert (
             expected_words(found) == "2 runs, about 70 min; 1 as measured in earlier runs, 1 by their frames"
         )
-        assert expected_words(found, 2).startswith("2 runs, about 60 min; 2 at once")
+        # In one process they share its cores, in two each has its own.
+        assert expected_words(found, 2).startswith("2 runs, about 70 min; 2 at once")
+        assert expected_words(found, 2, processes=True).startswith("2 runs, about 60 min; 2 at once")
         assert expected_words(found[:1]) == "1 run, about 60 min; as measured in earlier runs"
         assert expected_words(found[1:]) == "1 run, about 10 min; by their frames"
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import pty
 import shutil
 import subprocess
 from contextlib import redirect_stdout
@@ -46,12 +48,12 @@ def ask(script: Path, tmp_path: Path):
     def asked(line: str) -> list[str]:
         command = ["bash", "--norc", "-c", ASK, "bash", str(script), line]
         # Nothing but a shell and awk: no Python is on the way.
-        environment = {"PATH": "/usr/bin:/bin"}
+        environment = {"PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
         said = subprocess.run(
             command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
         )
         assert said.stderr == ""
-        return said.stdout.split()
+        return [line for line in said.stdout.splitlines() if line]
 
     return asked
 
@@ -109,8 +111,8 @@ class TestBash:
     def test_sequences(self, ask) -> None:
         assert "phantom/" in ask("extrags run ")
         assert {"phantom/0@sparse", "phantom/0@distanced"} <= set(ask("extrags run phantom/"))
-        # readline breaks words at @.
-        assert ask("extrags run phantom/0@sp") == ["sparse"]
+        # readline breaks words at @, and replaces it as well.
+        assert ask("extrags run phantom/0@sp") == ["@sparse"]
         assert "sinus/hopkins" in ask("extrags data check --ingest.width 48 sinus/")
         assert "phantom/0@sparse" in ask("extrags compare phantom/0")
 
@@ -123,12 +125,105 @@ class TestBash:
         assert ask("extrags run --json my.") == ["my.yaml"]
         assert ask("extrags run --depth.completion my.") == ["my.yaml"]
 
+    def test_names_of_files_are_quoted_as_the_word_is(self, ask, tmp_path: Path) -> None:
+        (tmp_path / "my frames").mkdir()
+        (tmp_path / "my frames" / "it's $1").mkdir()
+        assert ask("extrags run my") == [r"my\ frames/"]
+        assert ask(r"extrags run my\ fr") == [r"my\ frames/"]
+        assert ask("extrags run my\\") == [r"my\ frames/"]
+        assert ask(r"extrags run my\ frames/it") == [r"my\ frames/it\'s\ \$1/"]
+        # The quote itself is before what readline replaces.
+        assert ask('extrags run "my frames/i') == [r"my frames/it's \$1/"]
+        assert ask("extrags run 'my fr") == ["my frames/"]
+        assert ask("extrags run 'my frames/i") == [r"my frames/it'\''s $1/"]
+        assert ask('extrags run "my frames"/i') == [r""""my frames"/it\'s\ \$1/"""]
+        assert ask("extrags run --config=my") == [r"my\ frames/"]
+        assert ask('extrags run --config="my f') == ["my frames/"]
+
+    def test_quoted_words_are_one(self, ask) -> None:
+        assert ask(r"extrags run --store my\ store --profile q") == ["quick"]
+        assert ask("extrags run --store 'my store' --profile q") == ["quick"]
+        assert ask("extrags run --methods '--until' ex") == ask("extrags run --methods --until ex")
+        assert ask('extrags run "phantom/0@sp') == ["phantom/0@sparse"]
+        assert ask(r"extrags run phantom/0\@sp") == [r"phantom/0\@sparse"]
+
+    def test_home(self, ask, tmp_path: Path) -> None:
+        (tmp_path / ".cache" / "my frames").mkdir(parents=True)
+        (tmp_path / ".case").write_text("")
+        assert set(ask("extrags run ~/.ca")) == {"~/.cache/", "~/.case"}
+        assert ask("extrags run --config=~/.cac") == ["~/.cache/"]
+        assert ask("extrags run ~/.cache/") == [r"~/.cache/my\ frames/"]
+        # No user is called so.
+        (tmp_path / "~;x y").mkdir()
+        assert ask("extrags run '~;") == ["~;x y/"]
+
     def test_shells(self, ask) -> None:
         assert ask("extrags completion ") == ["bash", "zsh", "fish"]
 
     def test_other_settings_of_a_training_are_not_offered(self, ask) -> None:
         assert ask("extrags pretrain --set coarse.") == []
         assert ask("extrags pretrain --coarse.") == []
+
+
+class TestBashAtATerminal:
+    """What the command gets, where readline itself puts proposals into the line."""
+
+    @pytest.mark.parametrize(
+        ("typed", "got"),
+        [
+            ("my\ta\t", ["my frames/a.yaml"]),
+            ("my\\ f\ta\t", ["my frames/a.yaml"]),
+            ('"my\ta\t', ["my frames/a.yaml"]),
+            ("'my f\ta\t", ["my frames/a.yaml"]),
+            ("--config=my\ta\t", ["--config=my frames/a.yaml"]),
+            ('--config="my f\ta\t', ["--config=my frames/a.yaml"]),
+            ('"my frames"/a\t', ["my frames/a.yaml"]),
+            ("~/.ca\tb\t", ["{home}/.cache/b"]),
+            ("--config=~/.ca\tb\t", ["--config=~/.cache/b"]),
+            ("phantom/0@sp\t", ["phantom/0@sparse"]),
+            ("'phantom/0@sp\t", ["phantom/0@sparse"]),
+            ("a@f\t", ["a@file"]),
+            (
+                "--profile=q\t--set enhance.backend=cl\t",
+                ["--profile=quick", "--set", "enhance.backend=classical"],
+            ),
+            ("it\t", ["it's $1"]),
+            ('"it\t', ["it's $1"]),
+            ("'it\t", ["it's $1"]),
+        ],
+    )
+    def test_words(self, typed: str, got: list[str], script: Path, tmp_path: Path) -> None:
+        (tmp_path / "my frames").mkdir()
+        (tmp_path / "my frames" / "a.yaml").write_text("")
+        (tmp_path / ".cache").mkdir()
+        (tmp_path / ".cache" / "b").write_text("")
+        (tmp_path / "it's $1").write_text("")
+        (tmp_path / "a@file").write_text("")
+        (tmp_path / "start").write_text(
+            f"source {script}\n"
+            # Its words into a file: the terminal shows them too, but among what readline draws.
+            """extrags() { printf '%s\\0' "${@:2}" > said; exit; }\n"""
+            "PS1='ready> '\n"
+        )
+        command = ["bash", "--rcfile", "start", "-i"]
+        environment = {"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "TERM": "dumb", "INPUTRC": "/dev/null"}
+        terminal, inside = pty.openpty()
+        with subprocess.Popen(
+            command, cwd=tmp_path, env=environment, stdin=inside, stdout=inside, stderr=inside,
+            start_new_session=True,
+        ) as shell:  # fmt: skip
+            os.close(inside)
+            seen = b""
+            try:
+                while b"ready> " not in seen:
+                    seen += os.read(terminal, 4096)
+                os.write(terminal, f"extrags run {typed}\n".encode())
+                shell.wait(30)
+            finally:
+                shell.kill()
+                os.close(terminal)
+        words = (tmp_path / "said").read_text().split("\0")[:-1]
+        assert words == [word.format(home=tmp_path) for word in got]
 
 
 class TestTable:

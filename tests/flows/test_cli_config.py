@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from extrags.config import PROFILES
+from extrags.config import PROFILES, PipelineConfig
+from extrags.config.settings import settings_of
 from extrags.errors import ConfigError
 from flows.cli import main, parser
 from flows.commands.common import run_config
@@ -20,7 +21,7 @@ coarse:
   light:
     exponent: 5e-1
     # From a group to a dotted name.
-  densify.max_gaussians: 9
+  densify.max_gaussians: 900
 device: cpu
 ingest.width: none
 evaluate:
@@ -30,7 +31,7 @@ surface:
 SET = {
     "coarse.iterations": 500,
     "coarse.light.exponent": 0.5,
-    "coarse.densify.max_gaussians": 9,
+    "coarse.densify.max_gaussians": 900,
     "device": "cpu",
     "ingest.width": None,
     "evaluate.lpips_nets": ["alex", "vgg"],
@@ -86,6 +87,14 @@ class TestWhatIsTaken:
         assert main(["data", "show", SEQUENCE, "--config", str(file), "--json", "-"]) == 0
         assert json.loads(capsys.readouterr().out)["measured"]["width"] == 48
 
+    def test_yaml_may_override_what_it_merges(self, file: Path) -> None:
+        file.write_text("coarse: &c {<<: {iterations: 5, max_points: 600}, iterations: 7}\nfinetune: {}")
+        assert parsed("--config", str(file)) == {"coarse.iterations": 7, "coarse.max_points": 600}
+
+    def test_true_where_it_is_a_value(self, file: Path) -> None:
+        file.write_text("coarse.light.enabled: yes")
+        assert parsed("--config", str(file)) == {"coarse.light.enabled": True}
+
 
 class TestOrder:
     def test_the_command_line_counts_wherever_it_stands(self, file: Path) -> None:
@@ -100,9 +109,9 @@ class TestOrder:
 
     def test_of_several_files_the_last(self, file: Path, tmp_path: Path) -> None:
         second = tmp_path / "second.yaml"
-        second.write_text("coarse.iterations: 8\ncoarse.max_points: 50")
+        second.write_text("coarse.iterations: 8\ncoarse.max_points: 500")
         files = ["--config", str(file), "--config", str(second)]
-        expected = {**SET, "coarse.iterations": 8, "coarse.max_points": 50}
+        expected = {**SET, "coarse.iterations": 8, "coarse.max_points": 500}
         assert parsed(*files) == expected
         assert parsed("--coarse.iterations", "6", *files) == {**expected, "coarse.iterations": 6}
 
@@ -131,6 +140,23 @@ class TestWrongFiles:
             ("- coarse", "expected settings by name, e.g. coarse.iterations: 500"),
             ("coarse: [", "is no YAML: "),
             ("profile: quick", "no setting profile; settings begin with"),
+            (
+                "coarse.iterations: 500\ncoarse.iterations: 700",
+                "coarse.iterations is there twice, again in line 2",
+            ),
+            ("coarse:\n  iterations: 5\n  'iterations': 5", "iterations is there twice, again in line 3"),
+            ("coarse: {iterations: 5}\ncoarse: {max_points: 9}", "coarse is there twice, again in line 2"),
+            ("coarse.iterations: true", "setting coarse.iterations is true; expected a whole number of at"),
+            ("coarse: {iterations: yes}", "setting coarse.iterations is true; expected a whole number of at"),
+            ("coarse.light.exponent: off", "setting coarse.light.exponent is false; expected a number"),
+            ("ingest.width: true", "setting ingest.width is true; expected a whole number"),
+            ("coarse: {iterations: [1]}", "setting coarse.iterations is [1]; expected a whole number of at"),
+            ("coarse.iterations: {a: 1}", "setting coarse.iterations is {'a': 1}; expected a whole number"),
+            ("coarse.iterations: 1.5", "setting coarse.iterations is 1.5; expected a whole number"),
+            ("coarse.iterations: -5", "setting coarse.iterations is -5; expected a whole number of at"),
+            ("coarse.iterations:", "setting coarse.iterations is none; expected a whole number of at"),
+            ("device: 3", "setting device is 3; expected auto, cpu or cuda"),
+            ("evaluate.lpips_nets: [alex, 3]", "setting evaluate.lpips_nets is ['alex', 3]; expected one or"),
             ("seed: 3", "--seed is an option of the command line"),
         ],
     )
@@ -147,6 +173,30 @@ class TestWrongFiles:
         made.write_text("coarse.iterations: 5")
         with pytest.raises(ConfigError, match=r"settings\.json is no JSON"):
             parsed("--config", str(made))
+
+    @pytest.mark.parametrize(
+        "content",
+        [
+            '{"coarse.iterations": 500, "coarse.iterations": 700}',
+            '{"coarse": {"coarse.iterations": 500, "coarse.iterations": 500}}',
+        ],
+    )
+    def test_a_key_twice_in_json(self, content: str, tmp_path: Path) -> None:
+        made = tmp_path / "settings.json"
+        made.write_text(content)
+        with pytest.raises(ConfigError) as caught:
+            parsed("--config", str(made))
+        assert str(caught.value) == f"--config {made}: coarse.iterations is there twice"
+
+    def test_true_among_numbers(self, file: Path) -> None:
+        name = next(
+            name
+            for name, known in settings_of(PipelineConfig).items()
+            if known.annotation == tuple[int, int, int]
+        )
+        file.write_text(f"{name}: [true, 1, 1]")
+        with pytest.raises(ConfigError, match=rf"settings\.yaml: setting {name} is \[True, 1, 1\]; expected"):
+            parsed("--config", str(file))
 
     def test_no_file(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["run", SEQUENCE, "--config", str(tmp_path / "no.yaml")]) == 2

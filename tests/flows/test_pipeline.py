@@ -18,6 +18,7 @@ from extrags.errors import CaptureError, ConfigError
 from extrags.exploration import Exploration
 from extrags.in_memory_pipeline import InMemoryPipeline
 from extrags.pipeline import HELD_OUT_TRAINED_ON, INDISPENSABLE, NEED_GAUSSIANS, NEEDS, STAGES, needs_plan
+from extrags.poses import PoseEstimate
 from extrags.pseudo_views import PseudoViews
 from extrags.scene import Scene
 from extrags.sequence import EndoscopicSequence
@@ -213,6 +214,31 @@ class TestRules:
         )
         none_given = InMemoryPipeline(sequence.training_part(), tiny_config())
         assert none_given.reason_to_skip("evaluate") == "the sequence has no held-out frames"
+
+    def test_what_is_observed_is_what_registered_frames_saw(
+        self, in_memory: extrags.Result, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        sequence = in_memory.sequence
+        registered = np.ones(len(sequence), dtype=bool)
+        registered[sequence.train[2:]] = False
+        estimate = PoseEstimate(
+            method="colmap",
+            world_from_camera=np.where(registered[:, None, None], sequence.cameras.world_from_camera, np.nan),
+            registered=registered,
+            points=np.zeros((0, 3), np.float32),
+            points_rgb=np.zeros((0, 3), np.uint8),
+            mean_reprojection_px=1.0,
+            metric=True,
+            report={},
+        )
+        monkeypatch.setattr("extrags.poses.estimate_poses", lambda *_: estimate)
+        run = InMemoryPipeline(sequence, tiny_config())
+        run.poses()
+        left = run.result.sequence
+        assert run.frames_without_pose() == (len(sequence.train) - 2, 0)
+        assert sequence.observed is not None
+        assert left.observed is not None
+        assert left.observed[left.test].sum() < sequence.observed[sequence.test].sum()
 
     def test_nothing_rests_on_a_scene_that_has_seen_held_out_frames(self) -> None:
         sequence = extrags.read(SEQUENCE, tiny_config().ingest)

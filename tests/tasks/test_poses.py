@@ -9,15 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from data_catalog.visibility import observed_from_depth
 from extrags.config import CoarseConfig, IngestConfig, PosesConfig
 from extrags.errors import ConfigError
+from extrags.observed_surface import observed_from_depth
+from extrags.poses import observed_by_those_left
 from extrags.sequence import EndoscopicSequence
 from extrags.store import Ref, Slot, Store
 from extrags.zarr_io import group_exists
 from tasks.coarse import coarse, refined_frames
 from tasks.ingest import training_frames
-from tasks.poses import _observed_by_those_left, lens_settings, poses
+from tasks.poses import lens_settings, poses
 from tasks.stage import stage
 from tests.extrags.poses.textured_room import room_sequence
 
@@ -123,7 +124,7 @@ class TestDroppedTrainingFrames:
     def test_with_all_of_them_it_stays(self) -> None:
         room = replace(room_sequence(4, width=40, height=30), intrinsics="guessed")
         told = replace(room, observed=room.mask)
-        assert _observed_by_those_left(told, np.ones(4, dtype=bool)) is told.observed
+        assert observed_by_those_left(told, np.ones(4, dtype=bool)) is told.observed
 
 
 class TestLensSettings:

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from extrags.errors import ConfigError, NonFiniteError, ShapeError, SourceError, SourceNotFoundError
-from extrags.metrics.folder import read_renders
+from extrags.metrics.folder import _color, read_renders
 from extrags.metrics.protocol import RenderedViews, evaluate_views
 from extrags.sequence import EndoscopicSequence, Split
 
@@ -209,6 +209,15 @@ class TestRefused:
         (folder / "2.png").write_bytes(b"no image")
         with pytest.raises(SourceError, match="no image that can be read"):
             read_renders(folder, sequence)
+
+    @pytest.mark.parametrize("suffix", ["png", "jpg", "tif", "bmp", "webp"])
+    @pytest.mark.parametrize("size", [(160, 128), (216, 16)])
+    def test_eight_bits_of_any_size_are_read(
+        self, tmp_path: Path, suffix: str, size: tuple[int, int]
+    ) -> None:
+        Image.new("RGB", size, (200, 100, 50)).save(tmp_path / f"a.{suffix}")
+        found = _color(tmp_path / f"a.{suffix}", (size[1], size[0]))
+        np.testing.assert_allclose(found[0, 0], np.array([200, 100, 50]) / 255, atol=0.02)
 
     def test_sixteen_bits_are_not_cut_to_eight(self, sequence: EndoscopicSequence, tmp_path: Path) -> None:
         folder = write(tmp_path / "renders", {f"{index}.png": LEVELS[index] for index in range(3)})

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from data_catalog.visibility import observed_from_depth
 from extrags.cameras import Cameras
 from extrags.events import Event, Progress, subscribed
+from extrags.observed_surface import observed_from_depth
 
 
 def test_it_tells_how_far_it_is() -> None:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from extrags.cameras import Cameras, pixel_rays
 from extrags.events import Progress, emit
 from extrags.frame_stacks import empty_stack
-from extrags.sequence import Split
+from extrags.splits import Split
 
 __all__ = ["observed_by_depth", "observed_from_depth"]
 
