@@ -81,6 +81,7 @@ def resolve(name_or_path: str | Path) -> Source:
 
     Raises:
         UnknownSequenceError: neither a known name nor an existing path; suggests the nearest name.
+            Nor is an empty text.
         SourceNotFoundError: a known name whose files are not on this machine.
         SourceError: a folder that holds no sequence, or a file where a folder is needed.
         ConfigError: neither a text nor a path, such as a sequence that was read before.
@@ -88,6 +89,8 @@ def resolve(name_or_path: str | Path) -> Source:
     if not isinstance(name_or_path, str | PathLike):
         raise _no_name(name_or_path)
     text = fspath(name_or_path)
+    if not text.strip():
+        raise UnknownSequenceError("the name is empty; expected a sequence's name or a path")
     for dataset in DATASETS:
         found = dataset.resolve(text)
         if found is not None:
@@ -103,15 +106,18 @@ def glance(name_or_path: str | Path, config: IngestConfig | None = None) -> Glan
         config: settings it would be read with; defaults where None.
 
     Returns:
-        None for a sequence that another dataset knows: its `Descriptor` tells.
+        None for a sequence that another dataset knows: its `Descriptor` tells. With `ingest.size` = detail
+        the size before frames are shrunk to their detail, which only pictures tell.
 
     Raises:
         UnknownSequenceError: from `resolve`.
         SourceError: what can be seen to be wrong without reading pictures; `read` would raise it as well.
         ConfigError: settings that this source cannot be read with.
     """
-    source, config = resolve(name_or_path), config or IngestConfig()
+    config = _settings(config, "glance")
+    source = resolve(name_or_path)
     dataset = _dataset(source)
+    _check_calibration(dataset, source, config)
     _check_time_span(source, config)
     return dataset.glance(source, config) if isinstance(dataset, FolderDataset) else None
 
@@ -131,13 +137,8 @@ def read(source: Source | str | Path, config: IngestConfig | None = None) -> End
             `config` other settings, such as those of all stages.
     """
     source = source if isinstance(source, Source) else resolve(source)
-    dataset, config = _dataset(source), IngestConfig() if config is None else config
-    check_settings_argument(config, IngestConfig, "read", 'extrags.PROFILES["quick"].ingest')
-    if config.calibration is not None and not isinstance(dataset, FolderDataset):
-        raise ConfigError(
-            f"ingest.calibration is given, but {source.name} states its intrinsics itself; give one of the "
-            "two"
-        )
+    dataset, config = _dataset(source), _settings(config, "read")
+    _check_calibration(dataset, source, config)
     _check_time_span(source, config)
     detail = source_detail(dataset, source, config)
     sequence = dataset.read(source, config if detail is None else detail.applied_to(config))
@@ -163,6 +164,7 @@ def measured_detail(source: Source | str | Path, config: IngestConfig) -> Detail
         SourceError: as `read` does.
         ConfigError: as `read` does.
     """
+    config = _settings(config, "measured_detail")
     source = source if isinstance(source, Source) else resolve(source)
     return source_detail(_dataset(source), source, config)
 
@@ -183,9 +185,10 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
     Raises:
         SourceError: the folder is not readable as a sequence.
         SourceNotFoundError: there is no such calibration file.
+        ConfigError: `config` is other settings.
     """
+    config = _settings(config, "source_fingerprint")
     source = source if isinstance(source, Source) else resolve(source)
-    config = config or IngestConfig()
     found = _dataset(source).fingerprint(source, config)
     if config.calibration is None:
         return found
@@ -194,6 +197,26 @@ def source_fingerprint(source: Source | str | Path, config: IngestConfig | None 
         raise SourceNotFoundError("no such calibration file", file=file, field="ingest.calibration")
     told = {"calibration": file_digests([("calibration", file)]), "calibration_version": CALIBRATION_VERSION}
     return found | told
+
+
+def _settings(config: IngestConfig | None, function: str) -> IngestConfig:
+    """What a function was given, or the defaults.
+
+    Raises:
+        ConfigError: other settings, such as those of all stages.
+    """
+    config = IngestConfig() if config is None else config
+    check_settings_argument(config, IngestConfig, function, 'extrags.PROFILES["quick"].ingest')
+    return config
+
+
+def _check_calibration(dataset: Dataset, source: Source, config: IngestConfig) -> None:
+    """Refuse a calibration file for a sequence of the catalogue's own."""
+    if config.calibration is not None and not isinstance(dataset, FolderDataset):
+        raise ConfigError(
+            f"ingest.calibration is given, but {source.name} states its intrinsics itself; give one of the "
+            "two"
+        )
 
 
 def _check_time_span(source: Source, config: IngestConfig) -> None:

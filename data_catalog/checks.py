@@ -13,7 +13,7 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from extrags.cameras import invert_poses, project_points, transform_points, unproject_pixels
 from extrags.errors import PoseError, SourceError
@@ -39,8 +39,11 @@ _CONVINCING_ERROR = 0.10
 _CLEARLY_BETTER = 0.35
 # A pair of views whose points mostly leave the image tells nothing.
 _MIN_INSIDE_SHARE = 0.15
-# Nor does depth of few pixels: what a narrow or inverted mask keeps is soon outside the next frame.
-_MIN_COMPARED_SHARE = 0.2
+# Nor does depth of hardly any pixels (share of the image).
+_MIN_COMPARED_SHARE = 0.03
+# What less than this keeps, as narrow or inverted masks do, is soon outside the next frame, also where poses
+# are right: then no motion at all seems to fit.
+_NARROW_SHARE = 0.2
 _CHECKED_PAIRS = 6
 _CHECKED_POINTS = 400
 # Factors by which depth may be off: a tenth of a thousandth to ten thousand, in steps of 5 %.
@@ -108,8 +111,11 @@ def check_axes(sequence: EndoscopicSequence, *, file: object = None) -> None:
             error = _reprojection_error(sequence, base @ turn, pairs)
             if error < best_error:
                 best_error, best_name = error, reading_name(axes, inverted)
-    if best_error < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
-        _check_polarity(sequence, pairs, as_given, file)
+    # Along a narrow part of the image another reading fits by chance, though not as well as the right one.
+    convincing = _CONVINCING_ERROR if _are_wide(sequence, pairs) else _SUSPICIOUS_ERROR
+    if best_error < min(_CLEARLY_BETTER * as_given, convincing):
+        if _is_proven_outside(sequence, pairs, file):
+            return
         raise PoseError(
             f"the poses contradict the depth: carried from frame to frame it is off by {as_given:.0%} "
             f"(median), but only by {best_error:.1%} when the poses are read as {best_name}. "
@@ -152,9 +158,12 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     clearly_other = max(factor, 1 / factor) >= _CLEARLY_OTHER_FACTOR
     if not clearly_other or best >= min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
         return
-    _check_polarity(sequence, pairs, as_given, file)
+    if _is_proven_outside(sequence, pairs, file):
+        return
     still = error_with(np.inf)
     if best >= _CLEARLY_BETTER * still and still < min(_CLEARLY_BETTER * as_given, _CONVINCING_ERROR):
+        if not _are_wide(sequence, pairs):
+            return
         raise PoseError(
             f"the positions of the cameras contradict the depth: carried from frame to frame it is off by "
             f"{as_given:.0%} (median), but only by {still:.1%} if the cameras did not move at all (by "
@@ -174,27 +183,32 @@ def check_depth_scale(sequence: EndoscopicSequence, *, file: object = None) -> N
     )
 
 
-def _check_polarity(
-    sequence: EndoscopicSequence, pairs: list[tuple[int, int]], as_given: float, file: object
-) -> None:
-    """Before poses or units are blamed: refuse a mask outside of which all of them fit the depth.
+def _is_proven_outside(sequence: EndoscopicSequence, pairs: list[tuple[int, int]], file: object) -> bool:
+    """Before poses or units are blamed: whether they fit the depth that the mask leaves out.
+
+    Returns:
+        True where they do, and what the mask keeps tells nothing, since it is outside the next frame.
 
     Raises:
-        SourceError: the depth that the mask leaves out agrees with the poses.
+        SourceError: they do, and contradict the depth that the mask keeps.
     """
-    depth = sequence.depth_mm
     turned = replace(sequence, mask=~sequence.mask)
-    if depth is None or not set(pairs) <= set(_comparable_pairs(turned)):
-        return
-    outside = _reprojection_error(turned, np.asarray(sequence.world_from_camera, dtype=np.float64), pairs)
-    if outside < _SUSPICIOUS_ERROR:
-        raise SourceError(
-            f"depth carried from frame to frame is off by {as_given:.0%} (median) where the mask keeps it, "
-            f"and by {outside:.1%} where the mask leaves it out: the mask is inverted. Expected white on "
-            "tissue",
-            file=file,
-            field="mask",
-        )
+    if not _are_wide(turned, pairs):
+        return False
+    poses = np.asarray(sequence.world_from_camera, dtype=np.float64)
+    outside = _reprojection_error(turned, poses, pairs)
+    if outside >= _SUSPICIOUS_ERROR:
+        return False
+    compared = [error for error in _pair_errors(sequence, poses, pairs) if error is not None]
+    inside = float(np.mean(compared)) if compared else 0.0
+    if inside < _SUSPICIOUS_ERROR:
+        return True
+    raise SourceError(
+        f"depth carried from frame to frame is off by {inside:.0%} (median) where the mask keeps it, "
+        f"and by {outside:.1%} where the mask leaves it out: the mask is inverted. Expected white on tissue",
+        file=file,
+        field="mask",
+    )
 
 
 def neighbouring_frames(sequence: EndoscopicSequence, at_most: int = _CHECKED_PAIRS) -> list[tuple[int, int]]:
@@ -207,16 +221,23 @@ def neighbouring_frames(sequence: EndoscopicSequence, at_most: int = _CHECKED_PA
     return [neighbours[int(k)] for k in chosen]
 
 
-def _comparable_pairs(sequence: EndoscopicSequence) -> list[tuple[int, int]]:
-    """Of `neighbouring_frames` those with depth in enough of both masks: others tell nothing."""
+def _comparable_pairs(
+    sequence: EndoscopicSequence, at_least: float = _MIN_COMPARED_SHARE
+) -> list[tuple[int, int]]:
+    """Of `neighbouring_frames` those with depth, in both masks, for such a share of the image."""
     depth, mask = sequence.depth_mm, sequence.mask
     if depth is None:
         return []
     return [
         pair
         for pair in neighbouring_frames(sequence)
-        if all(((depth[index] > 0) & mask[index]).mean() >= _MIN_COMPARED_SHARE for index in pair)
+        if all(((depth[index] > 0) & mask[index]).mean() >= at_least for index in pair)
     ]
+
+
+def _are_wide(sequence: EndoscopicSequence, pairs: list[tuple[int, int]]) -> bool:
+    """Whether no pair compares a narrow part of the image alone."""
+    return set(pairs) <= set(_comparable_pairs(sequence, _NARROW_SHARE))
 
 
 def _reprojection_error(
@@ -228,11 +249,18 @@ def _reprojection_error(
     """
     if sequence.depth_mm is None:
         return 0.0
-    errors = []
-    height, width = sequence.height, sequence.width
-    stride = max(1, int(np.sqrt(height * width / _CHECKED_POINTS)))
-    v, u = (part.ravel() for part in np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride])
+    return float(np.mean([1.0 if e is None else e for e in _pair_errors(sequence, poses, pairs)]))
+
+
+def _pair_errors(
+    sequence: EndoscopicSequence, poses: Float[np.ndarray, "f 4 4"], pairs: list[tuple[int, int]]
+) -> list[float | None]:
+    """Of each pair the median, at most 1; None where too few points stay inside the image."""
+    if sequence.depth_mm is None:
+        return []
+    errors: list[float | None] = []
     for first, second in pairs:
+        v, u = _checked_pixels(sequence.depth_mm[first], sequence.mask[first])
         z = sequence.depth_mm[first][v, u].astype(np.float64)
         known = (z > 0) & sequence.mask[first][v, u]
         rays = unproject_pixels(
@@ -246,12 +274,26 @@ def _reprojection_error(
         found = sequence.depth_mm[second][row, column]
         comparable = found > 0
         if comparable.sum() < _MIN_INSIDE_SHARE * max(1, known.sum()):
-            errors.append(1.0)
+            errors.append(None)
             continue
         expected = found[comparable].astype(np.float64)
         relative_error = np.abs(carried[inside, 2][comparable] - expected) / expected
         errors.append(min(1.0, float(np.median(relative_error))))
-    return float(np.mean(errors))
+    return errors
+
+
+def _checked_pixels(
+    depth: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]
+) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    """Rows and columns of a grid over the image, finer where depth is known in a small part of it."""
+    height, width = depth.shape
+    stride = max(1, int(np.sqrt(height * width / _CHECKED_POINTS)))
+    seen = slice(stride // 2, None, stride)
+    share = float(((depth[seen, seen] > 0) & mask[seen, seen]).mean())
+    if share < _NARROW_SHARE:
+        stride = max(1, int(stride * np.sqrt(max(share, _MIN_COMPARED_SHARE))))
+    v, u = np.mgrid[stride // 2 : height : stride, stride // 2 : width : stride]
+    return v.ravel(), u.ravel()
 
 
 def axis_readings() -> list[Float[np.ndarray, "3 3"]]:

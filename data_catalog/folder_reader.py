@@ -25,7 +25,8 @@ class Glance:
     """What can be told of a sequence before a picture is read.
 
     Args:
-        width: of its frames, in pixels.
+        width: of its frames, in pixels; with `ingest.size` = detail before they are shrunk to their detail,
+            which only pictures tell.
         height: of its frames, in pixels.
         train: number of training frames; of footage, at most.
         test: number of held-out frames; of footage, at most.
@@ -92,6 +93,14 @@ def understood(place: Path) -> Iterator[None]:
         raise SourceError(problem, file=place) from error
 
 
+LensChange = Callable[[SourceFrames], SourceFrames]
+"""Gives a source other lenses, such as those of a calibration file."""
+
+
+def _as_stated(source: SourceFrames) -> SourceFrames:
+    return source
+
+
 @dataclass(frozen=True)
 class FolderReader:
     """One way in which a sequence lies in a folder (or is a file).
@@ -132,25 +141,29 @@ class FolderReader:
     outline: Callable[[Path, IngestConfig], SourceFrames] | None = None
     is_footage: bool = False
 
-    def read(self, place: Path, config: IngestConfig, name: str) -> EndoscopicSequence:
-        """The sequence in a folder, under a name.
+    def read(
+        self, place: Path, config: IngestConfig, name: str, lenses: LensChange = _as_stated
+    ) -> EndoscopicSequence:
+        """The sequence in a folder, under a name, with its own or other lenses.
 
         Raises:
             SourceError: a file is wrong; names file, frame and field.
             ConfigError: a size that the source cannot give.
         """
         with understood(place):
-            return assembled(self.frames(place, config), config, name)
+            return assembled(lenses(self.frames(place, config)), config, name)
 
-    def glance(self, place: Path, config: IngestConfig) -> Glance:
+    def glance(self, place: Path, config: IngestConfig, lenses: LensChange = _as_stated) -> Glance:
         """What `read` will give, without reading any picture, and without its warnings.
+
+        Only pictures tell what `ingest.size` = detail comes to: the size is then the one it starts from.
 
         Raises:
             SourceError: what can be seen to be wrong so.
             ConfigError: a size that the source cannot give.
         """
         with understood(place), _unheard():
-            source = (self.outline or self.frames)(place, config)
+            source = lenses((self.outline or self.frames)(place, config))
             kept, split, world_from_camera = chosen_frames(source, config)
             sampling = planned_sampling(source, kept[0], config)
         return Glance(

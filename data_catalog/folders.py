@@ -6,17 +6,17 @@ another package is handed to `register_reader`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from data_catalog.c3vd import reader as c3vd
 from data_catalog.calibration_files import with_calibration_file
 from data_catalog.dataset import Descriptor, Source
-from data_catalog.folder_reader import FolderReader, Glance, understood
+from data_catalog.folder_reader import FolderReader, Glance
 from data_catalog.footage import DICOM_SUFFIXES, VIDEO_SUFFIXES, files_of_kind
 from data_catalog.named_folders import find_folder, not_on_this_machine
-from data_catalog.posed_frames import assembled
+from data_catalog.posed_frames import SourceFrames
 from data_catalog.readers import (
     colmap_model,
     dicom,
@@ -114,17 +114,12 @@ class FolderDataset:
         return _reader(source).fingerprint(Path(source.paths[0]))
 
     def glance(self, source: Source, config: IngestConfig) -> Glance:
-        """What its reader tells without reading pictures; `config.calibration` is not looked at."""
-        return _reader(source).glance(Path(source.paths[0]), config)
+        """What its reader tells without reading pictures."""
+        return _reader(source).glance(Path(source.paths[0]), config, _lenses(config))
 
     def read(self, source: Source, config: IngestConfig) -> EndoscopicSequence:
         """Whatever its reader makes of it, with the lens of `config.calibration` where that is given."""
-        reader, place = _reader(source), Path(source.paths[0])
-        if config.calibration is None:
-            return reader.read(place, config, source.name)
-        with understood(place):
-            file = Path(config.calibration).expanduser()
-            return assembled(with_calibration_file(reader.frames(place, config), file), config, source.name)
+        return _reader(source).read(Path(source.paths[0]), config, source.name, _lenses(config))
 
     def _source(self, path: Path, reader: FolderReader) -> Source:
         return Source(
@@ -133,6 +128,17 @@ class FolderDataset:
             format=reader.name,
             paths=(str(path.resolve()),),
         )
+
+
+def _lenses(config: IngestConfig) -> Callable[[SourceFrames], SourceFrames]:
+    """Gives a source the lens of the calibration file that the settings name, if they do."""
+
+    def changed(source: SourceFrames) -> SourceFrames:
+        if config.calibration is None:
+            return source
+        return with_calibration_file(source, Path(config.calibration).expanduser())
+
+    return changed
 
 
 def _named_sets() -> tuple[Descriptor, ...]:

@@ -87,7 +87,9 @@ def inspect(name_or_path: str | Path, config: IngestConfig | None = None) -> Ins
         said = {item.topic for item in heard.findings}
         found = diagnose(sequence, source.path or source.name, thinned=thinned)
         findings = [item for item in found if item.topic not in said]
-        findings += [item.model_copy(update={"file": source.path or source.name}) for item in heard.findings]
+    # Also where reading then failed: what it has warned of may be why.
+    place = str(name_or_path) if source is None else source.path or source.name
+    findings += [item.model_copy(update={"file": place}) for item in heard.findings]
     return Inspection(
         name=source.name if source is not None else str(name_or_path),
         format=source.format if source is not None else None,

@@ -66,7 +66,7 @@ def sequence_from_arrays(
     labels = tuple(frame_names) or tuple(f"{k:04d}" for k in range(frames))
     if len(labels) != frames:
         raise ShapeError(f"{name}: {len(labels)} frame names for {frames} frames")
-    K = np.asarray(K, dtype=np.float64)
+    K = _numbers(K, f"{name}: K").astype(np.float64, copy=False)
     mask = np.ones((height, width), dtype=np.bool_) if mask is None else np.asarray(mask)
     sequence = EndoscopicSequence(
         name=name,
@@ -75,7 +75,7 @@ def sequence_from_arrays(
         mask=np.broadcast_to(mask, (frames, height, width)) if mask.shape == (height, width) else mask,
         split=every_nth(frames, _HELD_OUT_EVERY) if split is None else split,
         world_from_camera=None if world_from_camera is None else _rigid(world_from_camera, labels),
-        depth_mm=None if depth_mm is None else _without_gaps(np.asarray(depth_mm)),
+        depth_mm=None if depth_mm is None else _without_gaps(_numbers(depth_mm, f"{name}: depth_mm")),
         specular=None if specular is None else np.asarray(specular),
         metric=metric,
         frame_names=labels,
@@ -106,13 +106,26 @@ def _as_bytes(rgb: np.ndarray, labels: Sequence[str]) -> np.ndarray:
 
 
 def _rigid(poses: np.ndarray, labels: Sequence[str]) -> np.ndarray:
-    given = np.asarray(poses, dtype=np.float64)
+    given = _numbers(poses, "world_from_camera").astype(np.float64, copy=False)
     if given.shape != (len(labels), 4, 4):
         raise ShapeError(f"world_from_camera is {given.shape}, expected ({len(labels)}, 4, 4)")
     return np.stack([check_pose(pose, frame=label) for pose, label in zip(given, labels, strict=True)])
 
 
+def _numbers(given: object, what: str) -> np.ndarray:
+    """As an array of real numbers."""
+    try:
+        found = np.asarray(given)
+    except ValueError as error:
+        raise ShapeError(f"{what} is no array of numbers: {error}") from error
+    if found.dtype.kind not in "biuf":
+        raise ShapeError(f"{what} is {found.dtype} {found.shape}, expected real numbers")
+    return found
+
+
 def _without_gaps(depth_mm: np.ndarray) -> np.ndarray:
     """As float32, 0 where it is not finite."""
+    if depth_mm.ndim != 3:
+        raise ShapeError(f"depth_mm is {depth_mm.dtype} {depth_mm.shape}, expected [F, H, W]")
     known = (np.where(np.isfinite(depth), depth, 0).astype(np.float32) for depth in depth_mm)
     return stacked(known, len(depth_mm))

@@ -19,7 +19,7 @@ class Split:
     Args:
         name: e.g. `sparse`, `distanced`, `every8`.
         train: indices of frames the reconstruction may see.
-        test: indices of held-out frames.
+        test: indices of held-out frames. An empty array may be of any type, as `np.array([])` is of floats.
         version: version of the rule behind the name; raised by hand when the rule changes.
 
     Raises:
@@ -33,6 +33,9 @@ class Split:
 
     def __post_init__(self) -> None:
         for part, indices in (("train", self.train), ("test", self.test)):
+            if isinstance(indices, np.ndarray) and indices.shape == (0,):
+                indices = indices.astype(np.int64)
+                object.__setattr__(self, part, indices)
             check_array(indices, f"split {self.name}: {part}", (None,), np.integer)
 
 

@@ -64,6 +64,7 @@ _OTHER_KEYS = (
     *("scale", "offset", "aabb_scale", "applied_transform", "applied_scale", "orientation_override"),
     # Of a rolling shutter; the matrix of the frame as a whole stands beside them.
     *("transform_matrix_start", "transform_matrix_end", "depth_path", "normal_file_path"),
+    *("lidar_file_path", "event_file_path", "thermal_file_path", "camera_id", "n_frames", "split_filenames"),
 )
 """What programs write, what changes nothing here, and is spelt like a key that does."""
 

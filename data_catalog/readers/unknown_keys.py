@@ -52,7 +52,8 @@ def warn_of_unknown_keys(
         unknown = [
             key
             for key in unknown
-            if key.name not in others and (key.similarity >= _VERY_LIKELY or key.about_lens)
+            if key.name not in others
+            and (key.about_lens or (key.similarity >= _VERY_LIKELY and not _has_word_of_its_own(key)))
         ]
     if not unknown:
         return
@@ -78,6 +79,8 @@ class _UnknownKey:
     """To what was perhaps meant."""
     hint: str
     """What was perhaps meant, as the end of a sentence; empty where nothing is near."""
+    meant: str = ""
+    """What was perhaps meant; empty where nothing is near."""
     about_lens: bool = False
     first: str = ""
     """The first frame that has it."""
@@ -129,5 +132,28 @@ def _unknown_key(name: str, known: set[str], known_elsewhere: set[str], elsewher
     if not near:
         return _UnknownKey(name, 0.0, "")
     return _UnknownKey(
-        name, SequenceMatcher(None, near[0], given).ratio(), f" (did you mean {small[near[0]]}?)"
+        name,
+        SequenceMatcher(None, near[0], given).ratio(),
+        f" (did you mean {small[near[0]]}?)",
+        small[near[0]],
     )
+
+
+def _has_word_of_its_own(key: _UnknownKey) -> bool:
+    """Whether a key differs from what was perhaps meant by a whole word: then it is another key's name.
+
+    As `lidar_file_path` does from `depth_file_path`; a word that is missing, abbreviated or nearly spelt like
+    the other is a mistake.
+    """
+    if not key.meant:
+        return False
+    given, meant = (name.lower().split("_") for name in (key.name, key.meant))
+    if len(given) != len(meant):
+        return len(given) > len(meant) and set(meant) < set(given)
+    return any(not _is_like(one, other) for one, other in zip(given, meant, strict=True))
+
+
+def _is_like(word: str, other: str) -> bool:
+    short, long = sorted((word, other), key=len)
+    begins = len(short) > 1 and long.startswith(short)
+    return word == other or begins or SequenceMatcher(None, word, other).ratio() >= _LIKELY

@@ -25,7 +25,7 @@ pixels by chance."""
 
 MATCHED_SHARE = 0.05
 """Share of a frame's pixels that must match with other frames. It is at most 2 % where the picture is black,
-of one colour, noise, or mirrored, and 18 % and more in ordinary frames."""
+of one colour, noise, or mirrored, and 11 % and more in ordinary frames of 80 pixels' width or more."""
 
 
 def unmatched_frames(stereo: StereoDepth, mask: Bool[Tensor, "f h w"]) -> Bool[Tensor, "f"]:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from extrags.config import PosesConfig
+from extrags.errors import CaptureError
 from extrags.poses.job import PoseJob, PoseJobResult
 from extrags.poses.registration_report import MIN_TRAINING_FRAMES, colmap_report
 from extrags.sequence import EndoscopicSequence
@@ -68,6 +69,9 @@ def attempted(
         config: settings; `lenient_retry` allows the second.
         run: the job of a sequence of a name.
         retry: false where another way is left for frames without a pose.
+
+    Raises:
+        CaptureError: from `run`; from that of the second attempt only where the first was not enough.
     """
     first = _attempt(sequence, job, run)
     found, total = first.report["registered_train"], first.report["n_train"]
@@ -81,7 +85,13 @@ def attempted(
         found,
         total,
     )
-    second = _attempt(sequence, replace(job, lenient=True), run)
+    try:
+        second = _attempt(sequence, replace(job, lenient=True), run)
+    except CaptureError as error:
+        if not enough:
+            raise
+        _LOG.warning("%s: the second attempt failed; the first one counts (%s)", sequence.name, error)
+        return first
     gained = second.report["registered_train"] - found
     # A part of the recording with the right lens is worth more than all of it with a guess.
     loses_lens = enough and first.lens_determined and not second.lens_determined

@@ -9,6 +9,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from extrags.cameras import field_mask
 from extrags.config import IngestConfig
@@ -27,9 +28,13 @@ from extrags.sequence import EndoscopicSequence
 
 __all__ = ["LensCalibration", "check_lens_use", "with_calibration"]
 
-LARGEST_FIT_ERROR_PX = 1.0
-"""Root mean square over the image: frames of a lens that a radial model is farther from do not keep their
-pixels."""
+LARGEST_FIT_ERROR = 1 / 640
+"""Root mean square over the image, of its width: frames of a lens that a radial model is farther from do not
+keep their pixels."""
+
+LARGEST_KEPT_ERROR = 2 / 640
+"""Of the width: pixels of a kept lens that its radial model is farther from leave the mask, as in corners
+beyond which the estimated lens folds back."""
 
 _LOG = logging.getLogger(__name__)
 
@@ -76,7 +81,7 @@ class LensCalibration:
             fit = self.lens.radial()
         except SourceError:
             return None
-        return fit if fit.rms_px <= LARGEST_FIT_ERROR_PX else None
+        return fit if fit.rms_px <= LARGEST_FIT_ERROR * self.lens.width else None
 
     @property
     def own_field_of_view_deg(self) -> float:
@@ -162,7 +167,8 @@ def with_calibration(
     A lens without distortion only replaces `K`. Else all frames, held-out ones too, are resampled to a
     pinhole: that of the lens's central resolution, or of `ingest.field_of_view_deg`; what the lens did not
     see leaves the validity mask, and a warning says how much of the picture the pinhole leaves out. With
-    `ingest.lens=native` pixels stay, and the sequence's `lens` is the radial model of the lens. Poses and
+    `ingest.lens=native` pixels stay, and the sequence's `lens` is the radial model of the lens, if one is
+    within `LARGEST_FIT_ERROR`; pixels off by more than `LARGEST_KEPT_ERROR` leave the mask. Poses and
     points are of the camera's centre and stay as they are. Pixels that were not square are.
 
     Args:
@@ -193,7 +199,7 @@ def with_calibration(
     check_lens_use(ingest)
     if ingest.lens == "native":
         if calibration.radial is not None:
-            return _kept(known, calibration.radial)
+            return _kept(known, lens, calibration.radial)
         _LOG.warning(
             "%s: no radial model is near the lens that was estimated; frames are resampled to a pinhole "
             "although ingest.lens is native",
@@ -205,23 +211,39 @@ def with_calibration(
     return _resampled(known, plan)
 
 
-def _kept(sequence: EndoscopicSequence, fit: LensFit) -> EndoscopicSequence:
-    """Frames that keep their pixels; what lies beyond the lens's field leaves the mask."""
+def _kept(sequence: EndoscopicSequence, lens: Lens, fit: LensFit) -> EndoscopicSequence:
+    """Frames that keep their pixels; what lies beyond the lens's field, or is far off, leaves the mask."""
     seen = field_mask(fit.K, fit.lens, sequence.width, sequence.height)
+    error_px = _fit_error(lens, fit)
+    near = error_px <= LARGEST_KEPT_ERROR * sequence.width
     _LOG.info(
-        "%s: lens kept up to %.1f degrees from its axis: the radial model is at most %.2f px from the "
-        "estimated one, %.2f px in the root mean square",
+        "%s: lens kept up to %.1f degrees from its axis: the radial model is %.2f px from the estimated one "
+        "in the root mean square; %.1f %% of the pixels, where it is off by more than %.2f px (at most %.2f "
+        "px), leave the mask",
         sequence.name,
         np.degrees(fit.lens.max_angle_rad),
-        fit.error_px,
         fit.rms_px,
+        100 * np.count_nonzero(seen & ~near) / near.size,
+        LARGEST_KEPT_ERROR * sequence.width,
+        fit.error_px,
     )
+    seen = seen & near
     return replace(
         sequence,
         K=np.tile(fit.K, (len(sequence), 1, 1)),
         lens=fit.lens,
         mask=stacked((mask & seen for mask in sequence.mask), len(sequence)),
     )
+
+
+def _fit_error(lens: Lens, fit: LensFit) -> Float[np.ndarray, "h w"]:
+    """Distance of each pixel from where the lens itself sees the fit's ray; infinite where it sees none."""
+    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
+    K = fit.K
+    x, y = fit.lens.undistorted((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1])
+    true_u, true_v = lens.project(x, y)
+    off = np.hypot(true_u - u, true_v - v)
+    return np.where(np.isfinite(off), off, np.inf)
 
 
 def _tell_left_out(sequence: EndoscopicSequence, calibration: LensCalibration, plan: Undistortion) -> None:
@@ -235,12 +257,12 @@ def _tell_left_out(sequence: EndoscopicSequence, calibration: LensCalibration, p
     shown_deg = 2 * np.degrees(np.arctan(plan.valid.shape[1] / 2 / plan.K[0, 0]))
     _LOG.warning(
         "%s: the pinhole of %.0f degrees leaves out %.0f %% of the picture of the lens that was estimated, "
-        "which sees %.0f degrees from side to side; a larger ingest.field_of_view_deg shows more of it, and "
-        "ingest.lens=native all",
+        "which sees %.0f degrees from side to side; a larger ingest.field_of_view_deg shows more of it%s",
         sequence.name,
         shown_deg,
         100 * left_out,
         calibration.own_field_of_view_deg,
+        "" if calibration.radial is None else ", and ingest.lens=native all",
         extra={"topic": "lens"},
     )
 

@@ -138,24 +138,33 @@ def _scale_statements(given: Scene, sequence: EndoscopicSequence, scale: float, 
     statements = []
     if found.misfit > _CERTAIN_MISFIT or found.depth_error is None or not found.fits:
         tried = search.along()
-        least = min(tried, key=lambda fit: fit.misfit)
-        best = search.refined(least)
-        if best.fits and (best.clearly_better_than(found) or not found.fits):
+        best = search.refined(min(tried, key=lambda fit: fit.misfit))
+        if best.fits and (best.clearly_better_than(found) or not found.possible):
             raise SourceError(
                 f"with imported.scale {scale:g}, the training views {found.words}; with {best.scale:g}, "
                 f"which fits, they {best.words}",
                 file=path,
                 field="imported.scale",
             )
-        if not found.fits:
+        if not found.possible:
+            span = f"from {SMALLEST_SCALE:g} to {LARGEST_SCALE:g}"
+            told = (
+                f"Scales {span} could not be searched finely enough: the cameras are too far from the origin "
+                "for what is near them, and the scale that fits may lie between those that were tried. Is "
+                "imported.scale right? An origin near the cameras would tell. With the best"
+                if search.may_have_missed(tried)
+                else f"No scale {span} puts it where the frames show it: with the best"
+            )
             raise SourceError(
-                f"{_elsewhere(_scaled(given, scale), sequence, found.shown_share)}. No scale from "
-                f"{SMALLEST_SCALE:g} to {LARGEST_SCALE:g} puts it where the frames show it: with the best, "
-                f"{best.scale:g}, they {best.words}. Were other cameras used, other axes, or another light?",
+                f"{_elsewhere(_scaled(given, scale), sequence, found.shown_share)}. {told}, {best.scale:g}, "
+                f"they {best.words}. Were other cameras used, other axes, or another light?",
                 file=path,
                 field="means",
             )
-        alike = [fit.scale for fit in tried if not least.clearly_better_than(fit)]
+        # The steps may miss what the given scale and the refined one show.
+        possible = [fit for fit in (found, best, *tried) if fit.possible]
+        least = min(possible, key=lambda fit: fit.misfit)
+        alike = [scale, *(fit.scale for fit in possible if not least.clearly_better_than(fit))]
         if found.depth_error is None and max(alike) > _LOOSE_SCALE * min(alike):
             statements.append(
                 "its scale was taken as given: the frames have no depth, and their pictures fit alike from "
@@ -163,8 +172,8 @@ def _scale_statements(given: Scene, sequence: EndoscopicSequence, scale: float, 
             )
     if found.correlation is not None and found.correlation < _LOW_CORRELATION:
         statements.append(
-            f"its pictures and the training frames correlate by {found.correlation:.2f} only: its cameras or "
-            "its light may be others"
+            f"its pictures and the training frames correlate by {found.correlation:.2f} only: its cameras, "
+            "its light or its colours may be others"
         )
     return statements
 

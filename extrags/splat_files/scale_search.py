@@ -35,6 +35,7 @@ _STEP = 0.35
 """Step of the cameras, as a share of the distance of their surroundings."""
 _SHORTEST_STEP, _LONGEST_STEP = 0.002, 0.3
 """Of the logarithm of the scale."""
+_NEAR_GAUSSIANS = 0.9
 _REFINEMENTS = 7
 _NEAR_SHARE = 0.01
 """As in `Scene.near`: the unit that is looked for must not decide what is rendered."""
@@ -44,6 +45,7 @@ _LARGEST_MISFIT = 0.5
 _LIKE_BESIDE_DEPTH = 0.3
 _LIKE_AGAINST_DEPTH = 0.55
 _LIKE_WITHOUT_DEPTH = 0.35
+_ALL_SHOWN = 0.95
 _DEPTH_BIAS = 0.1
 _MISFIT_NOISE = 0.03
 _LESS_UNEXPLAINED = 0.6
@@ -86,6 +88,15 @@ class ScaleFit:
             return likeness >= _LIKE_WITHOUT_DEPTH
         shown = self.misfit <= _LARGEST_MISFIT or likeness >= _LIKE_BESIDE_DEPTH
         return (self.depth_error <= _NEAR_DEPTH and shown) or likeness >= _LIKE_AGAINST_DEPTH
+
+    @property
+    def possible(self) -> bool:
+        """Whether it fits, or nothing says that it does not.
+
+        Without depth, where practically all pixels show the scene, low correlation proves nothing about its
+        place: it may be a true surface in one grey, or a mesh without texture.
+        """
+        return self.fits or (self.depth_error is None and self.shown_share >= _ALL_SHOWN)
 
     def clearly_better_than(self, other: ScaleFit) -> bool:
         """Whether this scale has to be taken in place of the other one.
@@ -152,6 +163,16 @@ class ScaleSearch:
         """The agreement from the largest scale to the smallest, in steps that miss nothing, thinned."""
         return [self._fit(self._thinned, scale) for scale in self._path()]
 
+    def may_have_missed(self, tried: list[ScaleFit]) -> bool:
+        """Whether the shortest step, where it was taken, carries the cameras past a good part of the scene.
+
+        Args:
+            tried: from `along`.
+        """
+        across = _STEP * _width(self._thinned)
+        shortest = [fit.scale for fit in tried if self._wanted_step(fit.scale) < _SHORTEST_STEP]
+        return any(across < _SHORTEST_STEP * self._way(scale) for scale in shortest)
+
     def refined(self, start: ScaleFit) -> ScaleFit:
         """The scale of least misfit round one that `along` has rendered.
 
@@ -177,10 +198,15 @@ class ScaleSearch:
             scale *= math.exp(-self._step(scale))
 
     def _step(self, scale: float) -> float:
+        return min(_LONGEST_STEP, max(_SHORTEST_STEP, self._wanted_step(scale)))
+
+    def _wanted_step(self, scale: float) -> float:
         """Step of the logarithm of the scale by which the cameras move a share of the way to a surface."""
-        way = float(np.median(np.linalg.norm(self._cameras.centers, axis=1))) / scale
-        step = _STEP * self._distance(scale) / max(way, 1e-12)
-        return min(_LONGEST_STEP, max(_SHORTEST_STEP, step))
+        return _STEP * self._distance(scale) / self._way(scale)
+
+    def _way(self, scale: float) -> float:
+        """Typical distance of the cameras from the origin, in the file's unit; more than 0."""
+        return max(float(np.median(np.linalg.norm(self._cameras.centers, axis=1))) / scale, 1e-12)
 
     def _distance(self, scale: float) -> float:
         """Typical distance of the cameras from the scene, in the file's unit."""
@@ -243,6 +269,16 @@ def _thinned(scene: Scene) -> Scene:
     values = {name: value[::every] for name, value in scene.gaussians.parameters().items()}
     values["scales"] = values["scales"] + 0.5 * math.log(every)
     return Scene(Gaussians(**values), scene.light)
+
+
+def _width(scene: Scene) -> float:
+    """Standard deviation of its Gaussians across: of a tube across its length, of a plane along it."""
+    means = scene.gaussians.means.numpy().astype(np.float64)
+    means = means - np.median(means, axis=0)
+    distance = np.linalg.norm(means, axis=1)
+    # Floaters far outside would make it large.
+    near = means[distance <= np.quantile(distance, _NEAR_GAUSSIANS)]
+    return math.sqrt(max(0.0, float(np.linalg.eigvalsh(near.T @ near / len(near))[1])))
 
 
 def _correlation(

@@ -269,6 +269,20 @@ class TestCoarseDepth:
         read(posed_folder)
         assert "stairs of surfaces" in caplog.text
 
+    def test_is_told_as_well_where_reading_fails(self, posed_folder, edit_poses) -> None:
+        """It may be why the poses seem to contradict the depth."""
+        self.rewritten(posed_folder, ".png", lambda depth: depth.astype(np.uint16))
+
+        def to_opengl(content) -> None:
+            for entry in content["frames"]:
+                pose = np.array(entry["world_from_camera"]) @ np.diag([1.0, -1, -1, 1])
+                entry["world_from_camera"] = pose.tolist()
+
+        edit_poses(to_opengl)
+        refused, told = inspect(posed_folder).findings
+        assert (refused.topic, refused.kind) == ("cannot be read", "error")
+        assert (told.topic, told.kind, told.file) == ("depth resolution", "warning", str(posed_folder))
+
     @pytest.mark.parametrize("suffix", [".npy", ".tiff"])
     def test_floats_are_fine(self, posed_folder, suffix) -> None:
         self.rewritten(posed_folder, suffix, lambda depth: depth)
@@ -344,6 +358,40 @@ class TestMasksBeforePoses:
         edit_poses(to_opengl)
         with pytest.raises(PoseError, match="read as OpenGL axes"):
             read(posed_folder)
+
+    @pytest.mark.parametrize("share", [0.19, 0.08, 0.04])
+    @pytest.mark.parametrize("depth_outside", [True, False])
+    def test_what_is_wrong_behind_a_small_round_one_is_named(self, clip, share, depth_outside) -> None:
+        """The picture of a thin endoscope fills little of its image; that switched these checks off."""
+        rows, columns = np.mgrid[: clip.height, : clip.width] + 0.5
+        away = np.hypot(columns - clip.width / 2, rows - clip.height / 2)
+        white = away < np.sqrt(share * clip.height * clip.width / np.pi)
+        assert white.mean() == pytest.approx(share, abs=0.005)
+        depth = clip.depth_mm if depth_outside else clip.depth_mm * white
+        small = replace(clip, mask=clip.mask & white, depth_mm=depth)
+        check_sequence(small)
+        poses = clip.world_from_camera @ np.diag([1.0, -1, -1, 1])
+        with pytest.raises(PoseError, match="the poses contradict the depth"):
+            check_sequence(replace(small, world_from_camera=poses))
+        metres = (depth / 1000).astype(np.float32)
+        with pytest.raises((SourceError, PoseError), match=r"different units|positions of the cameras"):
+            check_sequence(replace(small, depth_mm=metres))
+
+    @pytest.mark.parametrize("columns", [10, 14])
+    def test_a_narrow_inverted_one_is_named(self, columns) -> None:
+        """It keeps 12 %, of which other depth stays in sight."""
+        white = np.zeros((64, 80), dtype=bool)
+        white[:, -columns:] = True
+        wall = self.along_a_wall(white)
+        other = replace(wall, depth_mm=wall.depth_mm * np.where(white, 0.5, 1).astype(np.float32))
+        with pytest.raises(SourceError, match="where the mask leaves it out: the mask is inverted"):
+            check_sequence(other)
+
+    def test_a_narrow_one_without_depth_outside_tells_nothing(self) -> None:
+        white = np.zeros((64, 80), dtype=bool)
+        white[:, :10] = True
+        wall = self.along_a_wall(white)
+        check_sequence(replace(wall, depth_mm=wall.depth_mm * white))
 
 
 class TestChecks:

@@ -15,6 +15,7 @@ from data_catalog.catalog import (
     describe,
     glance,
     list_sequences,
+    measured_detail,
     read,
     resolve,
     source_fingerprint,
@@ -180,12 +181,24 @@ class TestWhatIsNoName:
             with pytest.raises(ConfigError, match=f"expected the name of a sequence or a path, found {kind}"):
                 function(given)
 
+    @pytest.mark.parametrize("given", ["", " "])
+    def test_nothing(self, given, posed_folder, monkeypatch) -> None:
+        """It is no other name of the folder one happens to be in."""
+        monkeypatch.chdir(posed_folder)
+        for function in (read, extrags.read, resolve, glance, source_fingerprint):
+            with pytest.raises(UnknownSequenceError, match="the name is empty"):
+                function(given)
+        assert len(read(".")) == 10
+
 
 class TestWhatAreNoSettingsOfReading:
     @pytest.mark.parametrize("given", [extrags.PROFILES["quick"], "quick", {}, {"width": 40}, 0])
     def test_are_refused(self, given) -> None:
         with pytest.raises(ConfigError, match=r"^read was given .* as its config; pass an Ingest"):
             extrags.read("phantom/7@sparse", given)
+        for function in (glance, source_fingerprint, measured_detail):
+            with pytest.raises(ConfigError, match=f"^{function.__name__} was given .* pass an Ingest"):
+                function("phantom/7@sparse", given)
 
 
 class TestPartsOfRecordings:

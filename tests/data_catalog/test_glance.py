@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
 
 from data_catalog import Glance, glance, read
 from extrags.config import IngestConfig
-from extrags.errors import SourceError, SourceNotFoundError
+from extrags.errors import ConfigError, SourceError, SourceNotFoundError
 from extrags.sequence import EndoscopicSequence
 from tests.data_catalog.footage_fixture import turned, write_coded, write_dicom, write_video
 from tests.data_catalog.test_content import moving_scene
@@ -34,6 +36,20 @@ def plain_frames(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def fisheye(folder: Path) -> Path:
+    """A calibration file of a fisheye for images of 64 x 48 pixels."""
+    file = folder / "lens.json"
+    content = {
+        "camera_matrix": [[26.0, 0, 32], [0, 26.0, 24], [0, 0, 1]],
+        "distortion_model": "fisheye",
+        "distortion_coefficients": [0.02, 0, 0, 0],
+        "image_width": 64,
+        "image_height": 48,
+    }
+    file.write_text(json.dumps(content))
+    return file
+
+
 class TestFolders:
     @pytest.mark.parametrize(
         "settings", [{}, {"max_frames": 4}, {"downscale": 2}, {"holdout_every": 2}, {"width": 48}]
@@ -53,6 +69,24 @@ class TestFolders:
         assert glance(plain_frames) == Glance(64, 48, train=7, test=2, has_poses=False, has_depth=False)
         with pytest.raises(SourceError, match="damaged or truncated"):
             read(plain_frames)
+
+    @pytest.mark.parametrize("settings", [{}, {"size": "central", "field_of_view_deg": 130}, {"width": 32}])
+    def test_with_a_calibration_file(self, plain_frames: Path, settings: dict[str, Any]) -> None:
+        """A wide field of view enlarges the pinhole of the lens that is stated there."""
+        config = IngestConfig.model_validate({**settings, "calibration": str(fisheye(plain_frames))})
+        found = glance(plain_frames, config)
+        assert found == told(read(plain_frames, config))
+        assert found is not None
+        assert (found.width > 64) == ("size" in settings)
+
+    def test_what_a_lens_cannot_give_is_refused(self, plain_frames: Path) -> None:
+        calibration = str(fisheye(plain_frames))
+        config = IngestConfig(calibration=calibration, lens="native", field_of_view_deg=120)
+        for function in (glance, read):
+            with pytest.raises(ConfigError, match=r"ingest\.lens=native keeps the lens's own field"):
+                function(plain_frames, config)
+            with pytest.raises(ConfigError, match="states its intrinsics itself"):
+                function("phantom/1@sparse", IngestConfig(calibration=calibration))
 
     def test_what_a_reader_warns_of_is_said_when_it_reads(
         self, plain_frames: Path, caplog: pytest.LogCaptureFixture

@@ -129,6 +129,9 @@ class TestTransformsJson:
         [
             {"aabb_scale": 16, "applied_transform": [[1, 0, 0, 0]], "scale": 1, "offset": [0, 0, 0]},
             {"sharpness": 30.2, "colmap_im_id": 4, "near": 0.1, "author": "A"},
+            {"camera_id": 1, "n_frames": 10, "split_filenames": ["a"], "lidar_file_path": "a.bin"},
+            {"event_file_path": "a", "thermal_file_path": "a", "radar_file_path": "a"},
+            {"sonar_file_path": "a", "mono_depth_file_path": "a", "spare_filenames": []},
         ],
     )
     def test_what_programs_write_is_no_news(self, transforms, told, keys) -> None:
@@ -144,6 +147,9 @@ class TestTransformsJson:
             ("integer_depth_scal", "integer_depth_scale"),
             ("test_filename", "test_filenames"),
             ("depth_unit_scale", "depth_unit_scale_factor"),
+            ("depht_file_path", "depth_file_path"),
+            ("validation_filenames", "val_filenames"),
+            ("trian_filenames", "train_filenames"),
         ],
     )
     def test_misspelt(self, transforms, told, key, near) -> None:

@@ -180,6 +180,14 @@ class TestSequence:
         with pytest.raises(ShapeError, match=r"split half: train is .*, expected .*integer \(any\)"):
             Split("half", indices, np.array([1]))
 
+    @pytest.mark.usefixtures("unchecked")
+    def test_an_empty_part_of_a_split_may_be_of_any_type(self) -> None:
+        """`np.array([])` is of floats."""
+        split = Split("all", np.arange(4), np.array([]))
+        assert split.test.dtype == np.int64
+        sequence = replace(small_sequence(), split=split)
+        assert sequence.rgb[sequence.test].shape == (0, *sequence.rgb.shape[1:])
+
     def test_its_representation_is_a_line(self) -> None:
         sequence = replace(small_sequence(), truth={"exposure": list(range(5000))})
         assert repr(sequence) == (

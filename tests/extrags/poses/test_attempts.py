@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -120,6 +121,28 @@ def test_a_lens_that_was_found_is_not_given_up_for_a_guess(caplog: pytest.LogCap
     assert int(outcome(Colmap(20, (12, 20), (False, False))).registered.sum()) == 20
     # Too few frames are none that could be kept.
     assert int(outcome(Colmap(20, (6, 20), (True, False))).registered.sum()) == 20
+
+
+def test_a_first_attempt_that_was_enough_outlives_the_failure_of_the_second(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    def run(job: PoseJob, name: str, colmap: Colmap) -> PoseJobResult:
+        if job.lenient:
+            raise CaptureError("COLMAP's process ended with code -9")
+        return colmap(job, name)
+
+    given, config = sequence(20), PosesConfig()
+    job = estimate._job(given, config)
+    enough = partial(run, colmap=Colmap(20, (17, 20)))
+    found = attempted(given, job, config, enough, retry=True)
+    assert int(found.registered.sum()) == 17
+    assert "lenient" not in found.report
+    assert (
+        "the second attempt failed; the first one counts (COLMAP's process ended with code -9" in caplog.text
+    )
+    too_few = partial(run, colmap=Colmap(20, (6, 20)))
+    with pytest.raises(CaptureError, match="code -9"):
+        attempted(given, job, config, too_few, retry=True)
 
 
 def test_another_way_or_the_settings_leave_it_at_one() -> None:

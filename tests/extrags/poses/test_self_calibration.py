@@ -15,7 +15,7 @@ from extrags.errors import ConfigError, ShapeError
 from extrags.lens import Lens
 from extrags.poses import LensCalibration, estimate_poses, with_calibration, with_estimated_poses
 from extrags.poses.estimate import PoseEstimate
-from extrags.sequence import EndoscopicSequence
+from extrags.sequence import EndoscopicSequence, Split
 from tests.extrags.poses.textured_room import render_room, room_sequence, turning_room
 
 WIDTH, HEIGHT = 200, 150
@@ -312,11 +312,43 @@ class TestWideLens:
     def test_a_lens_that_no_radial_model_is_near_is_undone(
         self, room: EndoscopicSequence, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("extrags.poses.calibration.LARGEST_FIT_ERROR_PX", -1.0)
+        monkeypatch.setattr("extrags.poses.calibration.LARGEST_FIT_ERROR", -1.0)
         found = LensCalibration(WIDE, determined=True)
         posed = with_calibration(guessed(room), found, IngestConfig(lens="native"))
         assert posed.lens is None
         assert "no radial model is near the lens that was estimated" in caplog.text
+        assert "of the picture of the lens" in caplog.text
+        assert "ingest.lens=native all" not in caplog.text, "that was just refused"
+
+    def test_a_lens_is_near_or_far_at_any_size(self) -> None:
+        """The same lens was kept at 640 pixels, and refused at 1280."""
+        shares = []
+        for size in (1, 4, 8):
+            width, height = 160 * size, 128 * size
+            K = np.array([[120.0 * size, 0, width / 2], [0, 120.0 * size, height / 2], [0, 0, 1]])
+            frames = EndoscopicSequence(
+                "test/recording",
+                np.zeros((2, height, width, 3), np.uint8),
+                np.tile(K, (2, 1, 1)),
+                np.ones((2, height, width), bool),
+                Split("test", np.arange(2), np.arange(0)),
+                metric=False,
+                intrinsics="guessed",
+            )
+            parameters = (100.0 * size, 78.0 * size, 66.0 * size, -0.3, 0.05)
+            lens = Lens("RADIAL", parameters, width, height)
+            found = LensCalibration(lens, determined=True)
+            posed = with_calibration(frames, found, IngestConfig(lens="native"))
+            assert posed.lens is not None
+            # Corners, where the fit is off by up to 2 % of the width, are no part of the picture.
+            u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+            K = posed.K[0]
+            x, y = posed.lens.undistorted((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1])
+            seen_u, seen_v = lens.project(x, y)
+            assert np.hypot(seen_u - u, seen_v - v)[posed.mask[0]].max() <= 2 / 640 * width
+            shares.append(posed.mask.mean())
+        np.testing.assert_allclose(shares, shares[0], atol=0.01)
+        assert shares[0] > 0.9
 
     def test_a_pinhole_of_a_lens_that_is_kept_is_refused(self, room: EndoscopicSequence) -> None:
         both = IngestConfig(lens="native", field_of_view_deg=100)

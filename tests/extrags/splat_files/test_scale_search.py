@@ -151,6 +151,15 @@ class TestNoScale:
         with pytest.raises(SourceError, match=r"field means: .* around \(59, .* No scale"):
             imported(away, shown, 1.0, tmp_path)
 
+    def test_far_from_the_origin_a_wall_in_the_way_is_none_that_was_missed(
+        self, scene: Scene, shown: EndoscopicSequence, tmp_path: Path
+    ) -> None:
+        far_scene, far = moved(scene, shown, (0.0, 400.0, 300.0))
+        assert far.world_from_camera is not None
+        wrong = turned(far_scene, (0, 1.0, 0), 90, np.median(far.world_from_camera[:, :3, 3], axis=0))
+        with pytest.raises(SourceError, match="No scale from"):
+            imported(wrong, far, 1.0, tmp_path)
+
 
 class TestTaken:
     def test_a_scene_with_biased_depth(self, scene: Scene, shown: EndoscopicSequence, tmp_path: Path) -> None:
@@ -163,6 +172,38 @@ class TestTaken:
         write_ply_scene(Scene(tube.scene.gaussians), tmp_path / "albedo.ply")
         found = import_scene(tmp_path / "albedo.ply", tube.sequence)
         assert "correlate by 0.1" in " ".join(found.statements)
+
+    @pytest.mark.parametrize("by", [(0.0, 0.0, 0.0), (0.0, 400.0, 300.0)])
+    def test_the_right_place_in_other_colours(
+        self, by: tuple[float, float, float], scene: Scene, shown: EndoscopicSequence, tmp_path: Path
+    ) -> None:
+        """A surface in one grey hides the frames in its place, and resembles them nowhere."""
+        there, sequence = moved(scene, shown, by)
+        values = there.gaussians.parameters()
+        grey = Scene(Gaussians(**{**values, "sh0": torch.full_like(values["sh0"], 0.3)}))
+        with torch.no_grad():
+            seen = there.render(sequence.cameras).alpha.numpy() > 0.9
+        sequence = replace(sequence, mask=sequence.mask & seen)
+        write_ply_scene(grey, tmp_path / "grey.ply")
+        found = import_scene(tmp_path / "grey.ply", without_depth(sequence))
+        assert found.seen_share > 0.95
+        assert "training frames correlate by" in " ".join(found.statements)
+        with pytest.raises(SourceError, match="field means"):
+            import_scene(tmp_path / "grey.ply", without_depth(sequence), ImportedConfig(scale=0.05))
+
+    def test_far_from_the_origin_the_given_scale_may_be_the_only_one(
+        self, scene: Scene, shown: EndoscopicSequence, tmp_path: Path
+    ) -> None:
+        """No step of the search comes near it: what was tried fits alike badly at all scales."""
+        far_scene, far = moved(scene, shown, (500_000.0, 0.0, 0.0))
+        right = 1.2345678
+        values = far_scene.gaussians.parameters()
+        unit = {"means": values["means"] / right, "scales": values["scales"] - np.log(right)}
+        write_ply_scene(Scene(Gaussians(**{**values, **unit})), tmp_path / "a.ply")
+        found = import_scene(tmp_path / "a.ply", without_depth(far), ImportedConfig(scale=right))
+        assert "fit alike" not in " ".join(found.statements)
+        with pytest.raises(SourceError, match=r"could not be searched finely enough.* origin near the cam"):
+            import_scene(tmp_path / "a.ply", without_depth(far), ImportedConfig(scale=1.236))
 
     def test_a_scale_that_frames_without_depth_cannot_tell(
         self, scene: Scene, shown: EndoscopicSequence, tmp_path: Path
@@ -217,6 +258,12 @@ class TestComparison:
     )
     def test_one_world_or_another(self, fit: ScaleFit, fits: bool) -> None:
         assert fit.fits == fits
+
+    def test_what_is_shown_everywhere_may_have_other_colours(self) -> None:
+        low = replace(self.GOOD, depth_error=None, misfit=0.9, correlation=0.1, shown_share=0.99)
+        assert low.possible
+        assert not replace(low, shown_share=0.9).possible
+        assert not replace(low, depth_error=0.5).possible
 
     @pytest.mark.parametrize(
         ("fit", "words"),
