@@ -169,8 +169,9 @@ def _local_cluster(workers: int) -> distributed.LocalCluster:
     global _cluster
     with _cluster_guard:
         if _cluster is None:
+            # Told no port, Dask takes 8787 for its metrics, and warns where another cluster has it.
             _cluster = distributed.LocalCluster(
-                n_workers=workers, threads_per_worker=1, dashboard_address=None
+                n_workers=workers, threads_per_worker=1, dashboard_address=":0"
             )
             atexit.register(_close, _cluster)
         return _cluster

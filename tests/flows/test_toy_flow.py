@@ -120,7 +120,7 @@ def test_a_killed_run_resumes_where_it_was(tmp_path: Path, runs: Path) -> None:
 @pytest.mark.slow
 def test_dask_workers_share_the_cache(tmp_path: Path, runs: Path) -> None:
     store = str(tmp_path / "store")
-    cluster = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    cluster = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": ":0"}
     on_dask = toy.with_options(task_runner=DaskTaskRunner(cluster_kwargs=cluster))
     assert names(on_dask(store)) == ["Completed"] * 5
     assert names(toy(store)) == ["Cached"] * 5
