@@ -178,7 +178,8 @@ class TestAgain:
         found = benchmark(
             sequences=[SEQUENCE],
             methods=["coarse"],
-            settings=TINY,
+            # What is in the store needs none.
+            settings={**TINY, "coarse.iterations": 121},
             store=finished[0],
             name="little memory",
             limits=StageLimits(memory_gb=0.001),

@@ -304,7 +304,8 @@ def test_every_setting_changes_its_stage_and_what_follows() -> None:
 def test_features_of_triangulation_count_where_the_source_has_poses() -> None:
     names = [name for name in SETTINGS if name.startswith("poses.")]
     found = differences(BASE, names, has_poses=True)
-    counted = {"n_features", "peak_threshold", "edge_threshold", "sequential_overlap", "exhaustive_below"}
+    counted = {"max_width", "n_features", "peak_threshold", "edge_threshold"}
+    counted |= {"sequential_overlap", "exhaustive_below"}
     present = recorded_keys(SEQUENCE, BASE, has_poses=True)
     for name, stages in found.items():
         if name == "poses.replace_given":

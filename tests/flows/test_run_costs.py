@@ -44,7 +44,7 @@ def test_records_have_the_numbers_that_costs_depend_on(filled: Store) -> None:
     # The waves are part of the exploration.
     parts = filled.ls("explore*")
     (explore,) = [cost for _, cost in elapsed if cost.task == "explore"]
-    assert explore.seconds == pytest.approx(sum(part.seconds for part in parts), abs=0.01)
+    assert explore.seconds == pytest.approx(sum(part.elapsed_s for part in parts), abs=0.01)
 
 
 def test_the_history_of_a_store_tells_the_pace(filled: Store, monkeypatch: pytest.MonkeyPatch) -> None:

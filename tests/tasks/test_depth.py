@@ -15,6 +15,7 @@ from tasks.depth import TRIANGULATION, depth, keyed_settings, triangulation_sett
 from tasks.stage import stage_key
 
 OTHER: dict[str, Any] = {
+    "max_width": 200,
     "n_features": 500,
     "peak_threshold": 0.01,
     "edge_threshold": 8.0,
@@ -78,4 +79,6 @@ def test_triangulation_reads_no_other_setting() -> None:
         read |= set(re.findall(r'settings\["(\w+)"\]', source))
         for names in re.findall(r"settings\[key\] for key in \(([^)]*)\)", source):
             read |= set(re.findall(r'"(\w+)"', names))
+    before = (Path(folder) / "triangulation.py").read_text(encoding="utf-8")
+    read |= set(re.findall(r"\bconfig\.(\w+)\b(?!\()", before))
     assert read == TRIANGULATION
