@@ -428,7 +428,15 @@ def keeps_central_resolution(config: IngestConfig) -> bool:
 
 
 def pinhole_size(lens: Lens, config: IngestConfig) -> tuple[int, int] | None:
-    """Size at which a pinhole of the given field of view keeps the central resolution; None: the lens's."""
+    """Width and height in pixels at which a pinhole keeps the resolution at the centre of a lens's picture.
+
+    Args:
+        lens: of the source.
+        config: with the field of view of the pinhole in degrees.
+
+    Returns:
+        None where the settings name no field of view or another size: the lens's own holds.
+    """
     if config.field_of_view_deg is None or not keeps_central_resolution(config):
         return None
     focal = float(np.sqrt(lens.K[0, 0] * lens.K[1, 1]))
@@ -467,6 +475,14 @@ def left_out_share(lens: Lens, plan: Undistortion, picture: Float[np.ndarray, "h
 
 
 def source_areas(u: Float[np.ndarray, "h w"], v: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Area in source pixels of each pixel that is looked up at (u, v); 0 where that is unknown."""
+    """Area in source pixels of each pixel of a picture that is looked up in another.
+
+    Args:
+        u: column in the source, in pixels, [H, W]; not a number where there is none.
+        v: row in the source, the same way.
+
+    Returns:
+        0 where it is unknown, [H, W].
+    """
     (u_down, u_right), (v_down, v_right) = np.gradient(u), np.gradient(v)
     return np.asarray(np.nan_to_num(np.abs(u_right * v_down - u_down * v_right)))

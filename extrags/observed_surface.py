@@ -21,6 +21,7 @@ def observed_from_depth(
     *,
     tolerance_share: float = 0.03,
     tolerance_mm: float = 0.0,
+    stage: str = "ingest",
 ) -> Bool[np.ndarray, "f h w"]:
     """A depth test against every training frame.
 
@@ -35,6 +36,7 @@ def observed_from_depth(
         test: indices of held-out frames.
         tolerance_share: how much farther still counts, as a share of the depth.
         tolerance_mm: the same as a length: the step of the depth's encoding.
+        stage: whose progress it is.
 
     Returns:
         True where observed, [F, H, W]; false in training frames and where depth is unknown.
@@ -54,7 +56,7 @@ def observed_from_depth(
             depth = depth_mm[other]
             seen[left] = _in_front(points[left], cameras[int(other)], depth, tolerance_share, tolerance_mm)
         observed[index][known] = seen
-        emit(Progress("ingest", done, len(test)))
+        emit(Progress(stage, done, len(test)))
     return observed
 
 
@@ -66,7 +68,20 @@ def observed_by_depth(
     *,
     tolerance_mm: float = 0.0,
 ) -> Bool[np.ndarray, "f h w"] | None:
-    """`observed_from_depth` for the frames of a split, masks aside; None where there is no depth."""
+    """`observed_from_depth` for the frames of a split; None where there is no depth.
+
+    One of the functions that a reader of posed frames may be given: others look at a mesh, and at masks.
+
+    Args:
+        cameras: all frames.
+        mask: not looked at, [F, H, W].
+        depth_mm: z-depth, 0 where unknown, [F, H, W].
+        split: which frames train, and which are held out.
+        tolerance_mm: the step of the depth's encoding.
+
+    Returns:
+        True where observed, [F, H, W].
+    """
     if depth_mm is None:
         return None
     return observed_from_depth(cameras, depth_mm, split.train, split.test, tolerance_mm=tolerance_mm)

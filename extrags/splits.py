@@ -44,6 +44,13 @@ def every_nth(frames: int, holdout_every: int) -> Split:
 
     Source: the convention (n = 8) of Barron et al., Mip-NeRF 360, CVPR 2022, and Kerbl et al., 3D Gaussian
     Splatting, 2023.
+
+    Args:
+        frames: how many there are.
+        holdout_every: n, 1 or more; with 1 every frame is held out.
+
+    Returns:
+        The split named `every<n>`.
     """
     index = np.arange(frames)
     held_out = (index % holdout_every == 0) & (frames > 1)

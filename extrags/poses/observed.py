@@ -7,7 +7,6 @@ import logging
 import numpy as np
 from jaxtyping import Bool
 
-from extrags.events import subscribed
 from extrags.observed_surface import observed_from_depth
 from extrags.sequence import EndoscopicSequence
 
@@ -26,7 +25,10 @@ def observed_by_those_left(
 
     Args:
         sequence: as it came.
-        registered: frames that stay.
+        registered: true for frames that stay, [F].
+
+    Returns:
+        True where observed, [F, H, W]; None where nothing tells.
     """
     left = sequence.train[registered[sequence.train]]
     if sequence.observed is None or len(left) == len(sequence.train):
@@ -40,7 +42,5 @@ def observed_by_those_left(
             len(sequence.train) - len(left),
         )
         return None
-    # The search tells its progress as that of another stage.
-    with subscribed(lambda _event: None):
-        seen = observed_from_depth(sequence.cameras, depth, left, sequence.test)
+    seen = observed_from_depth(sequence.cameras, depth, left, sequence.test, stage="poses")
     return np.asarray(seen & sequence.observed)

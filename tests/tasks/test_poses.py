@@ -11,6 +11,7 @@ import pytest
 
 from extrags.config import CoarseConfig, IngestConfig, PosesConfig
 from extrags.errors import ConfigError
+from extrags.events import Event, Progress, subscribed
 from extrags.observed_surface import observed_from_depth
 from extrags.poses import observed_by_those_left
 from extrags.sequence import EndoscopicSequence
@@ -125,6 +126,17 @@ class TestDroppedTrainingFrames:
         room = replace(room_sequence(4, width=40, height=30), intrinsics="guessed")
         told = replace(room, observed=room.mask)
         assert observed_by_those_left(told, np.ones(4, dtype=bool)) is told.observed
+
+    def test_the_search_tells_how_far_it_is(self) -> None:
+        """Events are also where a run that is interrupted, or past its time limit, ends."""
+        room = room_sequence(7, width=40, height=30, holdout_every=4)
+        registered = np.ones(7, dtype=bool)
+        registered[room.train[-1]] = False
+        heard: list[Event] = []
+        with subscribed(heard.append):
+            observed_by_those_left(replace(room, observed=room.mask), registered)
+        frames = len(room.test)
+        assert heard == [Progress("poses", done, frames) for done in range(1, frames + 1)]
 
 
 class TestLensSettings:
