@@ -25,8 +25,10 @@ __all__ = ["LARGEST_SCALE", "SMALLEST_SCALE", "ScaleFit", "ScaleSearch"]
 
 SMALLEST_SCALE = 1e-4
 LARGEST_SCALE = 1e4
+"""The scales that are searched, in units of the sequence in one unit of the file."""
 _VIEWS = 5
 _WIDTH_PX = 64
+"""So many training frames are compared, at most so wide."""
 _SEARCHED_GAUSSIANS = 30_000
 """The search renders so many, enlarged; what it finds is rendered once more with all."""
 _NEIGHBOURS = 8
@@ -36,22 +38,35 @@ _STEP = 0.35
 _SHORTEST_STEP, _LONGEST_STEP = 0.002, 0.3
 """Of the logarithm of the scale."""
 _NEAR_GAUSSIANS = 0.9
+"""The nearest share of the Gaussians tells how wide a scene is."""
 _REFINEMENTS = 7
+"""How often the step is halved round the scale that fits best."""
 _NEAR_SHARE = 0.01
 """As in `Scene.near`: the unit that is looked for must not decide what is rendered."""
 _LEAST_CONTRAST = 0.005
+"""Standard deviation of brightness, in [0, 1], under which a frame has nothing to correlate with."""
+
+# What fits, and what fits better: set on the scenes and scales whose figures are in docs/export.md.
 _NEAR_DEPTH = 0.25
+"""Depth agrees where the median of its absolute log ratio is no larger."""
 _LARGEST_MISFIT = 0.5
+"""Misfit up to which agreeing depth is enough."""
 _LIKE_BESIDE_DEPTH = 0.3
 _LIKE_AGAINST_DEPTH = 0.55
 _LIKE_WITHOUT_DEPTH = 0.35
+"""Correlation from which pictures are alike: where depth agrees, where it does not, and without any."""
 _ALL_SHOWN = 0.95
+"""Share of the pixels that show the scene from which practically all do."""
 _DEPTH_BIAS = 0.1
+"""Error in depth, as a log ratio, that a scene trained without depth may have at the right scale."""
 _MISFIT_NOISE = 0.03
-_LESS_UNEXPLAINED = 0.6
 _LIKENESS_NOISE = 0.02
+"""Differences of misfit and of correlation that say nothing."""
+_LESS_UNEXPLAINED = 0.6
+"""Share of what the other scale's pictures leave unexplained, under which one explains clearly more."""
 _MOST_DIGITS = 5
 _ROUNDING_MISFIT = 0.005
+"""A scale is written with as few digits, at most so many, as cost no more misfit than this."""
 
 
 @dataclass(frozen=True)
