@@ -12,7 +12,7 @@ from prefect import flow
 from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
-from extrags.config import ProfileName
+from extrags.config import ProfileName, Seed
 from extrags.errors import ConfigError
 from extrags.pipeline import HELD_OUT_TRAINED_ON
 from extrags.store import Store, digest_of
@@ -78,7 +78,7 @@ def benchmark(
         "extrags",
     ],
     seeds: Annotated[
-        list[Annotated[int, Field(ge=0)]], Field(min_length=1, description="one run per seed")
+        list[Seed], Field(min_length=1, description="one run per seed")
     ] = [0],  # noqa: B006
     settings: Annotated[
         Settings, Field(description="overrides for all runs; they do not reach what a method pins")

@@ -12,7 +12,7 @@ from prefect.artifacts import create_markdown_artifact
 from prefect.client.schemas.objects import State
 from pydantic import Field
 
-from extrags.config import ProfileName
+from extrags.config import ProfileName, Seed
 from extrags.pipeline import StageName
 from extrags.store import Store
 from flows.cases import Only, SequenceCase, cases_of, record_outcome_quietly, selected
@@ -50,7 +50,7 @@ def reconstruct_dataset(
     ],
     profile: Annotated[ProfileName, Field(description="named settings")] = "balanced",
     settings: Annotated[Settings, Field(description="overrides by dotted name")] = None,
-    seed: Annotated[int | None, Field(ge=0, description="seed of all stages")] = None,
+    seed: Annotated[Seed | None, Field(description="seed of all stages")] = None,
     store: Annotated[
         StoreRoot, Field(description="directory or URL of the artefact store; EXTRAGS_STORE by default")
     ] = None,
@@ -73,8 +73,7 @@ def reconstruct_dataset(
         list[MethodName] | None, Field(min_length=1, description="several methods instead of one")
     ] = None,
     seeds: Annotated[
-        list[Annotated[int, Field(ge=0)]] | None,
-        Field(min_length=1, description="several seeds instead of one"),
+        list[Seed] | None, Field(min_length=1, description="several seeds instead of one")
     ] = None,
     matrix: Annotated[
         Matrix, Field(description='several values of settings, e.g. {"coarse.iterations": [500, 1000]}')

@@ -10,7 +10,7 @@ from prefect.artifacts import create_markdown_artifact
 from pydantic import Field
 
 from data_catalog.names import plain_name
-from extrags.config import ProfileName
+from extrags.config import ProfileName, Seed
 from extrags.pipeline import StageName
 from extrags.store import Store
 from extrags.store.runs import file_killed
@@ -42,7 +42,7 @@ def reconstruct_sequence(
     ],
     profile: Annotated[ProfileName, Field(description="named settings")] = "balanced",
     settings: Annotated[Settings, Field(description='overrides such as {"coarse.iterations": 500}')] = None,
-    seed: Annotated[int | None, Field(ge=0, description="seed of all stages")] = None,
+    seed: Annotated[Seed | None, Field(description="seed of all stages")] = None,
     store: Annotated[
         StoreRoot, Field(description="directory or URL of the artefact store; EXTRAGS_STORE by default")
     ] = None,

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from extrags.config import PipelineConfig, profile_config
+from extrags.config import LARGEST_SEED, PipelineConfig, profile_config
 from extrags.cores import usable_cores
 from extrags.data_directories import DATA_VARIABLE, user_directories
 from extrags.errors import ConfigError, did_you_mean
@@ -79,8 +79,8 @@ def pipeline_config(
     """
     config = profile_config(profile)
     if seed is not None:
-        if seed < 0:
-            raise ConfigError(f"the seed is {seed}; expected 0 or more")
+        if not 0 <= seed <= LARGEST_SEED:
+            raise ConfigError(f"the seed is {seed}; expected 0 to {LARGEST_SEED} (2^63 - 1)")
         config = config.with_seed(seed)
     return config.with_overrides(settings or {})
 

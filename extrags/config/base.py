@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, field_validator
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, field_validator
 from pydantic_core import CoreSchema, core_schema
 
 from extrags.errors import ConfigError, did_you_mean
 from extrags.redaction import has_credentials
 
-__all__ = ["KeyOf", "StageConfig"]
+__all__ = ["LARGEST_SEED", "KeyOf", "Seed", "StageConfig"]
+
+LARGEST_SEED = 2**63 - 1
+"""What the random number generators of numpy and torch both take, and fits a signed 64-bit integer."""
+
+Seed = Annotated[int, Field(ge=0, le=LARGEST_SEED)]
+"""Seed of random sampling."""
 
 
 class KeyOf:

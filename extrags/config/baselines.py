@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from extrags.config.base import StageConfig
+from extrags.config.base import Seed, StageConfig
 
 __all__ = ["UcNerfConfig"]
 
@@ -42,4 +42,4 @@ class UcNerfConfig(StageConfig):
         0.008, ge=0, description="of the scale-invariant gradient of rendered depth"
     )
     learning_rate: float = Field(2e-3, gt=0, description="at the start; falls to a twentieth as a cosine")
-    seed: int = Field(0, ge=0, description="seed of all random sampling")
+    seed: Seed = Field(0, description="seed of all random sampling")

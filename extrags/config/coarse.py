@@ -6,7 +6,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from extrags.config.base import StageConfig
+from extrags.config.base import Seed, StageConfig
 
 __all__ = ["CoarseConfig", "DensifyConfig", "LightConfig", "OptimiserConfig", "PoseRefinementConfig"]
 
@@ -199,4 +199,4 @@ class CoarseConfig(StageConfig):
         "where poses are off by pixels; where they are good it costs held-out views a few tenths of a dB",
     )
     pose_refinement: PoseRefinementConfig = PoseRefinementConfig()
-    seed: int = Field(0, ge=0, description="seed of all random sampling")
+    seed: Seed = Field(0, description="seed of all random sampling")

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field
 
-from extrags.config.base import StageConfig
+from extrags.config.base import Seed, StageConfig
 
 __all__ = ["CoverageConfig", "ExploreConfig", "FreespaceConfig", "SurfaceConfig", "Visibility"]
 
@@ -209,7 +209,7 @@ class ExploreConfig(StageConfig):
         "pairs; 0: when it adds nothing",
     )
     render_width: int = Field(80, ge=16, description="width of the scoring renders in pixels")
-    seed: int = Field(0, ge=0, description="seed of the probes")
+    seed: Seed = Field(0, description="seed of the probes")
 
     @property
     def coverage(self) -> CoverageConfig:

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from extrags.config.base import StageConfig
+from extrags.config.base import Seed, StageConfig
 
 __all__ = ["PosesConfig"]
 
@@ -68,4 +68,4 @@ class PosesConfig(StageConfig):
     )
     rgbd_width: int = Field(192, ge=32, description="alignment by colour and depth works at most so wide")
     rgbd_neighbours: int = Field(6, ge=1, description="frames each frame is aligned with")
-    seed: int = Field(0, ge=0, description="seed of all random sampling")
+    seed: Seed = Field(0, description="seed of all random sampling")

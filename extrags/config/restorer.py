@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, field_validator
 
 from extrags.config.backends import BACKEND_NAME, backend_schema, backend_summaries
-from extrags.config.base import StageConfig
+from extrags.config.base import Seed, StageConfig
 
 __all__ = [
     "CaptionConfig",
@@ -229,7 +229,7 @@ class EnhanceConfig(StageConfig):
     caption: CaptionConfig = CaptionConfig()
     pretrained: PretrainedConfig = PretrainedConfig()
     checkpoint: CheckpointConfig = CheckpointConfig()
-    seed: int = Field(0, ge=0, description="seed of all random sampling")
+    seed: Seed = Field(0, description="seed of all random sampling")
 
     @field_validator("samples")
     @classmethod

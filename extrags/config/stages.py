@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError, field_validator
 
-from extrags.config.base import StageConfig
+from extrags.config.base import Seed, StageConfig
 from extrags.config.baselines import UcNerfConfig
 from extrags.config.coarse import CoarseConfig
 from extrags.config.continuation import ContinuationConfig
@@ -144,7 +144,7 @@ class AssessConfig(StageConfig):
         0.2, gt=0, le=1, description="share of lacking pixels from which the whole budget is used"
     )
     force: bool = Field(False, description="run every stage whatever the measurements say")
-    seed: int = Field(0, ge=0, description="seed of all random sampling")
+    seed: Seed = Field(0, description="seed of all random sampling")
 
 
 class JudgeConfig(StageConfig):
@@ -224,7 +224,7 @@ class FinetuneConfig(StageConfig):
         True, description="weight virtual views by U_img; without it all have the same, the mean"
     )
     judge: JudgeConfig = JudgeConfig()
-    seed: int = Field(0, ge=0, description="seed of all random sampling")
+    seed: Seed = Field(0, description="seed of all random sampling")
 
 
 LpipsNet = Literal["alex", "vgg", "squeeze"]

@@ -6,6 +6,7 @@ import argparse
 import sys
 from typing import TYPE_CHECKING, Any
 
+from extrags.config import LARGEST_SEED
 from extrags.errors import ConfigError
 from flows.commands.common import (
     items,
@@ -166,13 +167,15 @@ def parsed_seeds(given: list[str]) -> list[int]:
     """`["0,1", "2"]` to `[0, 1, 2]`.
 
     Raises:
-        ConfigError: for anything but whole numbers from zero, or a seed that is there twice.
+        ConfigError: for anything but whole numbers from 0 to `LARGEST_SEED`, or a seed that is there twice.
     """
     texts = items(given)
     for text in texts:
         if not text.isdecimal():
             raise ConfigError(f"--seeds {text}: expected whole numbers from 0, e.g. --seeds 0,1,2")
     seeds = [int(text) for text in texts]
+    if seeds and max(seeds) > LARGEST_SEED:
+        raise ConfigError(f"--seeds {max(seeds)}: expected 0 to {LARGEST_SEED} (2^63 - 1)")
     if not seeds or len(set(seeds)) != len(seeds):
         raise ConfigError(f"--seeds {','.join(texts)}: expected one or more different seeds")
     return seeds

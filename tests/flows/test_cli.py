@@ -100,6 +100,9 @@ class TestUsage:
             ([SEQUENCE, "--set", "coarse.iterations=-1"], "coarse.iterations"),
             ([SEQUENCE, "--set", "coarse.iterations"], "expected NAME=VALUE"),
             ([SEQUENCE, "--seed", "-1"], "the seed is -1"),
+            ([SEQUENCE, "--seed", str(2**63)], f"the seed is {2**63}; expected 0 to {2**63 - 1}"),
+            ([SEQUENCE, "--seeds", f"0,{2**64}"], f"--seeds {2**64}: expected 0 to"),
+            ([SEQUENCE, "--coarse.seed", str(2**64)], "coarse.seed"),
             ([SEQUENCE, "--until", "finnish"], "invalid choice: 'finnish' (choose from 'ingest', 'poses'"),
             (
                 [],

@@ -21,7 +21,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from extrags.array_files import load_safetensors, save_safetensors
-from extrags.config.base import StageConfig
+from extrags.config.base import Seed, StageConfig
 from extrags.devices import chosen_device
 from extrags.errors import ConfigError, WeightsError
 from extrags.metrics.lpips import Lpips
@@ -95,7 +95,7 @@ class PretrainingConfig(StageConfig):
         math.inf, gt=0, description="the training ends after this time, however many steps it has made"
     )
     checkpoint_seconds: float = Field(300, gt=0, description="between two checkpoints")
-    seed: int = Field(0, ge=0)
+    seed: Seed = 0
 
     @model_validator(mode="after")
     def _generative_needs_perception(self) -> PretrainingConfig:

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from extrags.config.base import StageConfig
+from extrags.config.base import Seed, StageConfig
 from extrags.depth.completion import SEEN, CompletionNetwork, completion_loss
 from extrags.depth.hidden import LONGEST_SIDES_PX, met_where_known, read_depth
 from extrags.depth.pretraining.training import CompletionTraining, ExampleBank, train_completion
@@ -45,7 +45,7 @@ class HiddenDepthConfig(StageConfig):
     )
     completion: str = Field("bundled", description="the depth completion to start from: bundled, or a file")
     most_seconds: float = Field(math.inf, gt=0, description="the training ends after this time")
-    seed: int = Field(0, ge=0)
+    seed: Seed = 0
 
 
 def hidden_depth_loss(

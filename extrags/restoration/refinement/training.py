@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from extrags.config.base import StageConfig
+from extrags.config.base import Seed, StageConfig
 from extrags.errors import ConfigError
 from extrags.metrics.image import psnr_per_image
 from extrags.metrics.lpips import Lpips
@@ -53,7 +53,7 @@ class RefinerConfig(StageConfig):
     most_seconds: float | None = Field(
         None, gt=0, description="the training ends after this time; None: after all steps"
     )
-    seed: int = Field(0, ge=0)
+    seed: Seed = 0
 
 
 class _RefinerTraining(NetworkTraining):
