@@ -77,9 +77,7 @@ def benchmark(
         "coarse",
         "extrags",
     ],
-    seeds: Annotated[
-        list[Seed], Field(min_length=1, description="one run per seed")
-    ] = [0],  # noqa: B006
+    seeds: Annotated[list[Seed], Field(min_length=1, description="one run per seed")] = [0],  # noqa: B006
     settings: Annotated[
         Settings, Field(description="overrides for all runs; they do not reach what a method pins")
     ] = None,

@@ -127,22 +127,36 @@ def cells_of(
 
 
 def content_of(cell: Cell) -> str | None:
-    """Digest of what a cell reads: its source, with a calibration file, and a scene that is imported.
+    """Digest of what a cell reads: its source, with a calibration file, a scene that is imported, and weights.
 
     Returns:
-        None where it cannot be read: the cell's run then says why.
+        None where something cannot be read: the cell's run then says why.
     """
     from data_catalog.catalog import source_fingerprint
     from tasks.imported import scene_digest
+    from tasks.weights import (
+        depth_completion_digest,
+        depth_monocular_digest,
+        lpips_weights,
+        refiner_digest,
+        restorer_digest,
+    )
 
     config = cell.config()
     try:
         source = source_fingerprint(cell.sequence, config.ingest)
         scene = None if config.imported.scene is None else scene_digest(config.imported)
+        weights = [
+            restorer_digest(config.enhance),
+            refiner_digest(),
+            depth_completion_digest(config.depth),
+            depth_monocular_digest(config.depth.monocular),
+            *(found.digest for found in lpips_weights(config.evaluate)),
+        ]
     except ExtragsError as error:
         log.debug("%s cannot be read: %s", cell.sequence, error)
         return None
-    return digest_of({"source": source, "scene": scene})
+    return digest_of({"source": source, "scene": scene, "weights": weights})
 
 
 def run_grid(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from PIL import Image
 
 from extrags.errors import ConfigError
+from extrags.restoration.diffusion.weights import BUNDLED, find_weights
 from flows.budgets import Budget
 from flows.cli import main
 from flows.commands.bench_pipeline import grid_markdown
@@ -130,6 +132,15 @@ class TestGrid:
         assert [measured(SEQUENCE, **imported) for _ in range(2)] == [1, 0]
         scene.write_bytes(b"cOntent")
         assert [measured(SEQUENCE, **imported) for _ in range(2)] == [1, 0]
+        weights = tmp_path / "weights"
+        bundled = find_weights(BUNDLED)
+        assert bundled is not None
+        shutil.copytree(bundled.parent, weights)
+        own = {"enhance__pretrained_weights": str(weights)}
+        assert [measured(SEQUENCE, **own) for _ in range(2)] == [1, 0]
+        record = weights / "restorer.json"
+        record.write_text(record.read_text() + "\n")
+        assert [measured(SEQUENCE, **own) for _ in range(2)] == [1, 0]
 
     def test_a_source_that_cannot_be_read_is_a_cell_that_fails(self, tmp_path: Path) -> None:
         (tmp_path / "empty").mkdir()
