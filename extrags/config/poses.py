@@ -35,9 +35,9 @@ class PosesConfig(StageConfig):
     )
     lenient_retry: bool = Field(
         True,
-        description="where COLMAP leaves more than a tenth of the training frames without a pose and there "
-        "is no depth to align them by, try again with guided matching and lower thresholds; taken where that "
-        "registers clearly more, since poses are less exact then",
+        description="where COLMAP leaves more than a tenth of the training frames without a pose, try again "
+        "with guided matching and lower thresholds; taken where that registers clearly more, since poses are "
+        "less exact then. Not where too few registered and depth is there to align them by",
     )
     fallback: Literal["auto", "never", "rgbd"] = Field(
         "auto",

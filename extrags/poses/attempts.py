@@ -68,7 +68,8 @@ def attempted(
         job: the first attempt.
         config: settings; `lenient_retry` allows the second.
         run: the job of a sequence of a name.
-        retry: false where another way is left for frames without a pose.
+        retry: false where another way is left if too few frames register. Where enough do, and some are
+            missing, there is no other.
 
     Raises:
         CaptureError: from `run`; from that of the second attempt only where the first was not enough.
@@ -76,7 +77,8 @@ def attempted(
     first = _attempt(sequence, job, run)
     found, total = first.report["registered_train"], first.report["n_train"]
     enough = enough_registered(first.report, config)
-    if not (config.lenient_retry and retry) or (enough and total - found <= CLEAR_SHARE * total):
+    wanted = total - found > CLEAR_SHARE * total if enough else retry
+    if not (config.lenient_retry and wanted):
         return first
     _LOG.warning(
         "%s: COLMAP registered %d of %d training frames; trying again with guided matching and lower "

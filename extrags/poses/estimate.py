@@ -126,9 +126,9 @@ def estimate_poses(sequence: EndoscopicSequence, config: PosesConfig | None = No
     the median itself becomes that. COLMAP runs in
     a process of its own.
 
-    Where that leaves more than a tenth of the training frames without a pose, and no depth is there to align
-    them by, a second attempt with guided matching and lower thresholds is made (`config.lenient_retry`), and
-    taken if it registers clearly more (`extrags.poses.attempts`).
+    Where that leaves more than a tenth of the training frames without a pose, a second attempt with guided
+    matching and lower thresholds is made (`config.lenient_retry`), and taken if it registers clearly more
+    (`extrags.poses.attempts`); not where too few registered and depth is there to align them by.
 
     *An unknown lens* (`sequence.intrinsics` is `guessed`, see `PosesConfig.refine_intrinsics`): focal
     length and radial distortion are estimated with the map (`extrags.poses.self_calibration`), and the

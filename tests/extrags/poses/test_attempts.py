@@ -145,11 +145,22 @@ def test_a_first_attempt_that_was_enough_outlives_the_failure_of_the_second(
         attempted(given, job, config, too_few, retry=True)
 
 
-def test_another_way_or_the_settings_leave_it_at_one() -> None:
-    for retry, settings in ((False, {}), (True, {"lenient_retry": False})):
-        colmap = Colmap(17, (10, 17))
-        outcome(colmap, retry=retry, **settings)
-        assert colmap.lenient == [False]
+@pytest.mark.parametrize(
+    ("first", "retry", "settings"),
+    [(7, False, {}), (10, True, {"lenient_retry": False}), (7, True, {"lenient_retry": False})],
+)
+def test_another_way_or_the_settings_leave_it_at_one(
+    first: int, retry: bool, settings: dict[str, Any]
+) -> None:
+    colmap = Colmap(17, (first, 17))
+    outcome(colmap, retry=retry, **settings)
+    assert colmap.lenient == [False]
+
+
+def test_where_enough_registered_there_is_no_other_way_for_the_rest() -> None:
+    colmap = Colmap(17, (10, 17))
+    assert int(outcome(colmap, retry=False).registered.sum()) == 17
+    assert colmap.lenient == [False, True]
 
 
 def test_two_frames_make_no_map(monkeypatch: pytest.MonkeyPatch) -> None:
