@@ -127,7 +127,7 @@ def cells_of(
 
 
 def content_of(cell: Cell) -> str | None:
-    """Digest of what a cell reads: its source, with a calibration file, a scene that is imported, and weights.
+    """Digest of what a cell reads: its source, a calibration file, an imported scene, and weights.
 
     Returns:
         None where something cannot be read: the cell's run then says why.
